@@ -82,6 +82,7 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
     """
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
+    from netkf.scenario.usage import unused_notes
 
     # The verdict in --out to which --resume adds runs.
     earlier = _open_verdict_directory(scenario, options)
@@ -92,7 +93,9 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
     else:
         verdict = _run_check(scenario, options, earlier)
     text = verdict_text(verdict, scenario.claim, _replay_command(options))
-    print_notes((*scenario.notes, *filter(None, [sampling_note(scenario)])))
+    # Samples are taken at other times than those of ``probe``, at which states are recorded.
+    unused = unused_notes(scenario, without_states=True)
+    print_notes((*scenario.notes, *unused, *filter(None, [sampling_note(scenario)])))
     try:
         if options.out is not None:
             _write_verdict(scenario, verdict, "" if is_complete else text, options)

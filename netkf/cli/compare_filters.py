@@ -16,6 +16,7 @@ from netkf.cli.options import (
     load_scenario,
     parse_count,
     print_json,
+    print_table_notes,
     print_title,
 )
 from netkf.cli.progress import ProgressLine
@@ -82,6 +83,7 @@ def _compare(options: argparse.Namespace) -> int:
             scheduler=options.scheduler,
             progress=line.make_count_update("filters"),
         )
+    print_table_notes(scenario)
     try:
         if options.out is not None:
             written = write_comparison(scenario, comparison, options.out)

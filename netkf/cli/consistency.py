@@ -15,6 +15,7 @@ from netkf.cli.options import (
     load_scenario,
     parse_count,
     print_json,
+    print_table_notes,
 )
 
 
@@ -42,14 +43,16 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.studies.consistency import consistency
     from netkf.studies.tables import format_consistency
 
+    scenario = load_scenario(options)
     result = consistency(
-        load_scenario(options),
+        scenario,
         options.runs,
         confidence=options.confidence,
         workers=options.workers,
         scheduler=options.scheduler,
         engine=options.engine,
     )
+    print_table_notes(scenario)
     if options.json:
         print_json({**vars(result), "rows": [vars(row) for row in result.rows]})
     else:

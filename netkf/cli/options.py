@@ -212,6 +212,13 @@ def print_notes(notes: Sequence[str]) -> None:
         print(f"note: {one_line(note)}", file=sys.stderr)
 
 
+def print_table_notes(scenario: Scenario) -> None:
+    """Print notes on the rows of the scenario's tables that its runs merge or do not use."""
+    from netkf.scenario.usage import repeat_notes, unused_notes
+
+    print_notes((*repeat_notes(scenario), *unused_notes(scenario)))
+
+
 def print_title(scenario: Scenario) -> None:
     """Print the name of a scenario and its claim on one line."""
     print(one_line(f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name))

@@ -16,6 +16,7 @@ from netkf.cli.options import (
     load_scenario,
     parse_count,
     print_json,
+    print_table_notes,
 )
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
@@ -68,9 +69,10 @@ def _run(options: argparse.Namespace) -> int:
         remedy = "size searches one key; sweep varies several"
         raise ScenarioError("--vary", "is given more than once", options.vary, remedy)
     key, low, high = parse_interval(options.vary[0])
+    scenario = load_scenario(options)
     with ProgressLine() as line:
         sizing = size(
-            load_scenario(options),
+            scenario,
             key,
             low,
             high,
@@ -83,6 +85,7 @@ def _run(options: argparse.Namespace) -> int:
             engine=options.engine,
             progress=line.report,
         )
+    print_table_notes(scenario)
     if options.json:
         probes = [probe._asdict() for probe in sorted(sizing.probes)]
         target = sizing.target._asdict()

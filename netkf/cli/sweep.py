@@ -19,6 +19,7 @@ from netkf.cli.options import (
     load_scenario,
     parse_count,
     print_json,
+    print_table_notes,
     print_title,
 )
 from netkf.cli.progress import ProgressLine
@@ -86,6 +87,7 @@ def _print_sweep(
     """Print the table of a finished sweep and its duration, or JSON with ``--json``."""
     from netkf.studies.tables import format_sweep
 
+    print_table_notes(scenario)
     if options.json:
         rows = completed.table.to_dict("records")
         print_json({"directory": str(completed.directory), "rows": rows})

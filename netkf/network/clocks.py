@@ -373,11 +373,13 @@ class RecordedClock(LinkClock):
     def __post_init__(self) -> None:
         """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
-        _ = self._times  # a mistake in the file is found on construction
+        _ = self._instants  # a mistake in the file is found on construction
 
     @cached_property
-    def _times(self) -> dict[Entity, FloatArray]:
-        """Times (K,) of the table in seconds by entity, in the order of rows."""
+    def _rows(self) -> tuple[list[tuple[Entity, float]], dict[Entity, int]]:
+        """The entity and the time in seconds of each row, and the line number of the first row of
+        each node, or of each pair (node, peer) as listed.
+        """
         columns = ("node",) if self.at == "nodes" else ("node", "peer")
         if self.at == "nodes" and "peer" in read_header(self.path):
             raise ScenarioError(
@@ -392,26 +394,32 @@ class RecordedClock(LinkClock):
         if early.size:
             raise ScenarioError(
                 "path",
-                f"{self.path.name}: t must be above 0, nothing is sent at time 0",
+                f"{table.where(int(early[0]))}: t must be above 0, nothing is sent at time 0",
                 float(table["t"][early[0]]),
-                "shift the times or remove the row",
+                "shift the times of all tables",
             )
-        ids = zip(*map(table.integers, columns), strict=True)
-        times: dict[Entity, list[float]] = {}
-        for t, entity in zip(table["t"].tolist(), ids, strict=True):
-            key = tuple(sorted(entity)) if self.at == "links" else entity
-            times.setdefault(key, []).append(t)
-        return {entity: np.array(values) for entity, values in times.items()}
+        entities: list[Entity] = list(zip(*map(table.integers, columns), strict=True))
+        first_line: dict[Entity, int] = {}
+        for entity, line in zip(entities, table.lines.tolist(), strict=True):
+            first_line.setdefault(entity, line)
+        if self.at == "links":
+            entities = [(min(entity), max(entity)) for entity in entities]
+        return list(zip(entities, table["t"].tolist(), strict=True)), first_line
 
     @cached_property
     def _instants(self) -> dict[Entity, FloatArray]:
         """Increasing distinct times (K,) of each entity, in seconds."""
-        return {entity: np.unique(values) for entity, values in self._times.items()}
+        times: dict[Entity, list[float]] = {}
+        for entity, t in self.row_keys:
+            times.setdefault(entity, []).append(t)
+        return {entity: np.unique(values) for entity, values in times.items()}
 
     @property
-    def rows(self) -> FloatArray:
-        """The times (K,) of all rows in seconds, sorted."""
-        return np.sort(np.concatenate([np.empty(0), *self._times.values()]))
+    def row_keys(self) -> list[tuple[Entity, float]]:
+        """The entity and the time in seconds of each row, in the order of the table; equal ones are
+        one tick.
+        """
+        return self._rows[0]
 
     def ticks(
         self,
@@ -433,6 +441,6 @@ class RecordedClock(LinkClock):
         lists.
         """
         if self.at == "nodes":
-            demand_nodes(self.path, (node for (node,) in self._times), topology)
+            demand_nodes(self.path, {node: k for (node,), k in self._rows[1].items()}, topology)
         else:
-            demand_links(self.path, ((i, j) for i, j in self._times), topology)
+            demand_links(self.path, self._rows[1], topology)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from abc import abstractmethod
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +27,7 @@ from netkf.core.fields import (
     source_file,
     tuple_of,
 )
+from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.network.spectra import largest_laplacian_eigenvalue
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ class Topology:
     positions : (x, y) of each node, None if the graph has none
     notes     : one line for each group of nodes or links that were left out
     left_out  : nodes that the graph's table names but that have no link
+    tables    : use of the rows of the graph's tables, by the rest of their key path
     """
 
     nodes: tuple[int, ...]
@@ -58,6 +60,7 @@ class Topology:
     positions: dict[int, tuple[float, float]] | None = None
     notes: tuple[str, ...] = ()
     left_out: frozenset[int] = frozenset()
+    tables: Mapping[str, RowUse] = dataclasses.field(default_factory=dict)
 
     @cached_property
     def index(self) -> dict[int, int]:
@@ -130,25 +133,27 @@ class Topology:
         return sorted(components, key=len, reverse=True)
 
 
-def demand_links(source: SourceFile, pairs: Iterable[Link], topology: Topology) -> None:
-    """Raise ScenarioError if a file, such as one of recorded exchanges, names one of ``pairs``
-    (sender, receiver) that is not a link of the graph.
+def demand_links(source: SourceFile, lines: Mapping[Link, int], topology: Topology) -> None:
+    """Raise ScenarioError if a file, such as one of recorded exchanges, names a pair (sender,
+    receiver) that is not a link of the graph; ``lines`` has a line number of each pair.
     """
     links = set(topology.links)
     if not topology.directed:
         links |= {(j, i) for i, j in links}
-    unknown = sorted(set(pairs) - links)
-    if unknown:
-        rule = f"{source.name}: every pair must be a link of the graph"
-        raise ScenarioError("path", rule, list(unknown[0]), "add the link or remove the rows")
+    unknown = min(lines.keys() - links, key=lines.__getitem__, default=None)
+    if unknown is not None:
+        rule = f"{source.name} line {lines[unknown]}: every pair must be a link of the graph"
+        raise ScenarioError("path", rule, list(unknown), "correct the row or add the link")
 
 
-def demand_nodes(source: SourceFile, nodes: Iterable[int], topology: Topology) -> None:
-    """Raise ScenarioError if a file names one of ``nodes`` (ids) that the graph does not have."""
-    unknown = sorted(set(nodes) - topology.index.keys())
-    if unknown:
-        rule = f"{source.name} names a node that the graph does not have"
-        raise ScenarioError("path", rule, unknown[0], "correct the row or the graph")
+def demand_nodes(source: SourceFile, lines: Mapping[int, int], topology: Topology) -> None:
+    """Raise ScenarioError if a file names a node (id) that the graph does not have; ``lines`` has a
+    line number of each node.
+    """
+    unknown = min(lines.keys() - topology.index.keys(), key=lines.__getitem__, default=None)
+    if unknown is not None:
+        rule = f"{source.name} line {lines[unknown]} names a node that the graph does not have"
+        raise ScenarioError("path", rule, unknown, "correct the row or the graph")
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,10 +424,13 @@ class Edges(Graph):
 
 
 class _Table(NamedTuple):
-    """The delivery probability of each direction listed in a table, 1 without such a column."""
+    """The delivery probability of each direction listed in a table, 1 without such a column, and
+    the use of its rows.
+    """
 
     probability: dict[Link, float]
     has_probabilities: bool
+    rows: RowUse
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,7 +456,7 @@ class CsvGraph(Graph):
         """
         table = self._table()
         named = {node for link in table.probability for node in link}
-        delivery, has_probabilities = self._add_reverse_links(table)
+        delivery, has_probabilities, _ = self._add_reverse_links(table)
         links = self._links(delivery)
         # Pairs listed from i to j only, in a table that lists others both ways.
         one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
@@ -463,17 +471,19 @@ class CsvGraph(Graph):
             )
         nodes = {node for link in links for node in link}
         isolated = named - nodes
+        positions, place_rows = self._positions(nodes, isolated)
         return Topology(
             tuple(sorted(nodes)),
             tuple(sorted(links if self.directed else {(min(p), max(p)) for p in links})),
             directed=self.directed,
             delivery=self._delivery(delivery, links) if has_probabilities else None,
-            positions=self._positions(nodes),
+            positions=positions,
             notes=(
                 *_isolated_note(isolated, self.minimum or 0.0),
                 *_one_way_note(one_way if has_probabilities else []),
             ),
             left_out=frozenset(isolated),
+            tables={"": table.rows} | ({} if place_rows is None else {".positions": place_rows}),
         )
 
     def _table(self) -> _Table:
@@ -485,16 +495,16 @@ class CsvGraph(Graph):
         has_probabilities = "delivery_probability" in columns
         ones = [1.0] * len(senders)
         values = columns["delivery_probability"].tolist() if has_probabilities else ones
-        for i, j, p in zip(senders, receivers, values, strict=True):
+        for row, (i, j, p) in enumerate(zip(senders, receivers, values, strict=True)):
             if i == j or not 0.0 <= p <= 1.0:
-                rule = f"{self.path.name}: rows must join two nodes with a probability"
+                rule = f"{columns.where(row)}: rows must join two nodes with a probability"
                 raise ScenarioError("path", rule, [i, j, p], "correct the row")
         pairs = list(zip(senders, receivers, strict=True))
-        repeated = next((pair for pair, count in Counter(pairs).items() if count > 1), None)
-        if repeated is not None:
-            rule = f"{self.path.name}: each direction must be listed once"
-            raise ScenarioError("path", rule, list(repeated), "remove the other rows")
-        return _Table(dict(zip(pairs, values, strict=True)), has_probabilities)
+        rule = "each direction must be listed once, with one probability"
+        first = first_rows(columns, pairs, values, rule)
+        probability = {pair: values[row] for pair, row in first.items()}
+        use = count_rows(self.path.name, pairs, probability.__contains__)
+        return _Table(probability, has_probabilities, use)
 
     def _add_reverse_links(self, table: _Table) -> _Table:
         """Return the table with the reverse of each row added, for a table that lists every
@@ -542,28 +552,40 @@ class CsvGraph(Graph):
         pairs = links if self.directed else links | {(j, i) for i, j in links}
         return {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
 
-    def _positions(self, nodes: set[int]) -> dict[int, tuple[float, float]] | None:
-        """Return the coordinates (x, y) of ``nodes`` (ids) by node, None without a file."""
+    def _positions(
+        self, nodes: set[int], left_out: set[int]
+    ) -> tuple[dict[int, tuple[float, float]] | None, RowUse | None]:
+        """Return the coordinates (x, y) of ``nodes`` (ids) by node, and the use of the table's
+        rows; None for both without a file. Rows of nodes that are ``left_out`` count as used.
+        """
         if self.positions is None:
-            return None
-        source = self.positions
+            return None, None
         try:
-            names = tuple(read_header(source)[:3])
-            if len(names) < 3:
-                rule = f"{source.name} must have the columns node, x, y"
-                raise ScenarioError("", rule, list(names), "add what is missing")
-            columns = read_columns(source, names)
-            ids = columns.integers(names[0])
+            points, row_nodes = _read_positions(self.positions)
         except ScenarioError as error:
             # These errors name "path", which here is the key of the other table.
             raise ScenarioError("positions", error.rule, error.value, error.remedy) from None
-        x, y = columns[names[1]].tolist(), columns[names[2]].tolist()
-        points = dict(zip(ids, zip(x, y, strict=True), strict=True))
         missing = sorted(nodes - points.keys())
         if missing:
-            rule = f"{source.name} must place every node"
+            rule = f"{self.positions.name} must place every node"
             raise ScenarioError("positions", rule, missing, "add their rows")
-        return {node: points[node] for node in sorted(nodes)}
+        use = count_rows(self.positions.name, row_nodes, (nodes | left_out).__contains__)
+        return {node: points[node] for node in sorted(nodes)}, use
+
+
+def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]], list[int]]:
+    """Return the coordinates (x, y) by node id of a table whose first three columns are node, x and
+    y, and the node of each row. Raises ScenarioError for a node at two places.
+    """
+    names = tuple(read_header(source)[:3])
+    if len(names) < 3:
+        rule = f"{source.name} must have the columns node, x, y"
+        raise ScenarioError("path", rule, list(names), "add what is missing")
+    columns = read_columns(source, names)
+    points = list(zip(columns[names[1]].tolist(), columns[names[2]].tolist(), strict=True))
+    ids = columns.integers(names[0])
+    first = first_rows(columns, ids, points, "a node must have one position")
+    return {node: points[row] for node, row in first.items()}, ids
 
 
 def _isolated_note(nodes: set[int], minimum: float) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 
@@ -162,11 +163,6 @@ class Matching(SlotActivation):
         return dict(zip(links, _greedy_probabilities(links), strict=True))
 
 
-def _shares_node(link: Link, pairs: list[Link]) -> bool:
-    """Return True if the link shares a node with one of the pairs."""
-    return any(node in pair for pair in pairs for node in link)
-
-
 def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
     """Draw a node uniformly and one of its neighbours uniformly; return their link [(i, j)], i < j,
     or an empty list if the node has no neighbours.
@@ -270,6 +266,10 @@ class Broadcast(SlotActivation):
         """Accept any graph."""
 
 
+RowKey = tuple[int, int, int, Link]
+"""Slot, phase, step and link of a row of recorded exchanges."""
+
+
 @dataclass(frozen=True, eq=False)
 class RecordedSlots(SlotActivation):
     """Exchanges read from a table.
@@ -292,28 +292,50 @@ class RecordedSlots(SlotActivation):
         return "phase" not in read_header(self.path)
 
     @cached_property
-    def _pairs(self) -> dict[tuple[int, int, int], list[Link]]:
-        """Pairs of node ids of the table by (slot, phase, step)."""
-        names: tuple[str, ...] = ("slot", "node", "peer")
+    def _rows(self) -> tuple[list[RowKey], list[int]]:
+        """The key and the line number of each row."""
+        names: tuple[str, ...] = ("slot", "phase", "step", "node", "peer")
         matching = self.matching
-        if not matching:
-            names = ("slot", "phase", "step", "node", "peer")
+        if matching:
+            names = ("slot", "node", "peer")
         table = read_columns(self.path, names)
         columns = {name: table.integers(name) for name in names}
-        pairs: dict[tuple[int, int, int], list[Link]] = {}
-        for row, (slot, i, j) in enumerate(
-            zip(columns["slot"], columns["node"], columns["peer"], strict=True)
-        ):
-            phase, step = (0, 0) if matching else (columns["phase"][row], columns["step"][row])
-            listed = pairs.setdefault((slot, phase, step), [])
+        zeros = [0] * len(table.lines)
+        phases, steps = columns.get("phase", zeros), columns.get("step", zeros)
+        links: Iterable[Link] = zip(columns["node"], columns["peer"], strict=True)
+        if matching:
             # A pair has no direction, and may be listed from either end.
-            link = (min(i, j), max(i, j)) if matching else (i, j)
-            if matching and link not in listed and (i == j or _shares_node(link, listed)):
-                rule = f"{self.path.name}: a node may be paired once a slot"
-                raise ScenarioError("path", rule, [slot, i, j], "correct the row")
-            if link not in listed:
-                listed.append(link)
+            links = ((min(link), max(link)) for link in links)
+        keys = list(zip(columns["slot"], phases, steps, links, strict=True))
+        return keys, table.lines.tolist()
+
+    @property
+    def row_keys(self) -> list[RowKey]:
+        """The key of each row, in the order of the table; equal ones are one link that is up."""
+        return self._rows[0]
+
+    @cached_property
+    def _pairs(self) -> dict[tuple[int, int, int], list[Link]]:
+        """Pairs of node ids of the table by (slot, phase, step)."""
+        pairs: dict[tuple[int, int, int], dict[Link, int]] = {}
+        matching = self.matching
+        for (slot, phase, step, link), line in zip(*self._rows, strict=True):
+            listed = pairs.setdefault((slot, phase, step), {})
+            if matching and link not in listed:
+                self._demand_free(slot, link, line, listed)
+            listed.setdefault(link, line)
         return {key: sorted(listed) for key, listed in pairs.items()}
+
+    def _demand_free(self, slot: int, link: Link, line: int, listed: dict[Link, int]) -> None:
+        """Raise ScenarioError if a node of ``link`` is in one of the pairs ``listed`` for the slot,
+        each with its line number, or if the link joins a node to itself.
+        """
+        other = next((line for pair, line in listed.items() if set(pair) & set(link)), None)
+        if other is None and link[0] != link[1]:
+            return
+        where = f"line {line}" if other is None else f"lines {other} and {line}"
+        rule = f"{self.path.name} {where}: a node may be paired once a slot"
+        raise ScenarioError("path", rule, [slot, *link], "correct the row")
 
     @property
     def recorded(self) -> tuple[tuple[int, int, int], ...]:
@@ -328,4 +350,7 @@ class RecordedSlots(SlotActivation):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every recorded pair is a link."""
-        demand_links(self.path, {p for listed in self._pairs.values() for p in listed}, topology)
+        first_line: dict[Link, int] = {}
+        for (*_, link), line in zip(*self._rows, strict=True):
+            first_line.setdefault(link, line)
+        demand_links(self.path, first_line, topology)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, field, one_of, source_file
+from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.network.channels import Delay, Loss
 from netkf.network.graphs import Link, Topology, demand_links
 
@@ -20,26 +20,25 @@ AFTER = ("deliver", "lose", "repeat", "refuse")
 """The treatments of a message that the table does not list."""
 
 _after = one_of(*AFTER)
-
-
-class MessageUse(NamedTuple):
-    """Numbers of ``rows`` of a table, of ``unused`` rows, and of messages ``beyond`` the table: a
-    run sent them, but the table does not list them.
-    """
-
-    rows: int
-    unused: int
-    beyond: int
+COUNTER_REMEDY = (
+    "correct one of the two rows; messages of a link are counted on from 0, so if a counter of the "
+    "log wraps, add its length after each wrap"
+)
 
 
 @dataclass(frozen=True)
 class MessageTable:
     """A value for each listed message of each directed link: ``values[link][number]``, with
     messages of a link (sender, receiver) numbered from 0.
+
+    ``row_keys`` has the (sender, receiver, number) of each row: rows may repeat a message and its
+    value. ``lines`` has the line number of the first row of each link.
     """
 
     source: SourceFile
     values: Mapping[Link, Mapping[int, float]]
+    row_keys: Sequence[tuple[int, int, int]]
+    lines: Mapping[Link, int]
 
     @cached_property
     def _lengths(self) -> dict[Link, int]:
@@ -67,15 +66,14 @@ class MessageTable:
             )
         return value
 
-    def use(self, sent: Mapping[Link, int]) -> MessageUse:
-        """Return how a run with ``sent`` messages on each directed link used the table, so that
-        summaries can tell which rows were not needed and which messages were not listed.
+    def use(self, sent: Mapping[Link, int]) -> tuple[RowUse, int]:
+        """Return the use of the rows by a run with ``sent`` messages on each directed link, and how
+        many of these messages the table does not list.
         """
-        rows = sum(map(len, self.values.values()))
-        used = sum(
-            number < count for link, count in sent.items() for number in self.values.get(link, ())
+        use = count_rows(
+            self.source.name, self.row_keys, lambda key: key[2] < sent.get((key[0], key[1]), 0)
         )
-        return MessageUse(rows=rows, unused=rows - used, beyond=sum(sent.values()) - used)
+        return use, sum(sent.values()) - use.used
 
 
 def read_messages(
@@ -89,15 +87,18 @@ def read_messages(
     """
     names = ("sender", "receiver", "message")
     table = read_columns(source, (*names, column))
-    keys = zip(*map(table.integers, names), strict=True)
+    keys, entries = list(zip(*map(table.integers, names), strict=True)), table[column].tolist()
+    for row, entry in enumerate(entries):
+        if not allowed(entry):
+            printed = [*keys[row], int(entry) if entry.is_integer() else entry]
+            raise ScenarioError("path", f"{table.where(row)}: {rule}", printed, "correct the row")
+    first = first_rows(table, keys, entries, rule, COUNTER_REMEDY)
     values: dict[Link, dict[int, float]] = {}
-    for (sender, receiver, message), value in zip(keys, table[column].tolist(), strict=True):
-        listed = values.setdefault((sender, receiver), {})
-        if not allowed(value) or listed.setdefault(message, value) != value:
-            printed = int(value) if value.is_integer() else value
-            row = [sender, receiver, message, printed]
-            raise ScenarioError("path", f"{source.name}: {rule}", row, "correct the row")
-    return MessageTable(source, values)
+    first_line: dict[Link, int] = {}
+    for (sender, receiver, message), row in first.items():
+        values.setdefault((sender, receiver), {})[message] = entries[row]
+        first_line.setdefault((sender, receiver), int(table.lines[row]))
+    return MessageTable(source, values, keys, first_line)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +151,7 @@ class RecordedLoss(Loss):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every recorded pair is a link."""
-        demand_links(self.path, self.table.values, topology)
+        demand_links(self.path, self.table.lines, topology)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +203,7 @@ class RecordedDelay(Delay):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every recorded pair is a link."""
-        demand_links(self.path, self.table.values, topology)
+        demand_links(self.path, self.table.lines, topology)
 
 
 def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:

@@ -26,6 +26,7 @@ from netkf.core.fields import (
     matrix,
     source_file,
 )
+from netkf.core.repeated_rows import first_rows
 from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -73,9 +74,21 @@ class RecordedPlant(LinearPlant):
     @cached_property
     def table(self) -> Table:
         """The states (n,) by slot number; raises ScenarioError for a mistake in the file."""
-        times, states = _states(self.path, self.n)
-        rows = list(zip(times.tolist(), states, strict=True))
-        return index_by_slot(self.path, rows, self.period, whose="")
+        table, states = self._states
+        rule = "there may be one row a slot, or equal ones"
+        first = first_rows(table, self.row_keys, states.tolist(), rule)
+        return {slot: states[row] for slot, row in first.items()}
+
+    @cached_property
+    def _states(self) -> tuple[Columns, FloatArray]:
+        """The columns of the file and the states (K, n) of its rows."""
+        return _read_states(self.path, self.n)
+
+    @cached_property
+    def row_keys(self) -> list[int]:
+        """The slot number of each row, in the order of the table; rows of one slot are equal."""
+        times = enumerate(self._states[0]["t"].tolist())
+        return [slot_number(self._states[0].where(row), t, self.period) for row, t in times]
 
     def require_slots(self, slots: Iterable[int]) -> None:
         """Raise ScenarioError if the table has no state for one of the ``slots`` (numbers)."""
@@ -123,17 +136,30 @@ class RecordedDiffusion(Diffusion):
 
     @cached_property
     def table(self) -> tuple[FloatArray, FloatArray]:
-        """Increasing times (K,) in seconds and states (K, n); raises ScenarioError for two rows of
-        one time.
+        """Increasing times (K,) in seconds and states (K, n); raises ScenarioError for two states
+        at one time.
         """
-        times, states = _states(self.path, self.n)
+        table, states = self._states
+        rule = "there may be one row a time, or equal ones"
+        first = first_rows(table, self.row_keys, states.tolist(), rule)
+        rows = [first[key] for key in range(len(first))]
+        return table["t"][rows], states[rows]
+
+    @cached_property
+    def _states(self) -> tuple[Columns, FloatArray]:
+        """The columns of the file and the states (K, n) of its rows."""
+        return _read_states(self.path, self.n)
+
+    @cached_property
+    def row_keys(self) -> list[int]:
+        """The index of each row's time among all times of the table, in the order of the table;
+        rows of one time, up to TOLERANCE seconds, are equal.
+        """
+        times = self._states[0]["t"]
         order = np.argsort(times, kind="stable")
-        times, states = times[order], states[order]
-        twice = np.flatnonzero(np.diff(times) <= TOLERANCE)
-        if twice.size:
-            rule = f"{self.path.name}: there may be one row a time"
-            raise ScenarioError("path", rule, f"two at t = {times[twice[0]]:g}", "remove one")
-        return times, states
+        keys = np.zeros(len(order), dtype=np.int64)
+        keys[order[1:]] = np.cumsum(np.diff(times[order]) > TOLERANCE)
+        return [int(key) for key in keys]
 
     @property
     def recorded_truth(self) -> RecordedTruth:
@@ -148,11 +174,11 @@ class RecordedDiffusion(Diffusion):
         demand_rows(self.path, self.table[0], times, what)
 
 
-def _states(source: SourceFile, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return times (K,) in seconds and states (K, n) of a table ``t,x0,x1,...``, in its order."""
+def _read_states(source: SourceFile, n: int) -> tuple[Columns, FloatArray]:
+    """Return the columns of a table ``t,x0,x1,...``, and the states (K, n) of its rows."""
     names = [f"x{k}" for k in range(n)]
-    columns = read_columns(source, ("t", *names))
-    return columns["t"], np.stack([columns[name] for name in names], axis=1)
+    table = read_columns(source, ("t", *names))
+    return table, np.stack([table[name] for name in names], axis=1)
 
 
 class RecordedPath:
@@ -400,16 +426,24 @@ def index_by_slot(
     """
     table: Table = {}
     for t, values in rows:
-        # Decimal times of a file are multiples of the period up to rounding only.
-        slot = round(t / period)
-        if slot < 0 or abs(t - slot * period) > 1e-9 * max(period, abs(t)):
-            rule = f"{source.name}: t must be a slot, a multiple of the period {period:g}"
-            raise ScenarioError("path", rule, t, "correct the row")
+        slot = slot_number(source.name, t, period)
         if slot in table:
             rule = f"{source.name}: there may be one row{whose} a slot"
             raise ScenarioError("path", rule, f"two at t = {t:g}", "remove one")
         table[slot] = values
     return table
+
+
+def slot_number(where: str, t: float, period: float) -> int:
+    """Return the number of the slot of ``period`` seconds that begins at ``t``; raises
+    ScenarioError, with ``where`` the row is, if none does.
+    """
+    # Decimal times of a file are multiples of the period up to rounding only.
+    slot = round(t / period)
+    if slot < 0 or abs(t - slot * period) > 1e-9 * max(period, abs(t)):
+        rule = f"{where}: t must be a slot, a multiple of the period {period:g}"
+        raise ScenarioError("path", rule, t, "correct the row")
+    return slot
 
 
 def _demand_rows(

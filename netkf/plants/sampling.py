@@ -95,16 +95,27 @@ class RecordedSampling(Clock):
         _ = self._times  # a mistake in the file is found on construction
 
     @cached_property
-    def _times(self) -> dict[int, FloatArray]:
-        """Increasing sampling times (K,) in seconds, by node id."""
+    def row_times(self) -> list[tuple[int, float]]:
+        """Node id and time (seconds) of every row, in the order of the file; equal ones are one
+        sample.
+        """
         table = read_columns(self.path, ("t", "node"))
-        nodes = np.array(table.integers("node"), dtype=np.int64)
+        nodes = table.integers("node")
         early = np.flatnonzero(table["t"] <= 0.0)
         if early.size:
-            rule = f"{self.path.name}: t must be above 0, the first sample comes after the start"
-            remedy = "shift the times or remove the row"
+            where = table.where(int(early[0]))
+            rule = f"{where}: t must be above 0, the first sample comes after the start"
+            remedy = "shift the times of all tables"
             raise ScenarioError("path", rule, float(table["t"][early[0]]), remedy)
-        return {node: np.unique(table["t"][nodes == node]) for node in np.unique(nodes).tolist()}
+        return list(zip(nodes, table["t"].tolist(), strict=True))
+
+    @cached_property
+    def _times(self) -> dict[int, FloatArray]:
+        """Increasing sampling times (K,) in seconds, by node id."""
+        times: dict[int, list[float]] = {}
+        for node, t in self.row_times:
+            times.setdefault(node, []).append(t)
+        return {node: np.unique(times[node]) for node in sorted(times)}
 
     @property
     def listed(self) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from netkf.core.errors import ScenarioError
+from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
 from netkf.plants.truth import TOLERANCE
@@ -104,21 +105,22 @@ def exchange_slots(scenario: DerivedScenario) -> range:
     return range(scenario.node_filter.first_slot, sensed_slots(scenario).stop)
 
 
-def count_state_rows(scenario: DerivedScenario) -> tuple[str, int, int] | None:
-    """Return (file name, rows, used rows) of recorded states; None if states are not recorded."""
+def count_state_rows(scenario: DerivedScenario) -> RowUse | None:
+    """Return the use of the rows of recorded states; None if states are not recorded."""
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion):
-        return plant.path.name, len(plant.table[0]), _count_used_rows(scenario, plant)
-    if not isinstance(plant, RecordedPlant):
-        return None
-    used_slots = _state_slots(scenario) & plant.table.keys()
-    return plant.path.name, len(plant.table), len(used_slots)
+        used = _used_states(scenario, plant)
+        return count_rows(plant.path.name, plant.row_keys, used.__contains__)
+    if isinstance(plant, RecordedPlant):
+        slots = _state_slots(scenario)
+        return count_rows(plant.path.name, plant.row_keys, slots.__contains__)
+    return None
 
 
-def _count_used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int:
-    """Return how many rows of a recorded diffusion replica 0 uses.
+def _used_states(scenario: DerivedScenario, plant: RecordedDiffusion) -> set[int]:
+    """Return the indices of the states of a recorded diffusion that replica 0 uses.
 
-    These are the rows at probe times and, if a sensor draws its readings, at sample times, up to
+    These are the states at probe times and, if a sensor draws its readings, at sample times, up to
     TOLERANCE seconds.
     """
     times = [scenario.times]
@@ -128,7 +130,7 @@ def _count_used_rows(scenario: DerivedScenario, plant: RecordedDiffusion) -> int
     # A row is used if a needed time lies in [t - TOLERANCE, t + TOLERANCE].
     first = np.searchsorted(needed_times, row_times - TOLERANCE)
     end = np.searchsorted(needed_times, row_times + TOLERANCE, side="right")
-    return int((first < end).sum())
+    return {int(k) for k in np.flatnonzero(first < end)}
 
 
 def _state_slots(scenario: DerivedScenario) -> set[int]:

@@ -15,6 +15,7 @@ from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
 from netkf.scenario.stamps import stamp_notes
 from netkf.scenario.tables import change_keys
+from netkf.scenario.usage import repeat_notes
 
 FORMER_ATTRIBUTES = {
     "ends": "end_time",
@@ -100,6 +101,7 @@ class Scenario(DerivedScenario):
         return (
             *self.topology.notes,
             *self.node_filter.scenario_notes(self),
+            *repeat_notes(self),
             *record_notes(self),
             *sampling_notes(self),
             *stamp_notes(self),

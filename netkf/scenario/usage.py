@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
+from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.network.clocks import RecordedClock
 from netkf.network.graphs import Link
 from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedDelay, RecordedLoss
-from netkf.plants.recorded import RecordedSensor
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
 from netkf.plants.sampling import RecordedSampling
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import count_state_rows, exchange_slots, sensed_slots
 
 Use = dict[str, Any]
-"""The use of one table: ``path``, ``rows``, ``unused`` and, for losses and delays, ``beyond`` and
-``after``; see ``record_usage``.
+"""The use of one table: ``path``, ``rows``, ``unused``, where rows repeat others ``used`` and
+``merged``, and for losses and delays ``beyond`` and ``after``; see ``record_usage``.
 """
 OUTCOMES = {
     "deliver": "were delivered",
@@ -36,26 +35,33 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
     ``sent`` counts the messages of each directed link, lost ones included; None leaves out the
     tables of losses and delays, whose use differs from run to run. Each entry has ``path``, the
     name of the file, ``rows``, the number of its rows, and ``unused``, how many of them the run did
-    not use; those of losses and delays also have ``beyond``, the number of messages that the table
-    does not list, and ``after``, what the scenario says about these.
+    not use; where rows repeat others, also ``used`` and ``merged``, the number of rows that repeat
+    a used one (``rows`` is the sum of the three). Those of losses and delays also have ``beyond``,
+    the number of messages that the table does not list, and ``after``, what the scenario says about
+    these. Tables of graphs and positions have entries only if rows repeat others or are unused.
 
     Several sensors may name one table: its entry has the key of the first one, and a row is used
     if any of them uses it.
     """
-    uses = {"network.activation": _find_activation_use(scenario)}
+    uses = {
+        f"network.graph{key}": _make_use(use)
+        for key, use in scenario.topology.tables.items()
+        if use.used < use.rows
+    }
+    activation_use = _find_activation_use(scenario)
+    if activation_use is not None:
+        uses["network.activation"] = _make_use(activation_use)
     channel = scenario.network.channel
     for key, component in (("loss", channel.loss), ("delay", channel.delay)):
         if sent is not None and isinstance(component, RecordedLoss | RecordedDelay):
-            counts = component.table.use(sent)
-            use = _make_use(component.path.name, counts.rows, counts.unused)
-            use |= {"beyond": counts.beyond, "after": component.after}
-            uses[f"network.channel.{key}"] = use
-    uses |= _find_sensor_uses(scenario)
+            rows, beyond = component.table.use(sent)
+            more = {"beyond": beyond, "after": component.after}
+            uses[f"network.channel.{key}"] = _make_use(rows) | more
+    uses |= {key: _make_use(use) for key, use in _find_sensor_uses(scenario).items()}
     state_rows = count_state_rows(scenario)
     if state_rows is not None:
-        path, rows, used = state_rows
-        uses["plant"] = _make_use(path, rows, rows - used)
-    return {key: use for key, use in uses.items() if use is not None}
+        uses["plant"] = _make_use(state_rows)
+    return uses
 
 
 def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
@@ -77,29 +83,73 @@ def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _make_use(path: str, rows: int, unused: int) -> Use:
-    """Return the use of the table in the file ``path``: its number of ``rows``, and of those
-    ``unused``.
+def unused_notes(scenario: DerivedScenario, without_states: bool = False) -> tuple[str, ...]:
+    """Return a line for each table with rows that no run uses; tables of losses and delays are left
+    out, whose use differs from run to run, and on demand that of recorded states.
     """
-    return {"path": path, "rows": rows, "unused": unused}
+    usage = record_usage(scenario, sent=None)
+    if without_states:
+        usage.pop("plant", None)
+    return usage_notes(usage)
 
 
-def _find_activation_use(scenario: DerivedScenario) -> Use | None:
+def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
+    """Return a line for each table with rows that repeat others and are merged with them."""
+    activation, channel = scenario.network.activation, scenario.network.channel
+    # By key path: what rows repeat, the name of the file, and a key of each row.
+    tables: dict[str, tuple[str, str, Sequence[Any]]] = {}
+    if isinstance(activation, RecordedClock):
+        what = f"{activation.at.removesuffix('s')} and time"
+        tables["network.activation"] = what, activation.path.name, activation.row_keys
+    if isinstance(activation, RecordedSlots):
+        tables["network.activation"] = "slot and link", activation.path.name, activation.row_keys
+    for key, component in (("loss", channel.loss), ("delay", channel.delay)):
+        if isinstance(component, RecordedLoss | RecordedDelay):
+            table = component.table
+            tables[f"network.channel.{key}"] = "message", table.source.name, table.row_keys
+    for k, sensor in enumerate(scenario.sensors):
+        clock = getattr(sensor, "sampling", None)
+        if isinstance(clock, RecordedSampling):
+            key = f"sensors[{k}].sampling"
+            tables[key] = "node and time", clock.path.name, clock.row_times
+    if isinstance(scenario.plant, RecordedDiffusion | RecordedPlant):
+        tables["plant"] = "time", scenario.plant.path.name, scenario.plant.row_keys
+    uses = [
+        (f"network.graph{key}", "node" if key else "link", use)
+        for key, use in scenario.topology.tables.items()
+    ]
+    for key, (what, path, keys) in tables.items():
+        uses.append((key, what, count_rows(path, keys, lambda _: True)))
+    # A table that several sensors name is told once.
+    merged = {(what, use): key for key, what, use in reversed(uses) if use.merged}
+    return tuple(
+        f"{key}: {use.merged} of {use.rows} rows repeat the {what} of an earlier row and are "
+        f"merged with it ({use.path})"
+        for (what, use), key in reversed(merged.items())
+    )
+
+
+def _make_use(use: RowUse) -> Use:
+    """Return the numbers of rows of one table by their names in summary.json."""
+    counts: Use = {"path": use.path, "rows": use.rows}
+    if use.merged:
+        counts |= {"used": use.used, "merged": use.merged}
+    return counts | {"unused": use.unused}
+
+
+def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
     """Return the use of the table of a recorded activation, None for other activations."""
     activation, talks = scenario.network.activation, scenario.filter.algorithm.talks
     if isinstance(activation, RecordedClock):
-        row_times = activation.rows
-        used = int((row_times < scenario.horizon).sum()) if talks else 0
-        return _make_use(activation.path.name, len(row_times), len(row_times) - used)
+        end = scenario.horizon if talks else 0.0
+        return count_rows(activation.path.name, activation.row_keys, lambda key: key[1] < end)
     if isinstance(activation, RecordedSlots):
         slots = exchange_slots(scenario) if talks else range(0)
-        counts = {key: len(activation.pairs(*key)) for key in activation.recorded}
-        unused = sum(count for (slot, _, _), count in counts.items() if slot not in slots)
-        return _make_use(activation.path.name, sum(counts.values()), unused)
+        return count_rows(activation.path.name, activation.row_keys, lambda key: key[0] in slots)
     return None
 
 
-def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, Use]:
+def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:
     """Return the uses of tables of sampling times and of readings, by key path.
 
     Sensors with the same file share one entry.
@@ -125,18 +175,20 @@ def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, Use]:
 
 def _find_row_use(
     scenario: DerivedScenario, component: RecordedSampling | RecordedSensor, nodes: set[int]
-) -> Use:
+) -> RowUse:
     """Return the use of a table of sampling times or readings by the sensors of ``nodes``."""
-    if isinstance(component, RecordedSensor):
-        rows = component.row_times
-    else:
-        rows = [
-            (node, t) for node in component.listed for t in component.recorded_times(node).tolist()
-        ]
-    times = np.array([t for node, t in rows if node in nodes])
+    rows, horizon = component.row_times, scenario.horizon
+    # Rows of a sampling that tell a node twice to sample at one time are one sample; readings are
+    # told apart by their row.
+    is_reading = isinstance(component, RecordedSensor)
+    keys = [(node, t, row if is_reading else 0) for row, (node, t) in enumerate(rows)]
     if scenario.slotted:
-        slots = np.round(times / scenario.slot_plant.period)
-        used = int(np.isin(slots, list(sensed_slots(scenario))).sum())
-    else:
-        used = int((times < scenario.horizon).sum())
-    return _make_use(component.path.name, len(rows), len(rows) - used)
+        slots, period = sensed_slots(scenario), scenario.slot_plant.period
+        return count_rows(
+            component.path.name,
+            keys,
+            lambda key: key[0] in nodes and round(key[1] / period) in slots,
+        )
+    return count_rows(
+        component.path.name, keys, lambda key: key[0] in nodes and 0.0 <= key[1] < horizon
+    )

@@ -125,7 +125,7 @@ def test_recorded_ticks_of_links_directions_and_nodes(tmp_path):
     random = np.random.default_rng()
     links = recorded(tmp_path, text)
     assert links.ticks((0, 1), 0.0, 0, 0.0, random, 9).tolist() == [0.25, 0.5]
-    assert links.rows.tolist() == [0.25, 0.5, 0.5]
+    assert links.row_keys == [((0, 1), 0.5), ((0, 1), 0.25), ((0, 1), 0.5)]
     ways = recorded(tmp_path, text, at="directions")
     assert ways.ticks((0, 1), 0.0, 0, 0.0, random, 9).tolist() == [0.25, 0.5]
     assert ways.ticks((1, 0), 0.0, 0, 0.0, random, 9).tolist() == [0.5]

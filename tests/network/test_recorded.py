@@ -16,7 +16,7 @@ from netkf.network.channels import (
     delay_depends_on_message,
     transit_time,
 )
-from netkf.network.recorded import MessageUse, RecordedDelay, RecordedLoss
+from netkf.network.recorded import RecordedDelay, RecordedLoss
 
 WAY, BACK = (0, 1), (1, 0)
 FINE = ChannelDraw(0.0, False, 0.0)
@@ -79,9 +79,11 @@ def test_a_message_beyond_the_record_may_be_refused(record, cls, key):
 
 @pytest.mark.parametrize("cls", [RecordedLoss, RecordedDelay])
 def test_what_is_used_of_a_record(record, cls):
-    table = record(cls, ["0,1,0,1", "0,1,3,1", "0,1,9,1", "1,0,0,1"]).table
-    assert table.use({WAY: 5, (2, 0): 2}) == MessageUse(rows=4, unused=2, beyond=5)
-    assert table.use({}) == MessageUse(rows=4, unused=4, beyond=0)
+    table = record(cls, ["0,1,0,1", "0,1,3,1", "0,1,9,1", "1,0,0,1", "0,1,3,1", "0,1,9,1"]).table
+    use, beyond = table.use({WAY: 5, (2, 0): 2})
+    assert (use, use.unused, beyond) == (("record.csv", 6, 2, 1), 3, 5)
+    use, beyond = table.use({})
+    assert (use, use.unused, beyond) == (("record.csv", 6, 0, 0), 6, 0)
 
 
 def test_nothing_is_drawn_for_recorded_delays(record):
