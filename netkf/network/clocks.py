@@ -389,14 +389,14 @@ class RecordedClock(LinkClock):
                 'set at = "directions", or remove the column',
             )
         table = read_columns(self.path, ("t", *columns))
-        # Nothing is sent at time 0 or before.
+        # Nothing is sent at time 0 or before; of a longer log a scenario may choose its origin.
         early = np.flatnonzero(table["t"] <= 0.0)
-        if early.size:
+        if early.size and not self.path.stamps.origin:
             raise ScenarioError(
                 "path",
                 f"{table.where(int(early[0]))}: t must be above 0, nothing is sent at time 0",
                 float(table["t"][early[0]]),
-                "shift the times of all tables",
+                "set [time] origin to where the run begins in the log",
             )
         entities: list[Entity] = list(zip(*map(table.integers, columns), strict=True))
         first_line: dict[Entity, int] = {}
@@ -411,8 +411,14 @@ class RecordedClock(LinkClock):
         """Increasing distinct times (K,) of each entity, in seconds."""
         times: dict[Entity, list[float]] = {}
         for entity, t in self.row_keys:
-            times.setdefault(entity, []).append(t)
+            if t > 0.0:
+                times.setdefault(entity, []).append(t)
         return {entity: np.unique(values) for entity, values in times.items()}
+
+    @property
+    def rows(self) -> FloatArray:
+        """The times (K,) of all rows in seconds, in the order of the table."""
+        return np.array([t for _, t in self.row_keys])
 
     @property
     def row_keys(self) -> list[tuple[Entity, float]]:

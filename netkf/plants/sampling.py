@@ -102,10 +102,10 @@ class RecordedSampling(Clock):
         table = read_columns(self.path, ("t", "node"))
         nodes = table.integers("node")
         early = np.flatnonzero(table["t"] <= 0.0)
-        if early.size:
+        if early.size and not self.path.stamps.origin:
             where = table.where(int(early[0]))
             rule = f"{where}: t must be above 0, the first sample comes after the start"
-            remedy = "shift the times of all tables"
+            remedy = "set [time] origin to where the run begins in the log"
             raise ScenarioError("path", rule, float(table["t"][early[0]]), remedy)
         return list(zip(nodes, table["t"].tolist(), strict=True))
 
@@ -114,13 +114,14 @@ class RecordedSampling(Clock):
         """Increasing sampling times (K,) in seconds, by node id."""
         times: dict[int, list[float]] = {}
         for node, t in self.row_times:
-            times.setdefault(node, []).append(t)
+            if t > 0.0:
+                times.setdefault(node, []).append(t)
         return {node: np.unique(times[node]) for node in sorted(times)}
 
     @property
     def listed(self) -> tuple[int, ...]:
         """Ids of all nodes in the table."""
-        return tuple(self._times)
+        return tuple(sorted({node for node, _ in self.row_times}))
 
     def recorded_times(self, node: int) -> FloatArray:
         """Return the increasing times (K,) in seconds at which a node samples."""

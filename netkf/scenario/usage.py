@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -142,7 +143,7 @@ def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
     activation, talks = scenario.network.activation, scenario.filter.algorithm.talks
     if isinstance(activation, RecordedClock):
         end = scenario.horizon if talks else 0.0
-        return count_rows(activation.path.name, activation.row_keys, lambda key: key[1] < end)
+        return count_rows(activation.path.name, activation.row_keys, lambda key: 0.0 < key[1] < end)
     if isinstance(activation, RecordedSlots):
         slots = exchange_slots(scenario) if talks else range(0)
         return count_rows(activation.path.name, activation.row_keys, lambda key: key[0] in slots)
@@ -189,6 +190,8 @@ def _find_row_use(
             keys,
             lambda key: key[0] in nodes and round(key[1] / period) in slots,
         )
+    # A sampling clock ticks after time 0 only.
+    start = 0.0 if is_reading else math.ulp(0.0)
     return count_rows(
-        component.path.name, keys, lambda key: key[0] in nodes and 0.0 <= key[1] < horizon
+        component.path.name, keys, lambda key: key[0] in nodes and start <= key[1] < horizon
     )

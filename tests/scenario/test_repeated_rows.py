@@ -176,6 +176,24 @@ def test_rows_that_contradict_each_other_are_refused_with_both_lines(kind, make)
     assert "remove" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"network.activation": {**RECORDED, "at": "nodes"}}, "network.activation"),
+        ({"sensors": [{**SENSOR, "sampling": RECORDED}]}, "sensors[0].sampling"),
+    ],
+)
+def test_rows_before_the_origin_of_a_log_are_counted(changes, key, tmp_path):
+    (tmp_path / "table.csv").write_text("t,node\n98,0\n99,0\n99,0\n101,0\n102,0\n102,0\n104,0\n")
+    base = {**CLOCKS, "time": {"origin": 100}}
+    scenario = netkf.scenario.reading.from_table(base, tmp_path).replace(changes)
+    use = record_usage(scenario, {})[key]
+    assert (use["used"], use["merged"], use["unused"]) == (2, 1, 4)
+    (tmp_path / "table.csv").write_text("t,node\n0,0\n1,0\n")
+    with pytest.raises(netkf.ScenarioError, match=r"line 2: t must be above 0.*\[time\] origin"):
+        netkf.scenario.reading.from_table(CLOCKS, tmp_path).replace(changes)
+
+
 def test_a_counter_that_wraps_is_told_how_to_go_on(make):
     with pytest.raises(netkf.ScenarioError, match="if a counter of the log wraps, add its length"):
         make("losses", "0,1,0,0\n")

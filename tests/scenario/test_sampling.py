@@ -255,7 +255,9 @@ def test_recorded_samples_of_other_nodes_and_times_are_refused(make, tmp_path):
         assert str(caught.value).startswith("sensors[0].path: ")
     with (tmp_path / "x.csv").open("a") as file:
         file.write("0.5,1.0,1.0\n")
-    with pytest.raises(netkf.ScenarioError, match=r"x.csv lines \d+ and \d+: there may be one row a time"):
+    with pytest.raises(
+        netkf.ScenarioError, match=r"x.csv lines \d+ and \d+: there may be one row a time"
+    ):
         make([SAMPLED], {"kind": "recorded", "path": "x.csv"})
 
 
