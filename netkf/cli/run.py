@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
 MAX_LISTED_NODES = 12  # nodes that a note lists
+MIN_RATED_EVENTS = 10_000  # of fewer events a run takes as long as its preparations
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
@@ -105,8 +106,9 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
             replica,
         )
     _print_summary(scenario, completed)
-    rate = completed.events / max(completed.seconds, 1e-9)
-    duration = f"{completed.seconds:.2f} s, {rate:,.0f} per second"
+    duration = f"{completed.seconds:.2f} s"
+    if completed.events >= MIN_RATED_EVENTS:
+        duration += f", {completed.events / max(completed.seconds, 1e-9):,.0f} per second"
     print(f"events: {completed.events:,} in {duration}, engine {completed.engine}")
     if completed.status != "complete":
         message = _describe_divergence(completed)
