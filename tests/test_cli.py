@@ -27,7 +27,7 @@ def test_run_ends_with_a_table_and_a_picture(tmp_path, capsys):
     for words in (
         "node  RMS error  mean trace P  bound   ratio",
         "messages: ",
-        "per second",
+        "events: ",
         "limit S of H(13)",
         str(out),
     ):
