@@ -39,6 +39,7 @@ from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.rows import gaussian_noises, part_promises
 from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
 from netkf.checks.points import check_slots, probe_times
+from netkf.checks.records.rows import Audit, audit_run, record_promises
 from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
@@ -139,12 +140,14 @@ class ReplicaResult(NamedTuple):
                  base was not run or rounding hides the difference
     expected   : a divergence is no surprise, because the built-in filter diverges too
     parts      : statistics of the parts of the scenario
+    audit      : what is wrong with the record of the run
     """
 
     summary: ReplicaSummary | None
     difference: float
     expected: bool = False
     parts: PartSummary | None = None
+    audit: Audit = Audit()
 
     @property
     def diverged(self) -> bool:
@@ -161,16 +164,18 @@ def run_replica(
     A user's filter class is also run as its built-in base (the twin), for the first TWIN_RUNS
     replicas and where it diverged, to see whether the two compute the same.
     """
-    run, promised = simulate(scenario, seed, replica, engine), with_promised_filter(scenario)
+    chosen = choose_engine(engine, scenario, announce=False)
+    run, promised = simulate(scenario, seed, replica, chosen), with_promised_filter(scenario)
     diverged, difference = run.status == "diverged", math.nan
     expected = promised is scenario
     if own_attributes(scenario.filter.algorithm) and (diverged or replica < TWIN_RUNS):
         twin = simulate(with_base_filter(scenario), seed, replica, SimpyEngine())
         difference, expected = _error_difference(run, twin), twin.status == "diverged"
+    audit = audit_run(scenario, run, seed, replica, chosen)
     if diverged:
-        return ReplicaResult(None, difference, expected)
+        return ReplicaResult(None, difference, expected, audit=audit)
     summary, parts = find_checks(scenario).summarise(scenario, run), summarise_parts(scenario, run)
-    return ReplicaResult(summary, difference, parts=parts)
+    return ReplicaResult(summary, difference, parts=parts, audit=audit)
 
 
 def _error_difference(run: Run, twin: Run) -> float:
@@ -245,19 +250,26 @@ def judge_replicas(
 ) -> Verdict:
     """Return the verdict on a scenario from the ``results`` of its replicas of ``seed``, in their
     order: one row (holds, broken, undecided, not promised) for each promise of its filter's paper,
-    and each test of its clocks, channels, plant and sensors against the laws that they state.
+    each test of its clocks, channels, plant and sensors against the laws that they state, and each
+    test of what is recorded of its runs.
 
     All intervals hold together with probability ``confidence``. Raises TheoryError if there are no
     covariances with which promises could be compared.
     """
     checks, replicas = find_checks(scenario), list(results)
-    _require_covariances(scenario, replicas)
+    audits = [result.audit for result in replicas]
+    records = judge(record_promises(audits), audits, assumptions=[], runs=len(replicas), level=1.0)
     make_verdict = partial(Verdict, scenario.name, len(replicas), seed, confidence)
+    try:
+        _require_covariances(scenario, replicas)
+    except TheoryError:
+        if all(row.verdict != BROKEN for row in records):
+            raise
+        return make_verdict(tuple(records))  # runs whose record is wrong are no evidence
     if any(result.diverged for result in replicas):
         # The test is exact: it needs no assumptions and none of the level.
-        return make_verdict(
-            tuple(judge([NONE_DIVERGED], replicas, assumptions=[], runs=len(replicas), level=1.0))
-        )
+        rows = judge([NONE_DIVERGED], replicas, assumptions=[], runs=len(replicas), level=1.0)
+        return make_verdict((*rows, *records))
     stacked = stack_summaries([result.summary for result in replicas if result.summary is not None])
     promised = with_promised_filter(scenario)
     parts = stack_parts(
@@ -283,7 +295,7 @@ def judge_replicas(
         runs=len(replicas),
         level=0.5 * (1.0 - confidence),
     )
-    return make_verdict((*_judge_base(scenario, replicas), *rows))
+    return make_verdict((*_judge_base(scenario, replicas), *rows, *records))
 
 
 def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Evidence]:

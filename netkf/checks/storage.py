@@ -16,6 +16,7 @@ import numpy as np
 from netkf.checks.check import ReplicaResult, Verdict, find_checks, with_check_times
 from netkf.checks.evidence import Evidence
 from netkf.checks.parts.samples import PART_TYPES, PartSummary
+from netkf.checks.records.rows import audit_columns, read_audit
 from netkf.checks.report import verdict_json, verdict_text
 from netkf.core.errors import ScenarioError
 from netkf.core.interrupts import defer_signals
@@ -164,12 +165,14 @@ def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]
     """Return the results of all replicas as arrays, by name, for a file without pickles.
 
     "difference", "expected" and "diverged" have a first axis over all replicas; "summary.NAME" and
-    "PART.NAME", the fields of their summaries, one over those that did not diverge.
+    "PART.NAME", the fields of their summaries, one over those that did not diverge. "audit.NAME"
+    have one over all replicas again.
     """
     columns = {
         "difference": np.array([result.difference for result in results]),
         "expected": np.array([result.expected for result in results]),
         "diverged": np.array([result.diverged for result in results]),
+        **audit_columns([result.audit for result in results]),
     }
     completed = [result for result in results if result.summary is not None]
     if not completed:
@@ -191,15 +194,17 @@ def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
     """
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
+    audits = {name: columns.pop(name) for name in list(columns) if name.startswith("audit.")}
     chosen = with_check_times(scenario)
     summary_type = find_checks(chosen).summary_type
     results, index = [], 0
     for k, diverged in enumerate(columns["diverged"].tolist()):
         difference, expected = float(columns["difference"][k]), bool(columns["expected"][k])
+        audit = read_audit(_select_fields({name: v[k] for name, v in audits.items()}, "audit"))
         if diverged:
-            results.append(ReplicaResult(None, difference, expected))
+            results.append(ReplicaResult(None, difference, expected, audit=audit))
             continue
-        values_of_replica = {name: values[index] for name, values in columns.items() if "." in name}
+        values_of_replica = {name: v[index] for name, v in columns.items() if "." in name}
         summary = summary_type(**_select_fields(values_of_replica, "summary"))
         parts = {
             part: cls(**_select_fields(values_of_replica, part))
@@ -207,7 +212,7 @@ def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
             else None
             for part, cls in PART_TYPES.items()
         }
-        results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts)))
+        results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts), audit))
         index += 1
     return results
 

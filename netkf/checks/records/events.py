@@ -1,0 +1,397 @@
+"""The events of one run held against the rules of its record, each by a plain formula.
+
+Every fault is one line about the first event that breaks a rule. Ticks and readings are compared
+with times that are drawn again from the streams of the run; the order of events of one instant,
+the numbers of messages and what becomes of each follow from the scenario.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from netkf.core.clock import generate_ticks
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.network.clocks import LinkClock, OnReadings
+from netkf.network.matchings import Matching, RecordedSlots
+from netkf.plants.recorded import RecordedSensor
+from netkf.rng.streams import Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES, KINDS
+
+SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, SWAP, ROUND, STOP, TRANSMIT = (
+    CODES[kind]
+    for kind in (
+        "sense",
+        "tick",
+        "send",
+        "deliver",
+        "lost",
+        "late",
+        "absorb",
+        "swap",
+        "round",
+        "stop",
+        "transmit",
+    )
+)
+CLOCK_RANKS = np.full(len(KINDS), 6)
+"""Order of the kinds of events at one instant under clocks: samples, ticks with what they send,
+arrivals, absorptions; an arrival without delay is part of its tick.
+"""
+CLOCK_RANKS[[SENSE, TICK, TRANSMIT, SEND, LOST, DELIVER, LATE, ABSORB]] = 1, 2, 2, 2, 2, 3, 3, 4
+STEP_RANKS = np.full(len(KINDS), 1)
+"""The same in one step of an exchange of a slot: its round, messages, absorptions."""
+STEP_RANKS[[ROUND, ABSORB, SWAP, STOP]] = 0, 2, 2, 2
+TIME_TOLERANCE = 1e-9
+"""Relative rounding error of times that are computed here by another formula than in the run."""
+
+
+def event_fault(scenario: Scenario, run: Run) -> str:
+    """Return one line about the first fault of the record of a run's events; empty without one.
+
+    Looked at are the order of events, the numbers of messages, what becomes of each message,
+    readings, ticks with the messages that they send, and absorptions.
+    """
+    log = run.log
+    rules = [_ordered, _numbered, _decided, _absorbed]
+    rules += [_read_in_slots, _sent_in_slots] if scenario.slotted else [_read, _ticked, _caused]
+    for rule in rules:
+        for fault in rule(scenario, run, log):
+            return fault
+    return ""
+
+
+def _describe(log: IntArray, row: int) -> str:
+    """Return a text about a row of the log, with its kind, time, node and peer."""
+    event = log[row]
+    names = [f"node {event['node']}"] if event["node"] >= 0 else []
+    names += [f"peer {event['peer']}"] if event["peer"] >= 0 else []
+    return f"event {row}, {KINDS[event['kind']]} of {', '.join(names)} at {event['t']:.9g} s"
+
+
+def _first(wrong: np.ndarray) -> int | None:
+    """Return the index of the first True; None if there is none."""
+    return int(np.argmax(wrong)) if wrong.any() else None
+
+
+def _ordered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault if times decrease, or events of one instant are not in the order of their
+    kinds and entities.
+    """
+    if (row := _first(~np.isfinite(log["t"]) | (log["t"] < 0.0))) is not None:
+        yield f"{_describe(log, row)} has no time of the run"
+    if (row := _first(np.diff(log["t"]) < 0.0)) is not None:
+        yield f"{_describe(log, row + 1)} comes after a later one"
+    if scenario.slotted:
+        yield from _ordered_steps(log)
+        return
+    kinds = log["kind"]
+    inside_tick = np.isin(kinds, (DELIVER, LATE)) & (log["age"] == 0.0)
+    rank = np.where(inside_tick, CLOCK_RANKS[TICK], CLOCK_RANKS[kinds])
+    same = np.diff(log["t"]) == 0.0
+    if (row := _first(same & (np.diff(rank) < 0))) is not None:
+        yield f"{_describe(log, row + 1)} comes after {KINDS[kinds[row]]} of the same instant"
+    entities = np.array([scenario.topology.index[node] for node in scenario.nodes])
+    places = np.searchsorted(np.array(scenario.nodes), log["node"])
+    if not np.array_equal(entities, np.arange(len(entities))):
+        return
+    # All absorptions of an instant are in the order of nodes.
+    absorbs = np.flatnonzero(kinds == ABSORB)
+    order = np.diff(places[absorbs])
+    if (k := _first((np.diff(log["t"][absorbs]) == 0.0) & (order <= 0))) is not None:
+        yield f"{_describe(log, int(absorbs[k + 1]))} is out of the order of nodes"
+
+
+def _ordered_steps(log: Any) -> Iterator[str]:
+    """Yield a fault if a step of an exchange in slots has events out of their order: the round (or
+    the ticks), then messages, then absorptions.
+    """
+    # A message that takes time may arrive in a later exchange, where it is late.
+    rows = np.flatnonzero((log["phase"] >= 0) & (log["kind"] != LATE))
+    steps = np.cumsum(log["kind"][rows] == ROUND)
+    rank = STEP_RANKS[log["kind"][rows]]
+    # Without rounds (matchings) a phase of one slot is one step, which ends with its swaps.
+    same = (np.diff(steps) == 0) & (np.diff(log["phase"][rows]) == 0)
+    same &= (np.diff(log["t"][rows]) == 0.0) | (steps[1:] > 0)
+    if (k := _first(same & (np.diff(rank) < 0))) is not None:
+        yield f"{_describe(log, int(rows[k + 1]))} comes after the end of its exchange"
+
+
+def _keys(log: Any, senders: np.ndarray, receivers: np.ndarray) -> IntArray:
+    """Return one integer (K,) for each message of K rows, by its directed link and number."""
+    size = int(max(log["node"].max(initial=0), log["peer"].max(initial=0))) + 2
+    width = int(log["message"].max(initial=0)) + 2
+    return np.asarray(((senders + 1) * size + receivers + 1) * width + log["message"] + 1)
+
+
+def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless the messages of each directed link, and the transmissions of each node,
+    are numbered from 0 in the order in which they are sent.
+    """
+    links = set(scenario.topology.directions)
+    for kind in (SEND, TRANSMIT):
+        rows = np.flatnonzero(log["kind"] == kind)
+        ends = log[rows][["node", "peer"]]
+        pairs, first, index = np.unique(ends, return_index=True, return_inverse=True)
+        for pair, row in zip(pairs.tolist(), first.tolist(), strict=True):
+            if kind == SEND and pair not in links:
+                yield f"{_describe(log, int(rows[row]))} is on no link"
+        order = np.argsort(index, kind="stable")
+        counts = np.bincount(index, minlength=len(pairs))
+        expected = np.empty(len(rows), dtype=np.int64)
+        expected[order] = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        if (k := _first(log["message"][rows] != expected)) is not None:
+            row = int(rows[k])
+            yield f"{_describe(log, row)} has number {log['message'][row]}, not {expected[k]}"
+
+
+def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless each message is lost at once, or arrives once, as long after it was sent
+    as its age says; none may be under way longer than its delay can be.
+    """
+    sends = log[log["kind"] == SEND]
+    ends = np.flatnonzero(np.isin(log["kind"], (DELIVER, LOST, LATE)))
+    last = log[ends]
+    is_lost = last["kind"] == LOST
+    senders = np.where(is_lost, last["node"], last["peer"])
+    receivers = np.where(is_lost, last["peer"], last["node"])
+    every = _keys(log, log["node"], log["peer"])[log["kind"] == SEND]
+    keys = _keys(log, log["node"], log["peer"])[ends]
+    backwards = _keys(log, log["peer"], log["node"])[ends]
+    keys = np.where((senders == last["node"]) & (receivers == last["peer"]), keys, backwards)
+    order = np.argsort(every, kind="stable")
+    place = np.searchsorted(every[order], keys)
+    known = place < len(every)
+    known[known] = every[order][place[known]] == keys[known]
+    if (k := _first(~known)) is not None:
+        yield f"{_describe(log, int(ends[k]))} is of message {last['message'][k]}, never sent"
+        return
+    sent = sends[order[place]]
+    repeats = np.ones(len(keys), dtype=bool)
+    repeats[np.unique(keys, return_index=True)[1]] = False
+    if (k := _first(repeats)) is not None:
+        yield f"{_describe(log, int(ends[k]))} is a second end of message {last['message'][k]}"
+    age = np.where(is_lost, 0.0, last["age"])
+    if (
+        k := _first(~(last["t"] - sent["t"] == age) | (last["phase"] != sent["phase"]))
+    ) is not None:
+        yield (
+            f"{_describe(log, int(ends[k]))} is {last['t'][k] - sent['t'][k]:.9g} s after its "
+            f"message was sent in phase {sent['phase'][k]}, not {age[k]:.9g} s"
+        )
+    waiting = sends["t"][~np.isin(every, keys)]
+    longest = float(scenario.network.channel.delay.longest)
+    limit = scenario.horizon * (1.0 - TIME_TOLERANCE)
+    if run.status == "complete" and (waiting + longest < limit).any():
+        yield (
+            f"{int((waiting + longest < limit).sum()):,} messages are neither delivered nor lost, "
+            f"the first sent at {waiting.min():.9g} s"
+        )
+
+
+def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless each node that messages reach at one instant (in slots: in one step of
+    an exchange) absorbs them once, or swaps with each sender.
+    """
+    kinds = log["kind"]
+    if scenario.slotted and isinstance(scenario.network.activation, Matching):
+        swaps, arrivals = (np.flatnonzero(kinds == kind) for kind in (SWAP, DELIVER))
+        fields = ["node", "peer", "message", "phase"]
+        if not scenario.node_filter.pairwise:
+            return
+        one, other = (np.sort(log[rows][fields]) for rows in (swaps, arrivals))
+        # Messages of the last exchange may arrive in a slot that is not recorded to its end.
+        if not np.array_equal(one, other):
+            yield f"{len(swaps):,} swaps for {len(arrivals):,} messages delivered in pairs"
+        return
+    step = np.cumsum(kinds == ROUND) if scenario.slotted else log["t"]
+    rows = [np.flatnonzero(kinds == kind) for kind in (DELIVER, ABSORB)]
+    kind = np.dtype([("step", step.dtype), ("node", np.int64)])
+    reached, absorbed = (np.empty(len(part), dtype=kind) for part in rows)
+    for made, part in zip((reached, absorbed), rows, strict=True):
+        made["step"], made["node"] = step[part], log["node"][part]
+    distinct, counts = np.unique(absorbed, return_counts=True)
+    if (k := _first(counts > 1)) is not None:
+        yield f"node {distinct[k]['node']} absorbs {counts[k]} times in one exchange"
+    missing = np.setdiff1d(np.unique(reached), distinct)
+    extra = np.setdiff1d(distinct, np.unique(reached))
+    if len(missing) and run.status == "complete":
+        yield f"node {missing[0]['node']} never absorbs what reaches it at {missing[0]['step']:.9g}"
+    if len(extra):
+        yield f"node {extra[0]['node']} absorbs what never reached it at {extra[0]['step']:.9g}"
+
+
+def _compare_times(
+    log: Any, kind: str, node: int, times: FloatArray, expected: FloatArray, horizon: float
+) -> Iterator[str]:
+    """Yield a fault unless the ``times`` (K,) of events of a node are the ``expected`` ones."""
+    tolerance = TIME_TOLERANCE * horizon
+    # Rounding may put the last one on either side of the horizon.
+    inside = expected < horizon - tolerance
+    if len(times) not in (int(inside.sum()), len(expected)):
+        yield f"node {node} has {len(times):,} {kind} events, not {len(expected):,}"
+    elif (k := _first(~(np.abs(times - expected[: len(times)]) <= tolerance))) is not None:
+        yield f"{kind} of node {node} at {times[k]:.9g} s should be at {expected[k]:.9g} s"
+
+
+def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless nodes sense on the grid of their increments and at the times of their
+    samples, drawn again from the streams of the run.
+    """
+    if run.status != "complete":
+        return
+    sampled = scenario.sample_times(Streams(run.seed, run.replica))
+    period = scenario.diffusion.sensing_period or math.inf
+    senses = log[log["kind"] == SENSE]
+    for node in scenario.sensing_nodes:
+        times = [times for (owner, _), times in sampled.items() if owner == node]
+        expected = np.unique(np.concatenate([np.empty(0), *times]))
+        if node in scenario.increment_sensors:
+            count = math.ceil(scenario.horizon / period * (1.0 + TIME_TOLERANCE))
+            grid = period * np.arange(1, count + 1)
+            expected = np.sort(np.concatenate([expected, grid[grid < scenario.horizon]]))
+        taken = senses["t"][senses["node"] == node]
+        yield from _compare_times(log, "sense", node, taken, expected, scenario.horizon)
+
+
+def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless clocks tick at the times drawn again from their streams, those of one
+    instant in the order of clocks.
+    """
+    clock = scenario.network.activation
+    silent = not scenario.node_filter.talks or run.status != "complete"
+    if silent or not isinstance(clock, LinkClock) or isinstance(clock, OnReadings):
+        return
+    streams = Streams(run.seed, run.replica)
+    entities = list(clock.entities(scenario.topology))
+    times = [
+        generate_ticks(
+            clock,
+            entity,
+            partial(streams.generator, "phase", *entity),
+            streams.generator("clock", *entity),
+            scenario.horizon,
+        )
+        for entity in entities
+    ]
+    owner = np.repeat(np.arange(len(entities)), [len(part) for part in times])
+    drawn = np.concatenate([np.empty(0), *times])
+    order = np.lexsort((owner, drawn))
+    ends = np.array([(*entity, -1)[:2] for entity in entities]).reshape(-1, 2)[owner[order]]
+    rows = np.flatnonzero(log["kind"] == TICK)
+    if len(rows) != len(drawn):
+        yield f"{len(rows):,} ticks, not the {len(drawn):,} of the clocks"
+        return
+    ticks = log[rows]
+    wrong = (ticks["t"] != drawn[order]) | (ticks["node"] != ends[:, 0])
+    wrong |= ticks["peer"] != ends[:, 1]
+    if (k := _first(wrong)) is not None:
+        yield (
+            f"{_describe(log, int(rows[k]))} should be that of {ends[k].tolist()} at "
+            f"{drawn[order][k]:.9g} s"
+        )
+
+
+def _caused(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless each message under clocks follows the tick or the transmission of its
+    sender, and each of these sends to all receivers.
+    """
+    kinds = log["kind"]
+    clock: Any = scenario.network.activation
+    by_link = getattr(clock, "at", "links") in ("links", "directions")
+    causes = np.flatnonzero(kinds == (TICK if by_link else TRANSMIT))
+    sends = np.flatnonzero(kinds == SEND)
+    if not len(sends) and not len(causes):
+        return
+    block = np.searchsorted(causes, sends) - 1
+    if len(sends) and (not len(causes) or (block < 0).any()):
+        yield f"{_describe(log, int(sends[0]))} follows no tick of its sender"
+        return
+    cause, sent = log[causes[block]], log[sends]
+    fits = (cause["t"] == sent["t"]) & (cause["node"] == sent["node"])
+    if by_link:
+        forth = fits & (cause["peer"] == sent["peer"])
+        back = (cause["node"] == sent["peer"]) & (cause["peer"] == sent["node"])
+        fits = forth | (back & (cause["t"] == sent["t"]) & (clock.at == "links"))
+    if (k := _first(~fits)) is not None:
+        yield f"{_describe(log, int(sends[k]))} follows no tick of its sender"
+    receivers = dict.fromkeys(scenario.nodes, 0)
+    for sender, _ in scenario.topology.directions:
+        receivers[sender] += 1
+    if by_link:
+        both = clock.at == "links" and not scenario.topology.directed
+        expected = np.full(len(causes), 2 if both else 1)
+    else:
+        expected = np.array([receivers[node] for node in log["node"][causes].tolist()], dtype=int)
+    counts = np.bincount(block, minlength=len(causes))
+    # A link of which neither end sends anything is silent by design; half an exchange is not.
+    if (k := _first((counts != expected) & (counts > 0))) is not None:
+        yield f"{_describe(log, int(causes[k]))} sends {counts[k]} messages, not {expected[k]}"
+
+
+def _slots(scenario: Scenario) -> int:
+    """Return the number of slots that begin before the horizon."""
+    return math.ceil(scenario.horizon / scenario.slot_plant.period * (1.0 - 1e-12) - 1e-9)
+
+
+def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless each node with sensors senses once in every slot (filters that do not
+    predict begin in slot 1).
+    """
+    if run.status != "complete" or "sense" not in (scenario.node_filter.schedule or ()):
+        return
+    first = 0 if scenario.node_filter.predicts else 1
+    expected = np.arange(first, _slots(scenario))
+    senses = log[log["kind"] == SENSE]
+    slots = scenario.slot_plant.slots_of(senses["t"])
+    for node in scenario.placed_sensors:
+        taken = slots[senses["node"] == node]
+        if not np.array_equal(taken, expected):
+            yield f"node {node} senses {len(taken):,} times, not once in {len(expected):,} slots"
+
+
+def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
+    """Yield a fault unless all nodes send once on each link in every step of an exchange, and both
+    ends of each drawn pair do.
+    """
+    algorithm, activation = scenario.node_filter, scenario.network.activation
+    if run.status != "complete" or not algorithm.talks or algorithm.decides_in_slots():
+        return
+    kinds = log["kind"]
+    if algorithm.pairwise:
+        ticks, sends = (int((kinds == kind).sum()) for kind in (TICK, SEND))
+        if sends != 2 * ticks:
+            yield f"{sends:,} messages of {ticks:,} pairs"
+        return
+    if isinstance(activation, RecordedSlots) or any(
+        isinstance(sensor, RecordedSensor) for sensor in scenario.sensors
+    ):
+        return
+    phases = range((algorithm.schedule or ()).count("exchange"))
+    steps = [algorithm.exchange_steps(phase) for phase in phases]
+    rounds = log["phase"][kinds == ROUND]
+    slots = _slots(scenario) - algorithm.first_slot
+    expected = np.tile(np.repeat(np.array(phases), steps), max(slots, 0))
+    if not np.array_equal(rounds, expected):
+        yield f"{len(rounds):,} rounds of exchanges, not {len(expected):,} in order"
+        return
+    sends = np.flatnonzero(kinds == SEND)
+    step = np.searchsorted(np.flatnonzero(kinds == ROUND), sends) - 1
+    senders = [
+        [
+            direction
+            for direction in scenario.topology.directions
+            if algorithm.sends_in_slots(phase, direction[0] in scenario.placed_sensors)
+        ]
+        for phase in phases
+    ]
+    wanted = np.array([len(listed) for listed in senders], dtype=int)[expected]
+    sent = np.bincount(step, minlength=len(rounds))
+    if (row := _first(sent != wanted)) is not None:
+        yield f"{sent[row]} messages in round {row} of the run, not {wanted[row]}"

@@ -1,0 +1,164 @@
+"""The directory of a run read back and held against the run in memory, by plain formulas."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from netkf.core.errors import NetkfError
+from netkf.engines.base import Engine
+from netkf.runs.documents import DamagedError
+from netkf.runs.run import run_to_directory
+from netkf.runs.stored import MANIFEST_FORM, StoredRun, read_checked_document, read_run
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+FILE_TOLERANCE = 1e-9
+"""Relative difference above which an average or a column is not that of the run."""
+
+
+class FilesUnknownError(Exception):
+    """The files of a run cannot be written or read here, with the reason."""
+
+
+def files_fault(scenario: Scenario, run: Run, engine: Engine) -> str:
+    """Return one line about the first difference between a ``run`` in memory and the files that
+    ``netkf run`` writes of it: tables, manifest, counts and averages of the summary; empty without
+    one. The run is simulated again, by ``engine``, into a directory that is removed.
+
+    Raises FilesUnknownError if files cannot be written.
+    """
+    seeded = dataclasses.replace(scenario, seed=run.seed)
+    try:
+        with tempfile.TemporaryDirectory(prefix="netkf-check-") as folder:
+            directory = Path(folder) / "run"
+            run_to_directory(seeded, directory, engine, replica=run.replica)
+            manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
+            stored = read_run(directory, seeded, manifest)
+            return _tables_fault(run, stored) or _summary_fault(run, stored)
+    except DamagedError as error:
+        return f"the files cannot be read back: {error}"
+    except (NetkfError, OSError) as error:
+        raise FilesUnknownError(str(error)) from None
+
+
+def _tables_fault(run: Run, stored: StoredRun) -> str:
+    """Return a fault of the tables and manifest of a ``stored`` run, which should be ``run``."""
+    manifest = stored.manifest
+    facts = {
+        "status": (manifest["status"], run.status),
+        "fingerprint": (manifest.get("fingerprint"), run.fingerprint),
+        "number of events": (manifest.get("events"), len(run.log)),
+        "seed": (manifest["seed"], run.seed),
+        "replica": (manifest.get("replica"), run.replica),
+    }
+    for name, (seen, expected) in facts.items():
+        if seen != expected:
+            return f"manifest.json: {name} {seen}, not {expected}"
+    if stored.log.tobytes() != run.log.tobytes():
+        return f"events.parquet: {len(stored.log):,} events, not the {len(run.log):,} of the run"
+    for name in ("times", "x", "xhat", "P"):
+        if not np.array_equal(getattr(stored, name), getattr(run, name), equal_nan=True):
+            return f"states.parquet: {name} is not that of the run"
+    if not run.truth_known:
+        return ""
+    square, nees = (run.error**2).sum(axis=2), _nees(run)
+    for name, seen, expected in (
+        ("sq_error", stored.sq_error, square),
+        ("nees", np.where(np.isnan(nees), np.nan, stored.nees), nees),
+    ):
+        if not _equal(seen, expected):
+            return f"states.parquet: {name} is not that of errors and P"
+    return ""
+
+
+def _nees(run: Run) -> Any:
+    """Return e' P^-1 e (T, N); nan where P is not well conditioned, which decides nothing here."""
+    finite = np.asarray(np.isfinite(run.P).all(axis=(2, 3)))
+    P = np.where(finite[..., None, None], run.P, np.eye(run.P.shape[-1]))
+    with np.errstate(all="ignore"):
+        usable = finite & (np.linalg.cond(P) < 1e6)
+        P = np.where(usable[..., None, None], P, np.eye(P.shape[-1]))
+        solved = np.linalg.solve(P, run.error[..., None])[..., 0]
+        return np.where(usable, (run.error * solved).sum(axis=2), np.nan)
+
+
+def _equal(seen: Any, expected: Any) -> bool:
+    """Return True if numbers are equal up to rounding; nan equals nan, and None is nan."""
+    one, other = (np.asarray(value, dtype=np.float64) for value in (seen, expected))
+    return bool(np.allclose(one, other, rtol=FILE_TOLERANCE, atol=0.0, equal_nan=True))
+
+
+def _summary_fault(run: Run, stored: StoredRun) -> str:
+    """Return a fault of summary.json, whose counts and averages should be those of ``run``."""
+    summary, kinds = stored.summary, run.log["kind"]
+    count = {kind: int((kinds == code).sum()) for kind, code in CODES.items()}
+    senders = run.log["node"][kinds == CODES["send"]]
+    transmissions = _transmissions(run)
+    expected = {
+        "sent": count["send"],
+        "delivered": count["deliver"],
+        "lost": count["lost"] + count["late"],
+        "transmissions": sum(transmissions.values()),
+        "in_flight": count["send"] - count["deliver"] - count["lost"] - count["late"],
+    }
+    for name, value in expected.items():
+        if summary["messages"].get(name) != value:
+            return f"summary.json: messages.{name} {summary['messages'].get(name)}, not {value}"
+    rows = {row["node"]: row for row in summary["nodes"]}
+    if list(rows) != list(run.nodes):
+        return "summary.json: its nodes are not those of the run"
+    for node in run.nodes:
+        for name, value in (
+            ("sent", int((senders == node).sum())),
+            ("transmissions", transmissions.get(node, 0)),
+        ):
+            if rows[node].get(name) != value:
+                return f"summary.json: {name} of node {node} {rows[node].get(name)}, not {value}"
+    return _averages_fault(run, summary, rows) if run.status == "complete" else ""
+
+
+def _transmissions(run: Run) -> dict[int, int]:
+    """Return the number of transmissions of each node: its broadcasts, or else its messages, those
+    of one step of an exchange in slots together.
+    """
+    rows = run.log[np.isin(run.log["kind"], (CODES["send"], CODES["transmit"], CODES["round"]))]
+    sends = rows["kind"] == CODES["send"]
+    broadcasts = rows["node"][rows["kind"] == CODES["transmit"]]
+    if (rows["phase"][sends] >= 0).any():
+        keys = rows[sends][["node", "t", "phase"]]
+        broadcasts = np.unique(keys)["node"]
+    elif not len(broadcasts):
+        broadcasts = rows["node"][sends]
+    nodes, counts = np.unique(broadcasts, return_counts=True)
+    return dict(zip(nodes.tolist(), counts.tolist(), strict=True))
+
+
+def _averages_fault(run: Run, summary: dict[str, Any], rows: dict[int, Any]) -> str:
+    """Return a fault of the averages over time: the RMS error and the mean trace of P, of each node
+    and of all. Errors are averaged over the samples before rounding blurs them.
+    """
+    after = run.times > 0.0
+    after = after if after.any() else np.ones(len(run.times), dtype=bool)
+    blurred_from = summary.get("rounding_from")
+    exact = after & (run.times < (np.inf if blurred_from is None else blurred_from))
+    with np.errstate(all="ignore"):
+        square = (run.error**2).sum(axis=2)[exact]
+        mean_square = square.mean(axis=0) if len(square) else np.full(len(run.nodes), np.nan)
+        trace = np.trace(run.P[after], axis1=2, axis2=3).mean(axis=0)
+    for k, node in enumerate(run.nodes):
+        for name, value in (("rms_error", np.sqrt(mean_square[k])), ("mean_trace", trace[k])):
+            if not _equal(rows[node][name], value):
+                return f"summary.json: {name} of node {node} {rows[node][name]}, not {value:.9g}"
+    for name, value in (
+        ("rms_error", np.sqrt(mean_square.mean())),
+        ("mean_trace", trace.mean()),
+    ):
+        if not _equal(summary["overall"][name], value):
+            return f"summary.json: {name} of all nodes {summary['overall'][name]}, not {value:.9g}"
+    return ""

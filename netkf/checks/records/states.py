@@ -1,0 +1,143 @@
+"""The samples of one run held against the plant, the start and the rules of the record."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from netkf.checks.rounding import EPS
+from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+TRUTH_TOLERANCE, START_TOLERANCE = 1e-8, 1e-9
+"""Tolerated differences of states from those drawn again, relative to the largest state so far, and
+of starting estimates and covariances, relative to their largest entry.
+"""
+ROUNDINGS = 1e4
+"""Relative errors EPS of a state from which others grow as the plant does."""
+SUM_ROUNDINGS = 64.0
+"""The same of x - xhat, from the sizes of x and xhat."""
+
+
+def sample_fault(scenario: Scenario, run: Run, seed: int, replica: int) -> str:
+    """Return one line about the first fault of the record of a run, number ``replica`` of the runs
+    of ``seed``: of its number, status, fingerprint, sample times, true states and errors; empty
+    without one.
+    """
+    if (run.seed, run.replica, run.nodes) != (seed, replica, scenario.nodes):
+        return f"run {run.replica} of seed {run.seed} stands for run {replica} of seed {seed}"
+    return (
+        _status_fault(scenario, run)
+        or (_truth_fault(scenario, run) if run.truth_known else "")
+        or (_error_fault(run) if run.truth_known else "")
+    )
+
+
+def _status_fault(scenario: Scenario, run: Run) -> str:
+    """Return a fault of the status, the fingerprint or the sample times of a run."""
+    diverged = run.log[run.log["kind"] == CODES["diverged"]]
+    if (run.status == "diverged") != bool(len(diverged)):
+        return f"status {run.status} with {len(diverged)} events that say diverged"
+    if run.status == "complete" and not np.isfinite(run.xhat).all():
+        return "status complete with estimates that are not finite"
+    if run.fingerprint != hashlib.sha256(run.log.tobytes()).hexdigest():
+        return "the fingerprint is not that of the events"
+    expected = scenario.times if run.status == "complete" else scenario.times[: len(run.times)]
+    if not np.array_equal(run.times, expected):
+        return f"{len(run.times):,} samples, not those at the {len(expected):,} times asked for"
+    return ""
+
+
+def _truth_fault(scenario: Scenario, run: Run) -> str:
+    """Return a fault if true states are not those that the plant draws from the run's streams."""
+    expected, allowed = drawn_states(scenario, run.seed, run.replica, run.times)
+    gap = np.nan_to_num(np.abs(run.x - expected).max(axis=1, initial=0.0), nan=np.inf)
+    if not (gap > allowed).any():
+        return ""
+    k = int(np.argmax(gap > allowed))
+    return (
+        f"x at {run.times[k]:g} s is {gap[k]:.3g} away from the state that the plant draws, "
+        f"rounding explains {allowed[k]:.1e}"
+    )
+
+
+def drawn_states(
+    scenario: Scenario, seed: int, replica: int, times: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the true states (T, n) of one run at its first sample ``times`` (T,), drawn again from
+    its streams without sensors, filters or network, and the differences (T,) that rounding allows.
+    """
+    streams, truth = Streams(seed, replica), None
+    moments: list[Any]
+    if scenario.slotted:
+        truth = scenario.slot_plant.truth(streams.generator("plant"))
+        moments = [int(slot) for slot in scenario.sampled_slots[: len(times)]]
+    else:
+        truth, moments = scenario.continuous_truth(streams, frames=False), times.tolist()
+    x = np.array([truth.absolute(moment) for moment in moments]).reshape(-1, scenario.plant.n)
+    sizes = np.abs(x).max(axis=1, initial=0.0)
+    # Roundings of a state grow as the plant does, also in directions in which the state does not.
+    plant: Any = scenario.plant
+    allowed = TRUTH_TOLERANCE * np.maximum.accumulate(sizes)
+    A = np.asarray(plant.F if scenario.slotted else plant.A)
+    for k in range(1, len(x)):
+        gap = moments[k] - moments[k - 1]
+        with np.errstate(all="ignore"):
+            step = (
+                np.linalg.matrix_power(A, gap) if scenario.slotted else scipy.linalg.expm(A * gap)
+            )
+            growth = float(np.linalg.norm(step, 2)) if np.isfinite(step).all() else np.inf
+        allowed[k] = max(allowed[k], growth * (allowed[k - 1] + ROUNDINGS * EPS * sizes[k - 1]))
+    return x, allowed
+
+
+def _exponential(A: FloatArray, gap: float) -> FloatArray:
+    """Return exp(A gap) (n, n)."""
+    return np.asarray(scipy.linalg.expm(A * gap))
+
+
+def _error_fault(run: Run) -> str:
+    """Return a fault if errors are not x - xhat up to the rounding of these."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        gap = np.abs(run.x[:, None] - run.xhat - run.error)
+        size = np.abs(run.x).max(axis=1)[:, None] + np.abs(run.xhat).max(axis=2)
+        wrong = gap.max(axis=2, initial=0.0) > SUM_ROUNDINGS * EPS * size + 1e-300
+    if not wrong.any():
+        return ""
+    k, i = np.argwhere(wrong)[0].tolist()
+    return f"the error of node {run.nodes[i]} at {run.times[k]:g} s is not x - xhat"
+
+
+def with_start(scenario: Scenario, horizon: float) -> Scenario:
+    """Return the scenario with a sample at time 0 besides the others, cut at ``horizon`` (s)."""
+    times = scenario.times[scenario.times <= horizon]
+    return dataclasses.replace(
+        scenario, horizon=horizon, probe=np.unique(np.concatenate([[0.0], times]))
+    )
+
+
+def start_fault(scenario: Scenario, run: Run) -> str:
+    """Return one line about the first node whose estimate or covariance at time 0 is not that of
+    the scenario; empty without one. ``run`` has a sample at time 0.
+    """
+    plant, start = scenario.plant, scenario.filter
+    for k, node in enumerate(scenario.nodes):
+        for name, given, default, seen in (
+            ("estimate", start.mean, plant.start_mean, run.xhat[0, k]),
+            ("covariance", start.cov, plant.start_cov, run.P[0, k]),
+        ):
+            value = given[k] if isinstance(given, tuple) else given
+            expected = np.asarray(default if value is None else value)
+            if np.isnan(seen).all():  # a filter without covariances
+                continue
+            gap = np.abs(seen - expected).max()
+            if not gap <= START_TOLERANCE * np.abs(expected).max():
+                return f"the {name} of node {node} at time 0 is {gap:.3g} off that of [filter]"
+    return ""

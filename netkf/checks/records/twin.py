@@ -1,0 +1,66 @@
+"""One run on both engines, which should make the same events and states."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from netkf.checks.rounding import EPS, OPERATIONS, allowed_deviation, largest_terms
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run, first_difference
+
+STATE_TOLERANCE = 1e-6
+"""Difference of estimates in standard deviations, and of covariances relative to their largest
+entry, above which two engines do not compute the same.
+"""
+
+
+def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
+    """Return one line about the first difference between a ``run`` and the same one on another
+    engine; empty if their events are equal, and their states up to rounding.
+    """
+    difference = first_difference(run, twin)
+    if difference is not None:
+        return difference
+    if run.status != twin.status or not np.array_equal(run.times, twin.times):
+        return f"{run.status} after {len(run.times)} samples, {twin.status} after {len(twin.times)}"
+    for name, gap, allowed in _gaps(scenario, run, twin):
+        wrong = ~(gap <= allowed)
+        if wrong.any():
+            k, i = np.argwhere(wrong)[0].tolist()
+            return (
+                f"{name} of node {run.nodes[i]} at {run.times[k]:g} s differs by {gap[k, i]:.2e}, "
+                f"rounding explains {allowed[k, i]:.0e}"
+            )
+    return ""
+
+
+def _gaps(scenario: Scenario, run: Run, twin: Run) -> list[tuple[str, FloatArray, FloatArray]]:
+    """Return the names of compared values, the differences (T, N) of two runs, and the differences
+    (T, N) that rounding explains.
+    """
+    starts = np.array([scenario.initial_estimate(node)[1] for node in scenario.nodes])
+    information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
+    given = np.asarray(np.isfinite(twin.P).all(axis=(2, 3)))
+    P = np.where(given[..., None, None], twin.P, 0.0)
+    size = np.abs(P).max(axis=(2, 3), initial=0.0)
+    terms = largest_terms(P[None], starts, information)[0]
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariance = np.where(given, np.abs(run.P - twin.P).max(axis=(2, 3), initial=0.0), 0.0)
+        estimate = np.abs(run.error - twin.error).max(axis=2, initial=0.0)
+        state = np.abs(run.xhat - twin.xhat).max(axis=2, initial=0.0)
+    # An estimate inherits the relative rounding of the largest covariance so far, by which its
+    # gains were computed, and those of the errors and states that it comes from.
+    deviation = np.sqrt(np.trace(P, axis1=2, axis2=3))
+    errors = np.maximum.accumulate(np.abs(twin.error).max(axis=(1, 2), initial=0.0))[:, None]
+    states = np.maximum.accumulate(np.abs(twin.x).max(axis=1, initial=0.0))[:, None]
+    spread = np.divide(terms, np.square(deviation), out=np.ones_like(size), where=deviation > 0.0)
+    rounding = OPERATIONS * EPS * errors * np.maximum.accumulate(np.maximum(spread, 1.0))
+    rounding = rounding + OPERATIONS * EPS * (0.0 if twin.exact_errors else states)
+    floor = np.where(given, STATE_TOLERANCE * deviation, STATE_TOLERANCE * errors)
+    allowed = np.maximum(floor, rounding)
+    return [
+        ("the error", estimate, allowed),
+        ("the estimate", state, np.maximum(allowed, OPERATIONS * EPS * states)),
+        ("P", covariance, allowed_deviation(size, terms, STATE_TOLERANCE)),
+    ]
