@@ -365,9 +365,9 @@ def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
         return
     kinds = log["kind"]
     if algorithm.pairwise:
-        ticks, sends = (int((kinds == kind).sum()) for kind in (TICK, SEND))
-        if sends != 2 * ticks:
-            yield f"{sends:,} messages of {ticks:,} pairs"
+        ticks, messages = (int((kinds == kind).sum()) for kind in (TICK, SEND))
+        if messages != 2 * ticks:
+            yield f"{messages:,} messages of {ticks:,} pairs"
         return
     if isinstance(activation, RecordedSlots) or any(
         isinstance(sensor, RecordedSensor) for sensor in scenario.sensors
@@ -377,7 +377,7 @@ def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     steps = [algorithm.exchange_steps(phase) for phase in phases]
     rounds = log["phase"][kinds == ROUND]
     slots = _slots(scenario) - algorithm.first_slot
-    expected = np.tile(np.repeat(np.array(phases), steps), max(slots, 0))
+    expected = np.tile(np.repeat(np.array(phases, dtype=int), steps), max(slots, 0))
     if not np.array_equal(rounds, expected):
         yield f"{len(rounds):,} rounds of exchanges, not {len(expected):,} in order"
         return
