@@ -62,7 +62,7 @@ class Columns(dict[str, FloatArray]):
         column = self[name]
         wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > MAX_ID))
         if wrong.size:
-            rule = f"{self.where(int(wrong[0]))}: {name} must be an integer from 0 to 2^53"
+            rule = f"{self.where(int(wrong[0]))}: {name} must hold integers from 0 to 2^53"
             raise ScenarioError("path", rule, float(column[wrong[0]]), "correct it")
         return [int(value) for value in column]
 

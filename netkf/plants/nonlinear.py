@@ -11,6 +11,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
+    SourceFile,
     definite_covariance,
     either,
     field,
@@ -26,9 +28,17 @@ from netkf.core.fields import (
     list_of,
     matrix,
     one_of,
+    source_file,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import SlotReadings
+from netkf.plants.readings import (
+    Matrix,
+    ReadingTable,
+    RecordedReadings,
+    RecordedSamples,
+    take_from_record,
+)
 from netkf.plants.sampling import Samples, sampling
 from netkf.plants.sensors import Sensor, sampling_ticks
 
@@ -40,8 +50,19 @@ class Linearised:
     in the place of H, and call it with a reading and their own estimate.
     """
 
-    def __init__(self, sensor: NonlinearSensor, node: int) -> None:
+    def __init__(
+        self, sensor: NonlinearSensor, node: int, present: np.ndarray | None = None
+    ) -> None:
+        """Take the ``sensor``, the ``node`` (id) that it measures from, and, where values of a
+        reading are missing, flags (p,) of those that are ``present``.
+        """
         self._sensor, self._node = sensor, node
+        self._present = np.ones(len(sensor.R), dtype=bool) if present is None else present
+
+    @property
+    def size(self) -> int:
+        """The number p of values of a reading."""
+        return int(self._present.sum())
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the reading ``y`` (p,) of a sensor linearised at the estimate ``xhat`` (n,):
@@ -50,7 +71,10 @@ class Linearised:
         """
         J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)
         expected = np.asarray(self._sensor.h(xhat, self._node), dtype=np.float64)
-        return self._sensor.difference(y, expected) + J @ xhat, J
+        whole = expected.copy()
+        whole[self._present] = y
+        linear = self._sensor.difference(whole, expected) + J @ xhat
+        return linear[self._present], J[self._present]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +82,53 @@ class NonlinearSensor(Sensor):
     """The contract of nonlinear sensors, ``y = h(x) + v``, cov(v) = R (p, p), in every slot or, in
     continuous time, whenever the clock ``sampling`` ticks.
 
+    With a ``path`` the readings are recorded: a table ``t,node,y0,...``, which may repeat times,
+    leave values empty and bring its own noise, as that of a recorded linear sensor. A column ``to``
+    names the anchor that a row is measured from, by its id; else that is the node itself.
+
     A class defines ``h`` and ``jacobian``, and ``difference`` where readings are angles. Before a
     run the scenario calls ``located`` and ``check_state``.
     """
 
     R: FloatArray = field(definite_covariance)
     sampling: Clock | None = field(sampling, default=None)
+    path: SourceFile | None = field(source_file, default=None)
 
     linear: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Check the fields and the table; raises ScenarioError for a mistake in either."""
+        super().__post_init__()
+        if self.record is None:
+            return
+        if self.sampling is not None:
+            rule = "means nothing with path: samples are at the times of the table"
+            raise ScenarioError("sampling", rule, None, "leave it out")
+        take_from_record(self, self.record)
+        for node in self.nodes:
+            self.record.rows(node)  # a mistake in the file is found on construction
+
+    @cached_property
+    def record(self) -> ReadingTable | None:
+        """The table of its readings; None if they are drawn."""
+        if self.path is None:
+            return None
+        given: FloatArray | None = self.R
+        return ReadingTable(self.path, self._count(given), given, linear=False)
+
+    def _count(self, R: FloatArray | None) -> int:
+        """Return the number p of the values of a reading, with the ``R`` (p, p) that is given."""
+        return 0 if R is None else len(R)
+
+    @property
+    def is_random(self) -> bool:  # type: ignore[override]
+        """True if runs draw the readings, False if they are recorded."""
+        return self.path is None
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The ids of what readings are measured from: the anchors of the table, else ``nodes``."""
+        return self.record.anchors if self.record and self.record.has_anchors else self.nodes
 
     @abstractmethod
     def h(self, x: FloatArray, node: int) -> FloatArray:
@@ -104,10 +167,23 @@ class NonlinearSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> Any:
-        """Return the readings of the sensor on ``node`` (id) in one run in slots, with noise from
-        the stream "noise" that ``generator`` returns; ``period`` is not used.
+        """Return the readings of the sensor on ``node`` (id) in one run in slots of ``period``
+        seconds, recorded or with noise from the stream "noise" that ``generator`` returns.
         """
-        return NonlinearReadings(self, node, generator("noise"))
+        if self.record is None:
+            return NonlinearReadings(self, node, generator("noise"))
+        slots = self.record.slots(node, period)
+        return RecordedReadings(self.record.rows(node), slots, self._row_functions(node), 0)
+
+    def _row_functions(self, node: int) -> Matrix:
+        """Return the function that gives, for row k of the table of ``node`` (id) and the values of
+        it that are there, what linearises them.
+        """
+        assert self.record is not None
+        anchors, has_anchors = self.record.rows(node).anchors, self.record.has_anchors
+        return lambda k, present: Linearised(
+            self, int(anchors[k]) if has_anchors else node, present
+        )
 
     def sample_times(
         self,
@@ -117,9 +193,11 @@ class NonlinearSensor(Sensor):
         horizon: float,
     ) -> FloatArray:
         """Return the sample times (K,) in seconds, below the ``horizon``, of the sensor on ``node``
-        (id) with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling
-        phase" that ``generator`` returns.
+        (id) with the number ``ordinal`` there, those of its table or drawn from its streams
+        "sampling" and "sampling phase" that ``generator`` returns.
         """
+        if self.record is not None:
+            return self.record.times(node, horizon)
         # Only sensors with a clock are asked.
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
@@ -128,8 +206,10 @@ class NonlinearSensor(Sensor):
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
         """Return the samples of the sensor on ``node`` (id) in one run, with noise from the stream
-        "noise" that ``generator`` returns; they do not depend on the ``horizon``.
+        "noise" that ``generator`` returns, or recorded; they do not depend on the ``horizon``.
         """
+        if self.record is not None:
+            return RecordedSamples(self.record.rows(node), self._row_functions(node))
         return NonlinearSamples(self, node, generator("noise"))
 
 
@@ -185,10 +265,13 @@ class PositionedSensor(NonlinearSensor):
     """A sensor of the position of a target relative to its node, in 2 or 3 dimensions.
 
     positions  the coordinates of ``nodes``, in their order: rows (x, y) or (x, y, z); "graph", the
-               default, takes those of the graph
+               default, takes those of the graph. Of a table with a column ``to`` the coordinates of
+               all its anchors, in the order of their ids
     states     which components of the state are the target's position
     """
 
+    nodes: tuple[int, ...] = field(list_of(integer(), "node ids"), default=None)
+    R: FloatArray = field(definite_covariance, default=None)
     positions: str | FloatArray = field(either(one_of(GRAPH), matrix, has_depth(1)), default=GRAPH)
     states: tuple[int, ...] = field(list_of(integer(low=0), "numbers of states"), default=(0, 1))
 
@@ -196,6 +279,18 @@ class PositionedSensor(NonlinearSensor):
     """Number p of the values of a reading, which subclasses set."""
     turns: ClassVar[bool] = False
     """Whether the last of these values is an angle."""
+
+    def __post_init__(self) -> None:
+        """Check the fields and the table; raises ScenarioError for a mistake in either."""
+        if self.path is None:
+            for name in ("nodes", "R"):
+                if getattr(self, name) is None:
+                    raise ScenarioError(name, "is missing", None, f"add {name} = ...")
+        super().__post_init__()
+
+    def _count(self, R: FloatArray | None) -> int:
+        """Return the number p of the values of a reading, whatever ``R``."""
+        return self.rows
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
         """Return the sensor with its nodes at the ``positions`` of the graph, coordinates by node
@@ -213,7 +308,7 @@ class PositionedSensor(NonlinearSensor):
         # Nodes that the graph does not have are refused by name when the sensors are placed.
         nowhere = (0.0, 0.0)
         return replace(
-            self, positions=np.array([positions.get(node, nowhere) for node in self.nodes])
+            self, positions=np.array([positions.get(node, nowhere) for node in self.places])
         )
 
     def check_state(self, n: int) -> None:
@@ -226,8 +321,11 @@ class PositionedSensor(NonlinearSensor):
             rule = f"must be {' or '.join(map(str, dimensions))} for this sensor"
             raise ScenarioError("states", rule, list(self.states), "name those of the position")
         shape = np.shape(self.positions)
-        if not isinstance(self.positions, str) and shape != (len(self.nodes), len(self.states)):
-            rule = f"must be {len(self.nodes)} rows of {len(self.states)}, one for each of nodes"
+        places, which = self.places, "of nodes"
+        if self.record is not None and self.record.has_anchors:
+            which = f"anchor in {self.record.path.name}: {', '.join(map(str, places))}"
+        if not isinstance(self.positions, str) and shape != (len(places), len(self.states)):
+            rule = f"must be {len(places)} rows of {len(self.states)}, one for each {which}"
             raise ScenarioError("positions", rule, f"{shape[0]} x {shape[1]}", "add or remove")
         if self.R.shape != (self.rows, self.rows):
             rule = f"must be {self.rows} x {self.rows}"
@@ -238,7 +336,7 @@ class PositionedSensor(NonlinearSensor):
         len(states).
         """
         positions = np.asarray(self.positions, dtype=np.float64)
-        return np.asarray(x[list(self.states)] - positions[self.nodes.index(node)])
+        return np.asarray(x[list(self.states)] - positions[self.places.index(node)])
 
     def placed_columns(self, derivatives: FloatArray, n: int) -> FloatArray:
         """Return the Jacobian (p, n) by the state, of n components, from ``derivatives`` (p, d) by

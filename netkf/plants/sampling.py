@@ -55,32 +55,6 @@ class DrawnSamples:
         return self._readings.several(ks, x)
 
 
-class RecordedSamples:
-    """Samples from the ``rows`` of a table: y (K, p), or y and its row of H, (K, 1 + n); ``H``
-    (p, n) is that of rows without their own.
-    """
-
-    def __init__(self, H: FloatArray, rows: FloatArray) -> None:
-        self._H, self._rows = H, rows
-
-    def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``; the state x (n,) is not
-        used.
-        """
-        p = len(self._H)
-        phi = self._rows[k, p:]
-        return self._rows[k, :p], phi[None] if phi.size else self._H
-
-    def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the numbers ``ks``; the
-        states x (S, n) are not used.
-        """
-        p, rows = len(self._H), self._rows[list(ks)]
-        if rows.shape[1] > p:
-            return rows[:, :p], rows[:, None, p:]
-        return rows, np.broadcast_to(self._H, (len(rows), *self._H.shape))
-
-
 @dataclass(frozen=True, eq=False)
 class RecordedSampling(Clock):
     """Samples at the times of a table ``t,node`` (seconds, above 0); several rows of a node at one

@@ -36,6 +36,7 @@ from netkf.linalg.portable import cholesky
 from netkf.linalg.structs import Size
 from netkf.plants.linear import Readings, SlotReadings
 from netkf.plants.paths import BLOCK, DiffusionPath
+from netkf.plants.readings import ReadingTable
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
 
 ROOT_3 = math.sqrt(3.0)
@@ -57,8 +58,13 @@ class Sensor(Component):
 
     @property
     def varying(self) -> bool:
-        """True if H differs from reading to reading."""
+        """True if H, R or the values that are there differ from reading to reading."""
         return False
+
+    @property
+    def record(self) -> ReadingTable | None:
+        """The table of its readings; None if they are drawn, or are a user's own."""
+        return None
 
     def matrix_of(self, n: int) -> FloatArray:
         """Return H (p, n) of the first reading, for a state of n components; the filters' models

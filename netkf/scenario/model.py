@@ -39,7 +39,6 @@ from netkf.network.matchings import SlotActivation
 from netkf.plants.linear import LinearPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
-from netkf.plants.recorded import RecordedSensor
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.stamps import Time, restamp
 
@@ -120,7 +119,7 @@ def takes_samples(sensor: Sensor) -> bool:
 
     A sample is y = H x + v at an instant; increments are those of dy = H x dt + dv.
     """
-    return isinstance(sensor, RecordedSensor) or (
+    return sensor.record is not None or (
         isinstance(sensor, (LinearSensor, NonlinearSensor)) and sensor.sampling is not None
     )
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.network.matchings import RecordedSlots
-from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
+from netkf.plants.sensors import Sensor
 from netkf.plants.truth import TOLERANCE
 from netkf.rng.streams import Streams
 from netkf.scenario.derived import DerivedScenario
@@ -20,7 +22,7 @@ def check_records(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a recorded table does not fit the scenario or lacks a needed row."""
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
-        if isinstance(sensor, RecordedSensor):
+        if sensor.record is not None:
             _check_readings(scenario, key, sensor)
         elif not scenario.plant.truth_known:
             raise ScenarioError(
@@ -36,7 +38,7 @@ def check_records(scenario: DerivedScenario) -> None:
         _check_exchanges(scenario)
 
 
-def _check_under(key: str, check: Callable[[], None]) -> None:
+def _check_under(key: str, check: Callable[[], object]) -> None:
     """Call ``check``; put ``key`` before the keys of ScenarioErrors that it raises."""
     try:
         check()
@@ -44,17 +46,27 @@ def _check_under(key: str, check: Callable[[], None]) -> None:
         raise error.under(key) from None
 
 
-def _check_readings(scenario: DerivedScenario, key: str, sensor: RecordedSensor) -> None:
+def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
     """Raise ScenarioError if recorded readings do not fit the nodes of the graph, or the slots.
 
     ``key`` is the key path of the sensor.
     """
-    for node in sensor.listed:
-        if node not in scenario.topology.index:
-            rule = f"{sensor.path.name} names a node that the graph does not have"
-            raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
+    record = sensor.record
+    assert record is not None
+    # Anchors at given positions need not be nodes.
+    anchors = record.anchors if isinstance(getattr(sensor, "positions", None), str) else ()
+    for name, ids, listed in (
+        ("node", record.nodes, record.listed),
+        ("to", record.columns.integers("to") if anchors else [], anchors),
+    ):
+        for node in listed:
+            if node not in scenario.topology.index:
+                where = record.columns.where(ids.index(node))
+                rule = f"{where}: {name} must be a node of the graph"
+                raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
     if scenario.slotted:
-        _check_under(key, lambda: sensor.require_slot_times(scenario.slot_plant.period))
+        for node in sensor.nodes:
+            _check_under(key, partial(record.slots, node, scenario.slot_plant.period))
 
 
 def sensed_slots(scenario: DerivedScenario) -> range:

@@ -14,7 +14,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
-from netkf.plants.recorded import RecordedDiffusion, RecordedSensor
+from netkf.plants.recorded import RecordedDiffusion
 from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
@@ -122,7 +122,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
         if isinstance(sensor, (LinearSensor, NonlinearSensor)):
             if sensor.sampling is not None:
                 _check_clock(scenario, key, sensor)
-            elif not sensor.linear and not scenario.slotted:
+            elif not sensor.linear and not scenario.slotted and sensor.record is None:
                 raise ScenarioError(
                     f"{key}.sampling",
                     "is missing, and a nonlinear sensor takes samples in continuous time",
@@ -136,12 +136,6 @@ def check_sampling(scenario: ScenarioModel) -> None:
                 None,
                 'write sampling = { kind = "periodic", period = ... }',
             )
-        if isinstance(sensor, RecordedSensor) and not scenario.slotted:
-            for node in sensor.nodes:
-                try:
-                    sensor.rows(node)  # raises for wrong times
-                except ScenarioError as error:
-                    raise error.under(key) from None
     if not scenario.slotted and isinstance(scenario.plant, RecordedDiffusion):
         require_states(scenario, sample_times(scenario, Streams(scenario.seed)))
 
@@ -194,10 +188,11 @@ def sampling_notes(scenario: ScenarioModel) -> tuple[str, ...]:
     """Return a line for each recorded sensor whose table has no readings of some of its nodes."""
     notes: list[str] = []
     for sensor in scenario.sensors:
-        if not isinstance(sensor, RecordedSensor):
+        record = sensor.record
+        if record is None:
             continue
-        nodes = [node for node in sensor.nodes if not len(sensor.recorded_times(node))]
+        nodes = [node for node in sensor.nodes if not len(record.rows(node).t)]
         if nodes:
             listed = ", ".join(map(str, nodes[:3])) + (", ..." if len(nodes) > 3 else "")
-            notes.append(f"{sensor.path.name} has no readings of node {listed}")
+            notes.append(f"{record.path.name} has no readings of node {listed}")
     return tuple(notes)

@@ -16,7 +16,7 @@ from netkf.core.fields import MAX_SECONDS, Component, Rule, SourceFile, field, o
 from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import RecordedClock
-from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sampling import RecordedSampling
 
 LATE = 100.0  # seconds; records that begin earlier need no note
@@ -128,8 +128,8 @@ def stamp_notes(scenario: Any) -> tuple[str, ...]:
 def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
     """Yield the times (K,) in seconds of the rows of each recorded table of a scenario."""
     for sensor in scenario.sensors:
-        if isinstance(sensor, RecordedSensor):
-            yield np.array([t for _, t in sensor.row_times])
+        if sensor.record is not None:
+            yield sensor.record.columns["t"]
         clock = getattr(sensor, "sampling", None)
         if isinstance(clock, RecordedSampling):
             yield from map(clock.recorded_times, clock.listed)

@@ -11,7 +11,8 @@ from netkf.network.clocks import RecordedClock
 from netkf.network.graphs import Link
 from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedDelay, RecordedLoss
-from netkf.plants.recorded import RecordedDiffusion, RecordedPlant, RecordedSensor
+from netkf.plants.readings import ReadingTable
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sampling import RecordedSampling
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import count_state_rows, exchange_slots, sensed_slots
@@ -156,11 +157,11 @@ def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:
     Sensors with the same file share one entry.
     """
     nodes: dict[tuple[str, Any], set[int]] = {}
-    components: dict[tuple[str, Any], tuple[str, RecordedSampling | RecordedSensor]] = {}
+    components: dict[tuple[str, Any], tuple[str, RecordedSampling | ReadingTable]] = {}
     for k, sensor in enumerate(scenario.sensors):
-        component: RecordedSampling | RecordedSensor
-        if isinstance(sensor, RecordedSensor):
-            key, component = f"sensors[{k}]", sensor
+        component: RecordedSampling | ReadingTable
+        if sensor.record is not None:
+            key, component = f"sensors[{k}]", sensor.record
         elif isinstance(sampling := getattr(sensor, "sampling", None), RecordedSampling):
             key, component = f"sensors[{k}].sampling", sampling
         else:
@@ -175,20 +176,21 @@ def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:
 
 
 def _find_row_use(
-    scenario: DerivedScenario, component: RecordedSampling | RecordedSensor, nodes: set[int]
+    scenario: DerivedScenario, component: RecordedSampling | ReadingTable, nodes: set[int]
 ) -> RowUse:
     """Return the use of a table of sampling times or readings by the sensors of ``nodes``."""
     rows, horizon = component.row_times, scenario.horizon
     # Rows of a sampling that tell a node twice to sample at one time are one sample; readings are
     # told apart by their row.
-    is_reading = isinstance(component, RecordedSensor)
+    is_reading = isinstance(component, ReadingTable)
     keys = [(node, t, row if is_reading else 0) for row, (node, t) in enumerate(rows)]
     if scenario.slotted:
         slots, period = sensed_slots(scenario), scenario.slot_plant.period
         return count_rows(
             component.path.name,
             keys,
-            lambda key: key[0] in nodes and round(key[1] / period) in slots,
+            # A row without any value has no time.
+            lambda key: key[0] in nodes and key[1] >= 0.0 and round(key[1] / period) in slots,
         )
     # A sampling clock ticks after time 0 only.
     start = 0.0 if is_reading else math.ulp(0.0)

@@ -20,7 +20,6 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.network.deliveries import MessageKey
-from netkf.plants.recorded import RecordedSensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.trace.schema import CODES
 
@@ -419,13 +418,12 @@ class KeptReadings:
         """
         scenario = self._scenario
         sensors = [scenario.sensors[position.entry] for position in scenario.placed_sensors[node]]
-        if not scenario.slotted or not all(isinstance(s, RecordedSensor) for s in sensors):
+        records = [sensor.record for sensor in sensors]
+        if not scenario.slotted or None in records:
             return rows
-        recorded = [s.row_times for s in sensors if isinstance(s, RecordedSensor)]
-        # A table of readings may have rows of several nodes.
-        times = [t for listed in recorded for other, t in listed if other == node]
-        slots_of = scenario.slot_plant.slots_of
-        return rows[np.isin(slots_of(self._times[rows]), slots_of(np.array(times)))]
+        plant = scenario.slot_plant
+        read = [slot for record in records for slot in record.slots(node, plant.period)]
+        return rows[np.isin(plant.slots_of(self._times[rows]), read)]
 
     def newest(self, node: int, start: int, end: int) -> float:
         """Return the time in seconds of the newest reading of ``node`` (its id) in the rows of the

@@ -61,7 +61,7 @@ def test_a_table_is_the_same_in_every_dialect(tmp_path, text, packed):
         ("t,node,y0\n1,0,0,0,3\n", "with decimal commas separate columns by semicolons"),
         ('t,node,y0\n1,0,"0,3"\n', "write a decimal point"),
         ("t,node,y0,y0\n1,0,2,3\n", "must have one column y0"),
-        ("# a\nt,node,y0\n1,0,2\n1,0.5,2\n", "line 4: node must be an integer"),
+        ("# a\nt,node,y0\n1,0,2\n1,0.5,2\n", "line 4: node must hold integers"),
         ("t,node,y0\n2009-07-22T15:10:60Z,0,2\n", "or an ISO 8601 time"),
         ("t,node,y0\n1_0,0,2\n", "line 2: t must be a finite number"),
         ("t,node,y0\n1,0,1_0\n", "line 2: y0 must be a finite number"),

@@ -20,7 +20,6 @@ from netkf.checks.parts.sources import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
-from netkf.plants.recorded import RecordedSensor
 from netkf.rng.normals import StreamNormals
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor, takes_samples
@@ -186,7 +185,7 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
     for node, placed_sensors in scenario.placed_sensors.items():
         for placed_sensor in placed_sensors:
             sensor = scenario.sensors[placed_sensor.entry]
-            if not sensor.is_random or isinstance(sensor, RecordedSensor):
+            if not sensor.is_random:
                 continue
             stated: Any = stated_part(sensor, "sensor")
             rows += len(stated.R)

@@ -9,6 +9,7 @@ import numpy as np
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import Instants
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.readings import RecordedSamples
 from netkf.plants.sampling import Samples
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
@@ -16,14 +17,14 @@ from netkf.scenario.scenario import Scenario
 
 
 class SampledSensor(NamedTuple):
-    """One sensor: the ``times`` (K,) of its ``samples``, their ``indices`` (K,) among all samples
-    of the run, and the number ``order`` of the sensor among all; ``times`` are in seconds.
+    """One sensor: the ``times`` (K,) in seconds of its ``samples``, their ``indices`` (K,) among
+    all samples of the run, and whether each has an H of its own.
     """
 
     times: FloatArray
     samples: Samples
     indices: np.ndarray
-    order: int
+    varying: bool
 
 
 class SampleTables:
@@ -62,11 +63,15 @@ class SampleTables:
                 times[node, placed_sensor.ordinal],
                 scenario.sample_path(streams, node, placed_sensor),
                 indices,
-                k,
+                scenario.sensors[placed_sensor.entry].varying,
             )
-            for k, ((node, placed_sensor), indices) in enumerate(zip(placed, parts, strict=True))
+            for (node, placed_sensor), indices in zip(placed, parts, strict=True)
         ]
         self.instants = _make_instants(scenario, placed, t[order], sensor[order])
+        for (_, placed_sensor), sampled in zip(placed, self._sensors, strict=True):
+            if isinstance(sampled.samples, RecordedSamples) and sampled.varying:
+                R = scenario.noise_covariance(placed_sensor.entry, believed=True)
+                _add_noises(self.instants, sampled.samples, sampled.indices, R)
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
         """Fill in the values ``instants.y`` (and H, where it varies) of the samples taken in
@@ -85,11 +90,27 @@ class SampleTables:
             y, H = sensor.samples.several(range(first, last), x)
             indices, p = sensor.indices[first:last], y.shape[1]
             instants.y[indices, :p] = y
-            # Numbers of matrices beyond those of the sensors belong to single samples.
-            if instants.matrix[indices[0]] >= len(
-                instants.rows
-            ):  # a sensor with an H for each sample
+            if sensor.varying:
                 instants.H[instants.matrix[indices], :p] = H
+
+
+def _add_noises(
+    instants: Instants, samples: RecordedSamples, indices: np.ndarray, R: FloatArray
+) -> None:
+    """Give each sample of a recorded sensor, with the ``indices`` (K,) among all, its number of
+    rows and the root of its noise covariance: some of its values may be missing, or it brings its
+    own R. The sensor has R (p, p).
+    """
+    p, first = instants.root.shape[1], len(instants.rows)
+    root = np.zeros((len(indices), p, p))
+    rows = np.zeros(len(indices), dtype=np.int64)
+    for k in range(len(indices)):
+        own = np.linalg.cholesky(samples.covariance(k, R))
+        rows[k] = len(own)
+        root[k, : len(own), : len(own)] = own
+    instants.root = np.concatenate([instants.root, root])
+    instants.rows = np.concatenate([instants.rows, rows])
+    instants.sensor[indices] = first + np.arange(len(indices))
 
 
 @once_per_scenario

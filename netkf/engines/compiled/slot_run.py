@@ -47,7 +47,6 @@ from netkf.engines.compiled.slot_messages import (
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
-from netkf.linalg.portable import solve_lower
 from netkf.network.deliveries import Deliveries
 from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
@@ -522,10 +521,9 @@ class SlotRuns:
             return ReadingBlock(y, H, local, rebased)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
         for s, path in self._recorded:
-            rows = slice(s.row, s.row + len(s.root))
-            values, matrices = path.several(slots, x[0, times.sensed, :, 0])
+            rows = slice(s.row, s.row + s.rows)
             # L^-1 y and L^-1 H, with the R = L L' that filters believe; all runs read the same.
-            whitened_y, whitened_H = solve_lower(s.root, values.T).T, solve_lower(s.root, matrices)
+            whitened_y, whitened_H = path.whitened(slots, s.R, s.rows)
             y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
             H[:, times.sensed, s.estimator, rows] = whitened_H[..., None]
         return ReadingBlock(y, H, local, rebased)

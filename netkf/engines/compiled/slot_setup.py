@@ -46,14 +46,17 @@ def slot_setup(scenario: Scenario) -> SlotSetup:
 
 
 class AssignedSensor(NamedTuple):
-    """A sensor of ``node``: which filter reads it (``estimator``) and its first ``row`` there;
-    ``root`` (p, p) is the Cholesky factor of R as the filters believe it.
+    """A sensor of ``node``: which filter reads it (``estimator``), its first ``row`` there and the
+    number of its ``rows``, of a recorded one the most in a slot; ``R`` (p, p) is the covariance of
+    its noise as the filters believe it, ``root`` its Cholesky factor.
     """
 
     node: int
     placed_sensor: PlacedSensor
     estimator: int
     row: int
+    rows: int
+    R: FloatArray
     root: FloatArray
 
 
@@ -156,12 +159,13 @@ class SlotSetup:
             estimator = 0 if pooled else scenario.topology.index[node]
             for placed_sensor in scenario.placed_sensors[node]:
                 R = scenario.noise_covariance(placed_sensor.entry, believed=True)
-                root = cholesky(R)
+                count = self._most_rows(scenario, node, placed_sensor)
                 # A filter stacks the readings of its sensors, one below the other.
+                row = int(rows[estimator])
                 self.assigned.append(
-                    AssignedSensor(node, placed_sensor, estimator, int(rows[estimator]), root)
+                    AssignedSensor(node, placed_sensor, estimator, row, count, R, cholesky(R))
                 )
-                rows[estimator] += len(root)
+                rows[estimator] += count
         self.rows, self.p = rows, int(rows.max(initial=1))
         kinds = [type(scenario.sensors[s.placed_sensor.entry]) for s in self.assigned]
         self.recorded_sensors = [
@@ -179,6 +183,16 @@ class SlotSetup:
         # The same in all blocks of runs and all slots, hence 1, 1.
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
         self._set_kernel_sensors(scenario)
+
+    def _most_rows(self, scenario: Scenario, node: int, placed_sensor: PlacedSensor) -> int:
+        """Return the number of rows of a sensor of ``node`` (id), of a recorded one the most that
+        it has in a slot.
+        """
+        sensor = scenario.sensors[placed_sensor.entry]
+        if sensor.record is None:
+            return len(sensor.R)
+        slots = sensor.record.slots(node, scenario.slot_plant.period)
+        return len(sensor.R) * max(1, *map(len, slots.values()), 1)
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
         """Set ``self.sensors``, by which kernels draw readings: the whitened H = L_b^-1 H (K, p, n)
@@ -336,7 +350,7 @@ class SlotSetup:
         slots: dict[int, set[int]] = {}
         for s in self.recorded_sensors:
             sensor: Any = scenario.sensors[s.placed_sensor.entry]
-            recorded_slots = sensor.table(s.node, scenario.slot_plant.period)
+            recorded_slots = sensor.record.slots(s.node, scenario.slot_plant.period)
             slots.setdefault(scenario.topology.index[s.node], set()).update(recorded_slots)
         for s in self.kernel_sensors:
             slots.pop(scenario.topology.index[s.node], None)

@@ -167,7 +167,13 @@ class _Simulation:
         # Filters, readers and the clock are processes that meet by time and rank only.
         processes = [node.run_process(self.timeline) for node in distinct(nodes)]
         for node, placed in scenario.placed_sensors.items():
-            sensors = [scenario.slot_path(streams, node, sensor) for sensor in placed]
+            sensors = [
+                (
+                    scenario.slot_path(streams, node, sensor),
+                    scenario.noise_covariance(sensor.entry, believed=True),
+                )
+                for sensor in placed
+            ]
             entity = scenario.topology.index[node]
             reader = Reader(recorder, schedule, node, entity, nodes[node])
             processes.append(reader.run_process(self.timeline, truth, sensors))

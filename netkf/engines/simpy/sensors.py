@@ -12,6 +12,7 @@ from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.readings import covariance_of
 from netkf.plants.sampling import Samples
 from netkf.plants.sensors import LinearSensor, SensorPath
 from netkf.rng.streams import Streams
@@ -98,7 +99,7 @@ class SamplingProcess:
             yield timeline.at(time, Rank.SENSE, self.entity)
             # Relative to the moving origin, like the estimates.
             y, H = self.samples.reading(k, truth.local(time))
-            receiver.sample(self.node, y, H, self.R)
+            receiver.sample(self.node, y, H, covariance_of(self.samples, k, self.R))
 
 
 def increment_sensors(

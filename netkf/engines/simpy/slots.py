@@ -18,9 +18,10 @@ from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope, Node, distinct, linearise
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.linear import Readings
+from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -158,7 +159,7 @@ class SlotNode(Node):
         # -1: no exchange is open, and every message is late.
         self._open = -1
         self._stopped = False
-        self._samples: list[tuple[FloatArray, Any]] = []
+        self._samples: list[tuple[FloatArray, Any, FloatArray]] = []
 
     def run_process(self, timeline: Timeline) -> Process:
         """Follow the schedule, slot after slot, as a SimPy process: at each stage that concerns the
@@ -185,27 +186,26 @@ class SlotNode(Node):
         else:
             self._close(stage, slot)
 
-    def read(self, y: FloatArray, H: Any) -> None:
+    def read(self, y: FloatArray, H: Any, R: FloatArray) -> None:
         """Store the reading y (p,) of one sensor with its H (p, n), or the function that linearises
-        it, until the update of this slot.
+        it, and the R (p, p) that the filter believes, until the update of this slot.
         """
-        self._samples.append((y, H))
+        self._samples.append((y, H, R))
 
     def _update(self, time: float) -> None:
         """Update ``self.state`` by all readings of this slot, at ``time`` (seconds), in one update;
         a node without sensors gets a reading without rows.
         """
-        model = self.model
-        samples = [linearise(self.algorithm, self.state, y, H) for y, H in self._samples]
+        samples = [linearise(self.algorithm, self.state, y, H) for y, H, _ in self._samples]
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
-        H = np.concatenate([model.H[:0], *(H for _, H in samples)])
+        H = np.concatenate([self.model.H[:0], *(H for _, H in samples)])
+        R = block_diagonal([R for *_, R in self._samples])
         present = np.concatenate(
             [np.empty(0, dtype=bool), *(_finite_rows(y, H) for y, H in samples)]
         )
-        R = model.R
         # Rows without a value are left out of y, H and R alike.
-        if not present.all():  # a recorded sensor without a row for this slot
+        if not present.all():
             y, H, R = y[present], H[present], R[np.ix_(present, present)]
         self._samples = []
         self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
@@ -258,7 +258,7 @@ def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
     """Return flags (p,) of the rows of a reading ``y`` (p,) with ``H`` (p, n) that have a value,
     since the filter uses only these; ``y`` may be empty if the whole reading is missing.
     """
-    # A recorded sensor without a row has an empty y.
+    # A sensor without a reading may give an empty y.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
 
@@ -274,9 +274,12 @@ class Reader:
         self._recorder, self._schedule = recorder, schedule
         self._node, self._entity, self._carrier = node, entity, carrier
 
-    def run_process(self, timeline: Timeline, truth: Any, sensors: list[Readings]) -> Process:
-        """Read all ``sensors`` of the node at the "read" stage of every slot, in the state of the
-        ``truth``, and pass the readings to its filter: a SimPy process.
+    def run_process(
+        self, timeline: Timeline, truth: Any, sensors: list[tuple[Readings, FloatArray]]
+    ) -> Process:
+        """Read all ``sensors`` of the node, each with the R (p, p) that the filter believes, at the
+        "read" stage of every slot, in the state of the ``truth``, and pass the readings to its
+        filter: a SimPy process.
         """
         slot = 0
         while self._schedule.runs(slot):
@@ -286,8 +289,9 @@ class Reader:
                     self._recorder.append((stage.time, SENSE, self._node, -1, -1, -1, NAN))
                     # In the coordinates of the estimates, as H x is.
                     x = truth.local(slot)
-                    for sensor in sensors:
-                        self._carrier.read(sensor.reading(slot, x), sensor.matrix(slot))
+                    for sensor, R in sensors:
+                        y, H = sensor.reading(slot, x), sensor.matrix(slot)
+                        self._carrier.read(y, H, covariance_of(sensor, slot, R))
             slot += 1
 
 

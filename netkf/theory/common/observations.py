@@ -7,10 +7,12 @@ run.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, as_kernel_array
+from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import (
     sample_path,
@@ -43,6 +45,17 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
         )
         for k in range(len(scenario.sensors))
     ]
+
+
+def _noise(
+    path: Any, k: int, noise: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the assumed R (p, p) and the root (p, p) of the true one of reading number ``k`` (a
+    sample or a slot) of a ``path``, from those of its sensor, ``noise``.
+    """
+    R, root = noise
+    own, true = covariance_of(path, k, R), covariance_of(path, k, root @ root.T)
+    return (R, root) if own is R else (own, np.asarray(np.linalg.cholesky(true)))
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
@@ -91,9 +104,13 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
         for estimator, paths in enumerate(estimators):
             if not paths:
                 continue
-            rows = [(sensor, path.matrix(slot)) for sensor, path in paths]
+            rows = [(sensor, path, path.matrix(slot)) for sensor, path in paths]
             # A sensor without a reading in this slot has a matrix without rows.
-            readings = [Observation(H, *noises[sensor.entry]) for sensor, H in rows if len(H)]
+            readings = [
+                Observation(H, *_noise(path, slot, noises[sensor.entry]))
+                for sensor, path, H in rows
+                if len(H)
+            ]
             observations[estimator] = stack_observations(readings, n)
         return observations
 
@@ -124,7 +141,7 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
                     H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
                     at_time = observations.setdefault(time, {})
                     at_time.setdefault(estimator, []).append(
-                        Observation(H, *noises[placed_sensor.entry])
+                        Observation(H, *_noise(path, k, noises[placed_sensor.entry]))
                     )
     return {
         time: {

@@ -15,6 +15,7 @@ import scipy.sparse
 from netkf.core.clock import Clock
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock, Periodic
+from netkf.plants.readings import covariance_of
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
@@ -190,8 +191,11 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
         R = scenario.noise_covariance(placed_sensor.entry, believed=True)
         for k, time in enumerate(times[node, ordinal].tolist()):
             H = sensor.H if path is None else path.reading(k, np.zeros(n))[1]
+            own = covariance_of(path, k, R)
             # The bound has no true noise: R only fills the field of its root.
-            by_time.setdefault(time, {}).setdefault(index[node], []).append(Observation(H, R, R))
+            by_time.setdefault(time, {}).setdefault(index[node], []).append(
+                Observation(H, own, own)
+            )
     everyone = range(len(scenario.nodes))
     jumps = []
     for time in sorted(by_time):

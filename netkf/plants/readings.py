@@ -1,0 +1,451 @@
+"""Tables of readings: rows of many nodes and times, some of them partial, some with their own R.
+
+A row ``t,node,y0,...`` is one reading. Values may be missing: then their rows of H and R are not
+there. Columns ``R0, ...`` (the diagonal) or ``R00, R01, ...`` (the upper triangle) are the noise of
+the row itself, columns ``phi0, ...`` its row of H, and a column ``to`` names the anchor that a
+nonlinear sensor measures from. Several rows of one node at one time are used together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.core.csv_files import Columns, read_columns, read_header
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import MAX_MAGNITUDE, SourceFile
+from netkf.linalg.arrays import FloatArray, block_diagonal, readonly_array
+from netkf.linalg.portable import cholesky, solve_lower
+
+Matrix = Callable[[int, np.ndarray], Any]
+"""Returns the H (p', n) of row k of a node for the p' values that are there, flags (p,), or a
+function that linearises them.
+"""
+
+
+class NodeRows(NamedTuple):
+    """The K readings of one node, in order of time; rows of one time in the order of the file.
+
+    t, rows : (K,), seconds, and the indices of the rows in the table
+    y : (K, p), nan where a value is missing
+    phi : (K, n), rows of H of the readings; n is 0 without such columns
+    R : (K, p, p), nan where the sensor's R counts; (0, p, p) if it counts everywhere
+    anchors : (K,), the ids of anchors, -1 without such a column
+    """
+
+    t: FloatArray
+    rows: np.ndarray
+    y: FloatArray
+    phi: FloatArray
+    R: FloatArray
+    anchors: np.ndarray
+
+    def covariance(self, k: int, R: FloatArray) -> FloatArray:
+        """Return the noise covariance (p', p') of the p' values of reading k: its own, else the
+        part of the sensor's R (p, p).
+        """
+        present = np.flatnonzero(np.isfinite(self.y[k]))
+        own = self.R[k] if len(self.R) else R
+        chosen = np.ix_(present, present)
+        return own[chosen] if np.isfinite(own[chosen]).all() else R[chosen]
+
+    @property
+    def is_uniform(self) -> bool:
+        """True if all readings are whole and have the noise of the sensor."""
+        return not len(self.R) and bool(np.isfinite(self.y).all())
+
+
+class ReadingTable:
+    """A table of readings of p values each. ``regressors`` is the number n of columns phi, 0
+    without any, ``has_anchors`` says if there is a column ``to``, ``has_noise`` if rows bring their
+    own R.
+
+    Mistakes in the file raise ScenarioError, at the latest when ``rows`` is called.
+    """
+
+    def __init__(self, path: SourceFile, p: int, R: FloatArray | None, linear: bool) -> None:
+        """Take a file of readings of ``p`` values each (1 if it has columns phi), with the noise
+        covariance ``R`` (p, p) where rows bring none. A ``linear`` sensor may have columns phi, a
+        nonlinear one a column ``to``. Raises ScenarioError if it is no table.
+        """
+        header = read_header(path)
+        self.path, self._R = path, R
+        self.regressors = linear * sum(number_of(name, "phi") >= 0 for name in header)
+        self.p = p = 1 if self.regressors else p
+        self.has_anchors = not linear and "to" in header
+        triangle = {f"R{i}{j}": (i, j) for i in range(p) for j in range(i, p)}
+        diagonal = {f"R{i}": (i, i) for i in range(p)}
+        # R00 is no name of the diagonal: it tells which of the two forms the table has.
+        own = triangle if "R00" in header else diagonal if "R0" in header else {}
+        self._noise: dict[str, tuple[int, int]] = own
+        self.has_noise = bool(own)
+        self._surplus = [name for name in header if number_of(name) >= p]
+
+    @cached_property
+    def columns(self) -> Columns:
+        """The columns of the table; values and their noises may be missing."""
+        values = [f"y{k}" for k in range(self.p)]
+        others = [f"phi{k}" for k in range(self.regressors)] + ["to"] * self.has_anchors
+        required = ("t", "node", *values, *others, *self._noise)
+        gaps = {*values, *self._noise, *self._surplus}
+        return read_columns(self.path, required, tuple(self._surplus), gaps)
+
+    @cached_property
+    def nodes(self) -> list[int]:
+        """The node id of each row."""
+        return self.columns.integers("node")
+
+    @cached_property
+    def listed(self) -> tuple[int, ...]:
+        """The ids of all nodes in the table."""
+        return tuple(sorted(set(self.nodes)))
+
+    @cached_property
+    def anchors(self) -> tuple[int, ...]:
+        """The ids of all anchors in the table."""
+        return tuple(sorted(set(self.columns.integers("to")))) if self.has_anchors else ()
+
+    @cached_property
+    def present(self) -> np.ndarray:
+        """Flags (K, p) of the values that are there, of all rows."""
+        return np.isfinite(self._stack([f"y{k}" for k in range(self.p)]))
+
+    @property
+    def is_partial(self) -> bool:
+        """True if a value of some row is missing."""
+        return not bool(self.present.all())
+
+    def _stack(self, names: Sequence[str]) -> FloatArray:
+        """Return the named columns side by side (K, len(names))."""
+        columns = [self.columns[name] for name in names]
+        return np.stack(columns, axis=1) if columns else np.empty((len(self.columns.lines), 0))
+
+    @cached_property
+    def _covariances(self) -> FloatArray:
+        """The noise covariance (K, p, p) of each row itself, nan where the sensor's counts; empty
+        (0, p, p) if no row brings its own.
+
+        Raises ScenarioError, with the line, for one that is not positive definite.
+        """
+        K, p = len(self.columns.lines), self.p
+        if not self.has_noise:
+            return np.empty((0, p, p))
+        is_diagonal = "R00" not in self._noise
+        R = np.zeros((K, p, p)) if is_diagonal else np.full((K, p, p), np.nan)
+        for name, (i, j) in self._noise.items():
+            R[:, i, j] = R[:, j, i] = self.columns[name]
+        needed = self.present[:, :, None] & self.present[:, None, :]
+        if is_diagonal:
+            needed &= np.eye(p, dtype=bool)
+        missing, given = needed & np.isnan(R), needed & np.isfinite(R)
+        without = missing.any(axis=(1, 2)) & ~given.any(axis=(1, 2)) & (self._R is not None)
+        for k in np.flatnonzero(missing.any(axis=(1, 2)) & ~without):
+            i, j = np.argwhere(missing[k])[0].tolist()
+            name = next(
+                name for name, pair in self._noise.items() if pair == (min(i, j), max(i, j))
+            )
+            rule = f"{self.columns.where(k)}: {name} is missing, and y{i} has a value"
+            remedy = "write it, or leave all noises of the row empty and give R for the sensor"
+            raise ScenarioError("path", rule, None, remedy)
+        R[without] = np.nan
+        self._require_definite(R, ~without & self.present.any(axis=1))
+        return R
+
+    def _require_definite(self, R: FloatArray, checked: np.ndarray) -> None:
+        """Raise ScenarioError, with the line, if the covariances R (K, p, p) of the values that are
+        there are not positive definite in one of the rows ``checked`` (K,).
+        """
+        # In place of missing values stand independent ones of a middle size, which decide nothing.
+        both = self.present[:, :, None] & self.present[:, None, :]
+        whole = np.where(both, R, 0.0)[checked]
+        present = self.present[checked]
+        sizes = np.abs(np.einsum("kii->ki", whole)).sum(axis=1) / present.sum(axis=1)
+        k, i = np.nonzero(~present)
+        whole[k, i, i] = sizes[k]
+        eigenvalues = np.linalg.eigvalsh(whole)
+        least, largest = eigenvalues[:, 0], np.abs(eigenvalues[:, -1])
+        wrong = np.flatnonzero(~(least > np.maximum(1e-14 * largest, 1.0 / MAX_MAGNITUDE)))
+        if wrong.size:
+            row = int(np.flatnonzero(checked)[wrong[0]])
+            there = np.flatnonzero(self.present[row])
+            rule = f"{self.columns.where(row)}: the noise R of the row must be positive definite"
+            value = R[row][np.ix_(there, there)]
+            raise ScenarioError("path", rule, value, "variances are positive; correct the row")
+
+    def first_covariance(self) -> FloatArray | None:
+        """Return the noise covariance (p, p) of the first row that brings a whole one, or None: it
+        stands for R where the sensor has none.
+        """
+        whole = np.flatnonzero(np.isfinite(self._covariances).all(axis=(1, 2)))
+        return readonly_array(self._covariances[whole[0]]) if whole.size else None
+
+    def rows(self, node: int) -> NodeRows:
+        """Return the readings of ``node`` (id) that have any value, sorted by time.
+
+        Raises ScenarioError for a value that has no row in H, and for a time below 0.
+        """
+        if node not in self._rows:
+            self._rows[node] = self._make_rows(node)
+        return self._rows[node]
+
+    @cached_property
+    def _rows(self) -> dict[int, NodeRows]:
+        """Cache of ``rows``."""
+        return {}
+
+    def _make_rows(self, node: int) -> NodeRows:
+        """Return the readings of ``node`` (id), see ``rows``."""
+        columns, own = self.columns, np.array(self.nodes) == node
+        for name in self._surplus:
+            entries = columns[name]
+            wrong = np.flatnonzero(own & np.isfinite(entries) & (entries != 0.0))
+            if wrong.size:
+                rule = f"{columns.where(wrong[0])}: {name} has no row in H"
+                value = float(entries[wrong[0]])
+                raise ScenarioError("path", rule, value, "leave it empty or correct H")
+        require_start(columns, np.flatnonzero(own))
+        # A stamp may lie before the origin by its rounding.
+        begun = columns["t"] >= -columns.half_digits
+        rows = np.flatnonzero(own & begun & self.present.any(axis=1))
+        rows = rows[np.argsort(columns["t"][rows], kind="stable")]
+        anchors = np.array(columns.integers("to"))[rows] if self.has_anchors else None
+        R = self._covariances
+        return NodeRows(
+            t=np.maximum(columns["t"][rows], 0.0),
+            rows=rows,
+            y=self._stack([f"y{k}" for k in range(self.p)])[rows],
+            phi=self._stack([f"phi{k}" for k in range(self.regressors)])[rows],
+            R=R[rows] if len(R) else R,
+            anchors=np.full(len(rows), -1) if anchors is None else anchors,
+        )
+
+    def slots(self, node: int, period: float) -> dict[int, list[int]]:
+        """Return the readings k of ``node`` (id) by number of the slot of ``period`` seconds.
+
+        Raises ScenarioError for a time that is not the start of a slot.
+        """
+        if (node, period) not in self._slots:
+            slots: dict[int, list[int]] = {}
+            for k, row in enumerate(self.rows(node).rows.tolist()):
+                slots.setdefault(slot_number(self.columns, row, period), []).append(k)
+            self._slots[node, period] = slots
+        return self._slots[node, period]
+
+    @cached_property
+    def _slots(self) -> dict[tuple[int, float], dict[int, list[int]]]:
+        """Cache of ``slots``."""
+        return {}
+
+    def times(self, node: int, horizon: float) -> FloatArray:
+        """Return the times (K,) in seconds, below the ``horizon``, of the readings of ``node``
+        (id); equal ones are used together.
+        """
+        t = self.rows(node).t
+        return t[: int(np.searchsorted(t, horizon))]
+
+    @cached_property
+    def row_times(self) -> list[tuple[int, float]]:
+        """Node id and time (seconds) of every row, in the order of the file; nan where no value is
+        there, so that it is no reading.
+        """
+        t, half_digits = self.columns["t"], self.columns.half_digits
+        times = np.where((t < 0.0) & (t >= -half_digits), 0.0, t)
+        times[~self.present.any(axis=1)] = np.nan
+        return list(zip(self.nodes, times.tolist(), strict=True))
+
+
+def number_of(name: str, letter: str = "y") -> int:
+    """Return the number in the ``name`` of a column, 3 for "y3" with ``letter`` "y"; -1 for names
+    of another form.
+    """
+    number = name.removeprefix(letter)
+    return int(number) if name.startswith(letter) and number.isdecimal() else -1
+
+
+def require_start(columns: Columns, rows: np.ndarray) -> None:
+    """Raise ScenarioError, with the line, for a time below 0 in one of the ``rows`` (indices) if no
+    origin is given: of a longer log a scenario may choose where it begins.
+    """
+    early = rows[columns["t"][rows] < 0.0]
+    if early.size and not columns.source.stamps.origin:
+        raise ScenarioError(
+            "path",
+            f"{columns.where(early[0])}: t must be at least 0",
+            float(columns["t"][early[0]]),
+            "set [time] origin to where the run begins in the log",
+        )
+
+
+def slot_number(columns: Columns, row: int, period: float) -> int:
+    """Return the number of the slot of ``period`` seconds that begins at the time of a ``row``
+    (index), up to half of the last digit of its stamp where that tells slots apart.
+
+    Raises ScenarioError, with the line, if none does.
+    """
+    t, half_digit = float(columns["t"][row]), float(columns.half_digits[row])
+    slot = round(t / period)
+    off = t - slot * period
+    # Decimal stamps are multiples of most periods up to their last digit only, and times up to
+    # rounding.
+    tolerance = 1e-9 * max(period, abs(t))
+    if half_digit < 0.5 * period:
+        tolerance += half_digit
+    if abs(off) > tolerance:
+        raise ScenarioError(
+            "path",
+            f"{columns.where(row)}: t must be a slot, a multiple of the period {period!r}, up to "
+            "half of its last digit",
+            f"{t!r}, {abs(off):.3g} s {'after' if off > 0.0 else 'before'} slot {slot}",
+            "write stamps with more digits, correct plant.period or [time] origin, or choose a "
+            "plant in continuous time",
+        )
+    return slot
+
+
+class RecordedSamples:
+    """The readings of one node in continuous time, one sample each; ``matrix`` gives their H and n
+    the number of states.
+    """
+
+    def __init__(self, rows: NodeRows, matrix: Matrix) -> None:
+        self._rows, self._matrix = rows, matrix
+
+    def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, Any]:
+        """Return ``y`` (p',) and ``H`` (p', n), or a function that linearises the reading, of
+        sample number ``k``, for the p' values that are there; the state x (n,) is not used.
+        """
+        present = np.isfinite(self._rows.y[k])
+        return self._rows.y[k][present], self._matrix(k, present)
+
+    def covariance(self, k: int, R: FloatArray) -> FloatArray:
+        """Return the noise covariance (p', p') of sample number ``k`` of a sensor with R (p, p)."""
+        return self._rows.covariance(k, R)
+
+    def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the numbers ``ks``, with
+        zeros behind the values that are there; the states x (S, n) are not used.
+        """
+        y, H = np.zeros((len(ks), self._rows.y.shape[1])), []
+        for index, k in enumerate(ks):
+            values, matrix = self.reading(k, x)
+            y[index, : len(values)] = values
+            H.append(
+                np.concatenate([matrix, np.zeros((y.shape[1] - len(values), matrix.shape[1]))])
+            )
+        return y, np.array(H)
+
+
+class RecordedReadings:
+    """The readings of one node in slots: ``slots`` has the rows k of each; ``matrix`` gives the H
+    of a row. All rows of a slot are one stacked reading.
+    """
+
+    def __init__(self, rows: NodeRows, slots: dict[int, list[int]], matrix: Matrix, n: int) -> None:
+        self._rows, self._slots, self._matrix, self._n = rows, slots, matrix, n
+        # Of each row, once they are asked for.
+        self._whitened: list[tuple[FloatArray, FloatArray]] | None = None
+
+    def matrix(self, slot: int) -> Any:
+        """Return H (p', n) in slot number ``slot``, or a function that linearises its reading, for
+        the p' values that are there.
+        """
+        parts = [self._matrix(k, np.isfinite(self._rows.y[k])) for k in self._slots.get(slot, ())]
+        if parts and callable(parts[0]):
+            return Stacked(parts)
+        return np.concatenate([np.zeros((0, self._n)), *parts])
+
+    def reading(self, slot: int, x: FloatArray) -> FloatArray:
+        """Return the p' values (p',) in slot number ``slot``; the state x (n,) is not used."""
+        y = self._rows.y[self._slots.get(slot, [])].reshape(-1)
+        return y[np.isfinite(y)]
+
+    def covariance(self, slot: int, R: FloatArray) -> FloatArray:
+        """Return the noise covariance (p', p') in slot number ``slot`` of a sensor with R
+        (p, p).
+        """
+        return block_diagonal([self._rows.covariance(k, R) for k in self._slots.get(slot, ())])
+
+    def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return readings (S, p) and matrices (S, p, n) of S ``slots`` as they are without noises
+        of their own; zeros, which carry no information, for what is missing.
+        """
+        p = max([self._rows.y.shape[1], *(len(self.reading(slot, x)) for slot in slots)])
+        y, H = np.zeros((len(slots), p)), np.zeros((len(slots), p, self._n))
+        for index, slot in enumerate(slots):
+            values = self.reading(slot, x)
+            y[index, : len(values)], H[index, : len(values)] = values, self.matrix(slot)
+        return y, H
+
+    def whitened(
+        self, slots: Sequence[int], R: FloatArray, p: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return readings (S, p) and matrices (S, p, n) of S ``slots``, multiplied by the inverse
+        Cholesky factor of their noise covariance, where a sensor has R; zeros for what is missing.
+        """
+        if self._whitened is None:
+            self._whitened = self._whiten(R)
+        y, H = np.zeros((len(slots), p)), np.zeros((len(slots), p, self._n))
+        for index, slot in enumerate(slots):
+            row = 0
+            for k in self._slots.get(slot, ()):
+                values, matrix = self._whitened[k]
+                y[index, row : row + len(values)], H[index, row : row + len(values)] = (
+                    values,
+                    matrix,
+                )
+                row += len(values)
+        return y, H
+
+    def _whiten(self, R: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        """Return each row, y (p',) and H (p', n), times the inverse Cholesky factor of its noise
+        covariance, where a sensor has R (p, p).
+        """
+        rows, pairs = self._rows, []
+        uniform = cholesky(R) if rows.is_uniform else None
+        for k, y in enumerate(rows.y):
+            present = np.isfinite(y)
+            root = cholesky(rows.covariance(k, R)) if uniform is None else uniform
+            values = solve_lower(root, y[present][:, None])[:, 0]
+            pairs.append((values, solve_lower(root, self._matrix(k, present))))
+        return pairs
+
+
+class Stacked:
+    """A function that linearises several readings, each by its own function of ``parts``."""
+
+    def __init__(self, parts: Sequence[Any]) -> None:
+        self._parts = parts
+
+    def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the readings ``y`` (p,) linearised at the estimate ``xhat`` (n,), and H (p, n)."""
+        ends = np.cumsum([part.size for part in self._parts])[:-1]
+        pairs = [
+            part(values, xhat) for part, values in zip(self._parts, np.split(y, ends), strict=True)
+        ]
+        stacked = [np.concatenate(items) for items in zip(*pairs, strict=True)]
+        return stacked[0], stacked[1]
+
+
+def take_from_record(sensor: Any, record: ReadingTable) -> None:
+    """Give a ``sensor`` the nodes and the R of its table where it has none; raises ScenarioError if
+    the table lists no node, or has no R either.
+    """
+    if sensor.nodes is None:
+        object.__setattr__(sensor, "nodes", record.listed)
+    if not sensor.nodes:
+        raise ScenarioError("path", f"{record.path.name} has no rows", None, "add some")
+    if sensor.R is None:
+        object.__setattr__(sensor, "R", record.first_covariance())
+    if sensor.R is None:
+        raise ScenarioError("R", "is missing", None, "add R = ..., or columns R0, ... to the table")
+
+
+def covariance_of(path: Any, k: int, R: FloatArray) -> FloatArray:
+    """Return the noise covariance of reading number ``k`` (a sample, or a slot) of a ``path``: that
+    of its values if they are recorded, else the R (p, p) of the sensor.
+    """
+    covariance = getattr(path, "covariance", None)
+    return R if covariance is None else np.asarray(covariance(k, R))
