@@ -113,11 +113,6 @@ class ReadingTable:
         """Flags (K, p) of the values that are there, of all rows."""
         return np.isfinite(self._stack([f"y{k}" for k in range(self.p)]))
 
-    @property
-    def is_partial(self) -> bool:
-        """True if a value of some row is missing."""
-        return not bool(self.present.all())
-
     def _stack(self, names: Sequence[str]) -> FloatArray:
         """Return the named columns side by side (K, len(names))."""
         columns = [self.columns[name] for name in names]
@@ -142,7 +137,7 @@ class ReadingTable:
             needed &= np.eye(p, dtype=bool)
         missing, given = needed & np.isnan(R), needed & np.isfinite(R)
         without = missing.any(axis=(1, 2)) & ~given.any(axis=(1, 2)) & (self._R is not None)
-        for k in np.flatnonzero(missing.any(axis=(1, 2)) & ~without):
+        for k in np.flatnonzero(missing.any(axis=(1, 2)) & ~without).tolist():
             i, j = np.argwhere(missing[k])[0].tolist()
             name = next(
                 name for name, pair in self._noise.items() if pair == (min(i, j), max(i, j))
@@ -204,8 +199,8 @@ class ReadingTable:
             wrong = np.flatnonzero(own & np.isfinite(entries) & (entries != 0.0))
             if wrong.size:
                 rule = f"{columns.where(wrong[0])}: {name} has no row in H"
-                value = float(entries[wrong[0]])
-                raise ScenarioError("path", rule, value, "leave it empty or correct H")
+                value = str(entries[wrong[0]])
+                raise ScenarioError("path", rule, value, "give H a row for it, or empty the entry")
         require_start(columns, np.flatnonzero(own))
         # A stamp may lie before the origin by its rounding.
         begun = columns["t"] >= -columns.half_digits

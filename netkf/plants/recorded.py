@@ -15,7 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.csv_files import read_columns
+from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -260,7 +260,8 @@ class RecordedSensor(Sensor):
     @property
     def varying(self) -> bool:
         """True if the table has columns phi0, ... or R0, ..., or if values are missing."""
-        return bool(self.record.regressors) or self.record.has_noise or self.record.is_partial
+        is_uniform = (self.record.rows(node).is_uniform for node in self.nodes)
+        return bool(self.record.regressors) or not all(is_uniform)
 
     def _matrix_function(self, node: int) -> Matrix:
         """Return the function that gives H (p', n) of the values of row k of ``node`` (id) that are

@@ -61,8 +61,9 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None
     ):
         for node in listed:
             if node not in scenario.topology.index:
-                where = record.columns.where(ids.index(node))
-                rule = f"{where}: {name} must be a node of the graph"
+                line = record.columns.lines[ids.index(node)]
+                where = f"in column {name} of line {line}"
+                rule = f"{record.path.name} names a node that the graph does not have, {where}"
                 raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
     if scenario.slotted:
         for node in sensor.nodes:

@@ -67,6 +67,8 @@ def test_every_column_of_every_table_refuses_what_is_no_number(tmp_path, name, v
     first, *others = rows.splitlines()
     entries = first.split(",")
     for k, column in enumerate(header.split(",")):
+        if (name, column) == ("readings.csv", "y0") and value in ("", "nan"):
+            continue  # the reading is missing
         row = ",".join([*entries[:k], value, *entries[k + 1 :]])
         with pytest.raises(netkf.ScenarioError) as refused:
             scenario(tmp_path, {name: "\n".join([row, *others])})

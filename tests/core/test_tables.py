@@ -168,7 +168,7 @@ def scenario(folder, readings=READINGS, **keys):
 
 
 def times(s):
-    return s.sensors[0].rows(0)[0].tolist()
+    return s.sensors[0].record.rows(0).t.tolist()
 
 
 def test_records_that_begin_long_after_0_are_noted(tmp_path):

@@ -247,12 +247,11 @@ def test_recorded_samples_of_other_nodes_and_times_are_refused(make, tmp_path):
         netkf.ScenarioError, match=r"s.csv names a node that the graph does not have"
     ):
         make([sensor])
-    for row, words in (("0.5,0,9.0", "one row of node 0 a time"), ("-1.0,0,9.0", "at least 0")):
-        with (tmp_path / "r.csv").open("a") as file:
-            file.write(row + "\n")
-        with pytest.raises(netkf.ScenarioError, match=words) as caught:
-            make([RECORDED])
-        assert str(caught.value).startswith("sensors[0].path: ")
+    with (tmp_path / "r.csv").open("a") as file:
+        file.write("-1.0,0,9.0\n")
+    with pytest.raises(netkf.ScenarioError, match="at least 0") as caught:
+        make([RECORDED])
+    assert str(caught.value).startswith("sensors[0].path: ")
     with (tmp_path / "x.csv").open("a") as file:
         file.write("0.5,1.0,1.0\n")
     with pytest.raises(
