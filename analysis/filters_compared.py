@@ -9,7 +9,9 @@ there. A second table has the bytes that all nodes send per second.
 
 from __future__ import annotations
 
+import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,18 +62,26 @@ def filters_of(scenario: netkf.Scenario) -> dict[str, object]:
     }
 
 
-def main(runs: int) -> None:
-    """Run all comparisons and print both tables."""
+def main(arguments: Sequence[str] | None = None) -> list[Any]:
+    """Run all comparisons and print both tables; return comparisons with their horizons (s)."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", type=int, nargs="?", default=100)
+    parser.add_argument("--networks", nargs="+", choices=NETWORKS, default=NETWORKS)
+    parser.add_argument("--horizon", type=float, help="seconds (default: the scenarios')")
+    options = parser.parse_args(arguments)
+    changes = {} if options.horizon is None else {"horizon": options.horizon}
     names: list[str] = []
     found: list[Any] = []
-    for network in NETWORKS:
-        scenario = netkf.load(FOLDER / f"{network}.toml")
+    for network in options.networks:
+        scenario = netkf.load(FOLDER / f"{network}.toml", changes)
         chosen = filters_of(scenario)
         names = list(chosen)
-        found.append(netkf.compare_filters(scenario, list(chosen.values()), runs, workers=1))
+        runs = options.runs
+        comparison = netkf.compare_filters(scenario, list(chosen.values()), runs, workers=1)
+        found.append((comparison, scenario.horizon))
         print(network, file=sys.stderr, flush=True)
-    header = f"| | {' | '.join(network.replace('_', ' ') for network in NETWORKS)} |"
-    rule = "|---" * (1 + len(NETWORKS)) + "|"
+    header = f"| | {' | '.join(network.replace('_', ' ') for network in options.networks)} |"
+    rule = "|---" * (1 + len(options.networks)) + "|"
     print(
         "\n".join([header, rule, *(_row(name, k, found, _quality) for k, name in enumerate(names))])
     )
@@ -79,6 +89,7 @@ def main(runs: int) -> None:
     print(
         "\n".join([header, rule, *(_row(name, k, found, _traffic) for k, name in enumerate(names))])
     )
+    return found
 
 
 def _row(name: str, k: int, found: list[Any], cell: object) -> str:
@@ -86,7 +97,8 @@ def _row(name: str, k: int, found: list[Any], cell: object) -> str:
     return f"| {name} | {' | '.join(cell(one, k) for one in found)} |"
 
 
-def _quality(found: Any, k: int) -> str:
+def _quality(one: Any, k: int) -> str:
+    found, _ = one
     row, central = found.rows[k], found.rows[0]
     if not row.ran:
         return "-"
@@ -97,13 +109,14 @@ def _quality(found: Any, k: int) -> str:
     return f"{ratio:.2f} ({nees:.2f})"
 
 
-def _traffic(found: Any, k: int) -> str:
+def _traffic(one: Any, k: int) -> str:
+    found, horizon = one
     row = found.rows[k]
     if not row.ran:
         return "-"
-    rate = row.bytes / 60.0
+    rate = row.bytes / horizon
     return f"{rate:.2f}" if 0.0 < rate < 1.0 else f"{rate:,.0f}"
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
+    main()

@@ -19,7 +19,7 @@ CELLS = ((2.41, 3.0), (5.82, 7.0), (2.41, 15.0))
 
 def scalar_cells(axes, delivery, samples):
     """Fig. 1: the law on the cells S_0, S_1 and S_0 to S_2: exact curve and samples."""
-    law = netkf.theory.intermittent.scalar_law(*SCALAR, delivery)
+    law = netkf.theory.scalar_law(*SCALAR, delivery)
     P = np.sort(netkf.theory.invariant_samples(*SCALAR, delivery, samples, seed=1)[:, 0, 0])
     share = np.arange(1, len(P) + 1) / len(P)
     for ax, (low, high) in zip(axes, CELLS, strict=True):
@@ -44,6 +44,7 @@ def scalar_cells(axes, delivery, samples):
         f"counted in the samples: {np.round(counted, 4)}; "
         f"mean {P.mean():.4f}, exact {law.mean():.4f}"
     )
+    return cells, counted
 
 
 def ten_states(axes, samples):
@@ -78,16 +79,16 @@ def ten_states(axes, samples):
     axes[0].legend(frameon=False, fontsize=8, title="delivery")
 
 
-def main():
+def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("intermittent.png"))
     parser.add_argument("--samples", type=int, default=4000)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(11, 6.5), layout="constrained")
         grid = figure.add_gridspec(2, 6)
         cells = [figure.add_subplot(grid[0, 2 * k : 2 * k + 2]) for k in range(3)]
-        scalar_cells(cells, 0.6, options.samples)
+        found = scalar_cells(cells, 0.6, options.samples)
         ten_states(
             [figure.add_subplot(grid[1, 3 * k : 3 * k + 3]) for k in range(2)], options.samples
         )
@@ -101,6 +102,7 @@ def main():
         "(a histogram would show bins, not the law)."
     )
     print(f"written to {options.out}")
+    return found
 
 
 if __name__ == "__main__":

@@ -41,9 +41,9 @@ def one_run(case, replica):
     return (error**2).sum(axis=2).mean(), nees.mean(), count, run.x
 
 
-def several(pool, runs, rate, algorithm):
+def several(each, runs, rate, algorithm):
     """Mean square errors (runs,), NEES (runs,), transmissions, truths, of all replicas."""
-    done = pool.map(partial(one_run, (rate, algorithm)), range(runs))
+    done = each(partial(one_run, (rate, algorithm)), range(runs))
     squared, nees, counts, truths = zip(*done, strict=True)
     return np.array(squared), np.array(nees), np.mean(counts), np.array(truths)
 
@@ -56,26 +56,28 @@ def line(name, squared, nees, count):
     print(f" +-{nees.std(ddof=1) * share:5.2f} {count:8.2f}", flush=True)
 
 
-def main():
+def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--rates", type=float, nargs="+", default=RATES, help="rounds a second")
     parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     better = {name: [] for name in FILTERS if name != PUSH_SUM}
     print(f"{'':>34} {'RMS error':>14} {'NEES, n = 2':>15} {'rounds/s':>8}")
+    nees = {}
     with ProcessPoolExecutor(options.workers) as pool:
+        each = pool.map if options.workers > 1 else map
         truths = None
         for name, algorithm in LIMITS.items():
-            *numbers, truths = several(pool, options.runs, RATES[0], algorithm)
+            *numbers, truths = several(each, options.runs, RATES[0], algorithm)
             line(name, *numbers)
         for rate in options.rates:
             squared = {}
             for name, algorithm in FILTERS.items():
-                *numbers, met = several(pool, options.runs, rate, algorithm)
+                *numbers, met = several(each, options.runs, rate, algorithm)
                 assert np.array_equal(met, truths), "the truth may not depend on the network"
                 line(f"{name}, {rate:g} rounds/s", *numbers)
-                squared[name] = numbers[0]
+                squared[name], nees[name, rate] = numbers[:2]
             for name, rows in better.items():
                 gain = squared[name] - squared[PUSH_SUM]
                 rows.append((rate, gain.mean(), gain.std(ddof=1) / np.sqrt(options.runs)))
@@ -86,6 +88,7 @@ def main():
         print(
             f"better at {', '.join(sure) or 'no'} rounds/s, worse at {', '.join(worse) or 'none'}"
         )
+    return better, nees
 
 
 if __name__ == "__main__":

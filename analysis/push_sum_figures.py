@@ -60,11 +60,11 @@ def interval(values):
     return np.mean(values), width / np.sqrt(len(values))
 
 
-def points(runs, pool, central):
+def points(runs, each, central):
     """(gamma, delivery) -> mean and half width, with the baselines under their names."""
     cells = [*product(SIMULATED, DELIVERIES), ("local", 1.0), ("central", 1.0)]
     tasks = [(*cell, replica) for cell in cells for replica in range(runs)]
-    found = np.array(list(pool.map(simulated, tasks, chunksize=4))).reshape(len(cells), runs)
+    found = np.array(list(each(simulated, tasks))).reshape(len(cells), runs)
     plain = {cell: interval(values) for cell, values in zip(cells[-2:], found[-2:], strict=True)}
     beyond = found[:-2] - found[-1] + central
     return plain | {cell: interval(v) for cell, v in zip(cells, beyond, strict=False)}
@@ -124,18 +124,20 @@ def facts(curves):
     print(f"gamma = 1, p = 0.7 with Q as printed: exact radius {printed:.3f}")
 
 
-def main():
+def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("push_sum.png"))
     parser.add_argument("--runs", type=int, default=10)
-    options = parser.parse_args()
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args(arguments)
     model = at(1, 1.0).pooled_slot_model
     ahead = netkf.theory.steady_covariance(model.F, model.Q, model.H, model.R)
     central = float(np.trace(np.linalg.inv(np.linalg.inv(ahead) + model.information)))
     cells = list(product(GAMMAS, GRID))
-    with ProcessPoolExecutor() as pool:
-        curves = dict(zip(cells, pool.map(exact, cells), strict=True))
-        measured = points(options.runs, pool, central)
+    with ProcessPoolExecutor(options.workers) as pool:
+        each = pool.map if options.workers > 1 else map
+        curves = dict(zip(cells, each(exact, cells), strict=True))
+        measured = points(options.runs, each, central)
     facts(curves)
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(12, 4.2), layout="constrained")
@@ -155,6 +157,7 @@ def main():
         )
     print(CONCLUSION)
     print(f"written to {options.out}")
+    return curves, measured, central
 
 
 def shown(pair):

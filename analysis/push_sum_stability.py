@@ -90,19 +90,23 @@ def picture(axes, gammas, deliveries):
     axes[0].figure.colorbar(filled, ax=axes, label="mean-square radius")
 
 
-def main():
+def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("push_sum_stability.png"))
     parser.add_argument("--cells", type=int, default=15, help="delivery probabilities in a picture")
-    options = parser.parse_args()
+    parser.add_argument("--deltas", type=float, nargs="+", default=DELTAS, help="of the table")
+    parser.add_argument("--draws", nargs="+", choices=DRAWS, default=DRAWS, help="of the table")
+    options = parser.parse_args(arguments)
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(11, 4.2), layout="constrained")
         picture(figure.subplots(1, 2), range(1, 7), np.linspace(0.3, 1.0, options.cells))
         figure.savefig(options.out, dpi=130)
     print("\n".join(FACTS), "\n")
     print(f"{'Q':8} {'delta':>6} {'links':6}  {'  '.join(fact[0] for fact in FACTS)}")
-    for corner, delta, links in product(CORNERS, DELTAS, DRAWS):
-        marks = ["+" if held else "-" for held in facts(system(corner, delta, links))]
+    found = {}
+    for corner, delta, links in product(CORNERS, options.deltas, options.draws):
+        found[corner, delta, links] = facts(system(corner, delta, links))
+        marks = ["+" if held else "-" for held in found[corner, delta, links]]
         print(f"{corner:8} {delta:6.2f} {links:6}  {'  '.join(marks)}")
     made = system("tau I_2", 4.01, "fresh")
     print("\nsmallest gamma, by Theorem 5 (mean), Theorem 6 (mean square) and the exact radius,")
@@ -114,6 +118,7 @@ def main():
         print(f"  delivery {delivery:g}: {certified}, exact {theory.exact_minimum_gamma(at)}")
     print(AGREES)
     print(f"written to {options.out}")
+    return found
 
 
 if __name__ == "__main__":

@@ -57,14 +57,14 @@ def raw():
     return readings[readings.minute < MINUTES], heard
 
 
-def prepare():
-    """Write the four tables of the scenario and print the parameters of its model."""
+def prepare(folder):
+    """Write the four tables of the scenario into a folder and print the parameters of its model."""
     readings, heard = raw()
     given = readings[~readings.node.isin(HELD_OUT)]
-    given[["t", "node", "y0"]].to_csv(DATA / "temperatures.csv", index=False)
+    given[["t", "node", "y0"]].to_csv(folder / "temperatures.csv", index=False)
     nodes = sorted(readings.node.unique())
     pairs = sorted({(sender, receiver) for sender, receiver, _ in heard})
-    pd.DataFrame(pairs, columns=["sender", "receiver"]).to_csv(DATA / "pairs.csv", index=False)
+    pd.DataFrame(pairs, columns=["sender", "receiver"]).to_csv(folder / "pairs.csv", index=False)
     times = readings.pivot(index="minute", columns="node", values="t")
     usual = (times.sub(MINUTE * times.index, axis=0)).median()
     named = {(sender, minute) for sender, _, minute in heard}
@@ -76,9 +76,11 @@ def prepare():
             read = times[node].get(m, np.nan)
             ticks.append((round(usual[node] + MINUTE * m if np.isnan(read) else read, 3), node))
             missed += [(node, to_, message, 0) for to_ in to if (node, to_, m) not in heard]
-    pd.DataFrame(sorted(ticks), columns=["t", "node"]).to_csv(DATA / "broadcasts.csv", index=False)
+    pd.DataFrame(sorted(ticks), columns=["t", "node"]).to_csv(
+        folder / "broadcasts.csv", index=False
+    )
     columns = ["sender", "receiver", "message", "delivered"]
-    pd.DataFrame(missed, columns=columns).to_csv(DATA / "missed.csv", index=False)
+    pd.DataFrame(missed, columns=columns).to_csv(folder / "missed.csv", index=False)
     print(f"{len(given)} readings given, {len(ticks)} broadcasts, {len(pairs)} pairs", end=", ")
     print(f"{len(missed)} messages that were not heard or not reported")
     parameters(given[given.t < HOUR])
@@ -118,22 +120,29 @@ def _surprise(logarithms, means):
 
 
 def errors():
-    """Print the RMS error at each held-out mote over the second hour."""
+    """Print the RMS error at each held-out mote over the second hour; return those over all of
+    these motes, of filters with the first offset.
+    """
     readings, heard = raw()
     table = readings.pivot(index="minute", columns="node", values="y0")
     others = table.drop(columns=HELD_OUT).ffill().mean(axis=1)
     first = {node: table[node].iloc[0] - others.iloc[0] for node in HELD_OUT}
     columns = "".join(f" mote {n:2d}" for n in HELD_OUT)
     print(f"{'RMS error in C over the second hour':>38}{columns}     all")
-    line("last value heard", {n: last_heard(readings, heard, n) for n in HELD_OUT}, table)
-    line("mean of the others", dict.fromkeys(HELD_OUT, others), table)
-    line("mean + first offset", {n: others + first[n] for n in HELD_OUT}, table)
+    plain = {
+        "last value heard": {n: last_heard(readings, heard, n) for n in HELD_OUT},
+        "mean of the others": dict.fromkeys(HELD_OUT, others),
+        "mean + first offset": {n: others + first[n] for n in HELD_OUT},
+    }
+    found = {name: line(name, guesses, table) for name, guesses in plain.items()}
     for name, changes in FILTERS.items():
         run = netkf.simulate(netkf.load(FILE, {"probe": MINUTE, **changes}))
         # The sample at the end of a minute has all that the other rules have of that minute.
         shared = {n: pd.Series(run.xhat[1:, run.nodes.index(n), 0]) for n in HELD_OUT}
         line(name, shared, table)
-        line(name + " + first offset", {n: shared[n] + first[n] for n in HELD_OUT}, table)
+        late = {n: shared[n] + first[n] for n in HELD_OUT}
+        found[name] = line(name + " + first offset", late, table)
+    return found
 
 
 def last_heard(readings, heard, receiver):
@@ -144,20 +153,22 @@ def last_heard(readings, heard, receiver):
 
 
 def line(name, guesses, table):
-    """A row of the table, of guesses by mote and minute."""
+    """Print a row of the table, of guesses by mote and minute; return its last number."""
     late = table[table.index >= HOUR / MINUTE]
     squares = [((late[n] - guesses[n]) ** 2).mean() for n in HELD_OUT]
     numbers = np.sqrt([*squares, np.mean(squares)])
     print(f"{name:>38}" + "".join(f" {number:7.3f}" for number in numbers), flush=True)
+    return numbers[-1]
 
 
-def main():
+def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--prepare", action="store_true", help="write the tables, no simulation")
-    if parser.parse_args().prepare:
-        prepare()
-    else:
-        errors()
+    parser.add_argument("--folder", type=Path, default=DATA, help="of the tables that are written")
+    options = parser.parse_args(arguments)
+    if options.prepare:
+        return prepare(options.folder)
+    return errors()
 
 
 if __name__ == "__main__":

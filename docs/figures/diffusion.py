@@ -1,9 +1,7 @@
 """Drawing of docs/papers/diffusion.md: python docs/figures/diffusion.py [--runs 200]."""
 
-import argparse
-
 import numpy as np
-from look import BLUE, GREEN, GREY, ORANGE, SCENARIOS, draw
+from look import BLUE, GREEN, GREY, ORANGE, SCENARIOS, draw, options
 
 import netkf
 
@@ -32,11 +30,10 @@ def tracking(figure, runs):
         print(f"at k = {TIMES[-1]:g}: {squares[-1].mean():.1f}")
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=200)
-    runs = parser.parse_args().runs
-    draw("diffusion_tracking", lambda figure: tracking(figure, runs), (8.6, 3.3))
+def main(arguments=None):
+    chosen = options(__doc__, arguments, runs=200)
+    runs = chosen.runs
+    draw(chosen.out, "diffusion_tracking", lambda figure: tracking(figure, runs), (8.6, 3.3))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import networkx
 import numpy as np
-from look import BLUE, GREEN, GREY, ORANGE, draw
+from look import BLUE, GREEN, GREY, ORANGE, draw, options
 
 import netkf
 from netkf import theory
@@ -14,7 +14,7 @@ EXAMPLE = ([[1.25]], [[1.0]], [[1.0]], [[2.5]])  # F, Q, H, R
 NODES = 10
 
 
-def arrivals(figure):
+def arrivals(figure, runs):
     """Bounds on the mean covariance over the probability of arrival, and simulated means."""
     probabilities = 0.36 + np.geomspace(0.01, 0.63, 30)
     bounds = [
@@ -26,8 +26,8 @@ def arrivals(figure):
         axes.plot(probabilities, curve, color=BLUE, ls=style, label=f"{words} bound of the paper")
     base = netkf.load(SCENARIO)
     for k, delivery in enumerate((0.45, 0.5, 0.6, 0.7, 0.8, 0.9)):
-        mean, wide = simulated(base, delivery)
-        label = "simulated mean of 400 runs, 95 %" if k == 0 else None
+        mean, wide = simulated(base, delivery, runs)
+        label = f"simulated mean of {runs} runs, 95 %" if k == 0 else None
         axes.errorbar(delivery, mean, 1.96 * wide, fmt="o", color=ORANGE, ms=4, label=label)
     axes.axvline(0.36, color=GREY, ls=":")
     axes.text(0.365, 1.5, "0.36: no mean to the left", color=GREY)
@@ -37,7 +37,7 @@ def arrivals(figure):
     axes.legend()
 
 
-def simulated(base, delivery):
+def simulated(base, delivery, runs):
     """Return the mean of P of the node without a sensor, and its standard error."""
     scenario = base.replace(
         {
@@ -46,13 +46,13 @@ def simulated(base, delivery):
             "network.channel.loss.delivery": delivery,
         }
     )
-    ensemble = netkf.monte_carlo(scenario, 400, workers=1)
+    ensemble = netkf.monte_carlo(scenario, runs, workers=1)
     late = ensemble.times >= 30.0
     P, se = ensemble.mean_P[late, 1, 0, 0], ensemble.se_P[late, 1, 0, 0]
     return float(P.mean()), float(se.mean())
 
 
-def averaging(figure):
+def averaging(figure, runs):
     """The squared distance from the average under randomised gossip on a cycle."""
     laplacian = networkx.laplacian_matrix(networkx.cycle_graph(NODES)).toarray().astype(float)
     values, vectors = np.linalg.eigh(laplacian)
@@ -67,14 +67,14 @@ def averaging(figure):
         network=netkf.Network(graph=parts.Cycle(NODES), activation=parts.Poisson(rate=1.0)),
         filter=netkf.Filtering(parts.Hybrid(0.5), mean=slowest[:, None].tolist()),
     )
-    ensemble = netkf.monte_carlo(scenario, 400, workers=1)
+    ensemble = netkf.monte_carlo(scenario, runs, workers=1)
     t = ensemble.times
     axes = figure.subplots()
     axes.plot(t, np.exp(-0.5 * values[1] * t), color=BLUE, label="upper bound")
     axes.plot(t, np.exp(-values[1] * t), color=BLUE, ls="--", label="lower bound")
     axes.plot(t, exact_decay(slowest, t), color=GREEN, ls="-.", label="exact")
     square = ensemble.mean_error[:, :, 0, 0].sum(axis=1)
-    axes.plot(t, square, ".", color=ORANGE, ms=4, label="mean of 400 runs")
+    axes.plot(t, square, ".", color=ORANGE, ms=4, label=f"mean of {runs} runs")
     axes.set(yscale="log", xlabel="simulated seconds", ylabel="E |x - average|^2, at 0: 1")
     axes.set_title("gossip on a cycle of 10: the second eigenvalue decides")
     axes.legend()
@@ -95,6 +95,12 @@ def exact_decay(start, times):
     return np.array([trace @ (np.exp(values * t) * begin) for t in times])
 
 
+def main(arguments=None):
+    chosen = options(__doc__, arguments, runs=400)
+    for name, function in (("arrivals", arrivals), ("averaging", averaging)):
+        draw(chosen.out, f"gallery_{name}", lambda figure, f=function: f(figure, chosen.runs),
+             (6.4, 3.6))  # fmt: skip
+
+
 if __name__ == "__main__":
-    draw("gallery_arrivals", arrivals, (6.4, 3.6))
-    draw("gallery_averaging", averaging, (6.4, 3.6))
+    main()

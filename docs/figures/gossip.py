@@ -1,7 +1,7 @@
 """Drawing of docs/papers/gossip.md: python docs/figures/gossip.py."""
 
 import numpy as np
-from look import BLUE, GREEN, GREY, ORANGE, PINK, SCENARIOS, draw
+from look import BLUE, GREEN, GREY, ORANGE, PINK, SCENARIOS, draw, options
 
 import netkf
 from netkf import theory
@@ -15,12 +15,12 @@ PAIR = {  # one node sees the scalar state, the other one is blind; they swap ha
 STYLES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."), (PINK, ":"), (GREY, (0, (5, 1, 1, 1))))
 
 
-def laws(figure):
+def laws(figure, samples):
     """The law of the trace of P at each sensor and at a random one, in the steady state."""
     ring = netkf.load(SCENARIOS / "gossip_ring.toml")
     panels = ((ring.replace(PAIR), "one node sees, one is blind"), (ring, "gossip_ring"))
     for axes, (scenario, title) in zip(figure.subplots(1, 2), panels, strict=True):
-        drawn = theory.switched_samples(scenario, 4000, 1)
+        drawn = theory.switched_samples(scenario, samples, 1)
         trace = np.trace(drawn.P, axis1=1, axis2=2)
         for node, (colour, style) in zip(scenario.nodes, STYLES, strict=False):
             distribution(axes, trace[drawn.node == node], f"node {node}", color=colour, ls=style)
@@ -28,7 +28,7 @@ def laws(figure):
         axes.set(xscale="log", xlabel="trace of P", ylabel="share below", title=title)
         axes.set_xlim(trace.min() * 0.9, np.quantile(trace, 0.99))
         axes.legend()
-    pair = theory.switched_samples(panels[0][0], 4000, 1)
+    pair = theory.switched_samples(panels[0][0], samples, 1)
     for node in (0, 1):
         P = pair.P[pair.node == node, 0, 0]
         print(f"node {node}: P from {P.min():.2f} to {P.max():.3g}")
@@ -40,5 +40,10 @@ def distribution(axes, values, label, **style):
     axes.step(np.sort(values)[::4], share[::4], where="post", label=label, **style)
 
 
+def main(arguments=None):
+    chosen = options(__doc__, arguments, samples=4000)
+    draw(chosen.out, "gossip_laws", lambda figure: laws(figure, chosen.samples), (8.6, 3.3))
+
+
 if __name__ == "__main__":
-    draw("gossip_laws", laws, (8.6, 3.3))
+    main()

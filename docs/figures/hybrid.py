@@ -1,9 +1,7 @@
 """Drawings of docs/papers/hybrid.md: python docs/figures/hybrid.py [--runs 1000]."""
 
-import argparse
-
 import numpy as np
-from look import BLUE, GREEN, GREY, ORANGE, PINK, SCENARIOS, draw
+from look import BLUE, GREEN, GREY, ORANGE, PINK, SCENARIOS, draw, options
 
 import netkf
 from netkf import theory
@@ -39,10 +37,10 @@ def gap(figure, runs):
     print(*(f"{100 * (1 - mean_P[last, i] / bound[last, i]).mean():.1f} %" for i in (0, 1)))
 
 
-def slope(figure):
+def slope(figure, count):
     """Theorem 3: the distance of the steady bound from S falls as one over the rate."""
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml")
-    rates = np.logspace(0, 4, 25)
+    rates = np.logspace(0, 4, count)
     S = theory.limit_covariance(scenario)
     steady = [
         theory.steady_covariance_bound(scenario.replace({"network.activation.rate": float(rate)}))
@@ -104,13 +102,11 @@ def thresholds(figure):
     print(f"threshold of the bound by link_rate_threshold: {found:.6f}, closed form {2 * a / pi:g}")
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=1000)
-    runs = parser.parse_args().runs
-    draw("hybrid_gap", lambda figure: gap(figure, runs), (8.6, 3.2))
-    draw("hybrid_slope", slope, (8.6, 3.2))
-    draw("hybrid_thresholds", thresholds, (6.4, 3.2))
+def main(arguments=None):
+    chosen = options(__doc__, arguments, runs=1000, rates=25)
+    draw(chosen.out, "hybrid_gap", lambda figure: gap(figure, chosen.runs), (8.6, 3.2))
+    draw(chosen.out, "hybrid_slope", lambda figure: slope(figure, chosen.rates), (8.6, 3.2))
+    draw(chosen.out, "hybrid_thresholds", thresholds, (6.4, 3.2))
 
 
 if __name__ == "__main__":

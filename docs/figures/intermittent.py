@@ -1,7 +1,7 @@
 """Drawings of docs/papers/intermittent.md: python docs/figures/intermittent.py."""
 
 import numpy as np
-from look import BLUE, GREEN, GREY, ORANGE, PINK, draw
+from look import BLUE, GREEN, GREY, ORANGE, PINK, draw, options
 
 from netkf import theory
 
@@ -52,6 +52,11 @@ def means(figure):
         print(f"mean of P at {g:g}: {float(theory.scalar_law(*SCALAR, g).mean()):.6f}")
 
 
+def main(arguments=None):
+    folder = options(__doc__, arguments).out
+    draw(folder, "intermittent_sets", sets, (8.6, 3.4))
+    draw(folder, "intermittent_means", means, (6.4, 3.2))
+
+
 if __name__ == "__main__":
-    draw("intermittent_sets", sets, (8.6, 3.4))
-    draw("intermittent_means", means, (6.4, 3.2))
+    main()

@@ -1,5 +1,6 @@
 """The look of the drawings on the pages of the papers, and how they are written."""
 
+import argparse
 from pathlib import Path
 
 import matplotlib as mpl
@@ -21,9 +22,18 @@ LOOK = {
 }
 
 
-def draw(name, function, size):
-    """Write NAME.svg, drawn by a function on an empty figure."""
+def options(text, arguments=None, **numbers):
+    """The options of a script: the folder of its drawings, and numbers by name."""
+    parser = argparse.ArgumentParser(description=text)
+    parser.add_argument("--out", type=Path, default=HERE, help="folder of the drawings")
+    for name, number in numbers.items():
+        parser.add_argument(f"--{name}", type=type(number), default=number)
+    return parser.parse_args(arguments)
+
+
+def draw(folder, name, function, size):
+    """Write NAME.svg into a folder, drawn by a function on an empty figure."""
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=size, layout="constrained")
         function(figure)
-        figure.savefig(HERE / f"{name}.svg", metadata={"Date": None})
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})

@@ -21,9 +21,9 @@ END, STEP, SHUTTER = 7.0, 0.1, 0.02  # simulated seconds
 COLOURS, WORST = "cividis_r", 4.0  # of motes by their error in metres
 
 
-def simulate():
+def simulate(end):
     """The run, the places (N, 2) of the motes, and the positions (T, N, 2) that they believe in."""
-    scenario = netkf.load(SCENARIOS / "intel_lab.toml", {"horizon": END + STEP, "probe": STEP})
+    scenario = netkf.load(SCENARIOS / "intel_lab.toml", {"horizon": end + STEP, "probe": STEP})
     run = netkf.simulate(scenario)
     places = np.array([scenario.topology.positions[node] for node in run.nodes])
     return scenario, run, places
@@ -65,12 +65,13 @@ def picture(scenario, run, places, k):
     return Image.open(buffer).convert("RGB")
 
 
-def main():
+def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     default = Path(__file__).parent.parent / "moving_network.gif"
     parser.add_argument("--out", type=Path, default=default)
-    options = parser.parse_args()
-    scenario, run, places = simulate()
+    parser.add_argument("--end", type=float, default=END, help="simulated seconds")
+    options = parser.parse_args(arguments)
+    scenario, run, places = simulate(options.end)
     with mpl.rc_context(LOOK):
         frames = [picture(scenario, run, places, k) for k in range(len(run.times) - 1)]
     together = Image.new("RGB", (frames[0].width, 3 * frames[0].height))

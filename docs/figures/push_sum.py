@@ -1,7 +1,7 @@
 """Drawings of docs/papers/push_sum.md: python docs/figures/push_sum.py."""
 
 import numpy as np
-from look import BLUE, GREEN, GREY, ORANGE, PINK, SCENARIOS, draw
+from look import BLUE, GREEN, GREY, ORANGE, PINK, SCENARIOS, draw, options
 
 import netkf
 from netkf import theory
@@ -21,7 +21,7 @@ def cost(changes, gamma):
     return float(np.trace(covariances, axis1=1, axis2=2).mean()) / CENTRAL
 
 
-def errors(figure):
+def errors(figure, gains):
     """P Fig. 4, exactly: what few averaging steps and failing links cost; and the gain delta."""
     left, right = figure.subplots(1, 2)
     gammas = range(1, 7)
@@ -34,7 +34,7 @@ def errors(figure):
     left.minorticks_off()
     left.legend()
     radius = theory.consensus_gain_bound(PLANAR).radius
-    deltas = np.linspace(radius / 2 + 0.02, 8.0, 40)
+    deltas = np.linspace(radius / 2 + 0.02, 8.0, gains)
     for gamma, colour, style in ((1, ORANGE, "-."), (2, BLUE, "-"), (3, GREEN, "--")):
         ratios = [cost({DELTA: float(delta)}, gamma) for delta in deltas]
         right.plot(deltas, ratios, color=colour, ls=style, label=f"gamma = {gamma}")
@@ -46,5 +46,10 @@ def errors(figure):
     right.legend(loc=(0.33, 0.62))
 
 
+def main(arguments=None):
+    chosen = options(__doc__, arguments, gains=40)
+    draw(chosen.out, "push_sum_errors", lambda figure: errors(figure, chosen.gains), (8.6, 3.4))
+
+
 if __name__ == "__main__":
-    draw("push_sum_errors", errors, (8.6, 3.4))
+    main()
