@@ -86,9 +86,10 @@ def _explain(options: argparse.Namespace) -> int:
     from netkf.studies.why import why
 
     run: Run | Path = options.directory
-    node, at = options.node, options.at
+    node, at, notes = options.node, options.at, []
     if node is None:
-        run, node, at = _find_worst_sample(options)
+        run, node, at, note = _find_worst_sample(options)
+        notes.append(note)
     explanation = why(
         run,
         node,
@@ -99,6 +100,8 @@ def _explain(options: argparse.Namespace) -> int:
         replays=options.replays,
         trust=options.trust,
     )
+    # Not before: a refusal is one line.
+    print_notes(notes)
     try:
         if options.out is not None:
             _write_explanation(explanation, options.out)
@@ -110,9 +113,9 @@ def _explain(options: argparse.Namespace) -> int:
     return 0
 
 
-def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float]:
-    """Return a run that is read back, and the node and the time (s) of its worst sample, that with
-    the largest error of the worst node after the start-up of its filter; print a note on it.
+def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float, str]:
+    """Return a run that is read back, the node and the time (s) of its worst sample, that with the
+    largest error of the worst node after the start-up of its filter, and a note on it.
 
     Raises ScenarioError if the directory has no samples of a single run.
     """
@@ -126,13 +129,11 @@ def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float]:
         raise ScenarioError(shorten(options.directory), rule, None, remedy)
     worst = samples.explained
     quantity = "error" if worst.by_error else "trace of P"
-    print_notes(
-        [
-            f"node {worst.node} at {worst.time:.10g} s: the largest {quantity} of the worst node "
-            "after the start-up; --node and --at choose another sample"
-        ]
+    note = (
+        f"node {worst.node} at {worst.time:.10g} s: the largest {quantity} of the worst node after "
+        "the start-up; --node and --at choose another sample"
     )
-    return source.run, worst.node, worst.time
+    return source.run, worst.node, worst.time, note
 
 
 def _write_explanation(explanation: Why, directory: Path) -> None:

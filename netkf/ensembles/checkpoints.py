@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import io
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator
@@ -175,8 +176,11 @@ class BlockCheckpoints:
             for key, value in identity.items():
                 if not isinstance(stored, dict) or stored.get(key) != value:
                     raise DamagedError(f"is of another {key}")
-            if not self._has_form(_restore_statistics(arrays)):
+            statistics = _restore_statistics(arrays)
+            if not self._has_form(statistics):
                 raise DamagedError("does not fit the scenario")
+            if not self._has_numbers(statistics):
+                raise DamagedError("lacks numbers that every run has")
 
     def _has_form(self, statistics: RunStatistics) -> bool:
         """Return True if all arrays of ``statistics``, read from a file, have the shapes and types
@@ -195,6 +199,33 @@ class BlockCheckpoints:
             and quantity.size.shape == (rows.get(name, 1),)
             and all(values.dtype == np.float64 for values in quantity)
             for quantity, name in moments
+        )
+
+    def _has_numbers(self, statistics: RunStatistics) -> bool:
+        """Return True if ``statistics`` of the right form have no nan or impossible count where
+        runs of this scenario have numbers.
+        """
+        n, u = self._scenario.plant.n, self._scenario.plant.n * (self._scenario.plant.n + 1) // 2
+        moments = [getattr(statistics, name) for name in PARTS]
+        moments += [sums for sums, _ in statistics.conserved.values()]
+        counts = [statistics.totals, *(quantity.size for quantity in moments)]
+        # Of each node: P, squares of errors, and NEES, which a singular P leaves nan.
+        columns = np.arange(statistics.samples.mean.shape[1]) % (n * (n + 1) + 1)
+        exact = self._scenario.plant.truth_known and math.isinf(statistics.rounding_from)
+        samples = columns < (2 * u if exact and not statistics.totals[1] else u)
+        averages = np.arange(statistics.averages.mean.shape[1]) % 3 == 1  # traces of P
+        # In slots transmissions are not counted.
+        messages = np.arange(len(MESSAGES)) < len(MESSAGES) - self._scenario.slotted
+        used = zip(moments, (samples, averages, messages), strict=False)
+        return (
+            not math.isnan(statistics.rounding_from)
+            and all((count >= 0).all() for count in counts)
+            and all((quantity.size <= statistics.runs).all() for quantity in moments)
+            and not any(
+                np.isnan(values[quantity.size > 0][:, which]).any()
+                for quantity, which in used
+                for values in (quantity.mean, quantity.M2)
+            )
         )
 
     def _restore_trace(self, arrays: Any, k: int) -> Trace:

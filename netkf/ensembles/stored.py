@@ -135,8 +135,9 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     # The summary has the root of the mean square error; the standard error of its square is 2 rms
     # times that of the root.
     rms, rms_se = column("rms_error"), column("rms_error_se")
-    means = [rms**2, column("mean_trace"), column("mean_nees")]
-    errors = [2.0 * rms * rms_se, column("mean_trace_se"), column("mean_nees_se")]
+    with np.errstate(over="ignore", invalid="ignore"):
+        means = [rms**2, column("mean_trace"), column("mean_nees")]
+        errors = [2.0 * rms * rms_se, column("mean_trace_se"), column("mean_nees_se")]
     return np.column_stack(means), np.column_stack(errors)
 
 

@@ -62,6 +62,8 @@ MANIFEST_FORM: dict[str, Any] = {
     "fingerprint?": TEXT,
     "runs": {"wanted": COUNT, "done": COUNT},
     "simpy?": {},
+    "versions?": {},
+    "error?": TEXT,
 }
 TABLE_FILES = ("states.parquet", "events.parquet")
 

@@ -129,8 +129,8 @@ def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
     keys : keys of the scenario that were swept: columns of their values, numbers or texts
 
     Columns other than these and ``status`` (text) hold numbers. Raises DamagedError if a column of
-    keys, counts of runs, results or the status is missing or double, or if another column holds
-    texts.
+    keys, counts of runs, results or the status is missing or double, if another column holds texts,
+    or if a standard error is negative.
     """
     import pandas as pd
 
@@ -145,5 +145,7 @@ def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
         listed = ", ".join(sorted(texts))
         raise DamagedError(f"{path.name} has texts in columns of numbers: {listed}")
     columns: dict[str, Any] = dict(read_numbers(path, numeric, allow_empty=True))
+    if any((columns[name] < 0).any() for name in numeric if name.endswith("_se")):
+        raise DamagedError(f"{path.name} has negative standard errors")
     columns |= {n: read_texts(path, n).astype(str) for n in names if n not in numeric}
     return pd.DataFrame({name: columns[name] for name in names})

@@ -31,6 +31,7 @@ VERDICT: dict[str, Any] = {
     "seed?": COUNT,
     "confidence": NUMBER,
     "rows": [VERDICT_ROW],
+    "versions?": {},
 }
 COMPARISON: dict[str, Any] = {"filters": TEXTS, "confidence": NUMBER}
 """What the manifest of a comparison has beside that of a run."""

@@ -95,6 +95,11 @@ def forged(block, **changes):
     block.write_bytes(seal(made.getvalue()))
 
 
+def as_nan(block, name):
+    with np.load(block) as found:
+        return np.full_like(found[name], np.nan)
+
+
 def flip(block, draw):
     found = bytearray(block.read_bytes())
     found[draw.randrange(len(found))] ^= 1 << draw.randrange(8)
@@ -118,6 +123,11 @@ DAMAGE = {
     "other number": as_other_number,
     "other shape": lambda block, draw: forged(block, samples_mean=np.zeros((2, 2))),
     "other type": lambda block, draw: forged(block, totals=np.array(["a", "b"])),
+    "no mean": lambda block, draw: forged(block, samples_mean=as_nan(block, "samples_mean")),
+    "no M2": lambda block, draw: forged(block, averages_M2=as_nan(block, "averages_M2")),
+    "no messages": lambda block, draw: forged(block, messages_mean=as_nan(block, "messages_mean")),
+    "no size": lambda block, draw: forged(block, samples_size=as_nan(block, "samples_size")),
+    "less than nothing": lambda block, draw: forged(block, totals=np.array([-1, 0])),
     "no words": lambda block, draw: forged(block, words=np.array("[" * 100_000)),
     "no zip": lambda block, draw: block.write_bytes(seal(b"PK nothing")),
 }
