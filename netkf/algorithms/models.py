@@ -21,6 +21,7 @@ from netkf.algorithms.kernels.riccati import RiccatiTable, riccati_table
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
 from netkf.algorithms.kernels.slots import predict_root_alone
+from netkf.algorithms.modes import RateGroups, rate_groups
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 
@@ -33,12 +34,16 @@ TABLES = 32
 
 
 class Backward(NamedTuple):
-    """Transition of an information matrix U over a gap, ``fading inverse' U inverse``: ``inverse``
-    (n, n) is e^{-A gap}, and the factor ``fading`` <= 1 keeps it bounded (algorithms.running_sums).
+    """Transition of information about the state over a gap, which lets it fade so that it stays
+    bounded (algorithms.running_sums): ``U <- inverse' U inverse``, and ``fading[g] inverse' u`` of
+    the part u = U P_g x of each of G groups of modes.
+
+    inverse : (n, n), e^{-A gap} times ``fading`` in each group
+    fading : (G,), e^{-rate gap} with the rate of decay of each group, 1 where it does not decay
     """
 
     inverse: FloatArray
-    fading: float
+    fading: FloatArray
 
 
 def _shared_flow_table(
@@ -114,20 +119,19 @@ class FlowModel:
         return _shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
 
     @cached_property
-    def forgetting(self) -> float:
-        """Fastest decay rate of the plant in 1/s, or 0 if no mode decays."""
-        return max(0.0, -float(np.linalg.eigvals(self.A).real.min()))
+    def groups(self) -> RateGroups:
+        """Parts of the state that decay at one rate each."""
+        return rate_groups(self.A)
 
     def backward(self, gap: float) -> Backward:
         """Return the transition that turns information about the state now into information about
-        the state ``gap`` seconds later: ``e^{-A gap}`` (n, n), and the factor by which old
-        information fades, so that it stays bounded where the plant decays.
+        the state ``gap`` seconds later, in which what is about a mode that decays stays as it is.
         """
         # A constant state: the exponential would be I up to rounding, and nothing fades.
         if not self.A.any():
-            return Backward(np.eye(len(self.A)), 1.0)
-        inverse = np.asarray(scipy.linalg.expm(-gap * self.A))
-        return Backward(inverse, math.exp(-2.0 * self.forgetting * gap))
+            return Backward(np.eye(len(self.A)), np.ones(1))
+        inverse = np.asarray(scipy.linalg.expm(-gap * self.groups.kept))
+        return Backward(inverse, np.exp(-self.groups.rates * gap))
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float

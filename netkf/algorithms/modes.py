@@ -28,6 +28,8 @@ each other, as the two of a constant velocity that rounding has moved apart, sta
 """
 ROUNDING = 1e-9
 """Rates up to this (in slots; under clocks relative to the largest entry of A) count as 0."""
+SAME_RATE = 1e-6
+"""Rates that differ by less, relative to the largest entry of A, are one."""
 CHECKPOINT = 1024
 """Slots between two stored frames."""
 
@@ -178,3 +180,48 @@ def still_frame(n: int) -> ModeFrame:
     """Return the frame in which the coordinates are the n states of the present themselves."""
     eye = np.eye(n)
     return ModeFrame(eye, eye, n, eye, eye, 0.0)
+
+
+class RateGroups(NamedTuple):
+    """Parts of the state of a plant dx = A x dt, G groups of modes that decay at one rate each.
+
+    rates      : (G,), in 1/s, 0 for all modes that do not decay
+    projectors : (G, n, n), on each part along the others; their sum is I
+    kept       : (n, n), A with each part's own decay taken out: A plus the sum of all
+                 ``rates projectors``
+    """
+
+    rates: FloatArray
+    projectors: FloatArray
+    kept: FloatArray
+
+
+@lru_cache(maxsize=8)
+def _shared_groups(entries: bytes, n: int) -> RateGroups:
+    """Return the groups of rates of a plant whose A (n, n) has these ``entries``."""
+    A = np.frombuffer(entries).reshape(n, n)
+    rates, size = flow_rates(A), np.abs(A).max(initial=0.0)
+    ordered = np.sort(rates)[::-1]
+    # A group's rate is that of its fastest mode, which must not grow; all that do not decay, or not
+    # by more than rounding, are one group.
+    found, parts, above = [], [], np.zeros((n, n))
+    for faster, slower in zip(ordered[1:], ordered[:-1], strict=True):
+        if faster >= -ROUNDING * size or slower - faster <= SAME_RATE * size:
+            continue
+        split = split_modes(A, 0.5 * (faster + slower), False)
+        if split is not None:
+            projector = split.basis[:, : split.first] @ split.inverse[: split.first]
+            found.append(slower)
+            parts.append(projector - above)
+            above = projector
+    found.append(ordered[-1])
+    parts.append(np.eye(n) - above)
+    decays = np.maximum(-np.array(found), 0.0)
+    decays[decays <= ROUNDING * size] = 0.0
+    projectors = np.array(parts)
+    return RateGroups(decays, projectors, A + np.einsum("g,gij->ij", decays, projectors))
+
+
+def rate_groups(A: FloatArray) -> RateGroups:
+    """Return the groups of modes of a plant with A (n, n) in 1/s, by their rates of decay."""
+    return _shared_groups(np.asarray(A, dtype=np.float64).tobytes(), len(A))

@@ -618,7 +618,9 @@ class PushSum(Filter):
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message about n states in numbers of 64 bits: mass w, n~, C~, or an
-        estimate z; under clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat.
+        estimate z; under clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat, which
+        for a plant with modes of different rates of decay is in n more numbers for each further
+        rate.
         """
         if phase == AVERAGE:
             return n

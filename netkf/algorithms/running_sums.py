@@ -13,11 +13,19 @@ the last total that it ``heard``. So a lost message only delays mass, and the we
 under way stays N (running-sum push-sum; P has no such form). In the limit of fast rounds every node
 is the central filter.
 
-Totals refer to an instant: as time passes they are predicted with the plant, without its noise,
-``U -> s Phi^-T U Phi^-1`` and ``u -> s Phi^-T u`` with Phi = e^{A gap}. All totals are predicted
-in the same way, so their differences are too. s = e^{-2 r gap} lets old information fade where it
-would grow without bound, with r the fastest rate at which the plant forgets its state (0 if it
-never does).
+Totals refer to an instant: as time passes they are predicted with the plant, without its noise, for
+which ``U -> Phi^-T U Phi^-1`` and ``u -> Phi^-T u`` with Phi = e^{A gap} would be right. All totals
+are predicted in the same way, so their differences are too. But information about a mode that
+decays would grow without bound in old totals, until nothing else of them were left; so that about
+each mode fades by the rate r at which the plant forgets it: it stays as it is, and what is under
+way weighs as much as when it left, whatever other modes there are. The P_g, g = 1 to G, project on
+the parts of the state with one rate r_g each, 0 for all that do not decay (``modes.RateGroups``).
+With M = sum_g e^{-r_g gap} P_g Phi^-1
+
+    U -> M' U M,    u_g -> e^{-r_g gap} M' u_g    for each part u_g = U P_g x of u,
+
+which is again information about the plant's state: ``M' U M P_g Phi x = e^{-r_g gap} M' U P_g x``.
+The parts must be kept apart in totals, for that: u is their sum.
 """
 
 from __future__ import annotations
@@ -41,12 +49,13 @@ offers nothing.
 
 class Offer(NamedTuple):
     """The payload of a broadcast: its ``number`` among those of its sender, from 0, and the running
-    ``total`` (1 + n n + n,) of all shares so far: weight w, information U by rows and
-    ``u = U xhat``.
+    ``total`` (1 + n n + G n,) of all shares so far: weight w, information U by rows and, for each
+    of G groups of modes, the part ``U P_g xhat`` of u; ``projectors`` (G, n, n) are the P_g.
     """
 
     number: int
     total: FloatArray
+    projectors: FloatArray
 
 
 class RunningSums(NamedTuple):
@@ -55,8 +64,8 @@ class RunningSums(NamedTuple):
     xhat, root : estimate (n,) and root (n, n) of its covariance
     model : of the plant and the node's sensors
     weight : w, the node's part of the N of all nodes
-    sent : total (1 + n n + n,) of the shares offered to each receiver so far, of w, information U
-           and ``u = U xhat``
+    sent : total (1 + n n + G n,) of the shares offered to each receiver so far, of w, information
+           U and the G parts of ``u = U xhat``
     rounds : number of broadcasts so far
     heard : the newest offer heard, by sender; its total refers to the present state
     receivers, nodes : number of nodes that can hear this one, and N
@@ -88,7 +97,7 @@ def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Runn
         root=first_root(cov),
         model=model,
         weight=1.0,
-        sent=np.zeros(1 + n * n + n),
+        sent=np.zeros(1 + n * n + n * len(model.groups.rates)),
         rounds=0,
         heard={},
         receivers=node.receivers,
@@ -115,14 +124,13 @@ def predict_offer(offer: Offer, back: Backward) -> Offer:
 
 
 def _move_total(total: FloatArray, back: Backward) -> FloatArray:
-    """Return a ``total`` (1 + n n + n,) of (w, U, u) about a state one gap later:
-    ``U <- s F^-T U F^-1``, ``u <- s F^-T u``, where ``back`` is (F^-1, s).
-    """
+    """Return a ``total`` (1 + n n + G n,) of (w, U, parts of u) about a state one gap later."""
     inverse, fading = back
     n, out = len(inverse), total.copy()
     U = total[1 : 1 + n * n].reshape(n, n)
-    out[1 : 1 + n * n] = (fading * (inverse.T @ U @ inverse)).reshape(-1)
-    out[1 + n * n :] = fading * (inverse.T @ total[1 + n * n :])
+    out[1 : 1 + n * n] = (inverse.T @ U @ inverse).reshape(-1)
+    parts = total[1 + n * n :].reshape(-1, n)
+    out[1 + n * n :] = (fading[:, None] * (parts @ inverse)).reshape(-1)
     return out
 
 
@@ -133,22 +141,21 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
     """
     if state.receivers == 0:
         return state, None
-    n = len(state.xhat)
-    # The mass (w, U, u): U = (w / N) P^-1 with P^-1 = S^-T S^-1 for the root S.
+    n, projectors = len(state.xhat), state.model.groups.projectors
+    # The mass (w, U, parts of u): U = (w / N) P^-1 with P^-1 = S^-T S^-1 for the root S.
     inverse = scipy.linalg.solve_triangular(state.root, np.eye(n), lower=True)
     U = (state.weight / state.nodes) * (inverse.T @ inverse)
-    mass = np.concatenate([[state.weight], U.reshape(-1), U @ state.xhat])
+    mass = np.concatenate([[state.weight], U.reshape(-1), _parts(projectors, U, state.xhat)])
     sent = state.sent + mass / (state.receivers + 1)
     # The node gives up exactly the amount by which its total grew, for each receiver. The mass of a
     # node that receives nothing shrinks with each round, until the total no longer grows in
     # floating point: then it keeps its mass, and sends the same total again.
     grown, share = float(sent[0] - state.sent[0]), float(mass[0]) / (state.receivers + 1)
     if abs(grown - share) > MIN_ACCURACY * share:
-        return state._replace(rounds=state.rounds + 1), Offer(state.rounds, state.sent)
-    weight = state.weight - state.receivers * grown
-    return state._replace(weight=weight, sent=sent, rounds=state.rounds + 1), Offer(
-        state.rounds, sent
-    )
+        offered = Offer(state.rounds, state.sent, projectors)
+        return state._replace(rounds=state.rounds + 1), offered
+    weight, offered = state.weight - state.receivers * grown, Offer(state.rounds, sent, projectors)
+    return state._replace(weight=weight, sent=sent, rounds=state.rounds + 1), offered
 
 
 def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
@@ -173,7 +180,7 @@ def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSum
     if not gained[0] > 0.0:
         return state
     n, weight = len(state.xhat), state.weight + float(gained[0])
-    U, u = gained[1 : 1 + n * n].reshape(n, n), gained[1 + n * n :]
+    U, u = gained[1 : 1 + n * n].reshape(n, n), gained[1 + n * n :].reshape(-1, n).sum(axis=0)
     # P^-1 <- (w P^-1 + N U) / w+ with the new weight w+. With ``scaled`` T, T T' = (w+ / w) P, it
     # is T^-T (I + (N / w+) T' U T) T^-1; eigenvalues of the bracket below 1 would be negative
     # information, by rounding.
@@ -211,7 +218,7 @@ def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
     ``U offset`` to every ``u = U xhat``.
     """
     heard = {sender: shift_offer(offer, offset) for sender, offer in state.heard.items()}
-    sent = _shift_total(state.sent, offset)
+    sent = _shift_total(state.sent, offset, state.model.groups.projectors)
     return state._replace(xhat=state.xhat + offset, sent=sent, heard=heard)
 
 
@@ -219,13 +226,20 @@ def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
     """Return the ``offer`` with ``U offset`` added to its vector ``u = U xhat``, for a move of the
     origin by which estimates change by ``offset`` (n,).
     """
-    return offer._replace(total=_shift_total(offer.total, offset))
+    return offer._replace(total=_shift_total(offer.total, offset, offer.projectors))
 
 
-def _shift_total(total: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return a ``total`` (1 + n n + n,) of (w, U, u) after a move of the origin by which estimates
-    change by ``offset`` (n,): ``u + U offset``.
+def _shift_total(total: FloatArray, offset: FloatArray, projectors: FloatArray) -> FloatArray:
+    """Return a ``total`` (1 + n n + G n,) of (w, U, parts of u) after a move of the origin by which
+    estimates change by ``offset`` (n,): ``u + U offset``.
     """
     n, out = len(offset), total.copy()
-    out[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset
+    out[1 + n * n :] += _parts(projectors, total[1 : 1 + n * n].reshape(n, n), offset)
     return out
+
+
+def _parts(projectors: FloatArray, U: FloatArray, x: FloatArray) -> FloatArray:
+    """Return the parts ``U P_g x`` (G n,) of ``U x``, with U (n, n), x (n,) and the ``projectors``
+    P_g (G, n, n) on G groups of modes.
+    """
+    return np.asarray((projectors @ x @ U.T).reshape(-1))

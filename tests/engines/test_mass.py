@@ -13,7 +13,7 @@ from tests.engines.linearity import engine_covariance
 from tests.theory.test_replay import close
 
 
-def scenario(rounds, loss, delay):
+def scenario(rounds, loss, delay, **more):
     nodes, rate = 5, 50.0
     horizon = rounds / (nodes * rate)
     table = {
@@ -42,7 +42,7 @@ def scenario(rounds, loss, delay):
         },
         "filter": {"kind": "push-sum"},
     }
-    return from_table(table, Path())
+    return from_table({**table, **more}, Path())
 
 
 @pytest.mark.parametrize(
@@ -123,3 +123,45 @@ def test_both_engines_keep_the_same_totals_and_theory_follows_them():
 def test_running_sums_go_with_no_stop_rule():
     with pytest.raises(netkf.ScenarioError, match=r"filter\.stop: must be never with running sums"):
         in_slots(running_sums=True, stop="safe")
+
+
+def beside_a_fast_mode(rate, turn=None, growth=-0.05):
+    """A slow mode that node 0 reads beside an independent one that decays at ``rate``, in
+    coordinates ``turn`` times those of the modes.
+    """
+    turn = np.eye(2) if turn is None else turn
+    B, cov = turn @ np.diag([1.0, np.sqrt(2.0 * rate)]), turn @ np.diag([10.0, 1.0]) @ turn.T
+    plant = {"A": (turn @ np.diag([growth, -rate]) @ np.linalg.inv(turn)).tolist()}
+    plant |= {"kind": "diffusion", "B": B.tolist(), "cov": (0.5 * (cov + cov.T)).tolist()}
+    sensors = [{"nodes": [0], "H": (np.array([[1.0, 0.0]]) @ np.linalg.inv(turn)).tolist()}]
+    sensors[0] |= {"R": [[0.5]], "sampling": {"kind": "periodic", "period": 0.5}}
+    more = {"plant": plant, "sensors": sensors, "horizon": 10.0, "probe": 1.0}
+    return scenario(2500, 0.8, {"kind": "constant", "seconds": 0.1}, **more)
+
+
+@pytest.mark.parametrize("growth", [-0.05, 0.0, 0.1])
+def test_p_of_a_slow_mode_knows_nothing_of_a_fast_one(growth):
+    """Totals fade mode by mode: what is under way weighs the same whatever else the plant does."""
+    turn = np.array([[1.0, 0.3], [-0.7, 0.8]])
+    slow = [netkf.simulate(beside_a_fast_mode(rate, growth=growth)) for rate in (1.0, 20.0, 1000.0)]
+    turned = netkf.simulate(beside_a_fast_mode(20.0, turn, growth))
+    back = np.linalg.inv(turn)
+    for P in (slow[1].P, slow[2].P, back @ turned.P @ back.T):
+        np.testing.assert_allclose(P[..., 0, 0], slow[0].P[..., 0, 0], rtol=1e-9)
+    # The fast mode, which nobody reads, has its steady variance.
+    np.testing.assert_allclose(slow[2].P[..., 1, 1], 1.0, rtol=1e-9)
+    assert slow[2].P[-1, :, 0, 0].max() < 3.0
+    for run in (*slow, turned):
+        assert abs(run.sums["weight"][1] - 5.0) < 1e-12
+
+
+def test_totals_that_fade_mode_by_mode_are_information_about_the_state():
+    """Estimates stay affine in the readings, theory follows P and errors, and engines agree."""
+    turn = np.array([[1.0, 0.3], [-0.7, 0.8]])
+    for growth in (-0.05, 0.4):
+        coupled = beside_a_fast_mode(8.0, turn, growth)
+        assert_agree(coupled.replace({"horizon": 3.0}))
+        short = coupled.replace({"horizon": 0.8, "probe": [0.3, 0.7]})
+        exact, run = engine_covariance(short, "compiled")
+        close(netkf.theory.error_covariance(short, run), exact, 1e-9)
+        np.testing.assert_allclose(error_law(short, run).P, run.P, rtol=1e-9, atol=1e-12)

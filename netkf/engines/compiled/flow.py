@@ -536,7 +536,7 @@ def _make_totals(scenario: Scenario, state: Simulation) -> Totals | None:
         return None
     receivers = np.array([info.receivers for info in scenario.node_infos], dtype=np.int64)
     model: FlowModel = scenario.models[0]
-    return empty_totals(state, receivers, model.A, model.forgetting)
+    return empty_totals(state, receivers, model.groups)
 
 
 def _make_history(scenario: Scenario, state: Simulation) -> History | None:

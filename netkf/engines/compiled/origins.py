@@ -48,21 +48,24 @@ def move_origin(
 def _shift_totals(
     scenario: Scenario, state: Simulation, totals: Totals, now: float, offset: FloatArray
 ) -> None:
-    """Move the running sums of push-sum (weight, U (n, n), u (n,)) to a new origin: add ``U
+    """Move the running sums of push-sum (weight, U (n, n), parts of u) to a new origin: add ``U
     offset`` to the ``u`` of all that nodes have sent or heard or that are under way; ``offset``
     (n,) is first predicted from ``now`` (seconds) back to the time that each sum refers to.
     """
+    projectors = totals.projectors
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
-            _shift_total(values[k], scenario.move_back(offset, now - time))
+            _shift_total(values[k], scenario.move_back(offset, now - time), projectors)
     for m in state.heap[: state.in_flight]:
-        _shift_total(totals.offered[m], scenario.move_back(offset, now - state.pool["sent"][m]))
+        moved = scenario.move_back(offset, now - state.pool["sent"][m])
+        _shift_total(totals.offered[m], moved, projectors)
 
 
-def _shift_total(total: FloatArray, offset: FloatArray) -> None:
-    """Add ``U offset`` to u in place, for the total (1 + n n + n,) = (w, U by rows, u) and the
-    ``offset`` (n,) of the state x: since u = U x, it moves with x.
+def _shift_total(total: FloatArray, offset: FloatArray, projectors: FloatArray) -> None:
+    """Add ``U P_g offset`` to each of the G parts of u in place, for the total (1 + n n + G n,) =
+    (w, U by rows, parts of u), the ``offset`` (n,) of the state x and the ``projectors`` P_g
+    (G, n, n): since u = U x, it moves with x.
     """
     n = len(offset)
-    # u = U x: it moves by U times the move of x.
-    total[1 + n * n :] += total[1 : 1 + n * n].reshape(n, n) @ offset
+    U = total[1 : 1 + n * n].reshape(n, n)
+    total[1 + n * n :] += (projectors @ offset @ U.T).reshape(-1)

@@ -12,6 +12,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.root_flow import transform_root
+from netkf.algorithms.modes import RateGroups
 from netkf.algorithms.running_sums import MIN_ACCURACY
 from netkf.engines.compiled.late_readings import use_instant
 from netkf.engines.compiled.state import Simulation
@@ -23,8 +24,8 @@ from netkf.linalg.structs import Struct
 
 
 class Totals(Struct):
-    """Running sums of N nodes on W directed links; a total has m = 1 + n n + n numbers: weight w,
-    information U and u.
+    """Running sums of N nodes on W directed links; a total has m = 1 + n n + G n numbers: weight w,
+    information U and the parts of u of G groups of modes.
 
     weight : (N,), weights w that nodes hold
     sent, sent_at : totals (N, m) that each node has offered to each of its receivers, and the times
@@ -33,7 +34,7 @@ class Totals(Struct):
     heard, number, heard_at : last total (W, m) that was heard, its number (W,) (-1: none) and the
                               time that it refers to
     offered : totals (C, m) of messages under way
-    A, forgetting : matrix of the plant (n, n), and the rate in 1/s at which old information fades
+    kept, rates, projectors : of the plant's ``modes.RateGroups``
     gain, scratch : scratch, growth (m,) of the totals in an inbox, and (4, n, n)
     """
 
@@ -46,21 +47,20 @@ class Totals(Struct):
     number: IntArray
     heard_at: FloatArray
     offered: FloatArray
-    A: FloatArray
-    forgetting: float
+    kept: FloatArray
+    rates: FloatArray
+    projectors: FloatArray
     gain: FloatArray
     scratch: FloatArray
 
 
-def empty_totals(
-    state: Simulation, receivers: np.ndarray, A: FloatArray, forgetting: float
-) -> Totals:
+def empty_totals(state: Simulation, receivers: np.ndarray, groups: RateGroups) -> Totals:
     """Return the running sums of push-sum for N nodes at time 0: weight 1 at every node, and
-    nothing sent yet. ``receivers`` (N,) is the number of nodes that can hear each node, ``A`` (n,
-    n) the plant's matrix in 1/s, ``forgetting`` the rate in 1/s at which old information fades.
+    nothing sent yet. ``receivers`` (N,) is the number of nodes that can hear each node, ``groups``
+    are the parts of the state that fade at one rate each.
     """
     count, n = state.xhat.shape
-    m, directions = 1 + n * n + n, len(state.directions)
+    m, directions = 1 + n * n + n * len(groups.rates), len(state.directions)
     return Totals(
         weight=np.ones(count),
         sent=np.zeros((count, m)),
@@ -71,8 +71,9 @@ def empty_totals(
         number=np.full(directions, -1),
         heard_at=np.zeros(directions),
         offered=np.zeros((len(state.pool), m)),
-        A=np.array(A, dtype=np.float64),
-        forgetting=forgetting,
+        kept=groups.kept,
+        rates=groups.rates,
+        projectors=groups.projectors,
         gain=np.zeros(m),
         scratch=np.zeros((4, n, n)),
     )
@@ -81,17 +82,15 @@ def empty_totals(
 @kernel
 def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> None:
     """Predict one running total, the sum of all that a node has offered so far, by ``gap`` seconds
-    in place: ``U <- s Phi^-T U Phi^-1`` and ``u <- s Phi^-T u``, with Phi = e^{A gap} and the
-    factor s by which old information fades. It is ``values[k]`` of K totals ``values`` (K, 1 + n n
-    + n): weight w, information matrix U by rows, information vector u.
+    in place, as ``running_sums.predict_offer`` does: it is ``values[k]`` of K totals ``values``
+    (K, 1 + n n + G n), weight w, information matrix U by rows, and the G parts of u.
     """
     if not gap > 0.0:
         return
-    # Phi^-1 = exp(-A gap); information moves by Phi^-T from the left and by Phi^-1 from the right.
-    fill_inverse_transition(totals.A, gap, totals.scratch)
-    inverse, half, predicted_u = totals.scratch[0], totals.scratch[1], totals.scratch[2]
-    # Forgetting multiplies information by s = exp(-2 f gap).
-    n, fading = len(inverse), math.exp(-2.0 * totals.forgetting * gap)
+    # Information moves by the transpose of M from the left and by M from the right.
+    fill_inverse_transition(totals.kept, gap, totals.scratch)
+    inverse, half, predicted = totals.scratch[0], totals.scratch[1], totals.scratch[2]
+    n = len(inverse)
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -99,17 +98,21 @@ def predict_total(totals: Totals, values: FloatArray, k: int, gap: float) -> Non
                 total += values[k, 1 + i * n + r] * inverse[r, j]
             half[i, j] = total
     for i in range(n):
-        total = 0.0
-        for r in range(n):
-            total += inverse[r, i] * values[k, 1 + n * n + r]
-        predicted_u[0, i] = fading * total
-    for i in range(n):
-        values[k, 1 + n * n + i] = predicted_u[0, i]
         for j in range(n):
             total = 0.0
             for r in range(n):
                 total += inverse[r, i] * half[r, j]
-            values[k, 1 + i * n + j] = fading * total
+            values[k, 1 + i * n + j] = total
+    for g in range(len(totals.rates)):
+        # The mean of the modes of a group decays, unlike the information about them.
+        begin, fading = 1 + (n + g) * n, math.exp(-totals.rates[g] * gap)
+        for i in range(n):
+            total = 0.0
+            for r in range(n):
+                total += inverse[r, i] * values[k, begin + r]
+            predicted[0, i] = fading * total
+        for i in range(n):
+            values[k, begin + i] = predicted[0, i]
 
 
 @kernel
@@ -141,14 +144,21 @@ def offer_round(state: Simulation, totals: Totals, h: int, now: float) -> bool:
             total = 0.0
             for r in range(max(i, j), n):
                 total += inverse[r, i] * inverse[r, j]
-            # U = w / N P^-1 and u = U xhat.
+            # U = w / N P^-1.
             U[i, j] = weight / len(state.nodes) * total
             sent[h, 1 + i * n + j] += U[i, j] / (receivers + 1)
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += U[i, j] * state.xhat[h, j]
-        sent[h, 1 + n * n + i] += total / (receivers + 1)
+    part = totals.scratch[2]
+    for g in range(len(totals.rates)):
+        # U P_g xhat.
+        for i in range(n):
+            part[0, i] = 0.0
+            for j in range(n):
+                part[0, i] += totals.projectors[g, i, j] * state.xhat[h, j]
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += U[i, j] * part[0, j]
+            sent[h, 1 + (n + g) * n + i] += total / (receivers + 1)
     sent[h, 0] = before + share
     totals.weight[h] -= receivers * grown
     return True
@@ -215,10 +225,10 @@ def hear(state: Simulation, totals: Totals, h: int, now: float) -> None:
 
 @kernel
 def gain_mass(state: Simulation, totals: Totals, h: int, factor: float, share: float) -> None:
-    """Add mass, ``totals.gain`` = (weight, U (n, n), u (n,)), which node ``h`` (index) has heard
-    from others, to its estimate: ``P^-1 <- (w P^-1 + N U) / w+`` with the new weight w+, and the
-    estimate likewise. Changes ``state.xhat[h]`` and ``root[h]``, the root of P. ``factor`` is (w+ /
-    w)^1/2, ``share`` is N / w+.
+    """Add mass, ``totals.gain`` = (weight, U (n, n), parts of u), which node ``h`` (index) has
+    heard from others, to its estimate: ``P^-1 <- (w P^-1 + N U) / w+`` with the new weight w+, and
+    the estimate likewise. Changes ``state.xhat[h]`` and ``root[h]``, the root of P. ``factor`` is
+    (w+ / w)^1/2, ``share`` is N / w+.
     """
     root, gain, n = state.root, totals.gain, state.xhat.shape[1]
     inner, half, vectors = totals.scratch[0], totals.scratch[1], totals.scratch[2]
@@ -276,14 +286,16 @@ def move_by_gain(
     state: Simulation, h: int, gain: FloatArray, share: float, innovation: FloatArray
 ) -> None:
     """Correct ``state.xhat[h]`` of node ``h`` (index) by the mass that it has heard, ``gain`` (1 +
-    n n + n,) = (weight, information matrix U by rows, information vector u): ``xhat += P share (u -
-    U xhat)`` with the new P and share = N / w+, w+ being the new weight; ``innovation`` (n,) is
-    scratch.
+    n n + G n,) = (weight, information matrix U by rows, the parts of the information vector u):
+    ``xhat += P share (u - U xhat)`` with the new P and share = N / w+, w+ being the new weight;
+    ``innovation`` (n,) is scratch.
     """
     root, xhat, n = state.root, state.xhat, state.xhat.shape[1]
     # innovation = N / w+ (u - U xhat).
     for i in range(n):
-        total = gain[1 + n * n + i]
+        total = 0.0
+        for k in range(1 + n * n + i, len(gain), n):
+            total += gain[k]
         for j in range(n):
             total -= gain[1 + i * n + j] * xhat[h, j]
         innovation[i] = share * total

@@ -306,21 +306,21 @@ def fade_totals(
     first: int,
 ) -> None:
     """Predict the running totals of push-sum (the sums of all masses that a node has ever sent) at
-    ``indices`` to a later time; changes their matrices and forms.
+    ``indices`` to a later time; changes their matrices and forms, those of one part of u each.
 
-    The matrices of ``totals`` are their information U, the forms their errors u - U x as linear
-    functions of random inputs.
-    ``U+ = s F^-T U F^-1`` and ``(u - U x)+ = s F^-T (u - U x) - U+ w``, with ``inverse`` F^-1
-    (n, n), s = ``fading``, and the plant's noise w = ``noise`` (n, k) times the inputs from column
-    ``first`` on. Totals without information are left alone.
+    The matrices of ``totals`` are their information U, the forms the errors u_g - U P_g x of a part
+    of u as linear functions of random inputs. ``U+ = M' U M`` and ``(u_g - U P_g x)+ = s M' (u_g -
+    U P_g x) - U+ P_g w``, with ``inverse`` M (n, n), s = ``fading``, and ``noise`` (n, k), the part
+    P_g w of the plant's noise, times the inputs from column ``first`` on. Totals without
+    information are left alone.
     """
     forms, matrices, used = totals
     n = inverse.shape[0]
-    transform, half, noise_term = np.empty((n, n)), np.empty((n, n)), np.empty(noise.shape)
-    scratch = np.empty((n, used))
+    transform, faded, half = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    noise_term, scratch = np.empty(noise.shape), np.empty((n, used))
     for i in range(n):
         for j in range(n):
-            transform[i, j] = fading * inverse[j, i]
+            transform[i, j], faded[i, j] = inverse[j, i], fading * inverse[j, i]
     for index in indices:
         empty = True
         for i in range(n):
@@ -330,7 +330,7 @@ def fade_totals(
             continue
         _multiply_into(half, transform, matrices[index])
         _multiply_into(matrices[index], half, inverse)
-        multiply_form(forms[index], transform, used, scratch)
+        multiply_form(forms[index], faded, used, scratch)
         _multiply_into(noise_term, matrices[index], noise)
         add_columns(forms[index], first, noise_term, -1.0)
 

@@ -4,11 +4,12 @@ In slots the rule is P Fig. 1 with the corrected update of the mass; under clock
 broadcast rounds with running sums.
 
 Under clocks a node of weight w among N nodes holds the mass ``(w / N) (P^-1, P^-1 xhat)``. A total
-(U, u) that was sent is information U and information vector u, with the error ``u - U x``. Totals
-are predicted to the present: over a gap with transition F and noise v, ``U+ = s F^-T U F^-1`` and
-``(u - U x)+ = s F^-T (u - U x) - U+ v``, where s <= 1 is the factor by which old information fades.
-A node that gains (U, u), and then has the weight w, moves to ``xhat + (N / w) P (u - U xhat)``; its
-error becomes ``e - (N / w) P (U e + u - U x)``. So the errors obey equations without x.
+(U, u) that was sent is information U and information vector u, in parts u_g = U P_g x for groups of
+modes (``algorithms.running_sums``), with the errors ``u_g - U P_g x``. Totals are predicted to the
+present: over a gap with noise v, ``U+ = M' U M`` and
+``(u_g - U P_g x)+ = e^{-r_g gap} M' (u_g - U P_g x) - U+ P_g v``. A node that gains (U, u), and
+then has the weight w, moves to ``xhat + (N / w) P (u - U xhat)``; its error becomes
+``e - (N / w) P (U e + u - U x)``. So the errors obey equations without x.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from netkf.algorithms.modes import rate_groups
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.scenario.scenario import Scenario
@@ -167,9 +169,7 @@ class RunningTotalsRule(ErrorRule):
         if errors.follows:
             raise TheoryError("the exact errors are known for filters that have the plant's A")
         plant, n = scenario.diffusion, errors.n
-        self._A, self._rounds = plant.A, rounds
-        # Decay rate of the fastest mode, by which the information of old totals fades.
-        self._rate = max(0.0, -float(np.linalg.eigvals(plant.A).real.min()))
+        self._groups, self._rounds = rate_groups(plant.A), rounds
         self._weights = [1.0] * errors.estimators
         # The weight of each total; the stack has their information and errors.
         self._totals: dict[Hashable, float] = {}
@@ -179,22 +179,40 @@ class RunningTotalsRule(ErrorRule):
         for sender, _ in scenario.topology.directions:
             self._receivers[scenario.topology.index[sender]] += 1
         for estimator in range(errors.estimators):
-            self._put_total(("sent", estimator), 0.0, np.zeros((n, n)), np.zeros((n, 0)))
+            parts = [np.zeros((n, 0)) for _ in self._groups.rates]
+            self._put_total(("sent", estimator), 0.0, np.zeros((n, n)), parts)
 
-    def _put_total(self, name: Hashable, weight: float, U: FloatArray, form: FloatArray) -> None:
+    def _put_total(
+        self, name: Hashable, weight: float, U: FloatArray, parts: Sequence[FloatArray]
+    ) -> None:
         """Set the total ``name`` (of mass sent by a node, in a message, or last heard): its weight,
-        its information U (n, n) and the ``form`` (n, inputs) of its error, the matrix that gives
-        the error as a linear function of all noises so far.
+        its information U (n, n) and the forms (n, inputs) of the errors of its ``parts``, the
+        matrices that give them as linear functions of all noises so far.
         """
         stack, self._totals[name] = self.errors.stack, weight
-        stack.put(name, form)
-        stack.matrices[stack.index(name)] = U
+        for item, form in zip(self._items(name), parts, strict=True):
+            stack.put(item, form)
+            stack.matrices[stack.index(item)] = U
+
+    def _items(self, name: Hashable) -> list[Hashable]:
+        """Return the names, in the stack of errors, of the parts of a total ``name``."""
+        return [(name, g) for g in range(len(self._groups.rates))]
+
+    def _forms(self, name: Hashable) -> list[FloatArray]:
+        """Return the forms of the errors of the parts of a total ``name``."""
+        return [self.errors.stack.form(item) for item in self._items(name)]
 
     def _copy_information(self, name: Hashable) -> FloatArray:
         """Return a copy of the information U (n, n) of a total."""
         stack = self.errors.stack
-        U: FloatArray = stack.matrices[stack.index(name)].copy()
+        U: FloatArray = stack.matrices[stack.index((name, 0))].copy()
         return U
+
+    def _copy_total(self, name: Hashable, new: Hashable) -> None:
+        """Copy the total ``name`` to ``new``."""
+        self._totals[new] = self._totals[name]
+        for item, copy in zip(self._items(name), self._items(new), strict=True):
+            self.errors.stack.copy(item, copy)
 
     def elapse(self, gap: float, columns: slice | None, noise: FloatArray | None) -> None:
         """Predict the information and errors of all totals by ``gap`` seconds; called by the replay
@@ -204,18 +222,17 @@ class RunningTotalsRule(ErrorRule):
         """
         if gap <= 0.0 or columns is None or noise is None:
             return
-        # F^-1 with F = exp(A gap), and s = exp(-2 r gap), r the rate of the fastest decaying mode,
-        # so that old totals never grow.
-        inverse = np.asarray(scipy.linalg.expm(-gap * self._A), order="C")
-        fading, stack = math.exp(-2.0 * self._rate * gap), self.errors.stack
-        fade_totals(
-            stack.arrays,
-            stack.indices(self._totals),
-            inverse,
-            fading,
-            as_kernel_array(noise),
-            columns.start,
-        )
+        groups, stack = self._groups, self.errors.stack
+        inverse = np.asarray(scipy.linalg.expm(-gap * groups.kept), order="C")
+        for g, rate in enumerate(groups.rates.tolist()):
+            fade_totals(
+                stack.arrays,
+                stack.indices([self._items(name)[g] for name in self._totals]),
+                inverse,
+                math.exp(-rate * gap),
+                as_kernel_array(groups.projectors[g] @ noise),
+                columns.start,
+            )
 
     def sense(self, time: float, observations: EstimatorObservations) -> None:
         """Update the errors by the readings at ``time`` (seconds), each counted N / w times (w the
@@ -244,8 +261,10 @@ class RunningTotalsRule(ErrorRule):
         # an error as a linear function of all noises so far.
         U = (share * weight / self.errors.estimators) * (inverse.T @ inverse)
         old_total = self._totals[name]
-        new_total, form = old_total + share * weight, stack.form(name) - U @ stack.form(estimator)
-        self._put_total(name, new_total, self._copy_information(name) + U, form)
+        new_total, e = old_total + share * weight, stack.form(estimator)
+        parts = zip(self._forms(name), self._groups.projectors, strict=True)
+        forms = [form - U @ projector @ e for form, projector in parts]
+        self._put_total(name, new_total, self._copy_information(name) + U, forms)
         # One share stays with the node; the others are under way to its receivers.
         self._weights[estimator] = weight - count * (new_total - old_total)
 
@@ -254,9 +273,7 @@ class RunningTotalsRule(ErrorRule):
         when messages are sent.
         """
         for message in messages:
-            name = ("sent", message.sender)
-            self.errors.stack.copy(name, message)
-            self._totals[message] = self._totals[name]
+            self._copy_total(("sent", message.sender), message)
 
     def arrive(self, time: float, messages: Sequence[SentMessage]) -> None:
         """Add to each receiver's mass the difference between the totals received now, at ``time``
@@ -268,7 +285,7 @@ class RunningTotalsRule(ErrorRule):
             self._receive_totals(estimator, sorted(received, key=lambda m: (m.sender, m.number)))
         for message in messages:
             del self._totals[message]
-        self.errors.stack.drop(messages)
+            self.errors.stack.drop(self._items(message))
 
     def _receive_totals(self, estimator: int, messages: Sequence[SentMessage]) -> None:
         """Add the growth of the received totals, since those last heard over the same links, to the
@@ -288,11 +305,10 @@ class RunningTotalsRule(ErrorRule):
                 continue
             self._number[link] = message.number
             weight += self._totals[message] - self._totals.get(heard, 0.0)
-            U, form = U + self._copy_information(message), form + errors.stack.form(message)
+            U, form = U + self._copy_information(message), form + sum(self._forms(message))
             if heard in self._totals:
-                U, form = U - self._copy_information(heard), form - errors.stack.form(heard)
-            errors.stack.copy(message, heard)
-            self._totals[heard] = self._totals[message]
+                U, form = U - self._copy_information(heard), form - sum(self._forms(heard))
+            self._copy_total(message, heard)
         if not weight > 0.0:
             return
         new_weight = self._weights[estimator] + weight
