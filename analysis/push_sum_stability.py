@@ -94,12 +94,17 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("push_sum_stability.png"))
     parser.add_argument("--cells", type=int, default=15, help="delivery probabilities in a picture")
+    parser.add_argument("--gammas", type=int, default=6, help="averaging steps in a picture")
     parser.add_argument("--deltas", type=float, nargs="+", default=DELTAS, help="of the table")
     parser.add_argument("--draws", nargs="+", choices=DRAWS, default=DRAWS, help="of the table")
     options = parser.parse_args(arguments)
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(11, 4.2), layout="constrained")
-        picture(figure.subplots(1, 2), range(1, 7), np.linspace(0.3, 1.0, options.cells))
+        picture(
+            figure.subplots(1, 2),
+            range(1, options.gammas + 1),
+            np.linspace(0.3, 1.0, options.cells),
+        )
         figure.savefig(options.out, dpi=130)
     print("\n".join(FACTS), "\n")
     print(f"{'Q':8} {'delta':>6} {'links':6}  {'  '.join(fact[0] for fact in FACTS)}")

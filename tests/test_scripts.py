@@ -112,3 +112,144 @@ def test_laws_of_tokens_are_read_from_a_directory(kept, tmp_path):
     )
     assert tokens < sensors  # tokens share one law, fixed sensors do not
     assert (tmp_path / "laws.png").stat().st_size > 10_000
+
+
+def test_the_figures_of_the_intermittent_paper_are_drawn(tmp_path):
+    out = tmp_path / "drawn.png"
+    arguments = ["--samples", "200", "--out", str(out)]
+    masses, counted = script("analysis", "intermittent_figures").main(arguments)
+    assert masses == pytest.approx([0.6, 0.24, 0.096], abs=1e-9)
+    # Five standard deviations of a share of 200 samples.
+    assert np.abs(np.array(masses) - counted).max() < 5.0 * math.sqrt(0.24 / 200)
+    assert out.stat().st_size > 10_000
+
+
+def test_the_figures_of_the_push_sum_paper_are_drawn(tmp_path, monkeypatch):
+    figures = script("analysis", "push_sum_figures")
+    monkeypatch.setattr(figures, "DELIVERIES", (0.8, 1.0))
+    monkeypatch.setattr(figures, "SIMULATED", (1, 3))
+    monkeypatch.setattr(figures, "GRID", [0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
+    out = tmp_path / "drawn.png"
+    curves, measured, central = figures.main(["--runs", "3", "--workers", "1", "--out", str(out)])
+    radius = {cell: found for cell, (found, _) in curves.items()}
+    error = {cell: found for cell, (_, found) in curves.items()}
+    # What the script says at its end.
+    assert radius[1, 0.7] < 1.0 < radius[1, 0.6]
+    assert radius[2, 0.5] < 1.0 < figures.exact((2, 0.5, "held"))[0]
+    assert all(error[gamma, 1.0] > error[gamma, 0.9] for gamma in range(2, 7))
+    within = {cell for cell, found in error.items() if found <= 1.1 * central}
+    assert {gamma for gamma, _ in within} == {3, 4, 5, 6}
+    mean, _ = measured[3, 0.8]
+    assert mean == pytest.approx(error[3, 0.8], rel=0.2)
+    assert out.stat().st_size > 10_000
+
+
+def test_what_the_push_sum_paper_reports_holds_as_the_table_says(tmp_path):
+    arguments = ["--cells", "2", "--gammas", "1", "--deltas", "4.01", "--draws", "fresh"]
+    stability = script("analysis", "push_sum_stability")
+    found = stability.main([*arguments, "--out", str(tmp_path / "drawn.png")])
+    assert found["tau I_2", 4.01, "fresh"] == (True, True, True, False, True, True, True)
+    assert not found["I_2", 4.01, "fresh"][0]
+    assert (tmp_path / "drawn.png").stat().st_size > 10_000
+
+
+def test_the_figure_of_the_diffusion_paper_is_drawn(tmp_path):
+    out = tmp_path / "drawn.png"
+    arguments = ["--slots", "300", "--runs", "3", "--exact", "3", "--workers", "1"]
+    squared, exact, traces = script("analysis", "diffusion_figure").main(
+        [*arguments, "--out", str(out)]
+    )
+    assert squared.shape == traces.shape == (3, 3, 4, 3)  # runs, ways, times, sensors
+    alone, together, central = exact.mean(axis=(0, 3))
+    assert alone[1] < alone[2] < alone[3]
+    assert alone[3] > 10.0 * together[3]
+    assert 1.0 < together[2:].mean() / central[2:].mean() < 1.4
+    assert 1.3 < traces[:, 1, 2:].mean() / together[2:].mean() < 1.7
+    assert out.stat().st_size > 10_000
+
+
+def test_filters_are_compared_in_tables(capsys, monkeypatch):
+    compared = script("analysis", "filters_compared")
+    page = (ROOT / "docs" / "filters_compared.md").read_text(encoding="utf-8")
+    networks = [netkf.load(compared.FOLDER / f"{name}.toml") for name in compared.NETWORKS]
+    names = list(compared.filters_of(networks[0]))
+    assert all(page.count(f"| {name} |") == 2 for name in names)
+    kept, all_filters = ("central", "HCMCI, 3 steps", "hybrid", "local"), compared.filters_of
+    monkeypatch.setattr(
+        compared, "filters_of", lambda scenario: {k: all_filters(scenario)[k] for k in kept}
+    )
+    ((found, horizon),) = compared.main(["2", "--networks", "ring_loss", "--horizon", "2"])
+    lines = capsys.readouterr().out.splitlines()
+    assert (horizon, len(found.rows), len(lines)) == (2.0, 4, 13)
+    assert lines[2].startswith("| central | 1.00 (")
+    assert lines[4] == "| hybrid | - |"  # in slots
+
+
+def test_push_sum_and_hybrid_filters_meet_the_same_truth(capsys):
+    arguments = ["--runs", "3", "--rates", "4", "--workers", "1"]
+    better, nees = script("analysis", "push_sum_continuous").main(arguments)
+    ((rate, gain, _),) = better["hybrid"]
+    assert (rate, gain > 0.0) == (4.0, True)
+    assert nees["push-sum", 4.0].mean() > 1.5 * 2  # its P is too small
+    assert nees["hybrid", 4.0].mean() < 1.5 * 2
+    assert "better at" in capsys.readouterr().out
+
+
+def test_the_tables_of_the_library_are_those_of_its_raw_record(tmp_path):
+    library = script("analysis", "ulb_library")
+    library.main(["--prepare", "--folder", str(tmp_path)])
+    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    kept = SCENARIOS / "data" / "ulb_library"
+    assert set(made) == {"temperatures.csv", "pairs.csv", "broadcasts.csv", "missed.csv"}
+    assert made == {name: (kept / name).read_bytes() for name in made}
+
+
+def test_errors_at_motes_that_are_never_read_are_those_that_pages_name(monkeypatch):
+    library = script("analysis", "ulb_library")
+    chosen = ("diffusion, the scenario's", "covariance intersection", "all readings")
+    monkeypatch.setattr(library, "FILTERS", {name: library.FILTERS[name] for name in chosen})
+    found = {name: round(float(error), 3) for name, error in library.main([]).items()}
+    assert found == {
+        "last value heard": 0.187,
+        "mean of the others": 0.178,
+        "mean + first offset": 0.084,
+        "diffusion, the scenario's": 0.097,
+        "covariance intersection": 0.116,
+        "all readings": 0.095,
+    }
+
+
+DRAWINGS = {
+    "diffusion": ["--runs", "2"],
+    "gallery": ["--runs", "2", "--points", "3"],
+    "gossip": ["--samples", "100"],
+    "hybrid": ["--runs", "2", "--rates", "8"],
+    "intermittent": [],
+    "push_sum": ["--gains", "2"],
+}
+
+
+def test_every_script_of_the_pages_is_run():
+    names = {path.stem for path in (ROOT / "docs" / "figures").glob("*.py")}
+    assert names == {*DRAWINGS, "look", "moving_network"}
+
+
+@pytest.mark.parametrize("name", DRAWINGS)
+def test_the_drawings_of_the_pages_are_drawn(tmp_path, monkeypatch, name):
+    folder = ROOT / "docs" / "figures"
+    monkeypatch.syspath_prepend(str(folder))
+    script("docs/figures", name).main([*DRAWINGS[name], "--out", str(tmp_path)])
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert drawn == {path.name for path in folder.glob(f"{name}_*.svg")}
+    if not DRAWINGS[name]:  # nothing was left out, so that it is the same drawing
+        for path in tmp_path.iterdir():
+            assert path.read_text().count("<path") == (folder / path.name).read_text().count(
+                "<path"
+            )
+
+
+def test_the_network_moves(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "figures"))
+    out = tmp_path / "moving.gif"
+    script("docs/figures", "moving_network").main(["--end", "0.3", "--out", str(out)])
+    assert out.read_bytes().startswith(b"GIF89a")

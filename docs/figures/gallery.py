@@ -14,9 +14,9 @@ EXAMPLE = ([[1.25]], [[1.0]], [[1.0]], [[2.5]])  # F, Q, H, R
 NODES = 10
 
 
-def arrivals(figure, runs):
+def arrivals(figure, runs, points):
     """Bounds on the mean covariance over the probability of arrival, and simulated means."""
-    probabilities = 0.36 + np.geomspace(0.01, 0.63, 30)
+    probabilities = 0.36 + np.geomspace(0.01, 0.63, points)
     bounds = [
         theory.mean_covariance_bounds(*EXAMPLE, float(g), 800, [[1.0]]) for g in probabilities
     ]
@@ -52,7 +52,7 @@ def simulated(base, delivery, runs):
     return float(P.mean()), float(se.mean())
 
 
-def averaging(figure, runs):
+def averaging(figure, runs, _):
     """The squared distance from the average under randomised gossip on a cycle."""
     laplacian = networkx.laplacian_matrix(networkx.cycle_graph(NODES)).toarray().astype(float)
     values, vectors = np.linalg.eigh(laplacian)
@@ -96,9 +96,9 @@ def exact_decay(start, times):
 
 
 def main(arguments=None):
-    chosen = options(__doc__, arguments, runs=400)
+    chosen = options(__doc__, arguments, runs=400, points=30)
     for name, function in (("arrivals", arrivals), ("averaging", averaging)):
-        draw(chosen.out, f"gallery_{name}", lambda figure, f=function: f(figure, chosen.runs),
+        draw(chosen.out, f"gallery_{name}", lambda figure, f=function: f(figure, chosen.runs, chosen.points),
              (6.4, 3.6))  # fmt: skip
 
 

@@ -68,7 +68,7 @@ def slope(figure, count):
     print(f"slope of Theorem 3 at the fast end: {fall:.4f}")
 
 
-def thresholds(figure):
+def thresholds(figure, count):
     """The four rates of a scalar blind node, and the steady bound above the third."""
     scenario = netkf.load(SCENARIOS / "threshold.toml")
     a, pi = 0.5, 0.5
@@ -79,7 +79,7 @@ def thresholds(figure):
         (4 * a / (pi * (2 - pi)), "variance of P finite", PINK),
     )
     axes = figure.subplots()
-    rates = np.linspace(2.03, 8.0, 120)
+    rates = np.linspace(2.03, 8.0, 5 * count - 5)
     steady = [
         theory.steady_covariance_bound(scenario.replace({"network.activation.rate": float(rate)}))
         for rate in rates
@@ -106,7 +106,9 @@ def main(arguments=None):
     chosen = options(__doc__, arguments, runs=1000, rates=25)
     draw(chosen.out, "hybrid_gap", lambda figure: gap(figure, chosen.runs), (8.6, 3.2))
     draw(chosen.out, "hybrid_slope", lambda figure: slope(figure, chosen.rates), (8.6, 3.2))
-    draw(chosen.out, "hybrid_thresholds", thresholds, (6.4, 3.2))
+    draw(
+        chosen.out, "hybrid_thresholds", lambda figure: thresholds(figure, chosen.rates), (6.4, 3.2)
+    )
 
 
 if __name__ == "__main__":

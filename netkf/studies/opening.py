@@ -109,6 +109,8 @@ def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> S
     import pandas as pd
 
     require_form(manifest["vary"], {}, "vary")
+    if not all(isinstance(values, list) for values in manifest["vary"].values()):
+        raise DamagedError("manifest.json needs lists at vary")
     keys = tuple(manifest["vary"])
     path = folder / "sweep.parquet"
     table = _read_table(path, keys) if path.exists() else pd.DataFrame(columns=[*keys, *RESULTS])
