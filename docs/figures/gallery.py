@@ -1,5 +1,6 @@
 """Drawings of docs/gallery.md: python docs/figures/gallery.py."""
 
+from functools import partial
 from pathlib import Path
 
 import networkx
@@ -52,7 +53,7 @@ def simulated(base, delivery, runs):
     return float(P.mean()), float(se.mean())
 
 
-def averaging(figure, runs, _):
+def averaging(figure, runs, points):  # noqa: ARG001
     """The squared distance from the average under randomised gossip on a cycle."""
     laplacian = networkx.laplacian_matrix(networkx.cycle_graph(NODES)).toarray().astype(float)
     values, vectors = np.linalg.eigh(laplacian)
@@ -98,8 +99,8 @@ def exact_decay(start, times):
 def main(arguments=None):
     chosen = options(__doc__, arguments, runs=400, points=30)
     for name, function in (("arrivals", arrivals), ("averaging", averaging)):
-        draw(chosen.out, f"gallery_{name}", lambda figure, f=function: f(figure, chosen.runs, chosen.points),
-             (6.4, 3.6))  # fmt: skip
+        drawn = partial(function, runs=chosen.runs, points=chosen.points)
+        draw(chosen.out, f"gallery_{name}", drawn, (6.4, 3.6))
 
 
 if __name__ == "__main__":
