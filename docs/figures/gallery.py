@@ -53,7 +53,7 @@ def simulated(base, delivery, runs):
     return float(P.mean()), float(se.mean())
 
 
-def averaging(figure, runs, points):  # noqa: ARG001
+def averaging(figure, runs, points):
     """The squared distance from the average under randomised gossip on a cycle."""
     laplacian = networkx.laplacian_matrix(networkx.cycle_graph(NODES)).toarray().astype(float)
     values, vectors = np.linalg.eigh(laplacian)
