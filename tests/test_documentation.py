@@ -4,6 +4,7 @@ import subprocess
 
 import pytest
 
+from netkf.checks.report import PAPERS
 from tests.conftest import ROOT
 from tests.documents import DOCS, Follower, blocks, matches, shell_script
 
@@ -83,3 +84,14 @@ def test_pictures_are_small_and_used():
         assert picture.name in texts, picture
         limit = 1_500_000 if picture.parent == DOCS else 200_000
         assert picture.stat().st_size < limit, picture
+
+
+def test_a_paper_has_one_title():
+    """On its page, among the errors, and in the legend of a verdict."""
+    errors = (DOCS / "errors_in_the_papers.md").read_text(encoding="utf-8")
+    pages = [page.read_text(encoding="utf-8") for page in (DOCS / "papers").glob("*.md")]
+    assert {page.removeprefix("# ")[0] for page in pages} == set(PAPERS)
+    for page in pages:
+        title = PAPERS[page.removeprefix("# ")[0]].partition(": ")[2]
+        assert f"*{title}*" in page
+        assert f"*{title}*" in errors

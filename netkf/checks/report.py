@@ -17,11 +17,16 @@ INDENT = " " * 13
 WIDTH = 87  # with the indent 100 columns
 
 PAPERS = {
-    "H": "Tanwani: error bounds for locally optimal distributed filters",
-    "R": "Kar, Sinopoli, Moura: Kalman filtering with intermittent observations",
-    "G": "Kar, Moura: gossip and distributed Kalman filtering",
-    "D": "Xie, Gan, Liu: distributed Kalman filtering for stochastic regression",
-    "P": "Battilotti, Cacace, d'Angelo: random sub-graphs with link failures",
+    "H": "Tanwani: Error bounds for locally optimal distributed filters with random communication "
+    "graphs",
+    "R": "Kar, Sinopoli and Moura: Kalman filtering with intermittent observations: weak "
+    "convergence to a stationary distribution",
+    "G": "Kar and Moura: Gossip and distributed Kalman filtering: weak consensus under weak "
+    "detectability",
+    "D": "Xie, Gan and Liu: Stability analysis of distributed Kalman filtering algorithm for "
+    "stochastic regression model",
+    "P": "Battilotti, Cacace and d'Angelo: Consensus analysis of random sub-graphs for distributed "
+    "filtering with link failures",
 }
 """The papers behind the letters in the sources of promises."""
 
@@ -50,7 +55,7 @@ def _legend_lines(verdict: Verdict) -> list[str]:
     # A letter stands for a paper only at the beginning of a source or of one of its parts.
     sources = "; ".join(row.source for row in verdict.rows)
     return [
-        f"[{letter} ...]: {title}"
+        textwrap.fill(f"[{letter} ...]: {title}", WIDTH + len(INDENT), subsequent_indent=INDENT)
         for letter, title in PAPERS.items()
         if re.search(rf"(^|[;,] |from ){letter}[ (]", sources)
     ]
