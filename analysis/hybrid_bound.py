@@ -5,8 +5,9 @@
     python analysis/hybrid_bound.py slow fast
 
 Each line is a directory: its link rate, the trace of the mean of P at the worst node at the end
-with its standard error, the bound on it, how much of the bound is used, and the limit S of
-infinitely frequent resets. H Theorem 2 says that the mean stays below the bound; Theorem 3 that
+with its standard error, the bound on it, how much of the bound is used there, the least and the
+most that a node uses on average over the second half of the time, and the limit S of infinitely
+frequent resets. H Theorem 2 says that the mean stays below the bound; Theorem 3 that
 the bound approaches S as one over the rate. Only public names of netkf are used.
 """
 
@@ -28,8 +29,11 @@ def row(directory):
     mean = np.trace(ensemble.mean_P[-1], axis1=1, axis2=2)
     # Errors of the entries of one matrix are taken as one: a bound on that of their sum.
     error = np.trace(ensemble.se_P[-1], axis1=1, axis2=2)
-    bound = np.trace(netkf.theory.covariance_bound(scenario, ensemble.times[-1:])[0], axis1=1,
-                     axis2=2)  # fmt: skip
+    late = ensemble.times >= ensemble.times[-1] / 2.0
+    bounds = netkf.theory.covariance_bound(scenario, ensemble.times[late])
+    bounds = np.trace(bounds, axis1=2, axis2=3)
+    used = (np.trace(ensemble.mean_P[late], axis1=2, axis2=3) / bounds).mean(axis=0)
+    bound = bounds[-1]
     worst = int(np.argmax(mean))
     limit = np.trace(netkf.theory.limit_covariance(scenario))
     return {
@@ -41,6 +45,8 @@ def row(directory):
         "se": error[worst],
         "bound": bound[worst],
         "used": mean[worst] / bound[worst],
+        "least": used.min(),
+        "most": used.max(),
         "limit S": limit,
         "bound - S times rate": (bound[worst] - limit) * scenario.network.activation.rate,
     }

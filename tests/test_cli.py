@@ -177,7 +177,7 @@ def test_refusals_do_not_wait_for_matplotlib(tmp_path):
         [sys.executable, "-W", "error", "-c", code],
         check=False,
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])},
         capture_output=True,
         text=True,
     )

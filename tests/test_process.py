@@ -1,6 +1,7 @@
 """How the process of a command ends: closed streams, signals, text from files."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,9 +15,9 @@ from netkf.core.printable import one_line, printable
 from tests.conftest import SCENARIOS
 
 RING = str(SCENARIOS / "poisson_ring.toml")
-QUICK = str(SCENARIOS / "ulb_library.toml")
+QUICK = shlex.quote(str(SCENARIOS / "ulb_library.toml"))
 """Its theory is known at once."""
-NETKF = f"{sys.executable} -m netkf"
+NETKF = f"{shlex.quote(sys.executable)} -m netkf"
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_an_answer_of_no_stays_one_where_nobody_reads_it():
 def test_a_run_without_streams_is_complete(tmp_path):
     """The first files that are opened would get the numbers of the closed streams."""
     out = tmp_path / "out"
-    line = f"{NETKF} run {RING} --set horizon=1.0 --no-plot --out {out} >&- 2>&- <&-"
+    line = f"{NETKF} run {shlex.quote(RING)} --set horizon=1.0 --no-plot --out {out} >&- 2>&- <&-"
     assert subprocess.run(["bash", "-c", line], check=False).returncode == 0
     assert '"complete"' in (out / "manifest.json").read_text()
 

@@ -106,6 +106,20 @@ def test_hybrid_bounds_are_read_from_directories(kept, capsys):
     assert "no mean is above its bound" in capsys.readouterr().out
 
 
+def test_nodes_use_as_much_of_the_bound_as_the_page_says(tmp_path):
+    page = (ROOT / "analysis" / "README.md").read_text(encoding="utf-8")
+    assert "85 to 98 % at 1, 90 to 95 % at 2" in page
+    for rate in ("1", "10"):
+        change = ["--set", f"network.activation.rate={rate}", "--out", str(tmp_path / rate)]
+        ring = str(SCENARIOS / "poisson_ring.toml")
+        assert main(["run", ring, "--workers", "1", "--no-plot", "--runs", "100", *change]) == 0
+    table = script("analysis", "hybrid_bound").main([str(tmp_path / rate) for rate in ("1", "10")])
+    least, most = table["least"], table["most"]
+    # The standard error of a mean over these runs and times is 1 %.
+    assert least.tolist() == pytest.approx([0.85, 0.987], abs=0.03)
+    assert most.tolist() == pytest.approx([0.976, 0.99], abs=0.03)
+
+
 def test_laws_of_tokens_are_read_from_a_directory(kept, tmp_path):
     sensors, tokens = script("analysis", "weak_consensus").main(
         [str(kept / "gossip"), "--out", str(tmp_path / "laws.png")]

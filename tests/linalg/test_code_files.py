@@ -248,11 +248,12 @@ def test_settings_of_the_current_folder_are_not_read(tmp_path):
         "config.reload_config(); print([config.CACHE_DIR, config.DISABLE_JIT])"
     )
     environment = {name: text for name, text in os.environ.items() if "NUMBA" not in name}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
     done = subprocess.run(
         [sys.executable, "-c", code],
         check=True,
         cwd=tmp_path,
-        env={**environment, "PYTHONPATH": str(ROOT)},
+        env=environment,
         capture_output=True,
         text=True,
     )
