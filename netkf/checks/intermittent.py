@@ -56,6 +56,7 @@ from netkf.checks.statistics import (
 )
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.spectra import contracts, growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -475,7 +476,7 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
     unknown are left out.
     """
     factors, neighbours = {}, sensing_neighbours(scenario)
-    alpha = float(np.abs(np.linalg.eigvals(scenario.slot_belief[0])).max())
+    alpha = growth_factor(scenario.slot_belief[0])
     for node in sampled_nodes(scenario):
         if node in scenario.placed_sensors:
             continue
@@ -499,7 +500,7 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
     scenario, factors = samples.scenario, _outage_factors(samples.scenario)
     node = max(factors, key=lambda k: factors[k])
     F, Q = scenario.slot_belief
-    alpha = float(np.abs(np.linalg.eigvals(F)).max())
+    alpha = growth_factor(F)
     slots = check_slots(scenario)[-1]
     # The lower bound counts only the slots without a reading, so it needs no H. The outage factor
     # is (1 - g) alpha^2, with g the probability that a reading arrives.
@@ -741,7 +742,7 @@ class IntermittentChecks(PaperChecks):
         that E[P] diverges if losses are so frequent, and those on the exact law of a scalar P if it
         is known for a node.
         """
-        grows = max(_outage_factors(scenario).values(), default=0.0) >= 1.0
+        grows = not contracts(max(_outage_factors(scenario).values(), default=0.0))
         divergence = (DIVERGES,) if grows else ()
         return PROMISES + divergence + (SCALAR if _scalar_laws(scenario) else ())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,12 +25,12 @@ from netkf.cli.options import (
 )
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
+from netkf.engines.soundness import describe_divergence
 
 if TYPE_CHECKING:
     from netkf.runs.run import CompletedRun
     from netkf.scenario.scenario import Scenario
 
-MAX_LISTED_NODES = 12  # nodes that a note lists
 MIN_RATED_EVENTS = 10_000  # of fewer events a run takes as long as its preparations
 
 
@@ -111,7 +112,7 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
         duration += f", {completed.events / max(completed.seconds, 1e-9):,.0f} per second"
     print(f"events: {completed.events:,} in {duration}, engine {completed.engine}")
     if completed.status != "complete":
-        message = _describe_divergence(completed)
+        message = _describe_divergence(completed, scenario.nodes)
         print(f"status: {message}")
         print_notes([message])
     print(f"written to {completed.directory}")
@@ -190,23 +191,17 @@ def _print_ensemble(completed: Any, runs: int) -> None:
     print(f"written to {completed.directory}")
 
 
-def _describe_divergence(completed: CompletedRun) -> str:
-    """Return a text on which nodes diverged and when, and on the time up to which errors are
-    averaged, if rounding dominates them from then on.
+def _describe_divergence(completed: CompletedRun, nodes: Sequence[int]) -> str:
+    """Return a text on what diverged, at which nodes and when, and on the time up to which errors
+    are averaged, if rounding dominates them from then on.
     """
     samples = completed.samples
-    ids = samples.diverged
-    listed = ", ".join(map(str, ids[:MAX_LISTED_NODES]))
-    listed += ", ..." if len(ids) > MAX_LISTED_NODES else ""
-    nodes = f"node{'s' if len(ids) > 1 else ''} {listed}"
-    problem = f"estimate or covariance of {nodes} is no longer finite"
-    if samples.is_finite_at_end:
-        problem = f"covariance of {nodes} is no longer positive semidefinite"
+    problem = describe_divergence(nodes, *samples.last)
     averaging = ""
     if samples.rounding_from is not None:
         averaging = f"; errors are averaged before {samples.rounding_from:g} s"
     return (
-        f"{completed.status}, the {problem} at {samples.times[-1]:g} s and the run ended "
+        f"{completed.status}, {problem} at {samples.times[-1]:g} s and the run ended "
         f"there{averaging}"
     )
 

@@ -110,12 +110,18 @@ def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
 
 
 def broken(
-    scenario: Scenario, xhat: FloatArray, P: FloatArray, without: np.ndarray | None = None
+    scenario: Scenario,
+    xhat: FloatArray,
+    P: FloatArray,
+    error: FloatArray,
+    without: np.ndarray | None = None,
 ) -> list[int]:
     """Return the ids of the nodes whose estimates end a run as diverged: the estimate (row of
-    ``xhat`` (N, n)) or covariance (``P`` (N, n, n)) is not finite, or the covariance not positive
-    semidefinite. ``without``: mask (N,) of nodes that have no covariance, whose P is ignored.
+    ``xhat`` (N, n)), the square of the ``error`` (N, n), if the truth is known, or the covariance
+    (``P`` (N, n, n)) is not finite, or the covariance not positive semidefinite. ``without``: mask
+    (N,) of nodes that have no covariance, whose P is ignored.
     """
     # False broadcasts: every node then has a covariance to be looked at.
-    intact = sound_mask(xhat, P, False if without is None else without)
+    known_error = error if scenario.plant.truth_known else None
+    intact = sound_mask(xhat, P, False if without is None else without, known_error)
     return [scenario.nodes[k] for k in np.flatnonzero(~intact)]

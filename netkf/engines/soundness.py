@@ -1,4 +1,4 @@
-"""The test of estimates and covariances that ends a run as diverged."""
+"""The test of states, estimates and covariances that ends a run as diverged, and its reasons."""
 
 from __future__ import annotations
 
@@ -31,15 +31,24 @@ INDEFINITE = 1e-9
 """The tolerated negative eigenvalue, as a share of the largest; rounding errors are far smaller."""
 
 
-def sound_mask(xhat: FloatArray, P: FloatArray, without: BoolArray | bool = False) -> BoolArray:
+def sound_mask(
+    xhat: FloatArray,
+    P: FloatArray,
+    without: BoolArray | bool = False,
+    error: FloatArray | None = None,
+) -> BoolArray:
     """Return a mask (...) of sound pairs of estimates ``xhat`` (..., n) and covariances ``P``
     (..., n, n).
 
     Both must be finite, and the covariance positive semidefinite; a filter ``without`` covariance
-    (mask (...), or False for none) needs only a finite estimate. Estimates are in the coordinates
-    that the filters compute in. A run continues while all pairs are sound.
+    (mask (...), or False for none) needs only a finite estimate. Estimates are in the plant's
+    coordinates, so that they are finite only if the true state is. If the truth is known, squares
+    of the ``error`` (..., n) must be finite too. A run continues while all pairs are sound.
     """
     finite = np.isfinite(xhat).all(axis=-1)
+    if error is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite &= np.isfinite((error * error).sum(axis=-1))
     whole = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
     semidefinite = _semidefinite(np.where(whole[..., None, None], P, 0.0))
     return np.asarray(finite & ((whole & semidefinite) | np.asarray(without)))
@@ -60,3 +69,53 @@ def _semidefinite(P: FloatArray) -> BoolArray:
         values = np.linalg.eigvalsh(P)
         return np.asarray(values[..., 0] >= -INDEFINITE * np.abs(values).max(axis=-1))
     return np.ones(P.shape[:-2], dtype=bool)
+
+
+MAX_NAMED = 10
+"""Nodes that a sentence names at most."""
+LARGEST = "1.8e308, the largest number there is"
+
+
+def describe_divergence(
+    nodes: Sequence[int], x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
+) -> str:
+    """Return what ends a run as diverged at its last sample, as the subject and verb of a sentence:
+    what passed the largest number, is not a number, or is not positive semidefinite, at which of
+    the N ``nodes`` (ids).
+
+    ``x`` (n,) is the true state, nan if it is unknown, ``xhat`` (N, n), ``P`` (N, n, n), nan where
+    a filter gives none, and ``error`` = x - xhat (N, n), possibly more precise.
+    """
+    reasons: dict[str, list[int]] = {}
+    if np.isinf(x).any() or (np.isnan(x).any() and not np.isnan(error).all()):
+        reasons[f"the true state passed {LARGEST},"] = []
+    sound = sound_mask(
+        xhat, P, np.isnan(P).all(axis=(-1, -2)), None if np.isnan(x).all() else error
+    )
+    for k in np.flatnonzero(~sound):
+        reason = _describe_break(xhat[k], P[k])
+        # Estimates cannot follow a state beyond the largest number.
+        if not reasons or "covariance" in reason:
+            reasons.setdefault(reason, []).append(nodes[k])
+    return " and ".join(_fill_in(reason, found) for reason, found in reasons.items())
+
+
+def _describe_break(xhat: FloatArray, P: FloatArray) -> str:
+    """Return why the estimate xhat (n,) and covariance P (n, n) of a node end a run, with {} in
+    place of the node.
+    """
+    for name, values in (("covariance", P), ("estimate", xhat)):
+        if np.isinf(values).any():
+            return f"the {name} of {{}} passed {LARGEST},"
+    if np.isnan(xhat).any() or (np.isnan(P).any() and not np.isnan(P).all()):
+        name = "estimate" if np.isnan(xhat).any() else "covariance"
+        return f"the {name} of {{}} is not a number (infinity - infinity, or 0 / 0)"
+    if not np.isnan(P).all() and not sound_mask(xhat, P):
+        return "the covariance of {} is no longer positive semidefinite"
+    return f"the squared error of {{}} passed {LARGEST},"
+
+
+def _fill_in(reason: str, nodes: Sequence[int]) -> str:
+    """Return the ``reason`` with the ``nodes`` (ids) in place of {}."""
+    listed = ", ".join(map(str, nodes[:MAX_NAMED])) + (", ..." if len(nodes) > MAX_NAMED else "")
+    return reason.format(f"node{'s' if len(nodes) > 1 else ''} {listed}")

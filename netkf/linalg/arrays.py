@@ -19,6 +19,7 @@ __all__ = [
     "address_of",
     "block_diagonal",
     "readonly_array",
+    "is_definite",
     "is_semidefinite",
     "as_kernel_array",
     "square_root",
@@ -57,6 +58,19 @@ def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
     values = np.linalg.eigvalsh(matrix)
     # Relative to the largest eigenvalue; the smallest normal number admits the zero matrix.
     return bool(values[0] >= -tolerance * max(abs(values[-1]), np.finfo(float).tiny))
+
+
+def is_definite(matrix: FloatArray) -> bool:
+    """Return True if a symmetric ``matrix`` (n, n) is positive definite beyond rounding, whatever
+    the units of its rows.
+    """
+    sizes = np.diagonal(matrix)
+    if not (sizes > 0.0).all():
+        return False
+    roots = np.sqrt(sizes)
+    # With a diagonal of 1 the largest eigenvalue is at most n.
+    least = np.linalg.eigvalsh(matrix / roots[:, None] / roots)[0]
+    return bool(least > 8.0 * len(matrix) * np.finfo(float).eps)
 
 
 def square_root(matrix: FloatArray) -> FloatArray:

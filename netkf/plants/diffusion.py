@@ -18,6 +18,7 @@ import numpy as np
 
 from netkf.core.fields import field, matrix, positive, square
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.spectra import eigenvalues
 from netkf.plants.laws import GridLaws
 from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
@@ -155,12 +156,12 @@ def default_sensing_period(
     ``longest_period`` demands it, rounded down to 1, 2 or 5 times a power of ten. It depends on
     nothing else, so that all algorithms and networks see the same truth.
     """
-    fastest = float(np.abs(np.linalg.eigvals(plant.A)).max())
+    fastest = float(np.abs(eigenvalues(plant.A)).max())
     for G in informations:
         # The eigenvalues of the Hamiltonian matrix of the Riccati equation are those of the
         # node's filter, with both signs.
         M = np.block([[-plant.A.T, G], [plant.Q, plant.A]])
-        fastest = max(fastest, float(np.abs(np.linalg.eigvals(M)).max()))
+        fastest = max(fastest, float(np.abs(eigenvalues(M)).max()))
     bound = min(0.5 / fastest if fastest > 0.0 else 1.0, longest, plant.longest_period)
     power = 10.0 ** math.floor(math.log10(bound))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= bound * (1.0 + 1e-9))

@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply, gauss_legendre, norm, product
+from netkf.linalg.spectra import growth_factor, growth_rate
 
 UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
 DEPENDENT = 1e-9  # a remainder below this share of the row's norm counts as rounding
@@ -177,10 +178,10 @@ def frame_period(A: FloatArray) -> float | None:
     """Return the seconds g after which the states of ``dx = A x dt``, ``A`` (n, n) in 1/s, are
     taken relative to a new origin: the length of a frame.
 
-    The growth e^{a g} is 2^10 for the spectral abscissa a of A; None if a <= 0.
+    The growth e^{a g} is 2^10 for the spectral abscissa a of A; None if a <= 0 up to rounding.
     """
-    abscissa = float(np.linalg.eigvals(A).real.max())
-    return _round_seconds(GROWTH / abscissa) if abscissa > 0.0 else None
+    rate = growth_rate(A)
+    return _round_seconds(GROWTH / rate) if rate > 0.0 else None
 
 
 def _round_seconds(seconds: float) -> float:
@@ -193,7 +194,8 @@ def frame_slots(F: FloatArray) -> int | None:
     """Return the number k of slots after which the states of ``x[k+1] = F x[k]``, F (n, n), are
     taken relative to a new origin: the length of a frame.
 
-    The growth r^k of the spectral radius r of F is at most 2^10, or k = 1; None if r <= 1.
+    The growth r^k of the spectral radius r of F is at most 2^10, or k = 1; None if r <= 1 up to
+    rounding.
     """
-    radius = float(np.abs(np.linalg.eigvals(F)).max())
-    return max(1, int(_round_seconds(GROWTH / math.log(radius)))) if radius > 1.0 else None
+    factor = growth_factor(F)
+    return max(1, int(_round_seconds(GROWTH / math.log(factor)))) if factor > 1.0 else None

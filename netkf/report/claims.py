@@ -10,6 +10,7 @@ import numpy as np
 import scipy.special
 
 from netkf.checks.report import PAPERS
+from netkf.engines.soundness import describe_divergence
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import describe_innovations
@@ -24,7 +25,6 @@ from netkf.studies.compare_filters import ComparedFilter
 from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
 from netkf.trace.run import first_difference
-from netkf.trace.schema import CODES
 
 UNUSUAL_SHARE = 0.9
 """An age of information is called unusually old if it exceeds this share of the node's samples."""
@@ -134,14 +134,10 @@ def _describe_status(source: ReportSource) -> list[str]:
     elif source.status == "failed":
         sentences.append(f"Failed: {source.manifest.get('error', 'no reason was written')}")
     if run is not None and run.count("diverged"):
-        rows = run.log[run.log["kind"] == CODES["diverged"]]
-        nodes = ", ".join(map(str, rows["node"][:MAX_LISTED].tolist()))
-        more = ", ..." if len(rows) > MAX_LISTED else ""
-        # Events may be counted without being recorded.
-        time = _format_time(float(rows["t"][0])) if len(rows) else "an unknown time"
+        last = (values[-1] for values in (run.x, run.xhat, run.P, run.error))
         sentences.append(
-            f"Diverged: at {time} the estimate or the covariance of node {nodes}{more} was no "
-            "longer usable, and the run ended there"
+            f"Diverged: {describe_divergence(run.nodes, *last)} at "
+            f"{_format_time(float(run.times[-1]))}, and the run ended there"
         )
     if run is not None and len(run.nodes) == 1:
         sentences.append("There is one node, so nothing is sent")

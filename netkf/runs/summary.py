@@ -45,6 +45,7 @@ class SummarySink(Sink):
     rounding_from   : time of the first sample whose errors are mostly rounding, because the state
                       is large (unstable plants over long horizons); None if there is none
     diverged        : nodes whose estimate or covariance was unusable at the last sample
+    last            : x, xhat, P and error of the last sample
     transmissions   : number of messages and transmissions of each node
     """
 
@@ -60,6 +61,7 @@ class SummarySink(Sink):
         self.delivered: dict[tuple[int, int], int] = {}
         self.rounding_from: float | None = None
         self.diverged: list[int] = []
+        self.last: tuple[FloatArray, ...] = ()
         self.transmissions = Transmissions()
 
     def events(self, rows: np.ndarray) -> None:
@@ -93,6 +95,7 @@ class SummarySink(Sink):
         self.nees += list(nees)
         self.first_component += list(np.array(xhat[:, :, 0]))
         self.trace += list(np.trace(P, axis1=2, axis2=3))
+        self.last = tuple(values[-1].copy() for values in (x, xhat, P, error))
         if self.rounding_from is None:
             first = rounding_from(t, carried_size(x, error, self.exact_errors), P, error)
             self.rounding_from = first if first < np.inf else None
@@ -101,11 +104,6 @@ class SummarySink(Sink):
     def has_covariance(self) -> bool:
         """True if the filter gives a covariance, or no sample was taken."""
         return not self.trace or any(np.isfinite(trace).any() for trace in self.trace)
-
-    @property
-    def is_finite_at_end(self) -> bool:
-        """True if errors and covariances were finite at the last sample."""
-        return bool(np.isfinite([self.sq_error[-1], self.trace[-1]]).all())
 
 
 NO_COVARIANCE = "the filter gives no covariance"

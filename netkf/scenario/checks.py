@@ -11,6 +11,7 @@ from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
+from netkf.linalg.spectra import growth_rate
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
@@ -182,7 +183,7 @@ def _check_speed(scenario: DerivedScenario) -> None:
             A,
             "shorten them, or choose another unit of time",
         )
-    growth = float(np.linalg.eigvals(A).real.max()) * scenario.horizon
+    growth = growth_rate(A) * scenario.horizon
     if growth > MAX_GROWTH:
         raise ScenarioError(
             "plant.A",

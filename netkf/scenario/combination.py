@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.core.errors import ScenarioError
+from netkf.linalg.arrays import is_definite
+from netkf.linalg.spectra import hidden_mode, outputs_of
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
@@ -75,16 +77,14 @@ def check_invertible(scenario: DerivedScenario) -> None:
     """
     n = scenario.plant.n
     initial_covs = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    initially = all(np.linalg.matrix_rank(P, hermitian=True) == n for P in initial_covs)
+    initially = all(map(is_definite, initial_covs))
     if scenario.slotted:
         F, Q = scenario.slot_belief
-        noise_reaches_all = np.linalg.matrix_rank(Q, hermitian=True) == n
-        nonsingular = noise_reaches_all or (initially and np.linalg.matrix_rank(F) == n)
+        nonsingular = is_definite(Q) or (initially and np.linalg.matrix_rank(F) == n)
     else:
         A, Q = scenario.belief
-        blocks = [np.linalg.matrix_power(A, k) @ Q for k in range(n)]
-        controllability = np.concatenate(blocks, axis=1)
-        nonsingular = initially or np.linalg.matrix_rank(controllability) == n
+        # (A, Q) is controllable if and only if (A', Q) is observable.
+        nonsingular = initially or hidden_mode(A.T, outputs_of(Q)) is None
     if not nonsingular:
         name = kind_name(scenario.filter.algorithm)
         raise ScenarioError(

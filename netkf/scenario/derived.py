@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -199,18 +200,22 @@ class DerivedScenario(ScenarioModel):
 
         On an unstable plant x and xhat grow beyond the size at which x - xhat has correct digits; a
         frame is an interval in which both are taken relative to an origin near x (plants.truth).
-        This needs a plant whose state and readings are all drawn, linear sensors, and filters that
-        believe the true A (in slots F) and commute with a shift of the state.
+        This needs a plant whose state and readings are all drawn, linear sensors, filters that
+        believe the true A (in slots F) and commute with a shift of the state, and growth so fast
+        that a second frame begins before the horizon.
         """
         # Nonlinear readings depend on the absolute state.
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):
             return False
         plant = self.plant
         if isinstance(plant, LinearPlant):
-            F_is_true = np.array_equal(self.slot_belief[0], plant.F)
-            return F_is_true and frame_slots(plant.F) is not None
-        A_is_true = np.array_equal(self.belief[0], self.diffusion.A)
-        return A_is_true and frame_period(self.diffusion.A) is not None
+            slots = frame_slots(plant.F)
+            frame = math.inf if slots is None else slots * plant.period
+            model_is_true = np.array_equal(self.slot_belief[0], plant.F)
+        else:
+            frame = frame_period(self.diffusion.A) or math.inf
+            model_is_true = np.array_equal(self.belief[0], self.diffusion.A)
+        return model_is_true and frame < self.horizon
 
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
         """Return exp(-A age) ``offset`` (n,): the offset of states ``age`` seconds earlier.

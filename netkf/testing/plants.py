@@ -12,6 +12,7 @@ import scipy.linalg
 
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray, is_semidefinite
+from netkf.linalg.spectra import eigenvalues, growth_factor, growth_rate
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.paths import BLOCK
@@ -275,10 +276,10 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
         demand_array(where, "a state", states[0], (part.n,))
         return np.array([np.asarray(x).reshape(-1) for x in states])
 
-    radius = float(np.abs(np.linalg.eigvals(part.F)).max())
+    factor = growth_factor(part.F)
     length = LENGTH
-    if radius > 1.0:
-        length = max(8, min(LENGTH, int(MAX_LOG_GROWTH / math.log(radius))))
+    if factor > 1.0:
+        length = max(8, min(LENGTH, int(MAX_LOG_GROWTH / math.log(factor))))
     last = min(SHORT_LENGTH, length)
     slots = list(range(last + 1))
     path = draw_path(part, slots)
@@ -366,8 +367,7 @@ def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> 
     ``copy`` is the plant after pickling, ``name`` the class in messages, ``seed`` that of the
     random generators.
     """
-    eigenvalues = np.linalg.eigvals(part.A)
-    speed, growth = float(np.abs(eigenvalues).max()), float(eigenvalues.real.max())
+    speed, growth = float(np.abs(eigenvalues(part.A)).max()), growth_rate(part.A)
     time_constant = 1.0 / speed if speed > 0.0 else 1.0
     max_seconds = MAX_LOG_GROWTH / growth if growth > 0.0 else math.inf
     is_inherited = type(part).start is Diffusion.start

@@ -195,7 +195,7 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
         batch.counts[run, kind] = state.counts[kind]
     for k in range(state.samples):
         batch.lengths[run] = k + 1
-        diverged = count_diverged_filters(state, run, k)
+        diverged = count_diverged_filters(state, batch, run, k)
         if diverged > 0:
             # The counts are those at the broken sample, not those at the end.
             for kind in range(batch.counts.shape[1]):
@@ -220,17 +220,21 @@ def fill_errors(batch: BatchArrays, xhat: FloatArray, run: int, samples: int) ->
 
 
 @kernel
-def count_diverged_filters(state: Simulation, run: int, k: int) -> int:
-    """Return how many of the N filters have an estimate or covariance that is not finite in sample
-    ``k`` of run number ``run``; such a run ends with that sample.
+def count_diverged_filters(state: Simulation, batch: BatchArrays, run: int, k: int) -> int:
+    """Return how many of the N filters have an estimate, a covariance or the square of an error
+    that is not finite in sample ``k`` of run number ``run``; such a run ends with that sample.
     """
     xhat, P, n, diverged = state.buffer.xhat, state.buffer.P, len(state.size), 0
+    # Where the truth is unknown it is nan from the beginning.
+    truth_known = not np.isnan(batch.x[run, 0, 0])
     for h in range(len(state.nodes)):
         # P = S S' cannot be indefinite, so only finiteness is tested: 0 times a number that is not
         # finite is nan.
         total = 0.0
         for i in range(n):
             total += 0.0 * xhat[run, k, h, i]
+            if truth_known:
+                total += 0.0 * (batch.error[run, k, h, i] * batch.error[run, k, h, i])
             for j in range(n):
                 total += 0.0 * P[run, k, h, i, j]
         diverged += total != 0.0

@@ -24,8 +24,8 @@ def record_samples(
     pass_rows_on: Callable[[int], None],
 ) -> bool:
     """Record K samples (times (K,), x (K, n), xhat (K, F, n), ... of F filters) up to the first one
-    that is not sound, at which the run ends as diverged: an estimate is not finite, or a covariance
-    not positive semidefinite. Return True if all are sound.
+    that is not sound, at which the run ends as diverged: an estimate or the square of an error is
+    not finite, or a covariance not positive semidefinite. Return True if all are sound.
 
     ``pass_rows_on`` is called with the index of the first sample that is not sound, to record the
     events before it; later ones are dropped. If filters are pooled, ``samples`` have one estimator
@@ -36,11 +36,14 @@ def record_samples(
     # The loop may stop for other reasons than samples.
     if not len(times):
         return True
-    sound = sound_mask(xhat, P).all(axis=1)
+    sound_filters = sound_mask(xhat, P, error=error if scenario.plant.truth_known else None)
+    sound = sound_filters.all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.
     if scenario.node_filter.pooled:
         nodes = len(scenario.nodes)
-        xhat, P, error = (np.repeat(values, nodes, axis=1) for values in (xhat, P, error))
+        xhat, P, error, sound_filters = (
+            np.repeat(values, nodes, axis=1) for values in (xhat, P, error, sound_filters)
+        )
     # argmin finds the first False.
     last = len(times) - 1 if sound.all() else int(np.argmin(sound))
     after, time = last + 1, float(times[last])
@@ -50,7 +53,6 @@ def record_samples(
         return True
     # Events up to the sample come first, and then which nodes have diverged.
     pass_rows_on(last)
-    diverged = ~sound_mask(xhat[last], P[last])
-    for node in (scenario.nodes[k] for k in np.flatnonzero(diverged)):
+    for node in (scenario.nodes[k] for k in np.flatnonzero(~sound_filters[last])):
         recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
     return False

@@ -707,6 +707,10 @@ def slot_batch(
         for rows in runs.first_events(block) if fingerprint else ():
             events_hash.update(rows.data)
     x, xhat, P, error = runs.samples
+    broken = runs.broken
+    if scenario.plant.truth_known:
+        with np.errstate(over="ignore", invalid="ignore"):
+            broken |= ~np.isfinite(np.einsum("rtfn,rtfn->r", error, error))
     return RunBatch(
         replicas=replicas,
         times=runs.setup.sample_times,
@@ -716,7 +720,7 @@ def slot_batch(
         error=error,
         lengths=np.full(len(replicas), x.shape[1]),
         counts=runs.counts,
-        status=np.where(runs.broken, DIVERGED, COMPLETE),
+        status=np.where(broken, DIVERGED, COMPLETE),
         sums=runs.conserved(),
         exact_errors=scenario.exact_errors,
         fingerprint=events_hash.hexdigest() if fingerprint else "",

@@ -238,15 +238,17 @@ class _Simulation:
         local_estimates, P, has_no_P = stack_estimates(estimates)
         # The trace has absolute states. Adding the origin loses digits, so the error is computed
         # from local ones.
-        xhat = local_estimates if x is local else local_estimates + (x - local)
-        recorder.sample(time, x, xhat, P, local - local_estimates)
+        with np.errstate(over="ignore", invalid="ignore"):
+            xhat = local_estimates if x is local else local_estimates + (x - local)
+            error = local - local_estimates
+        recorder.sample(time, x, xhat, P, error)
         # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
         if sums.start:
             recorder.sums = sums.pairs()
         recorder.flush_if_full()
         self._progress(time)
         # An estimate that is not sound ends the run; it is noticed at samples only.
-        diverged = broken(scenario, local_estimates, P, without=has_no_P)
+        diverged = broken(scenario, xhat, P, error, without=has_no_P)
         # Recorded after the sample, which has the diverged estimate.
         for node in diverged:
             recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))

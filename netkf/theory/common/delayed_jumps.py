@@ -34,6 +34,7 @@ import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.spectra import contracts, growth_factor
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse
 from netkf.theory.common.random_links import Directions
 
@@ -376,13 +377,11 @@ class DelayedJumps:
 
         size = K * M
         if size <= MAX_DENSE_MEAN:
-            values = np.linalg.eigvals(
-                np.stack([next_means(unit) for unit in np.eye(size)], axis=1)
-            )
-        else:
-            operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=next_means)
-            values = scipy.sparse.linalg.eigs(operator, k=4, return_eigenvectors=False)
-        return bool(np.abs(values).max() < 1.0)
+            dense = np.stack([next_means(unit) for unit in np.eye(size)], axis=1)
+            return contracts(growth_factor(dense))
+        operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=next_means)
+        values = scipy.sparse.linalg.eigs(operator, k=4, return_eigenvectors=False)
+        return contracts(float(np.abs(values).max()))
 
 
 def chebyshev_points(K: int) -> FloatArray:

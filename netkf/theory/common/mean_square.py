@@ -14,6 +14,7 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.spectra import contracts, growth_rate
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.alone import silent_jumps
@@ -22,7 +23,11 @@ from netkf.theory.common.errors import diagonal_blocks
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse, SlotJumps
 from netkf.theory.common.papers import paper_function
 from netkf.theory.common.replay import require_known_filter
-from netkf.theory.numerics.positive_maps import PositiveMap, fixed_point, spectral_radius
+from netkf.theory.numerics.positive_maps import (
+    PositiveMap,
+    fixed_point,
+    spectral_radius,
+)
 
 MAX_ERRORS = 200
 """Largest number of errors of all nodes; a step then takes milliseconds, a solution seconds."""
@@ -96,13 +101,13 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
         radius = (
             0.0 if system.mean_is_stable and system.is_bounded else mean_square_radius(scenario)
         )
-        if not radius < 1.0:
+        if not contracts(radius):
             return radius, None
         X = system.covariance
     else:
         T, Q = _slot_map(system) if isinstance(system, SlotJumps) else _clock_map(system)
         radius = spectral_radius(T, system.shape) if Q is not None else np.inf
-        if Q is None or not radius < 1.0:
+        if Q is None or not contracts(radius):
             return float(radius), None
         X = fixed_point(T, Q, radius)
     X = X.sum(axis=0)
@@ -236,7 +241,7 @@ def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
     are a fixed point of ``X = L^-1(inflow(X)) + L^-1(noise)``. The second result is None if some B
     is not stable: errors then grow even between jumps.
     """
-    if max(np.linalg.eigvals(B).real.max() for B in system.flows) >= 0.0:
+    if max(map(growth_rate, system.flows)) >= 0.0:
         return system.inflow, None
     inverse = LyapunovInverse(system.flows)
     stationary = system.directions.stationary if system.directions else np.ones(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.linalg.arrays import is_definite
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
 from netkf.theory.intermittent.riccati import undetectable_slot_mode
@@ -31,7 +32,7 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "Q is positive definite",
             "G II-A, R Theorem 9",
-            *judge_plant(scenario, smallest > 0.0, positive),
+            *judge_plant(scenario, is_definite(plant.Q), positive),
         ),
         true_model_row(scenario, "G (10), R (15)", "same F, Q and R"),
     ]

@@ -7,6 +7,7 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import is_definite
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, UNKNOWN_LAW, AssumptionRow, is_recorded
 from netkf.theory.common.plant_assumptions import start_rows
@@ -119,7 +120,7 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "the filters' Q and r are positive definite",
             "D Algorithm 1",
-            smallest > 0.0,
+            is_definite(Q),
             f"least eigenvalue of Q {smallest:.3g}; they are the true ones"
             if same
             else f"least eigenvalue of Q {smallest:.3g}; {UNKNOWN_LAW}"

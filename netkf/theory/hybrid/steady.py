@@ -21,6 +21,7 @@ import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.spectra import growth_rate
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.linearised import is_stable, solve_linearised
@@ -320,7 +321,7 @@ def _necessary_factor(equations: CoupledRiccati) -> float | None:
     if not equations.coupling.nnz:
         return None
     # Without readings P grows like exp(2 a t) in the direction of the fastest mode.
-    growth = 2.0 * float(np.linalg.eigvals(equations.A).real.max())
+    growth = 2.0 * growth_rate(equations.A)
     unobserved = np.abs(equations.G).max(axis=(1, 2)) == 0.0
     for group in equations.samples:
         unobserved[group.nodes] = False

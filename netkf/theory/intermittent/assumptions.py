@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.spectra import contracts
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, AssumptionRow, is_recorded
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
@@ -132,7 +133,7 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
         lower, upper = critical_probability(F, _reachable_readings(scenario)[node])
         evidence += f", critical probability in [{lower:.6g}, {upper:.6g}] by R (31), (32)"
     evidence += "; below it P is still stochastically bounded, its mean may not be"
-    return (BOUNDED_MEAN, "R (32)", radius < 1.0, evidence)
+    return (BOUNDED_MEAN, "R (32)", contracts(radius), evidence)
 
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:

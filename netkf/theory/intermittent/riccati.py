@@ -15,6 +15,7 @@ import scipy.linalg
 from netkf.algorithms.kernels.chains import move_roots, reading_modes
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
+from netkf.linalg.spectra import FACTOR, eigenvalues, growth_factor, hidden_mode
 from netkf.rng.streams import Streams
 from netkf.theory.numerics.matrices import (
     RESIDUAL,
@@ -136,7 +137,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     residual = np.abs(riccati_step(P, F, Q, H, R) - P).max()
     if not residual <= RESIDUAL * np.abs(P).max():
         raise TheoryError(f"P* was solved to {residual:.1e} only")
-    if not np.abs(np.linalg.eigvals(F - _optimal_gain(P, F, H, R) @ H)).max() < 1.0:
+    if not growth_factor(F - _optimal_gain(P, F, H, R) @ H) < 1.0:
         raise TheoryError("the fixed point found does not stabilise the filter")
     return P
 
@@ -164,16 +165,7 @@ def undetectable_slot_mode(F: FloatArray, H: FloatArray) -> complex | None:
     """Return an eigenvalue of F (n, n) on or outside the unit circle that H (p, n) does not
     observe, or None.
     """
-    size = max(float(np.linalg.norm(F, 2)), 1e-300)
-    scaled = H / max(float(np.abs(H).max(initial=0.0)), 1e-300) * size
-    for value in np.linalg.eigvals(F):
-        # A mode that decays needs no reading.
-        if abs(value) < 1.0 - 1e-12:
-            continue
-        pencil = np.concatenate([F - value * np.eye(len(F)), scaled])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9 * size:
-            return complex(value)
-    return None
+    return hidden_mode(F, H, FACTOR)
 
 
 class CriticalProbability(NamedTuple):
@@ -234,8 +226,7 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
     paper R (32), for F (n, n) and H (p, n), with the ``search`` over gains for them; raises
     TheoryError if the upper one is not found.
     """
-    moduli = np.abs(np.linalg.eigvals(F))
-    alpha = float(moduli.max())
+    moduli, alpha = np.abs(eigenvalues(F)), growth_factor(F)
     lower = max(0.0, 1.0 - 1.0 / alpha**2) if alpha > 0.0 else 0.0
 
     def radius(g: float) -> float:

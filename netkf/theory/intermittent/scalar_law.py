@@ -19,6 +19,7 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray
+from netkf.linalg.spectra import contracts
 from netkf.theory.intermittent.riccati import check_system, steady_covariance
 
 NEGLIGIBLE = 1e-18  # probability of the values that the recursion has not resolved yet
@@ -151,7 +152,7 @@ class ScalarLaw:
         by more than 1e-6.
         """
         growth = (1.0 - self.delivery) * self.F**2
-        if growth >= 1.0:
+        if not contracts(growth):
             return float("inf")
         low, high = np.array([self.least]), np.array([np.inf])
         # All compositions at once: both maps applied to every value, with their probabilities.

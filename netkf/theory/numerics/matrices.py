@@ -8,6 +8,7 @@ import scipy.linalg
 from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, is_semidefinite, square_root, symmetric
+from netkf.linalg.spectra import RATE, growth_rate, hidden_mode, outputs_of
 
 RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a failed solver
 
@@ -122,7 +123,7 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
     size = np.abs(A @ S).max() + np.abs(Q).max() + np.abs(S @ G @ S).max()
     if not np.abs(residual).max() <= RESIDUAL * size:
         raise TheoryError(f"the Riccati equation was solved to {np.abs(residual).max():.1e} only")
-    if not np.linalg.eigvals(A - S @ G).real.max() < 0.0:
+    if not growth_rate(A - S @ G) < 0.0:
         raise TheoryError("the solution found does not stabilise the filter")
     return S
 
@@ -131,7 +132,7 @@ def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return the solution X (n, n) of ``0 = A X + X A' + Q`` for A and Q (n, n), the steady
     covariance of ``dx = A x dt`` and noise Q per second; raises TheoryError for an unstable A.
     """
-    if not np.linalg.eigvals(A).real.max() < 0.0:
+    if not growth_rate(A) < 0.0:
         raise TheoryError("the error dynamics are not stable, their covariance has no limit")
     X = _solve_lyapunov(A, Q)
     residual = np.abs(A @ X + X @ A.T + Q).max()
@@ -147,31 +148,13 @@ def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 def undetectable_mode(A: FloatArray, G: FloatArray) -> complex | None:
     """Return an eigenvalue of A (n, n) with nonnegative real part that G (n, n) does not observe,
-    or None; ``G = H' R^-1 H``, or any matrix with the null space of H.
+    or None; ``G = H' R^-1 H``, or any semidefinite matrix with the null space of H.
     """
-    return _hidden_mode(A, G, only_unstable=True)
+    return hidden_mode(A, outputs_of(G), RATE)
 
 
 def unobservable_mode(A: FloatArray, G: FloatArray) -> complex | None:
-    """Return an eigenvalue of A (n, n) that G (n, n), such as ``H' R^-1 H``, does not observe
-    (Popov, Belevitch, Hautus), or None.
+    """Return an eigenvalue of A (n, n) that the semidefinite matrix G (n, n), such as ``H' R^-1
+    H``, does not observe (Popov, Belevitch, Hautus), or None.
     """
-    return _hidden_mode(A, G, only_unstable=False)
-
-
-def _hidden_mode(A: FloatArray, G: FloatArray, only_unstable: bool) -> complex | None:
-    """Return an eigenvalue of A (n, n) whose mode G (n, n) does not observe, or None (test of
-    Popov, Belevitch and Hautus).
-
-    With ``only_unstable`` eigenvalues with negative real part (1/s) are skipped.
-    """
-    n, size = len(A), max(float(np.linalg.norm(A, 2)), 1e-300)
-    scaled = G / max(float(np.abs(G).max()), 1e-300) * size  # rank does not depend on units
-    for value in np.linalg.eigvals(A):
-        if only_unstable and value.real < -1e-12 * size:
-            continue
-        pencil = np.concatenate([A - value * np.eye(n), scaled])
-        # The mode is hidden if A - value I and G have a common null vector.
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9 * size:
-            return complex(value)
-    return None
+    return hidden_mode(A, outputs_of(G))

@@ -20,6 +20,7 @@ import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
+from netkf.linalg.spectra import growth_factor
 
 PositiveMap = Callable[[FloatArray], FloatArray]
 Shape = tuple[int, ...]
@@ -45,7 +46,7 @@ def spectral_radius(T: PositiveMap, shape: Shape) -> float:
             return value
         if _count_numbers(shape) > MAX_DENSE_FALLBACK:
             return _confirm(T, X, value)
-    return float(np.abs(np.linalg.eigvals(_dense_matrix(T, shape))).max())
+    return growth_factor(_dense_matrix(T, shape))
 
 
 def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:

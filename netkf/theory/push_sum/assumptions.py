@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from netkf.core.errors import TheoryError
+from netkf.linalg.spectra import contracts
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, true_model_row
@@ -232,12 +233,13 @@ def _exact_row(
     except TheoryError as error:
         return *name, None, f"not decided: {error}"
     evidence = f"exact radius {radius:.6g} at the asymptotic gains; necessary and sufficient"
-    if heavy and radius >= 1.0:
+    stable = contracts(radius)
+    if heavy and not stable:
         evidence += "; single paths may still stay bounded in probability"
     elif heavy and radius > HEAVY_TAIL_RADIUS:
         evidence += f"; above {HEAVY_TAIL_RADIUS} averages over runs have heavy tails "
         evidence += "and no honest interval"
-    return *name, radius < 1.0, evidence
+    return *name, stable, evidence
 
 
 def _certified_row(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:

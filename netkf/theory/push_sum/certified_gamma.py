@@ -17,6 +17,7 @@ import scipy.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.spectra import contracts
 from netkf.scenario.scenario import Scenario
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.disconnection import disconnection_probability
@@ -256,6 +257,6 @@ def exact_minimum_gamma(
     if _check_moment(moment) == "mean-square":
         measure = radius
     for gamma in range(1, most + 1):
-        if measure(steps.with_gamma(gamma)) < 1.0:
+        if contracts(measure(steps.with_gamma(gamma))):
             return gamma
     raise TheoryError(f"no gamma up to {most} has a {moment} radius below 1")

@@ -6,6 +6,7 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.spectra import contracts
 from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.positive_maps import fixed_point
 from netkf.theory.push_sum.estimation_steps import EstimationSteps, estimation_steps
@@ -37,7 +38,7 @@ def _covariance(steps: EstimationSteps, value: float) -> FloatArray:
     whose mean-square radius (spectral radius of the second moments' recursion) is ``value``; raises
     TheoryError unless it is below 1.
     """
-    if not value < 1.0:
+    if not contracts(value):
         raise TheoryError(
             f"no steady error covariance: the mean-square radius is {value:.6g}, not below 1; "
             "raise gamma or the delivery probability"

@@ -17,6 +17,7 @@ import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.spectra import growth_factor
 from netkf.scenario.scenario import Scenario
 from netkf.theory.numerics.positive_maps import PositiveMap, spectral_radius
 from netkf.theory.push_sum.averaging import Averaging
@@ -91,7 +92,7 @@ def _mean_radius(law: Averaging, closed: FloatArray) -> float:
         return _mean_radius_by_arnoldi(law, closed)
     # (E[M^gamma] (x) I) diag(A_j)
     mean_map = np.einsum("ij,jab->iajb", law.mean, closed).reshape(N * n, N * n)
-    return float(np.abs(np.linalg.eigvals(mean_map)).max())
+    return growth_factor(mean_map)
 
 
 def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:

@@ -11,11 +11,11 @@ import itertools
 import math
 
 import numpy as np
-import scipy.linalg
 
 from netkf.algorithms.track_fusion import best_combination
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.spectra import growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, is_recorded
@@ -64,7 +64,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
         block = np.linalg.solve(np.eye(n * n) - np.kron(C @ F, D @ F), driven.reshape(-1))
         joint[i, j] = block.reshape(n, n)
         joint[j, i] = block.reshape(n, n).T
-    radius = max(float(np.abs(scipy.linalg.eigvals(C @ F)).max()) for C in closed)
+    radius = max(growth_factor(C @ F) for C in closed)
     return joint, radius**2
 
 

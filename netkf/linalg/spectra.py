@@ -1,0 +1,209 @@
+"""Eigenvalues of small real matrices, and decisions about them that rounding does not make.
+
+Whether a plant grows is the sign of a number that is often zero on paper: rotations, chains of
+integrators, random walks. Its computed sign is that of a rounding error, and differs between
+machines. So here an eigenvalue is on the border of stability if a change of the matrix by no more
+than its rounding moves it there. The least change that makes z an eigenvalue of A has the size of
+the least singular value of A - z I: the points z at which it is below a tolerance are the
+pseudospectrum of A (Trefethen and Embree 2005, Spectra and Pseudospectra, chapter 2).
+
+That holds for multiple eigenvalues too, which rounding moves much farther than simple ones: those
+of a double integrator in other coordinates by 1e-8.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from netkf.linalg.arrays import FloatArray, square_root
+
+ComplexArray = NDArray[np.complex128]
+
+ROUNDING = 32.0 * float(np.finfo(float).eps)
+"""Rounding of a matrix (n, n), and of its eigenvalues as changes of the matrix, as a share of n
+times its norm."""
+BORDER = 1e-9
+"""A spectral radius that is closer to 1 is 1, as large matrices have it to that only."""
+HIDDEN = 1e-9
+"""A mode is hidden if it changes no output by more than this share of its size."""
+MAX_CLUSTERED, MAX_TESTED, MAX_MULTIPLE = 32, 8, 8
+"""Largest number of states for which multiple eigenvalues are looked for, number of eigenvalues of
+larger matrices that are compared with a border, and largest multiplicity that is told."""
+
+
+class Border(NamedTuple):
+    """The border between modes that decay and modes that grow.
+
+    A mode grows if the ``measure`` of its eigenvalue is above ``limit``; ``nearest`` is the point
+    of the border that is nearest to an eigenvalue.
+    """
+
+    measure: Callable[[complex], float]
+    limit: float
+    nearest: Callable[[complex], complex]
+
+
+RATE = Border(lambda value: value.real, 0.0, lambda value: complex(0.0, value.imag))
+"""The border of ``dx = A x dt``: the imaginary axis."""
+FACTOR = Border(abs, 1.0, lambda value: value / abs(value) if value else 1.0 + 0.0j)
+"""The border of ``x[k+1] = F x[k]``: the unit circle."""
+
+
+def eigenvalues(A: FloatArray) -> ComplexArray:
+    """Return the eigenvalues (n,) of ``A`` (n, n), a multiple one as often as it counts.
+
+    Those that only rounding tells apart are replaced by their mean, which is accurate where they
+    are not, and those that only rounding tells from 0 by 0.
+    """
+    blocks = [A[np.ix_(block, block)] for block in _irreducible_blocks(A)]
+    return np.concatenate([np.zeros(0), *map(_block_eigenvalues, blocks)])
+
+
+def growth_rate(A: FloatArray) -> float:
+    """Return the rate, per unit of time, at which ``dx = A x dt``, A (n, n), grows in the long run:
+    the largest real part of an eigenvalue, 0 if only rounding tells it from 0.
+    """
+    return _largest(A, RATE)
+
+
+def growth_factor(F: FloatArray) -> float:
+    """Return the factor by which ``x[k+1] = F x[k]``, F (n, n), grows in a step in the long run:
+    the spectral radius, 1 if only rounding tells it from 1.
+    """
+    return _largest(F, FACTOR)
+
+
+def contracts(radius: float) -> bool:
+    """Return True if a spectral ``radius`` is below 1 by more than rounding: what it multiplies
+    dies out. At 1, which is that of plants without damping, nothing does.
+    """
+    return radius < 1.0 - BORDER
+
+
+def hidden_mode(A: FloatArray, C: FloatArray, border: Border | None = None) -> complex | None:
+    """Return an eigenvalue of ``A`` (n, n) whose mode the outputs ``C x``, C (p, n), do not show,
+    or None (test of Popov, Belevitch and Hautus). With a ``border``, RATE or FACTOR, modes that
+    decay are skipped.
+
+    Neither units of states that A couples nor those of all outputs together matter.
+    """
+    n = len(A)
+    balanced, scale = _balance(A)
+    outputs = C * scale
+    size = float(np.linalg.norm(balanced, 2)) or 1.0
+    largest = float(np.abs(outputs).max(initial=0.0)) or 1.0
+    values = eigenvalues(A).tolist() if border is None else _remaining_eigenvalues(A, border)
+    for value in values:
+        # The mode is hidden if A - value I and C have a common null vector.
+        pencil = np.concatenate([balanced - value * np.eye(n), outputs * (size / largest)])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < HIDDEN * size:
+            return value
+    return None
+
+
+def outputs_of(information: FloatArray) -> FloatArray:
+    """Return rows C (n, n) with ``C' C = information``, a semidefinite matrix (n, n) such as
+    ``H' R^-1 H``: they show the same modes, and sensors of very different precision count alike.
+    """
+    root = square_root(information)
+    size = np.abs(root).max(initial=0.0)
+    # Roots of eigenvalues that are rounding of 0.
+    root[:, np.abs(root).max(axis=0, initial=0.0) <= math.sqrt(ROUNDING * len(root)) * size] = 0.0
+    return np.asarray(root.T)
+
+
+def _largest(A: FloatArray, border: Border) -> float:
+    """Return the largest measure of an eigenvalue of A (n, n), the limit for those that rounding
+    moves onto the ``border``.
+    """
+    largest = -math.inf if len(A) else 0.0
+    for block in _irreducible_blocks(A):
+        matrix = A[np.ix_(block, block)]
+        values = sorted(_block_eigenvalues(matrix).tolist(), key=border.measure, reverse=True)
+        # The first that is not on the border decides, and those of large matrices cost time.
+        for value in values if len(A) <= MAX_CLUSTERED else values[:MAX_TESTED]:
+            if border.measure(value) <= largest:
+                break
+            on_border = _joined(matrix, value, border.nearest(value))
+            largest = max(largest, border.limit if on_border else border.measure(value))
+    return largest
+
+
+def _remaining_eigenvalues(A: FloatArray, border: Border) -> list[complex]:
+    """Return the eigenvalues of A (n, n) whose modes do not decay: beyond the ``border``, or on it
+    but for rounding.
+    """
+    remaining = []
+    for block in _irreducible_blocks(A):
+        matrix = A[np.ix_(block, block)]
+        for value in _block_eigenvalues(matrix).tolist():
+            grows = border.measure(value) > border.limit
+            if grows or _joined(matrix, value, border.nearest(value)):
+                remaining.append(value)
+    return remaining
+
+
+def _irreducible_blocks(A: FloatArray) -> list[list[int]]:
+    """Return the states of each diagonal block of A (n, n) in block triangular form: its
+    eigenvalues are those of A, without the rounding of other blocks.
+    """
+    n = len(A)
+    reaches = (A != 0.0) | np.eye(n, dtype=bool)
+    for _ in range(n.bit_length()):
+        reaches = reaches @ reaches
+    mutual = reaches & reaches.T
+    first = np.argmax(mutual, axis=1) if n else np.zeros(0, dtype=int)
+    return [np.flatnonzero(first == k).tolist() for k in np.unique(first)]
+
+
+def _block_eigenvalues(A: FloatArray) -> ComplexArray:
+    """Return the eigenvalues (n,) of A (n, n), which is not block triangular, see
+    :func:`eigenvalues`.
+    """
+    if len(A) == 1:
+        return A[0].astype(complex)
+    values = np.linalg.eigvals(A).astype(complex)
+    if len(A) > MAX_CLUSTERED:
+        return values
+    group = np.arange(len(values))
+    for i in range(len(values)):
+        for j in range(i):
+            if group[i] != group[j] and _joined(A, values[i], values[j]):
+                group[group == group[i]] = group[j]
+    for k in np.unique(group):
+        mean = complex(values[group == k].mean())
+        values[group == k] = 0.0 if _joined(A, mean, 0.0) else mean
+    return values
+
+
+def _joined(A: FloatArray, value: complex, other: complex) -> bool:
+    """Return True if changes of A (n, n) no larger than its rounding move the eigenvalue ``value``
+    to ``other``: the pseudospectrum joins both.
+    """
+    balanced, _ = _balance(A)
+    n, size = len(A), float(np.linalg.norm(balanced))
+    tolerance = ROUNDING * n * size
+    # No change of that size moves an eigenvalue farther (Elsner 1985).
+    reach = 2.0 * size * (ROUNDING * n) ** (1.0 / min(n, MAX_MULTIPLE))
+    if abs(value - other) > reach:
+        return False
+    for share in (0.5, 1.0, 0.75, 0.25):
+        shifted = balanced - (value + share * (other - value)) * np.eye(n)
+        # The other end may be an eigenvalue as inaccurate as this one.
+        if np.linalg.svd(shifted, compute_uv=False)[-1] > tolerance:
+            return False
+    return True
+
+
+def _balance(A: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``D^-1 A D`` (n, n), with rows and columns of like size, and the diagonal D (n,) of
+    powers of 2.
+    """
+    balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+    return balanced, scale
