@@ -73,46 +73,56 @@ def _semidefinite(P: FloatArray) -> BoolArray:
 
 MAX_NAMED = 10
 """Nodes that a sentence names at most."""
-LARGEST = "1.8e308, the largest number there is"
+LARGEST = "1.8e308, the largest number there is,"
+LARGE, SMALL = 1e100, 1e-290
+"""Sizes beyond which an estimate that is not a number is so by overflow or by underflow."""
 
 
 def describe_divergence(
     nodes: Sequence[int], x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
 ) -> str:
-    """Return what ends a run as diverged at its last sample, as the subject and verb of a sentence:
-    what passed the largest number, is not a number, or is not positive semidefinite, at which of
-    the N ``nodes`` (ids).
+    """Return what ended a run as diverged, as the subject and verb of a sentence: what passed the
+    largest number, is not a number, or is not positive semidefinite, at which of the N ``nodes``
+    (ids).
 
-    ``x`` (n,) is the true state, nan if it is unknown, ``xhat`` (N, n), ``P`` (N, n, n), nan where
-    a filter gives none, and ``error`` = x - xhat (N, n), possibly more precise.
+    The others are the samples of the run, or its last one or two: true states ``x`` (T, n), nan if
+    unknown, ``xhat`` (T, N, n), ``P`` (T, N, n, n), nan where a filter gives none, and ``error`` =
+    x - xhat (T, N, n), possibly more precise.
     """
+    known = not np.isnan(error).all()
+    without = np.isnan(P[0]).all(axis=(-1, -2))
+    sound = sound_mask(xhat[-1], P[-1], without, error[-1] if known else None)
     reasons: dict[str, list[int]] = {}
-    if np.isinf(x).any() or (np.isnan(x).any() and not np.isnan(error).all()):
-        reasons[f"the true state passed {LARGEST},"] = []
-    sound = sound_mask(
-        xhat, P, np.isnan(P).all(axis=(-1, -2)), None if np.isnan(x).all() else error
-    )
+    truth_ends = known and not np.isfinite(x[-1]).all()
+    if truth_ends:
+        reasons[f"the true state passed {LARGEST}"] = []
     for k in np.flatnonzero(~sound):
-        reason = _describe_break(xhat[k], P[k])
+        reason = _describe_break(xhat[:, k], P[:, k], without[k])
         # Estimates cannot follow a state beyond the largest number.
-        if not reasons or "covariance" in reason:
+        if not truth_ends or "covariance" in reason:
             reasons.setdefault(reason, []).append(nodes[k])
     return " and ".join(_fill_in(reason, found) for reason, found in reasons.items())
 
 
-def _describe_break(xhat: FloatArray, P: FloatArray) -> str:
-    """Return why the estimate xhat (n,) and covariance P (n, n) of a node end a run, with {} in
-    place of the node.
+def _describe_break(xhat: FloatArray, P: FloatArray, without: bool) -> str:
+    """Return why the last estimate xhat (T, n) or covariance P (T, n, n), unless the filter is
+    ``without``, of a node ends a run, with {} in place of the node.
     """
-    for name, values in (("covariance", P), ("estimate", xhat)):
-        if np.isinf(values).any():
-            return f"the {name} of {{}} passed {LARGEST},"
-    if np.isnan(xhat).any() or (np.isnan(P).any() and not np.isnan(P).all()):
-        name = "estimate" if np.isnan(xhat).any() else "covariance"
-        return f"the {name} of {{}} is not a number (infinity - infinity, or 0 / 0)"
-    if not np.isnan(P).all() and not sound_mask(xhat, P):
+    values = {"estimate": xhat} if without else {"covariance": P, "estimate": xhat}
+    for name, samples in values.items():
+        if np.isinf(samples[-1]).any():
+            return f"the {name} of {{}} passed {LARGEST}"
+    for name, samples in values.items():
+        if np.isnan(samples[-1]).any():
+            before = {name: abs(v[-2]).max() for name, v in values.items() if len(v) > 1}
+            if max(before.values(), default=0.0) > LARGE:
+                return f"the {name} of {{}} is not a number, after numbers beyond {LARGE:g},"
+            if before.get("covariance", 1.0) < SMALL:
+                return f"the {name} of {{}} is not a number, after a covariance below {SMALL:g},"
+            return f"the {name} of {{}} is not a number (infinity - infinity, or 0 / 0)"
+    if not without and not sound_mask(xhat[-1], P[-1]):
         return "the covariance of {} is no longer positive semidefinite"
-    return f"the squared error of {{}} passed {LARGEST},"
+    return f"the squared error of {{}} passed {LARGEST}"
 
 
 def _fill_in(reason: str, nodes: Sequence[int]) -> str:

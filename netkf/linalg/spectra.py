@@ -61,8 +61,7 @@ def eigenvalues(A: FloatArray) -> ComplexArray:
     Those that only rounding tells apart are replaced by their mean, which is accurate where they
     are not, and those that only rounding tells from 0 by 0.
     """
-    blocks = [A[np.ix_(block, block)] for block in _irreducible_blocks(A)]
-    return np.concatenate([np.zeros(0), *map(_block_eigenvalues, blocks)])
+    return np.concatenate([np.zeros(0), *map(_block_eigenvalues, _irreducible_blocks(A))])
 
 
 def growth_rate(A: FloatArray) -> float:
@@ -124,13 +123,12 @@ def _largest(A: FloatArray, border: Border) -> float:
     """
     largest = -math.inf if len(A) else 0.0
     for block in _irreducible_blocks(A):
-        matrix = A[np.ix_(block, block)]
-        values = sorted(_block_eigenvalues(matrix).tolist(), key=border.measure, reverse=True)
+        values = sorted(_block_eigenvalues(block).tolist(), key=border.measure, reverse=True)
         # The first that is not on the border decides, and those of large matrices cost time.
         for value in values if len(A) <= MAX_CLUSTERED else values[:MAX_TESTED]:
             if border.measure(value) <= largest:
                 break
-            on_border = _joined(matrix, value, border.nearest(value))
+            on_border = _joined(block, value, border.nearest(value))
             largest = max(largest, border.limit if on_border else border.measure(value))
     return largest
 
@@ -141,17 +139,16 @@ def _remaining_eigenvalues(A: FloatArray, border: Border) -> list[complex]:
     """
     remaining = []
     for block in _irreducible_blocks(A):
-        matrix = A[np.ix_(block, block)]
-        for value in _block_eigenvalues(matrix).tolist():
+        for value in _block_eigenvalues(block).tolist():
             grows = border.measure(value) > border.limit
-            if grows or _joined(matrix, value, border.nearest(value)):
+            if grows or _joined(block, value, border.nearest(value)):
                 remaining.append(value)
     return remaining
 
 
-def _irreducible_blocks(A: FloatArray) -> list[list[int]]:
-    """Return the states of each diagonal block of A (n, n) in block triangular form: its
-    eigenvalues are those of A, without the rounding of other blocks.
+def _irreducible_blocks(A: FloatArray) -> list[FloatArray]:
+    """Return the diagonal blocks of A (n, n) in block triangular form, each balanced: their
+    eigenvalues are those of A, and the rounding of one block is none of another.
     """
     n = len(A)
     reaches = (A != 0.0) | np.eye(n, dtype=bool)
@@ -159,12 +156,13 @@ def _irreducible_blocks(A: FloatArray) -> list[list[int]]:
         reaches = reaches @ reaches
     mutual = reaches & reaches.T
     first = np.argmax(mutual, axis=1) if n else np.zeros(0, dtype=int)
-    return [np.flatnonzero(first == k).tolist() for k in np.unique(first)]
+    groups = (np.flatnonzero(first == k) for k in np.unique(first))
+    return [_balance(A[np.ix_(group, group)])[0] for group in groups]
 
 
 def _block_eigenvalues(A: FloatArray) -> ComplexArray:
-    """Return the eigenvalues (n,) of A (n, n), which is not block triangular, see
-    :func:`eigenvalues`.
+    """Return the :func:`eigenvalues` (n,) of A (n, n), which is balanced and not block
+    triangular.
     """
     if len(A) == 1:
         return A[0].astype(complex)
@@ -183,18 +181,17 @@ def _block_eigenvalues(A: FloatArray) -> ComplexArray:
 
 
 def _joined(A: FloatArray, value: complex, other: complex) -> bool:
-    """Return True if changes of A (n, n) no larger than its rounding move the eigenvalue ``value``
-    to ``other``: the pseudospectrum joins both.
+    """Return True if changes of the balanced A (n, n) no larger than its rounding move the
+    eigenvalue ``value`` to ``other``: the pseudospectrum joins both.
     """
-    balanced, _ = _balance(A)
-    n, size = len(A), float(np.linalg.norm(balanced))
+    n, size = len(A), float(np.linalg.norm(A))
     tolerance = ROUNDING * n * size
     # No change of that size moves an eigenvalue farther (Elsner 1985).
     reach = 2.0 * size * (ROUNDING * n) ** (1.0 / min(n, MAX_MULTIPLE))
     if abs(value - other) > reach:
         return False
     for share in (0.5, 1.0, 0.75, 0.25):
-        shifted = balanced - (value + share * (other - value)) * np.eye(n)
+        shifted = A - (value + share * (other - value)) * np.eye(n)
         # The other end may be an eigenvalue as inaccurate as this one.
         if np.linalg.svd(shifted, compute_uv=False)[-1] > tolerance:
             return False

@@ -134,10 +134,9 @@ def _describe_status(source: ReportSource) -> list[str]:
     elif source.status == "failed":
         sentences.append(f"Failed: {source.manifest.get('error', 'no reason was written')}")
     if run is not None and run.count("diverged"):
-        last = (values[-1] for values in (run.x, run.xhat, run.P, run.error))
+        problem = describe_divergence(run.nodes, run.x, run.xhat, run.P, run.error)
         sentences.append(
-            f"Diverged: {describe_divergence(run.nodes, *last)} at "
-            f"{_format_time(float(run.times[-1]))}, and the run ended there"
+            f"Diverged: {problem} at {_format_time(float(run.times[-1]))}, and the run ended there"
         )
     if run is not None and len(run.nodes) == 1:
         sentences.append("There is one node, so nothing is sent")

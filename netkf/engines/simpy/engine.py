@@ -59,14 +59,14 @@ class SimpyEngine(Engine):
         samples to ``recorder``, and return the status, "complete" or "diverged". ``progress`` is
         called with the simulated time in seconds at each sample.
         """
-        simulation = _Simulation(scenario, streams, recorder, progress)
-        # Slots and clocks share the timeline, but no process.
-        processes = simulation.slots() if scenario.slotted else simulation.clocks()
-        timeline = simulation.timeline
-        # Any order will do: every event has an explicit time, rank and entity.
-        for process in self.arrange(processes):
-            timeline.start(process)
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
+            simulation = _Simulation(scenario, streams, recorder, progress)
+            # Slots and clocks share the timeline, but no process.
+            processes = simulation.slots() if scenario.slotted else simulation.clocks()
+            timeline = simulation.timeline
+            # Any order will do: every event has an explicit time, rank and entity.
+            for process in self.arrange(processes):
+                timeline.start(process)
             try:
                 timeline.run()
             except DivergedError:
@@ -238,9 +238,8 @@ class _Simulation:
         local_estimates, P, has_no_P = stack_estimates(estimates)
         # The trace has absolute states. Adding the origin loses digits, so the error is computed
         # from local ones.
-        with np.errstate(over="ignore", invalid="ignore"):
-            xhat = local_estimates if x is local else local_estimates + (x - local)
-            error = local - local_estimates
+        xhat = local_estimates if x is local else local_estimates + (x - local)
+        error = local - local_estimates
         recorder.sample(time, x, xhat, P, error)
         # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
         if sums.start:
