@@ -34,8 +34,8 @@ swap     node replaced its estimate and covariance by those of peer
 round    a step of exchange number ``phase`` of the slot begins, in which every node sends
 stop     node has stopped learning from the others in exchange number ``phase``
 crash, restart  recorded by no engine; they keep the codes of the kinds after them as they were
-diverged the estimate of node was no longer finite, or its covariance no longer finite and positive
-         semidefinite
+diverged the estimate of node or its squared error was no longer finite, or its covariance no longer
+         finite and positive semidefinite
 transmit node transmitted once, as its transmission number ``message``, to all that may hear it
 """
 

@@ -1,4 +1,4 @@
-"""Numbers that pass 1.8e308 end a run as diverged, on both engines and in batches, with a reason."""
+"""Numbers that pass 1.8e308 end a run as diverged, on both engines and in batches, and why."""
 
 from pathlib import Path
 
