@@ -96,7 +96,7 @@ def describe_divergence(
     truth_ends = known and not np.isfinite(x[-1]).all()
     if truth_ends:
         reasons[f"the true state passed {LARGEST}"] = []
-    for k in np.flatnonzero(~sound):
+    for k in np.flatnonzero(~sound).tolist():
         reason = _describe_break(xhat[:, k], P[:, k], without[k])
         # Estimates cannot follow a state beyond the largest number.
         if not truth_ends or "covariance" in reason:

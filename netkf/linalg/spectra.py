@@ -165,7 +165,7 @@ def _block_eigenvalues(A: FloatArray) -> ComplexArray:
     triangular.
     """
     if len(A) == 1:
-        return A[0].astype(complex)
+        return np.asarray(A[0], dtype=np.complex128)
     values = np.linalg.eigvals(A).astype(complex)
     if len(A) > MAX_CLUSTERED:
         return values
@@ -203,4 +203,4 @@ def _balance(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     powers of 2.
     """
     balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
-    return balanced, scale
+    return np.asarray(balanced, dtype=np.float64), np.asarray(scale, dtype=np.float64)

@@ -45,7 +45,7 @@ class SummarySink(Sink):
     rounding_from   : time of the first sample whose errors are mostly rounding, because the state
                       is large (unstable plants over long horizons); None if there is none
     diverged        : nodes whose estimate or covariance was unusable at the last sample
-    last            : x, xhat, P and error of the last two samples
+    last            : x, xhat, P and error of the last two samples, arrays (2, ...)
     transmissions   : number of messages and transmissions of each node
     """
 
@@ -95,8 +95,9 @@ class SummarySink(Sink):
         self.nees += list(nees)
         self.first_component += list(np.array(xhat[:, :, 0]))
         self.trace += list(np.trace(P, axis1=2, axis2=3))
-        blocks = zip(self.last or ((), (), (), ()), (x, xhat, P, error), strict=True)
-        self.last = tuple(np.array([*last, *block[-2:]][-2:]) for last, block in blocks)
+        blocks = tuple(values[-2:].copy() for values in (x, xhat, P, error))
+        pairs = zip(self.last or blocks, blocks, strict=True)
+        self.last = tuple(np.concatenate(pair)[-2:] for pair in pairs)
         if self.rounding_from is None:
             first = rounding_from(t, carried_size(x, error, self.exact_errors), P, error)
             self.rounding_from = first if first < np.inf else None

@@ -41,9 +41,8 @@ def record_samples(
     # The trace shows a row for each node, though all of them share a pooled filter.
     if scenario.node_filter.pooled:
         nodes = len(scenario.nodes)
-        xhat, P, error, sound_filters = (
-            np.repeat(values, nodes, axis=1) for values in (xhat, P, error, sound_filters)
-        )
+        xhat, P, error = (np.repeat(values, nodes, axis=1) for values in (xhat, P, error))
+        sound_filters = np.repeat(sound_filters, nodes, axis=1)
     # argmin finds the first False.
     last = len(times) - 1 if sound.all() else int(np.argmin(sound))
     after, time = last + 1, float(times[last])
