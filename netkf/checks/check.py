@@ -16,6 +16,7 @@ import numpy as np
 from netkf.algorithms.registry import LINK_WEIGHTS, own_attributes
 from netkf.checks.clocked import CHECKS as UNDER_CLOCKS
 from netkf.checks.evidence import (
+    BASE,
     BROKEN,
     NOT_PROMISED,
     VERDICTS,
@@ -25,6 +26,7 @@ from netkf.checks.evidence import (
     Promise,
     find_identity,
     find_nothing,
+    fold_followers,
     judge,
 )
 from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
@@ -36,7 +38,7 @@ from netkf.checks.looks import (
     next_runs,
 )
 from netkf.checks.paper import PaperChecks
-from netkf.checks.parts.rows import gaussian_noises, part_promises
+from netkf.checks.parts.rows import gaussian_noises, part_assumptions, part_promises
 from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
 from netkf.checks.points import check_slots, probe_times
 from netkf.checks.records.rows import Audit, audit_run, record_promises
@@ -202,16 +204,18 @@ def _error_difference(run: Run, twin: Run) -> float:
 
 
 def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
-    """Compare the errors of the first TWIN_RUNS replicas of a user's filter class with those of the
-    built-in filter that it derives from; the differences are in ``results``.
+    """Compare the errors of a user's filter class with those of the built-in filter that it derives
+    from, in the first TWIN_RUNS replicas and those that depart in another row; the differences are
+    in ``results``.
 
     Serves as the test of the promise SAME_AS_BASE. No interval is estimated, so that ``level`` is
     not used.
     """
-    differences = [result.difference for result in results[:TWIN_RUNS]]
+    differences = [result.difference for result in results]
     if np.isnan(differences).all():
         return find_nothing(0.0)
-    message = f"{min(TWIN_RUNS, len(results))} runs beside those of the filter that it should be"
+    count = int(np.isfinite(differences).sum())
+    message = f"{count} runs beside those of the filter that it should be"
     finding = find_identity(float(np.nanmax(differences)), TWIN_TOLERANCE, message)
     departing = np.flatnonzero(np.nan_to_num(differences) > TWIN_TOLERANCE).tolist()
     return finding._replace(replica=departing[0] if departing else None)
@@ -226,7 +230,9 @@ def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:
     diverged = sum(result.diverged for result in results)
     message = f"{diverged} of {len(results)} runs ended early, so no other promise is looked at"
     margin = -diverged / len(results)
-    return Finding((margin, margin, margin), 0.0, message)
+    finding = Finding((margin, margin, margin), 0.0, message)
+    first = next((k for k, result in enumerate(results) if result.diverged), None)
+    return finding._replace(seen=float(diverged), expected=0.0, replica=first)
 
 
 SAME_AS_BASE = Promise(
@@ -235,6 +241,7 @@ SAME_AS_BASE = Promise(
     (),
     _same_as_base,
     exact=True,
+    group=BASE,
 )
 NONE_DIVERGED = Promise(
     "estimates are finite and covariances positive semidefinite",
@@ -242,6 +249,7 @@ NONE_DIVERGED = Promise(
     (),
     _none_diverged,
     exact=True,
+    group=BASE,
 )
 
 
@@ -291,11 +299,30 @@ def judge_replicas(
     rows += judge(
         part_promises(parts),
         parts,
-        assumptions=[],
+        assumptions=part_assumptions(parts),
         runs=len(replicas),
         level=0.5 * (1.0 - confidence),
     )
-    return make_verdict((*_judge_base(scenario, replicas), *rows, *records))
+    base = _judge_base(scenario, _run_departed(scenario, replicas, rows, seed))
+    return make_verdict(tuple(fold_followers([*base, *rows, *records])))
+
+
+def _run_departed(
+    scenario: Scenario, results: list[ReplicaResult], rows: list[Evidence], seed: int
+) -> list[ReplicaResult]:
+    """Return the results with the differences from the built-in base of a user's filter class also
+    for the replicas that broken ``rows`` name, which are run again beside those of the base.
+    """
+    departed = {row.replica for row in rows if row.verdict == BROKEN} - {None}
+    if not own_attributes(scenario.filter.algorithm):
+        return results
+    results = list(results)
+    for replica in departed:
+        if replica is not None and math.isnan(results[replica].difference):
+            twin = simulate(with_base_filter(scenario), seed, replica, SimpyEngine())
+            difference = _error_difference(simulate(scenario, seed, replica), twin)
+            results[replica] = results[replica]._replace(difference=difference)
+    return results
 
 
 def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Evidence]:

@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing, find_unknown
+from netkf.checks.evidence import (
+    COMPUTED,
+    Assumption,
+    Finding,
+    Promise,
+    error_test,
+    find_nothing,
+    find_unknown,
+)
 from netkf.checks.exact import (
     MIN_REPLAYED,
     check_bias,
@@ -99,6 +107,7 @@ def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
     return Finding((margin, margin, margin), 0.0, message, early=margin < 0.0)
 
 
+@error_test
 def _errors_bounded(samples: RunSamples, level: float) -> Finding:
     """Test that errors stay bounded: compare the growth of the law of e e' at each node, from half
     of the horizon to its end, with that of Gaussian errors drawn with the exact covariances of the
@@ -178,6 +187,7 @@ PROMISES = (
         ("D Assumption 3.2",),
         _sensors_excite,
         exact=True,
+        group=COMPUTED,
     ),
     Promise(
         "P is stochastically bounded: its law does not grow any more",

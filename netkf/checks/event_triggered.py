@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from netkf.checks.evidence import Assumption, Finding, Promise, find_nothing
+from netkf.checks.evidence import Assumption, Finding, Promise, error_test, find_nothing
 from netkf.checks.laws import NEES_TOLERANCE, exact_start
 from netkf.checks.paper import PaperChecks
 from netkf.checks.samples import RunSamples
@@ -15,6 +15,7 @@ from netkf.checks.statistics import student_interval
 from netkf.scenario.scenario import Scenario
 
 
+@error_test
 def check_nees_bound(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that the mean of NEES / n is at most 1 at every time and node, as it
     is if P is at least the second moment of the error.
@@ -41,7 +42,9 @@ def check_nees_bound(samples: RunSamples, level: float) -> Finding:
     message = f"NEES / n, at most 1, the largest of {len(finite)} points at {label}"
     message += samples.blurred_note
     margin = 1.0 - float(means[k]), 1.0 - highest, 1.0 - lowest
-    return Finding(margin, NEES_TOLERANCE, message, seen=float(means[k]), expected=1.0)
+    detectable = max(interval.detectable for interval in intervals)
+    finding = Finding(margin, NEES_TOLERANCE, message, detectable=detectable)
+    return finding._replace(seen=float(means[k]), expected=1.0)
 
 
 BOUND = Promise(

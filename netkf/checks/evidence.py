@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from netkf.core.errors import TheoryError
 
@@ -27,14 +30,16 @@ class Evidence:
         its confidence interval, simultaneous for all comparisons of the row
     tolerance : distance below 0 that the interval may reach for the verdict ``holds``
     verdict   : broken if the whole interval is below 0, holds if it stays above ``-tolerance``,
-        undecided if it is too wide, not promised if an assumption fails
+        undecided if it is too wide or not a number, not promised if an assumption fails
     needed    : estimated number of runs that would decide an undecided promise, or None
     seen, expected : measured and promised value of the comparison with the largest deviation; nan
-        if the promise does not equate two values
+        if the promise does not equate two values. A broken row always has both: by default its
+        distance from the promise, and 0
     off       : their distance (relative for covariances and rates)
     detectable : error that would have been detected with probability 0.9
     runs_needed : ``needed``
     replica   : number of a run that alone shows the promise to be broken, else None
+    group     : name of the rows that one mistake can break together
     """
 
     promise: str
@@ -53,6 +58,7 @@ class Evidence:
     detectable: float = math.nan
     runs_needed: int | None = None
     replica: int | None = None
+    group: str = ""
 
 
 class Finding(NamedTuple):
@@ -91,7 +97,10 @@ class Promise:
 
     ``needs`` are substrings of names or sources in the table of assumptions. A test takes the
     samples of all runs and a level; the interval of its Finding misses the truth with at most that
-    probability. ``exact`` tests compare paths, not laws, and use none of the level.
+    probability. ``exact`` tests compare paths, not laws, and use none of the level. ``group`` names
+    the rows that one mistake can break together (:data:`FOLLOWS`); by default EQUATIONS for exact
+    tests, ERRORS for those marked by :func:`error_test`, and LAWS for others. Rows of the group
+    COMPUTED look at no run, so that no run can break them.
     """
 
     statement: str
@@ -99,6 +108,43 @@ class Promise:
     needs: tuple[str, ...]
     test: Callable[[Any, float], Finding]
     exact: bool = False
+    group: str = ""
+
+    @property
+    def kind(self) -> str:
+        """The group of rows to which the promise belongs."""
+        if self.group or self.exact:
+            return self.group or EQUATIONS
+        return ERRORS if self.test in ERROR_TESTS else LAWS
+
+
+BASE, EQUATIONS, ERRORS, LAWS, COMPUTED = "base", "equations", "errors", "laws", "computed"
+START, PLANT, SENSORS = "start", "plant", "sensors"
+CLOCKS, SAMPLING, LOSSES, DELAYS, MATCHINGS = "clocks", "sampling", "losses", "delays", "matchings"
+NOISES = (START, PLANT, SENSORS)
+NETWORK = (CLOCKS, SAMPLING, LOSSES, DELAYS, MATCHINGS)
+EVENTS, STATES, STARTS = "events", "states", "starts"
+ENGINES, FILES = "engines", "files"
+FOLLOWS = {
+    ENGINES: (EVENTS, STATES, STARTS),
+    FILES: (EVENTS, STATES, STARTS),
+    EQUATIONS: (EVENTS, STARTS),
+    ERRORS: (EVENTS, STATES, STARTS, EQUATIONS, *NOISES),
+    LAWS: (EVENTS, STARTS, EQUATIONS, *NOISES, *NETWORK),
+    BASE: (EQUATIONS, ERRORS, LAWS),
+}
+"""Groups of rows on whose promises those of a group rely: all on what is recorded of runs, the law
+of the errors on the filter's equations and on noises, laws of P on the network too; and that a
+user's class is the filter from which it derives on all that is promised of that filter.
+"""
+ERROR_TESTS: set[Callable[[Any, float], Finding]] = set()
+"""Tests marked by :func:`error_test`."""
+
+
+def error_test(test: Callable[[Any, float], Finding]) -> Callable[[Any, float], Finding]:
+    """Mark a test as one of the law of errors given the events, and return it."""
+    ERROR_TESTS.add(test)
+    return test
 
 
 GAUSSIAN_TESTS: set[Callable[[Any, float], Finding]] = set()
@@ -152,8 +198,41 @@ def judge(
     return evidence
 
 
+def fold_followers(rows: Sequence[Evidence]) -> list[Evidence]:
+    """Return the ``rows`` of a verdict with one broken row for each mistake.
+
+    The first broken row of a group is its root, unless the group relies on another one with a
+    broken row (FOLLOWS). Other broken rows are not promised: they say from which row they follow.
+    """
+    first: dict[str, Evidence] = {}
+    for row in rows:
+        if row.verdict == BROKEN:
+            first.setdefault(row.group, row)
+
+    def find_root(group: str) -> Evidence:
+        """Return the broken row from which those of a ``group`` follow."""
+        for other in FOLLOWS.get(group, ()):
+            # The base says no more than rows about the filter, unless these follow from its parts.
+            if other in first and (group != BASE or find_root(other).group == other):
+                return find_root(other)
+        return first[group]
+
+    folded = []
+    for row in rows:
+        root = find_root(row.group) if row.verdict == BROKEN else row
+        if root is not row:
+            reason = f'follows from the broken row "{root.promise}"'
+            folded.append(
+                dataclasses.replace(row, verdict=NOT_PROMISED, assumptions=reason, replica=None)
+            )
+        else:
+            folded.append(row)
+    return folded
+
+
 def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
-    """Return the finding of a test; undecided if theory cannot compute the expected value.
+    """Return the finding of a test; undecided if theory cannot compute the expected value, or a
+    matrix is so singular that linear algebra fails.
 
     The interval of the finding misses the truth with at most the probability ``level``.
     """
@@ -161,6 +240,8 @@ def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
         return promise.test(samples, level)
     except TheoryError as error:
         return find_unknown(f"not computed: {error}")
+    except np.linalg.LinAlgError as error:
+        return find_unknown(f"not judged, its numbers are too large or singular: {error}")
 
 
 def _is_needed(promise: Promise, row: Assumption) -> bool:
@@ -178,7 +259,8 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     The margin is how far the promise is from being broken. A promise is broken if the whole
     interval of the margin is below 0, and holds if the interval is above - tolerance. If neither,
     more runs may decide, and their number is forecast. A promise about a limit that is not reached
-    (``early``) or about errors that rounding hides (``blurred``) is undecided.
+    (``early``) or about errors that rounding hides (``blurred``) is undecided, and so is one whose
+    test gives no number.
     """
     (margin, low, high), tolerance, message = finding.margin, finding.tolerance, finding.message
     needed = None
@@ -186,7 +268,9 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict = UNDECIDED
     elif finding.early:
         verdict, message = UNDECIDED, f"{message}; {_describe_horizon(finding.horizon)}"
-    elif not high >= 0.0:  # also if all values are nan
+    elif math.isnan(low) or math.isnan(high):
+        verdict, message = UNDECIDED, f"not judged, its test gives no number (nan): {message}"
+    elif not high >= 0.0:
         verdict = BROKEN
     elif low >= -tolerance:
         verdict = HOLDS
@@ -202,8 +286,11 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
                 "too few to decide it"
             )
     off = finding.off
-    if math.isnan(off) and low < high:
+    if math.isnan(off) and (low < high or verdict == BROKEN):
         off = max(0.0, -margin)
+    seen, expected = finding.seen, finding.expected
+    if verdict == BROKEN and (math.isnan(seen) or math.isnan(expected)):
+        seen, expected = off, 0.0
     return Evidence(
         promise=promise.statement,
         source=promise.source,
@@ -215,12 +302,13 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         verdict=verdict,
         needed=needed,
         evidence=message,
-        seen=finding.seen,
-        expected=finding.expected,
+        seen=seen,
+        expected=expected,
         off=off,
         detectable=finding.detectable,
         runs_needed=needed,
         replica=finding.replica if verdict == BROKEN else None,
+        group=promise.kind,
     )
 
 
@@ -267,6 +355,7 @@ def _unpromised_row(promise: Promise, reason: str) -> Evidence:
         verdict=NOT_PROMISED,
         needed=None,
         evidence="",
+        group=promise.kind,
     )
 
 

@@ -18,6 +18,7 @@ from netkf.algorithms.registry import LINK_WEIGHTS, base_filter, built_in_class,
 from netkf.checks.evidence import (
     Assumption,
     Finding,
+    error_test,
     find_nothing,
     find_unknown,
     gaussian_test,
@@ -364,11 +365,14 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     """
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
-    size = np.trace(Sigma, axis1=-2, axis2=-1)
+    known = np.isfinite(Sigma).all(axis=(-1, -2))
+    if not known.any():
+        return find_unknown("no exact covariance could be computed")
+    size = np.where(known, np.trace(Sigma, axis1=-2, axis2=-1), 0.0)
     # Covariances that are not finite count as below Sigma; eigvalsh needs finite entries.
     gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
-    shortfall = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0)
-    count = f"{shortfall.size:,} covariances"
+    shortfall = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0) * known
+    count = f"{known.sum():,} covariances"
     message = f"least eigenvalue of P - Sigma relative to trace(Sigma) in {count}"
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), BOUND_TOLERANCE
@@ -376,6 +380,7 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     return with_departure(finding, samples, shortfall, limits)
 
 
+@error_test
 @gaussian_test
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that errors have their exact mean and covariance Sigma, computed
@@ -423,6 +428,7 @@ def _compare_pooled(joint: FloatArray, level: float) -> Interval:
     return deviation_interval(1.0, scale_interval(total, freedom, level))
 
 
+@error_test
 def check_bias(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that errors less their exact mean have no constant bias, the same at
     all nodes and times.
@@ -459,6 +465,13 @@ def gaussian_radius(level: float, n: int) -> float:
     return math.sqrt(2.0 * float(scipy.special.gammainccinv(n / 2.0, level)))
 
 
+def detectable_length(radius: float, n: int) -> float:
+    """Return the length of the mean of a standard Gaussian vector (n,) with which the vector is
+    longer than ``radius`` with probability POWER.
+    """
+    return math.sqrt(float(scipy.special.chndtrinc(radius**2, n, 1.0 - POWER)))
+
+
 def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interval:
     """Return an interval for the length |spread m| of a bias, where ``z`` (k,) is normal with mean
     m and covariance I and ``spread`` (d, k) turns m into the bias. It excludes 0 if and only if
@@ -473,11 +486,12 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
     # The mean is within ``reach`` of z, so that |spread m| >= (|z| - reach) smallest.
     excess = float(np.linalg.norm(z)) - reach
     low = max(value - max_reach, excess * max(smallest, 1e-9 * float(sizes[0])), 0.0)
-    detectable = max_reach + float(scipy.special.ndtri(POWER)) * float(sizes[0])
+    detectable = detectable_length(reach, len(z)) * float(sizes[0])
     low = low if excess > 0.0 else 0.0
     return Interval(value, low, value + max_reach, detectable, seen=value, expected=0.0)
 
 
+@error_test
 @gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that NEES has its expected value given the events of each run, which
@@ -492,6 +506,9 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     runs, n = samples.runs, samples.scenario.plant.n
     max_runs = max_replayed(samples.scenario)
     P, Sigma = runs.replayed[:max_runs], runs.Sigma[:max_runs]
+    # Points without exact covariances have no weight, and so are not tested.
+    known = np.isfinite(P + Sigma).all(axis=(-1, -2), keepdims=True)
+    P, Sigma = np.where(known, P, 0.0), np.where(known, Sigma, 0.0)
     inverse, m = np.linalg.pinv(P), runs.mean[:max_runs]  # m is the exact mean of the errors
     weights = np.linalg.eigvals(inverse @ Sigma).real
     weights = np.maximum(weights, 0.0).reshape(len(P), -1, n)
@@ -538,6 +555,7 @@ def _pooled_expected_nees(quadratic: FloatArray, level: float) -> Interval:
     return deviation_interval(1.0, ratio) if len(finite) else ratio
 
 
+@error_test
 @gaussian_test
 def check_nees(samples: RunSamples, level: float) -> Finding:
     """Test the null hypothesis that errors are Gaussian with covariance P of the filter, given the

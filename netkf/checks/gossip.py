@@ -18,6 +18,7 @@ from netkf.checks.exact import (
     summarise_exactly,
 )
 from netkf.checks.laws import (
+    FIXED_READINGS,
     LAW_TOLERANCE,
     Pair,
     compare_growth,
@@ -25,6 +26,7 @@ from netkf.checks.laws import (
     diagonal_distances,
     exact_start,
     find_largest,
+    fixed_readings,
     growth_intervals,
 )
 from netkf.checks.mode_sequences import (
@@ -94,8 +96,16 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
     """Return the summary of a run at K slots and N sampled nodes: exact errors, and P (K, N, n, n)
     replayed by the Riccati recursion along the nodes that each pair (estimate, covariance) visited.
     """
-    slots = list(check_slots(scenario))
-    sources, table = pair_sources(scenario, run, slots[-1]), gossip_modes(scenario)
+    slots, exact = list(check_slots(scenario)), vars(summarise_exactly(scenario, run))
+    sources = pair_sources(scenario, run, slots[-1])
+    counts: dict[str, Any] = {
+        "moves": _count_moves(scenario, sources[1 : slots[-1]]),
+        "slots": slots[-1] - 1,
+    }
+    if not fixed_readings(scenario).holds:
+        unknown = np.full(exact["P"].shape, np.nan)
+        return GossipSummary(**exact, **counts, bounds=unknown, tokens=unknown[0])
+    table = gossip_modes(scenario)
     # Square roots of P(0), (N', n, n) for all N' nodes.
     starts, n, sampled = initial_roots(scenario), scenario.plant.n, sampled_indices(scenario)
     replayed, bounds = [], []
@@ -112,13 +122,11 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
     # replay differs from P and the covariances of tokens mean nothing.
     positions = token_positions(sources, slots[-1])
     holders = np.full(len(starts), -1) if positions is None else positions
-    exact = vars(summarise_exactly(scenario, run)) | {"replayed": np.array(replayed)}
     return GossipSummary(
-        **exact,
+        **exact | {"replayed": np.array(replayed)},
+        **counts,
         bounds=np.array(bounds),
         tokens=run.P[-1, holders[sampled]],
-        moves=_count_moves(scenario, sources[1 : slots[-1]]),
-        slots=slots[-1] - 1,
     )
 
 
@@ -446,8 +454,8 @@ def _token_memory(chain: ChainSamples) -> float:
 
 # What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 CHAIN = ("every exchange is a swap", "slots are independent")
-LAWS = (*CHAIN, "every node is watched")
-STABLE = (*CHAIN, "G C.1", "G S.1", "G D.1")
+LAWS = (*CHAIN, "every node is watched", FIXED_READINGS)
+STABLE = (*CHAIN, "G C.1", "G S.1", "G D.1", FIXED_READINGS)
 ERGODIC = (*LAWS, "G C.1", "G S.1", "G D.1")
 PROMISES = (
     Promise(
@@ -460,7 +468,7 @@ PROMISES = (
     Promise(
         "a walk that detects bounds the covariance that passes through it",
         "G Lemma 14",
-        ("G D.1",),
+        ("G D.1", FIXED_READINGS),
         _walks_bound,
         exact=True,
     ),
@@ -562,6 +570,7 @@ class GossipChecks(PaperChecks):
             Assumption("slots are independent and Abar is known", "G II-A", is_known, evidence),
             exact_start(scenario),
             few_errors(scenario),
+            fixed_readings(scenario),
             all_sampled(scenario),
         ]
 

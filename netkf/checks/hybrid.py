@@ -11,7 +11,14 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from netkf.checks.evidence import Assumption, Finding, Promise, find_identity, find_unknown
+from netkf.checks.evidence import (
+    COMPUTED,
+    Assumption,
+    Finding,
+    Promise,
+    find_identity,
+    find_unknown,
+)
 from netkf.checks.exact import (
     check_bias,
     check_error_covariance,
@@ -136,7 +143,10 @@ def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval
     # An event of probability up to log(1 / level) / R may have occurred in no run. It could bring P
     # down to 0, so that the lower limit of E[P] is reduced by this share.
     unseen = min(1.0, math.log(1.0 / level) / len(P))
-    return affine(ratio, 1.0, -1.0)._replace(low=ratio.low * (1.0 - unseen) - 1.0)
+    excess = affine(ratio, 1.0, -1.0)
+    # The reduced limit must still exceed 1.
+    detectable = (1.0 + ratio.detectable) / (1.0 - unseen) - 1.0 if unseen < 1.0 else math.nan
+    return excess._replace(low=ratio.low * (1.0 - unseen) - 1.0, detectable=detectable)
 
 
 def _bound_settles(samples: HybridSamples, level: float) -> Finding:
@@ -314,14 +324,17 @@ PROMISES = (
     ),
 )
 SETTLES = ("H(12) speaks", "H(12) has a steady state")
-COMPUTED = (
-    Promise("the bound settles", "H Proposition 4", SETTLES, _bound_settles, exact=True),
+LIMITS = (
+    Promise(
+        "the bound settles", "H Proposition 4", SETTLES, _bound_settles, exact=True, group=COMPUTED
+    ),
     Promise(
         "time-varying gains have a smaller bound than constant ones",
         "H Remark 1, (15)",
         SETTLES,
         _constant_gains_are_worse,
         exact=True,
+        group=COMPUTED,
     ),
     Promise(
         "the steady bound approaches S as one over the rate of the links",
@@ -329,6 +342,7 @@ COMPUTED = (
         ("H(12) speaks",),
         _bound_approaches_limit,
         exact=True,
+        group=COMPUTED,
     ),
 )
 
@@ -361,12 +375,12 @@ class HybridChecks(PaperChecks):
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the statements about a scenario's filter that are tested: those of all scenarios,
-        and each of COMPUTED, on limits of the bound on the mean of P, whose subject exists here.
+        and each of LIMITS, on limits of the bound on the mean of P, whose subject exists here.
         """
         listed, promised = list(PROMISES), with_promised_filter(scenario)
-        # One function for each of COMPUTED raises TheoryError if its subject does not exist.
+        # One function for each of LIMITS raises TheoryError if its subject does not exist.
         requirements = _require_known_steadiness, _require_constant_gains, _require_limit
-        for promise, require in zip(COMPUTED, requirements, strict=True):
+        for promise, require in zip(LIMITS, requirements, strict=True):
             try:
                 require(promised)
             except TheoryError:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.chains import trace_paths
-from netkf.checks.evidence import Assumption, Finding, Promise
+from netkf.checks.evidence import COMPUTED, Assumption, Finding, Promise
 from netkf.checks.exact import (
     check_bias,
     check_error_covariance,
@@ -21,6 +21,7 @@ from netkf.checks.exact import (
     summarise_exactly,
 )
 from netkf.checks.laws import (
+    FIXED_READINGS,
     LAW_TOLERANCE,
     Pair,
     compare_growth,
@@ -28,6 +29,7 @@ from netkf.checks.laws import (
     diagonal_distances,
     exact_start,
     find_largest,
+    fixed_readings,
     growth_intervals,
 )
 from netkf.checks.mode_sequences import (
@@ -60,6 +62,7 @@ from netkf.linalg.spectra import contracts, growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.random_links import delivery_of
 from netkf.theory.intermittent.averages import mean_covariance_bounds
 from netkf.theory.intermittent.riccati import steady_covariance
 from netkf.theory.intermittent.scalar_law import ScalarLaw, scalar_law
@@ -138,8 +141,19 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
     and from a very large start, which should converge, and from P* (the steady covariance with all
     readings), which stays in the support of the invariant law.
     """
-    slots = list(check_slots(scenario))
-    last = slots[-1:]
+    slots, exact = list(check_slots(scenario)), vars(summarise_exactly(scenario, run))
+    last, counts = (
+        slots[-1:],
+        {
+            "sent": _count_messages(scenario, run, "send", slots[-1]),
+            "arrived": _count_messages(scenario, run, "deliver", slots[-1]),
+        },
+    )
+    if not fixed_readings(scenario).holds:
+        nodes, n = len(sampled_indices(scenario)), scenario.plant.n
+        unknown = np.full((nodes, n, n), np.nan)
+        nothing = {"spread": unknown[:, 0, 0], "averages": unknown[:, 0, 0]}
+        return IntermittentSummary(**exact, **counts, **nothing, in_support=unknown)
     table, sequences, _ = find_arrivals(scenario, run, slots[-1])
     # Roots of the covariances at the start, (W, n, n) each.
     starts = initial_roots(scenario)[sampled_indices(scenario)]
@@ -149,12 +163,11 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
     from_zero = table.covariances(np.zeros(starts.shape), sequences, last)[0]
     replayed = table.covariances(starts, sequences, slots)
     return IntermittentSummary(
-        **vars(summarise_exactly(scenario, run)) | {"replayed": replayed},
+        **exact | {"replayed": replayed},
+        **counts,
         in_support=table.covariances(steady_roots, sequences, last)[0],
         spread=np.trace(from_above - from_zero, axis1=-2, axis2=-1),
         averages=_path_averages(table, starts, sequences),
-        sent=_count_messages(scenario, run, "send", slots[-1]),
-        arrived=_count_messages(scenario, run, "deliver", slots[-1]),
     )
 
 
@@ -293,7 +306,7 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
     delay = channel.delay.fixed
     if delay is None:
         raise TheoryError("random delays make some readings late")
-    delivery = channel.loss.mean_delivery(direction, scenario.table_probability(direction))
+    delivery = delivery_of(scenario, direction)
     return delivery if delay <= scenario.phase_length else 0.0
 
 
@@ -526,6 +539,8 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
     out, and those for which the law has no closed form.
     """
     laws, neighbours = {}, sensing_neighbours(scenario)
+    if not fixed_readings(scenario).holds:
+        return {}
     for k, node in enumerate(sampled_nodes(scenario)):
         peers = neighbours[node]
         if scenario.plant.n != 1 or node in scenario.placed_sensors or len(peers) != 1:
@@ -613,7 +628,8 @@ def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
 
 # What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
 FRESH, KNOWN = ("readings arrive independently",), ("the filters know", "the filters start")
-LIMIT = (*FRESH, "stabilisable", "positive definite", "detectable at every node", "(12), Theorem 9")
+FIXED = (*FRESH, FIXED_READINGS)
+LIMIT = (*FIXED, "stabilisable", "positive definite", "detectable at every node", "(12), Theorem 9")
 PROMISES = (
     Promise(
         "P(t+1) = f(P(t)) with the readings that arrived",
@@ -625,14 +641,14 @@ PROMISES = (
     Promise(
         "P is at least what it is without losses, which converges to P*",
         "R Theorem 10, mu({P >= P*}) = 1",
-        (),
+        (FIXED_READINGS,),
         _above_least,
         exact=True,
     ),
     Promise(
         "in the end P is a point of the support",
         "R Theorem 10",
-        ("stabilisable", "positive definite", "detectable at every node"),
+        (FIXED_READINGS, "stabilisable", "positive definite", "detectable at every node"),
         _in_support,
         exact=True,
     ),
@@ -640,7 +656,7 @@ PROMISES = (
     Promise(
         "the law of P is that of independent arrivals, at every time",
         "R (18)",
-        FRESH,
+        FIXED,
         _law_of_arrivals,
     ),
     Promise(
@@ -658,7 +674,7 @@ PROMISES = (
     Promise(
         "averages over one path are those of the law of independent arrivals",
         "R Proposition 25, (140)",
-        FRESH,
+        FIXED,
         _averages_of_paths,
     ),
     Promise(
@@ -692,6 +708,7 @@ DIVERGES = Promise(
     FRESH,
     _mean_diverges,
     exact=True,
+    group=COMPUTED,
 )
 
 
@@ -735,6 +752,7 @@ class IntermittentChecks(PaperChecks):
             Assumption(stated, "R (12)", is_known, evidence),
             exact_start(scenario),
             few_errors(scenario),
+            fixed_readings(scenario),
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:

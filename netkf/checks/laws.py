@@ -21,6 +21,8 @@ from netkf.scenario.scenario import Scenario
 
 LAW_TOLERANCE, NEES_TOLERANCE = 0.25, 0.3
 """Tolerated distance of distribution functions, and relative difference of the mean NEES from n."""
+FIXED_READINGS = "H is the same in every slot"
+"""Name of the assumption of tests that know a reading's H without the run."""
 GROWTH = 4.0
 """Factor by which a covariance may still be larger at the end than at half of the horizon."""
 
@@ -47,8 +49,17 @@ def find_largest(
     up to ``tolerance``; ``message`` begins its text.
 
     It reports the distance with the largest lower limit. The caller makes each interval at a share
-    of the level, so that all of them together miss with at most its probability.
+    of the level, so that all of them together miss with at most its probability. Distances that are
+    nan are left out, with a word in the text; undecided if all are.
     """
+    known = [item for item in distances if not np.isnan(item[0][:3]).any()]
+    if not known:
+        return find_unknown(f"not judged, no comparison gives a number: {message}", tolerance)
+    if len(known) < len(distances):
+        message = (
+            f"{message} (left out, because they are not numbers: {len(distances) - len(known)})"
+        )
+    distances = known
     chosen, label = max(distances, key=lambda item: (item[0].low, item[0].value))
     widest = max(interval.high for interval, _ in distances)
     detectable = max(interval.detectable for interval, _ in distances)
@@ -221,6 +232,15 @@ def compare_chi_square(
         intervals.append((deviation_interval(1.0, ratio), f"at {labels[k]}"))
     message = f"largest relative difference of the mean {name} from its freedom"
     return find_largest(intervals, NEES_TOLERANCE, message)
+
+
+def fixed_readings(scenario: Scenario) -> Assumption:
+    """Return the assumption that H is the same in every slot, on which laws of P that are computed
+    from sets of readings rely: a row of the table of assumptions that says whether it holds.
+    """
+    holds = not any(sensor.varying for sensor in scenario.sensors)
+    evidence = "as the scenario gives it" if holds else "a sensor's H differs from slot to slot"
+    return Assumption(FIXED_READINGS, "G II-B, R (16)", holds, evidence)
 
 
 def exact_start(scenario: Scenario) -> Assumption:

@@ -208,13 +208,11 @@ class Arrivals(NamedTuple):
 
 
 def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
-    """Return the neighbours of each node that have sensors, in order."""
-    sensing, senders = set(scenario.sensing_nodes), dict[int, list[int]]()
-    for i, j in scenario.topology.links:
-        for source, receiver in ((i, j), (j, i)):
-            if source in sensing:
-                senders.setdefault(receiver, []).append(source)
-    return {node: tuple(sorted(senders.get(node, ()))) for node in scenario.nodes}
+    """Return the nodes with sensors that each node may hear, in order."""
+    sensing, topology = set(scenario.sensing_nodes), scenario.topology
+    return {
+        node: tuple(k for k in topology.senders(node) if k in sensing) for node in topology.nodes
+    }
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:

@@ -10,12 +10,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.special
 
 from netkf.checks.evidence import (
+    COMPUTED,
     Assumption,
     Finding,
     Promise,
+    error_test,
     find_nothing,
     find_unknown,
     gaussian_test,
@@ -24,6 +25,7 @@ from netkf.checks.exact import (
     MIN_VARIANCE,
     check_bias,
     check_error_covariance,
+    detectable_length,
     few_errors,
     gaussian_radius,
     max_replayed,
@@ -42,7 +44,6 @@ from netkf.checks.samples import (
     relative_difference,
 )
 from netkf.checks.statistics import (
-    POWER,
     Interval,
     affine,
     deviation_interval,
@@ -190,6 +191,7 @@ def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
     return 1.2 * (1.0 + 0.5 * math.log(last / STEADY_TOLERANCE) / math.log(half / last))
 
 
+@error_test
 def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     """Test the null hypothesis that errors at the end have mean 0, in all directions at once.
 
@@ -207,7 +209,7 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     radius = gaussian_radius(level / len(nodes), n) / math.sqrt(count)
     for i, node in enumerate(nodes):
         bias = float(np.linalg.norm(samples.standardised[:, i].mean(axis=0)))
-        detectable = radius + float(scipy.special.ndtri(POWER)) / math.sqrt(count)
+        detectable = detectable_length(radius * math.sqrt(count), n) / math.sqrt(count)
         low = max(0.0, bias - radius)
         distance = Interval(bias, low, bias + radius, detectable, seen=bias, expected=0.0)
         intervals.append((distance, f"at node {node}"))
@@ -215,6 +217,7 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
     return find_largest(intervals, BIAS_TOLERANCE, message)._replace(most_runs=max_runs)
 
 
+@error_test
 @gaussian_test
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
     """Test the null hypothesis that mean-square errors at the end are the exact steady ones.
@@ -370,6 +373,7 @@ LIMIT = Promise(
     ("P Assumption 2", "P Assumption 1"),
     _many_steps,
     exact=True,
+    group=COMPUTED,
 )
 CERTIFIED = Promise(
     "the gamma that Theorem 6 certifies keeps mean squares bounded",
@@ -377,6 +381,7 @@ CERTIFIED = Promise(
     ("P Assumption 3",),
     _gamma_certified,
     exact=True,
+    group=COMPUTED,
 )
 
 

@@ -10,7 +10,7 @@ from collections import Counter
 from typing import Any
 
 from netkf.checks.check import Verdict
-from netkf.checks.evidence import BROKEN, NOT_PROMISED, VERDICTS, Evidence
+from netkf.checks.evidence import BROKEN, COMPUTED, NOT_PROMISED, VERDICTS, Evidence
 from netkf.runs.files import to_json_value
 
 INDENT = " " * 13
@@ -31,21 +31,41 @@ PAPERS = {
 """The papers behind the letters in the sources of promises."""
 
 
-def verdict_text(verdict: Verdict, claim: str = "", command: str = "") -> str:
+def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: bool = True) -> str:
     """Return the text of ``netkf check``.
 
     Broken rows come first; then all others, the counts of the verdicts, and the broken rows once
-    more in short. ``command`` followed by the number of a run replays that run.
+    more in short. ``command`` followed by the number of a run replays that run. Unless ``full``,
+    rows that are not broken have one line below their promise, and those that hold or follow from
+    others without looking at a run are one line together.
     """
     lines = [f"{verdict.scenario}: {claim}" if claim else verdict.scenario, ""]
     broken = [row for row in verdict.rows if row.verdict == BROKEN]
-    for row in [*broken, *(row for row in verdict.rows if row.verdict != BROKEN)]:
+    others = [row for row in verdict.rows if row.verdict != BROKEN]
+    folded = [] if full else [row for row in others if row.group == COMPUTED]
+    for row in [*broken, *(row for row in others if row not in folded)]:
         mark = row.verdict.upper() if row.verdict == BROKEN else row.verdict
         lines.append(f"{mark:<{len(INDENT)}}{row.promise}  [{row.source}]")
-        message = _describe_row(row)
-        lines += textwrap.wrap(message, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
-    lines += ["", *_legend_lines(verdict), *_summary_lines(verdict)]
+        if full or row.verdict == BROKEN:
+            message = _describe_row(row)
+            lines += textwrap.wrap(message, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
+        else:
+            lines.append(INDENT + textwrap.shorten(_summarise_row(row), WIDTH, placeholder=" ..."))
+    lines += [*_computed_lines(folded), "", *_legend_lines(verdict), *_summary_lines(verdict)]
+    if not full:
+        lines.append("--all shows the evidence of all rows")
     return "\n".join([*lines, *_broken_again(broken, command)])
+
+
+def _computed_lines(rows: list[Evidence]) -> list[str]:
+    """Return one line on ``rows`` that are computed without any run, which therefore cannot break
+    them; no line without such rows.
+    """
+    if not rows:
+        return []
+    listed = "; ".join(f"{row.promise} [{row.source}]: {row.verdict}" for row in rows)
+    text = f"{'computed':<{len(INDENT)}}no run can break these: {listed}"
+    return textwrap.wrap(text, len(INDENT) + WIDTH, subsequent_indent=INDENT)
 
 
 def _legend_lines(verdict: Verdict) -> list[str]:
@@ -85,11 +105,7 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
     """
     lines = []
     for row in broken:
-        values = ""
-        if math.isfinite(row.seen) and math.isfinite(row.expected) and row.low < row.high:
-            values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"
-        elif math.isfinite(row.off):
-            values = f": off by {row.off:.3g}"
+        values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"
         lines.append(f"BROKEN: {row.promise}  [{row.source}]{values}")
         if command and row.replica is not None:
             lines.append(f"        replay it: {command} {row.replica}")
@@ -111,6 +127,18 @@ def _describe_row(row: Evidence) -> str:
         if math.isfinite(row.seen) and math.isfinite(row.expected):
             parts.append(f"seen {row.seen:.4g}, expected {row.expected:.4g}")
     return "; ".join([*parts, row.evidence])
+
+
+def _summarise_row(row: Evidence) -> str:
+    """Return what a row says in short: the runs that would decide it, its measured deviation and
+    the smallest one that it would have seen; its evidence or reason if it has no interval.
+    """
+    if row.verdict == NOT_PROMISED or not row.low < row.high:
+        return _describe_row(row)
+    needed = f"needs about {row.needed:,} runs; " if row.needed is not None else ""
+    limit = f"; an error of {row.detectable:.2g} would have been seen"
+    limit = limit if row.detectable > 0.0 else f"; {row.evidence}"
+    return f"{needed}off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}{limit}"
 
 
 def _describe_limits(row: Evidence) -> str:

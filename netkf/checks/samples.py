@@ -121,13 +121,16 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
     same computed by the equations of the filter from the events of the run (ticks, losses, delays)
     without the engine.
 
-    Only some runs are replayed, the entries of the others are nan. The finding is undecided if none
-    was. No interval is estimated, so that ``level`` is not used.
+    Only some runs are replayed, the entries of the others are nan; so are covariances that the
+    equations cannot give, which are left out. The finding is undecided if there are no others. No
+    interval is estimated, so that ``level`` is not used.
     """
-    replayed = ~np.isnan(samples.runs.replayed).all(axis=(1, 2, 3, 4))
+    replayed = np.isfinite(samples.runs.replayed).any(axis=(1, 2, 3, 4))
     P, expected = samples.runs.P[replayed], samples.runs.replayed[replayed]
     if not len(P):
         return find_unknown("no run could be replayed")
+    unknown = ~np.isfinite(expected).all(axis=(-1, -2), keepdims=True)
+    P, expected = np.where(unknown, 0.0, P), np.where(unknown, 0.0, expected)
     with np.errstate(invalid="ignore"):
         gap = np.abs(P - expected).max(axis=(-1, -2))
         size = np.abs(expected).max(axis=(-1, -2))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ MIN_EXPECTED = 5.0
 """Expected count of a cell below which Pearson's statistic is not chi-square."""
 POWER = 0.9
 """Probability with which a deviation of the detectable size is detected."""
+_MIDDLES = (np.arange(2000) + 0.5) / 2000.0  # of equal parts of [0, 1]
 
 
 class Interval(NamedTuple):
@@ -66,9 +68,38 @@ def detectable_shift(deviation: float, level: float) -> float:
     return deviation * float(_normal_quantile(1.0 - level / 2.0) + _normal_quantile(POWER))
 
 
-def student_interval(value: float, deviation: float, count: int, level: float) -> Interval:
+def detectable_shift_of_student(count: float, level: float) -> float:
+    """Return the shift, in true standard deviations of an estimate, that Student's test at
+    ``level`` with ``count`` - 1 degrees of freedom detects with probability POWER.
+
+    It is the noncentrality at which the quantile 1 - POWER of the noncentral t law is Student's
+    critical value; the other tail has a negligible part of the power.
+    """
+    freedom = max(count - 1.0, 1.0)
+    critical = -float(scipy.special.stdtrit(freedom, level / 2.0))
+    return noncentrality(freedom, critical)
+
+
+@lru_cache(maxsize=1024)
+def noncentrality(freedom: float, critical: float) -> float:
+    """Return the noncentrality at which a t variable with ``freedom`` degrees of freedom exceeds
+    ``critical`` with probability POWER.
+    """
+    # (z + shift) / sqrt(u / freedom) > critical, z normal and u chi-square: by quadrature over the
+    # quantiles of u, since scipy's noncentral t fails for the small levels used here.
+    u = scipy.special.gammaincinv(0.5 * freedom, _MIDDLES) * 2.0 / freedom
+    limits = critical * np.sqrt(u)
+    low, high = 0.0, float(limits.max()) + 10.0
+    for _ in range(60):
+        shift = 0.5 * (low + high)
+        power = float(scipy.special.ndtr(shift - limits).mean())
+        low, high = (low, shift) if power > POWER else (shift, high)
+    return 0.5 * (low + high)
+
+
+def student_interval(value: float, deviation: float, count: float, level: float) -> Interval:
     """Return Student's t interval for an estimate ``value``, whose standard ``deviation`` was
-    estimated from ``count`` independent values.
+    estimated from ``count`` independent values (or an effective number of them).
 
     The interval misses the truth with at most the probability ``level``.
     """
@@ -80,7 +111,8 @@ def student_interval(value: float, deviation: float, count: int, level: float) -
         return value - reach, value + reach
 
     low, high = limits(value, 1.0)
-    return Interval(value, low, high, detectable_shift(deviation, level), again=limits)
+    detectable = deviation * detectable_shift_of_student(count, level)
+    return Interval(value, low, high, detectable, again=limits)
 
 
 def _normal_quantile(probability: float) -> float:
@@ -107,9 +139,34 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
     if trials:
         low, high = limits(successes / trials, 1.0)
         # Half a success and half a failure are added: a fraction of 0 or 1 has a variance too.
-        p = (successes + 0.5) / (trials + 1.0)
-        detectable = detectable_shift(math.sqrt(p * (1.0 - p) / trials), level)
+        detectable = _binomial_shift((successes + 0.5) / (trials + 1.0), trials, level)
     return Interval(successes / max(trials, 1), low, high, detectable, again=limits)
+
+
+def _binomial_shift(p: float, trials: int, level: float) -> float:
+    """Return the error of a probability ``p`` that an exact two-sided binomial test at ``level``
+    detects with probability POWER, in ``trials``; the larger one of both directions, of those in
+    which an error can be so large that it is detected.
+    """
+    # Of the rarer outcome: q rises where p > 1/2 falls.
+    up = _binomial_rise(p, trials, level), _binomial_rise(1.0 - p, trials, level)
+    possible = [shift for shift in up if math.isfinite(shift)]
+    return max(possible, default=math.nan)
+
+
+def _binomial_rise(p: float, trials: int, level: float) -> float:
+    """Return by how much a probability must exceed ``p`` for its test to be significant with
+    probability POWER; nan if no number of successes is significant.
+    """
+    # The least number of successes that has at most the probability level / 2: by bisection.
+    low, high = 0, trials + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        tail = float(scipy.special.betainc(middle, trials - middle + 1, p))
+        low, high = (low, middle) if tail <= 0.5 * level else (middle, high)
+    if high > trials:
+        return math.nan
+    return float(scipy.special.betaincinv(high, trials - high + 1, POWER)) - p
 
 
 def affine(interval: Interval, scale: float, shift: float) -> Interval:
@@ -412,8 +469,9 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
     flat = samples.reshape(count, -1)
     covariance = np.atleast_2d(np.cov(flat, rowvar=False))
     widest = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
-    spread = float(deviations[-1]) / math.sqrt(count)
-    detectable = reach * float(deviations.max()) + _normal_quantile(POWER) * spread
+    # Student's statistic of the direction with the largest mean must exceed Hotelling's limit.
+    spread = float(deviations.max()) / math.sqrt(count)
+    detectable = spread * noncentrality(max(count - 1.0, 1.0), reach * math.sqrt(count))
     return Interval(float(values[-1]), low, float(values[-1]) + reach * widest, detectable)
 
 

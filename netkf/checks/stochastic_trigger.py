@@ -84,13 +84,15 @@ class TriggerChecks(EquationChecks):
         """Return the promises about a scenario, in the order of the report: those about the
         equations, and after the first of them those about silent slots and the rate of messages.
 
-        All of them need the assumptions that every node hears all others and that the filters know
-        the models: with losses silence would not be information.
+        All of them need the assumptions that every node hears all others, that the filters know
+        the models and that they start alike: otherwise silence would not be the same information
+        for its sender and its hearers.
         """
         # ``needs`` are parts of the names of assumptions in the table of the report.
         equations = [
             dataclasses.replace(
-                promise, needs=(*promise.needs, "every node hears", "the filters know")
+                promise,
+                needs=(*promise.needs, "every node hears", "the filters know", "one estimate"),
             )
             for promise in PROMISES
         ]

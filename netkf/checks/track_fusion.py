@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from netkf.checks.clocked import PROMISES, REACH, UPPER_BOUND
-from netkf.checks.evidence import Finding, Promise, find_identity
+from netkf.checks.evidence import Finding, Promise, find_identity, find_unknown
 from netkf.checks.exact import max_replayed, with_promised_filter
 from netkf.checks.kalman_consensus import EquationChecks
 from netkf.checks.points import check_slots, sampled_indices
@@ -33,11 +33,14 @@ def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
     """
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
-    size = np.trace(Sigma, axis1=-2, axis2=-1)
-    gap = np.nan_to_num(np.abs(P - Sigma).max(axis=(-1, -2)), nan=1e300, posinf=1e300)
+    known = np.isfinite(Sigma).all(axis=(-1, -2))
+    if not known.any():
+        return find_unknown("no exact covariance could be computed")
+    size = np.where(known, np.trace(Sigma, axis1=-2, axis2=-1), 0.0)
+    gap = np.nan_to_num(np.abs(P - Sigma).max(axis=(-1, -2)), nan=1e300, posinf=1e300) * known
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), EXACT_TOLERANCE
-    message = f"largest entry of P - Sigma relative to trace(Sigma) in {gap.size:,} covariances"
+    message = f"largest entry of P - Sigma relative to trace(Sigma) in {known.sum():,} covariances"
     return with_departure(compare_identities(gap, *limits, message), samples, gap, limits)
 
 

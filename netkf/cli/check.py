@@ -13,6 +13,7 @@ from netkf.cli import pictures
 from netkf.cli.options import (
     FAILED,
     Command,
+    add_all,
     add_json,
     add_no_plot,
     add_pool,
@@ -57,6 +58,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         "--resume", action="store_true", help="add runs to the verdict in --out, up to --runs"
     )
     add_pool(parser)
+    add_all(parser)
     add_json(parser)
     add_no_plot(parser)
 
@@ -92,7 +94,8 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
         verdict = earlier
     else:
         verdict = _run_check(scenario, options, earlier)
-    text = verdict_text(verdict, scenario.claim, _replay_command(options))
+    command = _replay_command(options)
+    text = verdict_text(verdict, scenario.claim, command)
     # Samples are taken at other times than those of ``probe``, at which states are recorded.
     unused = unused_notes(scenario, without_states=True)
     print_notes((*scenario.notes, *unused, *filter(None, [sampling_note(scenario)])))
@@ -103,7 +106,9 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
         if options.json:
             print_json(verdict_json(verdict))
         else:
-            print(text)
+            print(
+                text if options.all else verdict_text(verdict, scenario.claim, command, full=False)
+            )
     if options.out is not None and not options.json:
         result = "nothing left to do in" if is_complete else "written to"
         print(f"{result} {options.out}")

@@ -8,6 +8,7 @@ import sys
 from netkf.cli.options import (
     FAILED,
     Command,
+    add_all,
     add_engine,
     add_json,
     add_pool,
@@ -33,6 +34,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     add_seed(parser)
     add_engine(parser)
     add_pool(parser)
+    add_all(parser)
     add_json(parser)
 
 
@@ -56,7 +58,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print_json({**vars(result), "rows": [vars(row) for row in result.rows]})
     else:
-        print(f"{result.scenario}\n\n{format_consistency(result)}")
+        print(f"{result.scenario}\n\n{format_consistency(result, full=options.all)}")
     if not result:
         nodes = ", ".join(str(row.node) for row in result.rows if row.verdict.startswith("BROKEN"))
         print(f"netkf: errors are inconsistent with P at node {nodes}", file=sys.stderr)

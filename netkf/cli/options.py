@@ -126,6 +126,11 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON document only")
 
 
+def add_all(parser: argparse.ArgumentParser) -> None:
+    """Add ``--all``."""
+    parser.add_argument("--all", action="store_true", help="show all rows with all that they say")
+
+
 def add_no_plot(parser: argparse.ArgumentParser) -> None:
     """Add ``--no-plot``."""
     parser.add_argument("--no-plot", action="store_true", help="do not draw a picture")

@@ -10,7 +10,7 @@ from netkf.core.printable import shorten
 from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
 from netkf.studies.compare import Comparison, Entry
 from netkf.studies.compare_filters import QUANTITIES, FilterComparison
-from netkf.studies.consistency import Consistency
+from netkf.studies.consistency import Consistency, NodeConsistency
 from netkf.studies.filter_values import Quantity
 from netkf.studies.search import Sizing
 
@@ -105,9 +105,12 @@ def format_answer(sizing: Sizing) -> str:
     )
 
 
-def format_consistency(consistency: Consistency) -> str:
+def format_consistency(consistency: Consistency, full: bool = True) -> str:
     """Return the result of ``netkf.consistency`` for a terminal: one row per node with NEES and NIS
     beside their expected values, and a legend of the columns.
+
+    Unless ``full``, a large network has rows for the nodes whose P is inconsistent, and for the
+    first and last of the others.
     """
     header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
     rows = [
@@ -120,14 +123,14 @@ def format_consistency(consistency: Consistency) -> str:
             format_number(row.expected_nis),
             row.verdict,
         ]
-        for row in consistency.rows
+        for row in _worst_first(consistency, full)
     ]
     level = f"{consistency.confidence:g}"
     ends = f"{consistency.low:.4g} .. {consistency.high:.4g}"
     scaled = f"{consistency.low / consistency.n:.4g} .. {consistency.high / consistency.n:.4g}"
     return "\n".join(
         [
-            format_table(header, shorten_rows(rows, MAX_ROWS)),
+            format_table(header, rows if full else shorten_rows(rows, MAX_ROWS)),
             "",
             f"{consistency.runs:,} runs, n = {consistency.n}; +-: half width of the interval on "
             f"the difference from what NEES should be, all nodes together at confidence {level}",
@@ -136,6 +139,16 @@ def format_consistency(consistency: Consistency) -> str:
             *(f"note: {note}" for note in consistency.notes),
         ]
     )
+
+
+def _worst_first(consistency: Consistency, full: bool) -> list[NodeConsistency]:
+    """Return the rows of all nodes in their order; of a table that is shortened those of nodes
+    whose P is inconsistent come first.
+    """
+    rows = list(consistency.rows)
+    if full or len(rows) <= MAX_ROWS:
+        return rows
+    return sorted(rows, key=lambda row: not row.verdict.startswith("BROKEN"))
 
 
 def format_filters(comparison: FilterComparison) -> str:

@@ -52,7 +52,8 @@ def test_wrong_covariances_break_the_exact_rows(clocked, monkeypatch):
     monkeypatch.setattr(type(scenario.node_filter), "estimate", sure)
     monkeypatch.setattr(CompiledEngine, "refusal", lambda *_: "this filter is not the built-in one")
     verdict = netkf.check(scenario, runs=20, workers=1)
-    assert list(verdict.table.verdict[:2]) == ["broken", "broken"]
+    assert list(verdict.table.verdict[:2]) == ["broken", "not promised"]
+    assert "follows from the broken row" in verdict.table.assumptions[1]
 
 
 @pytest.mark.parametrize("kind", CLOCKS)

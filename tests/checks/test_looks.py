@@ -300,7 +300,7 @@ def test_the_printed_command_replays_a_broken_run(tmp_path, monkeypatch, capsys)
     text = capsys.readouterr().out
     # Each broken row has the command of a run that shows it.
     command = re.search(r"BROKEN: P follows.+\n\s+replay it: netkf (.+)", text)[1]
-    assert re.search(r"BROKEN: P is at least.+\n\s+replay it: netkf run", text)
+    assert text.count("BROKEN: ") == 1  # what follows from it is not a further mistake
     found = re.search(r"first seen to depart in run (\d+)\s+at ([0-9.]+) s, node (\d+)", text)
     assert command.endswith(f"--replica {found[1]}")
     more = ["--out", "replayed", "--no-plot", "--set", "probe=0.25"]

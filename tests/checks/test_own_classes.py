@@ -55,7 +55,10 @@ def test_weights_that_change_nothing_hold(tmp_path):
 @pytest.mark.parametrize(("name", "own"), [("LateSwaps", "first_slot"), ("SwapsOnlyX", "absorb")])
 def test_what_should_be_the_same_and_is_not_is_broken(name, own, tmp_path):
     verdict, row = beside(GOSSIP, name, tmp_path)
-    assert row.verdict == BROKEN
-    assert row.replica == 0
+    if name == "SwapsOnlyX":  # its P departs too, which says more
+        assert 'follows from the broken row "pairs are swapped first' in row.assumptions
+    else:
+        assert row.verdict == BROKEN
+    assert row.off > 1e-3
     assert own in row.evidence
-    assert not verdict
+    assert [one.replica for one in verdict.rows if one.verdict == BROKEN] == [0]

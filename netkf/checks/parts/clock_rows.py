@@ -10,16 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.special
 
-from netkf.checks.evidence import Finding, Promise, find_identity
+from netkf.checks.evidence import CLOCKS, SAMPLING, Finding, Promise, find_identity
 from netkf.checks.laws import find_largest
-from netkf.checks.parts.moments import (
-    compare_cells,
-    with_best,
-)
+from netkf.checks.parts.moments import MIN_EVENTS, compare_shares, with_best
 from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.ticks import (
     ClockGroup,
-    correlation_of_neighbours,
     count_drawn_ticks,
     draw_samples,
     network_clocks,
@@ -27,10 +23,11 @@ from netkf.checks.parts.ticks import (
     sampling_clocks,
     ticks_on_lattice,
 )
+from netkf.checks.parts.waiting import correlation_of_neighbours
 from netkf.checks.statistics import (
     POWER,
     Interval,
-    detectable_shift,
+    detectable_shift_of_student,
     deviation_interval,
     scale_interval,
     student_interval,
@@ -302,8 +299,28 @@ def _poisson_interval(total: float, mean: float, level: float) -> Interval:
         high = float(scipy.special.gammaincinv(count + 1.0, 1.0 - level / 2.0))
         return low / expected, high / expected
 
-    detectable = detectable_shift(1.0 / math.sqrt(mean), level)
+    detectable = _poisson_shift(mean, level)
     return Interval(total / mean, *limits(total / mean, 1.0), detectable, again=limits)
+
+
+def _poisson_shift(mean: float, level: float) -> float:
+    """Return the relative error of the ``mean`` of a Poisson variable that Garwood's test at
+    ``level`` detects with probability POWER in one observation: the larger one of both directions,
+    of those in which an error can be so large that it is detected.
+    """
+    # The least count that has at most the probability level / 2, and the largest such one.
+    many = math.ceil(scipy.special.pdtrik(1.0 - 0.5 * level, mean)) + 1
+    few = math.floor(scipy.special.pdtrik(0.5 * level, mean)) - 1
+    while scipy.special.gammainc(many - 1, mean) <= 0.5 * level and many > 1:
+        many -= 1
+    while scipy.special.gammainc(many, mean) > 0.5 * level:
+        many += 1
+    up = float(scipy.special.gammaincinv(many, POWER)) / mean - 1.0
+    while few >= 0 and scipy.special.gammaincc(few + 1, mean) > 0.5 * level:
+        few -= 1
+    if few < 0:
+        return up
+    return max(up, 1.0 - float(scipy.special.gammaincinv(few + 1, 1.0 - POWER)) / mean)
 
 
 def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
@@ -315,7 +332,7 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
     numbers, have correlation 0; each test gets half of the level.
     """
     counts = group(samples).counts
-    finding = compare_cells(counts.cells.sum(axis=0), ["all clocks"], level / 2.0, "gaps")
+    finding = compare_shares(counts.cells.sum(axis=0), level / 2.0, "gaps")
     correlation = correlation_of_neighbours(counts.products, level / 2.0)
     if correlation is None:
         return finding
@@ -360,7 +377,8 @@ def _clocks_apart(group: Group, samples: PartSamples, level: float) -> Finding:
     ratio = scale_interval(freedom * float((values**2).mean()) / mean, freedom, level / 2.0)
     distance = deviation_interval(1.0, ratio)
     intervals = [(distance, "variance of all ticks at once over that of independent clocks")]
-    pairs = largest_correlation(counts - counts.mean(axis=0), level / 2.0)
+    means = counts.mean(axis=0)  # also the variances of Poisson counts
+    pairs = largest_correlation(counts - means, np.broadcast_to(means, counts.shape), level / 2.0)
     if pairs is not None:
         correlation, (a, b) = pairs
         labels = clocks.group.labels
@@ -369,49 +387,67 @@ def _clocks_apart(group: Group, samples: PartSamples, level: float) -> Finding:
 
 
 def largest_correlation(
-    values: FloatArray, level: float
+    values: FloatArray, variances: FloatArray, level: float
 ) -> tuple[Interval, tuple[int, int]] | None:
     """Return an interval for the largest |correlation| of two columns of ``values`` (K, L), such as
     the counts of two clocks, and the indices of the two.
 
-    Columns have mean 0 and rows are independent; the products of two standardised columns are
-    averaged by Student's interval, with Bonferroni's correction for all pairs. None with fewer than
-    two varying columns or 100 rows. The interval misses the truth with at most the probability
-    ``level``.
+    Values have mean 0, the expected ``variances`` (K, L), and independent rows. The products of two
+    columns, in units of their expected deviations (those that were seen would be far too small
+    where events are rare), are averaged by Student's interval, with Bonferroni's correction for all
+    pairs. None with fewer than two columns of MIN_EVENTS expected events, or 100 rows. The interval
+    misses the truth with at most the probability ``level``.
     """
-    compared = values[:, :MAX_CLOCKS]
-    varying = np.flatnonzero(compared.var(axis=0) > 0.0)
-    runs = len(compared)
-    if len(varying) < 2 or runs < 100:
+    frequent = np.flatnonzero(variances[:, :MAX_CLOCKS].sum(axis=0) >= MIN_EVENTS)
+    if len(frequent) < 2 or len(values) < 100:
         return None
-    z = compared[:, varying] / compared[:, varying].std(axis=0)
-    correlations = z.T @ z / runs
-    upper = np.triu_indices(len(varying), 1)
+    x, variance = values[:, frequent], variances[:, frequent]
+    deviation = np.sqrt(variance)
+    correlations = x.T @ x / (deviation.T @ deviation)
+    upper = np.triu_indices(len(frequent), 1)
     largest = int(np.argmax(np.abs(correlations[upper])))
     a, b = int(upper[0][largest]), int(upper[1][largest])
-    products = z[:, a] * z[:, b]
-    spread = max(float(products.std(ddof=1)), 1.0) / math.sqrt(runs)
-    interval = student_interval(
-        float(correlations[upper][largest]), spread, runs, level / len(upper[0])
+    interval = _correlation_of_columns(
+        x[:, a] * x[:, b], variance[:, a] * variance[:, b], level / len(upper[0])
     )
-    return deviation_interval(0.0, interval), (int(varying[a]), int(varying[b]))
+    return deviation_interval(0.0, interval), (int(frequent[a]), int(frequent[b]))
 
 
-def _promises(clocks: ClockSamples, group: Group, sentences: dict[str, str]) -> list[Promise]:
+def _correlation_of_columns(products: FloatArray, variances: FloatArray, level: float) -> Interval:
+    """Return Student's interval for a correlation from K ``products`` (K,) of independent values
+    of mean 0, and the ``variances`` (K,) of these products without correlation.
+
+    Rare events that coincide are counted as a Poisson variable: of a correlation r its mean exceeds
+    that without correlation, lambda, by r times ``scale``, and its deviation is that of the sum.
+    """
+    scale, expected = float(np.sqrt(variances).sum()), float(variances.sum())
+    # The effective number of rows, those of small variances counting less.
+    rows = expected**2 / float((variances**2).sum())
+    spread = math.sqrt(max(float(products @ products), expected))
+    interval = student_interval(float(products.sum()) / scale, spread / scale, rows, level)
+    quantile = detectable_shift_of_student(rows, level)
+    root = 0.5 * (quantile + math.sqrt(quantile**2 + 4.0 * expected))
+    detectable = (root**2 - expected) / scale
+    return interval._replace(detectable=detectable if detectable <= 1.0 else math.nan)
+
+
+def _promises(
+    clocks: ClockSamples, group: Group, sentences: dict[str, str], about: str
+) -> list[Promise]:
     """Return the promises about the ``clocks`` that ``group`` selects from the samples: which tests
     apply depends on whether they are Poisson, deterministic or of another known law. ``sentences``
-    has the statement of each promise by a short name.
+    has the statement of each promise by a short name, ``about`` names the group of these rows.
     """
     # Rows (name, test, whether it is exact, that is uses none of the level).
     rows: list[tuple[str, Callable[..., Finding], bool]] = [("rates", _check_rates, False)]
     if clocks.poisson:
         rows += [("exponential", _check_gaps, False), ("apart", _clocks_apart, False)]
     elif all(ticks_on_lattice(stated) for stated in clocks.group.stated):
-        rows.append(("lattice", _check_lattice, True))
+        rows.insert(0, ("lattice", _check_lattice, True))
     if not clocks.poisson and clocks.counts.cells.any():
         rows.append(("law", _check_gaps, False))
     return [
-        Promise(sentences[name], "the scenario", (), partial(test, group), exact)
+        Promise(sentences[name], "the scenario", (), partial(test, group), exact, about)
         for name, test, exact in rows
     ]
 
@@ -437,12 +473,12 @@ def clock_promises(samples: PartSamples) -> list[Promise]:
     are stated and the runs have ticks of them.
     """
     promises: list[Promise] = []
-    for counts, group, sentences in (
-        (samples.ticks, _network_clocks, NETWORK_SENTENCES),
-        (samples.sampling, _sampling_clocks, SAMPLING_SENTENCES),
+    for counts, group, sentences, about in (
+        (samples.ticks, _network_clocks, NETWORK_SENTENCES, CLOCKS),
+        (samples.sampling, _sampling_clocks, SAMPLING_SENTENCES, SAMPLING),
     ):
         if counts is not None:
             clocks = group(samples)
             if np.isfinite(clocks.rates).all():
-                promises += _promises(clocks, group, sentences)
+                promises += _promises(clocks, group, sentences, about)
     return promises

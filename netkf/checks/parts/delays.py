@@ -8,19 +8,28 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.special
 
-from netkf.checks.evidence import Finding, Promise, find_identity
+from netkf.checks.evidence import DELAYS, Finding, Promise, find_identity
 from netkf.checks.laws import find_largest
 from netkf.checks.parts.events import direction_indices, in_direction, shares_draws
 from netkf.checks.parts.moments import (
     CELLS,
     MIN_COUNT,
-    compare_cells,
-    count_cells,
+    compare_shares,
 )
 from netkf.checks.parts.sources import stated_part
-from netkf.checks.parts.ticks import correlate_neighbours, correlation_of_neighbours
+from netkf.checks.parts.waiting import (
+    WaitingLaw,
+    censored_ranks,
+    correlate_neighbours,
+    correlation_of_neighbours,
+    count_ranks,
+    exponential_law,
+    fill_in,
+    fill_in_normal,
+    uniform_law,
+)
 from netkf.checks.statistics import Interval, detectable_shift, deviation_interval
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.channels import ExponentialDelay, LognormalDelay, UniformDelay
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -34,9 +43,9 @@ MEAN_TOLERANCE = 0.05
 
 class DelayCounts(NamedTuple):
     """Delays of the messages of one run over D directions (directed links), as numbers u that are
-    uniform in [0, 1] under the stated law: P(delay <= this one), given that it is logged.
+    uniform in [0, 1] under the stated law: P(delay <= this one).
 
-    cells    : (CELLS, 1) numbers of u in equal parts of [0, 1]
+    cells    : (CELLS, 2) numbers of u in equal parts of [0, 1], and of those looked at
     products : (3,) sums over neighbouring delays of a direction, as in TickCounts
     sums     : (2, D) of each direction the number of delays and the sum of u - 1/2
     off      : () largest distance in seconds of a delay from a stated constant
@@ -56,29 +65,37 @@ def stated_delay(scenario: Scenario) -> Any:
     return stated_part(scenario.network.channel.delay, "delay")
 
 
+def law_of_delay(delay: Any) -> WaitingLaw | None:
+    """Return the law that ``delay`` states; None if it is unknown or has no density."""
+    # By exact type: a class with statements of its own has a law of its own.
+    if type(delay) is ExponentialDelay and delay.mean > 0.0:
+        return exponential_law(np.array(1.0 / delay.mean))
+    if type(delay) is UniformDelay and delay.high > delay.low:
+        return uniform_law(delay.low, delay.high - delay.low)
+    if type(delay) is LognormalDelay and delay.sigma > 0.0:
+        mean, sigma = delay.mean, delay.sigma
+        return WaitingLaw(
+            lambda t: scipy.special.ndtr(
+                np.log(np.maximum(t, 1e-300) / mean) / sigma + 0.5 * sigma
+            ),
+            lambda p: mean * np.exp(sigma * (scipy.special.ndtri(p) - 0.5 * sigma)),
+        )
+    return None
+
+
 def delay_law(delay: Any, seconds: FloatArray) -> FloatArray | None:
     """Return P(delay <= ``seconds``) (K,) under the law that ``delay`` states; None if the law is
     unknown or has no density.
     """
-    seconds = np.maximum(seconds, 0.0)
-    # By exact type: a class with statements of its own has a law of its own.
-    if type(delay) is ExponentialDelay:
-        return np.asarray(-np.expm1(-seconds / delay.mean))
-    if type(delay) is UniformDelay and delay.high > delay.low:
-        return np.clip((seconds - delay.low) / (delay.high - delay.low), 0.0, 1.0)
-    if type(delay) is LognormalDelay and delay.sigma > 0.0:
-        with np.errstate(divide="ignore"):
-            z = np.log(seconds / delay.mean) / delay.sigma + 0.5 * delay.sigma
-        return np.asarray(scipy.special.ndtr(z))
-    return None
+    law = law_of_delay(delay)
+    return None if law is None else np.asarray(law.cdf(np.maximum(seconds, 0.0)))
 
 
 def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
     """Return counts and sums by which the delays of the messages of a run are compared with their
     stated law, over D directions (directed links); None without links or a stated law.
 
-    Only messages that arrive before the run ends are in the log. So the law of a delay is
-    conditioned on its being at most the time from sending to the end of the run.
+    Messages that have not arrived when the run ends take longer than that.
     """
     delay, indices = stated_delay(scenario), direction_indices(scenario)
     rows = run.log[np.isin(run.log["kind"], (CODES["deliver"], CODES["late"]))]
@@ -87,30 +104,56 @@ def count_delays(scenario: Scenario, run: Run) -> DelayCounts | None:
     ages, fixed = rows["age"], delay.fixed
     if fixed is not None:
         largest_error = np.abs(ages - fixed).max(initial=0.0)
-        zeros = np.zeros((CELLS, 1)), np.zeros(3), np.zeros((2, len(indices)))
+        zeros = np.zeros((CELLS, 2)), np.zeros(3), np.zeros((2, len(indices)))
         return DelayCounts(*zeros, np.array(largest_error))
-    law = delay_law(delay, ages)
+    law = law_of_delay(delay)
     if law is None:
         return None
-    # The receiver of a message comes first in the row of its arrival.
-    directions = in_direction(rows["peer"], rows["node"], indices)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        probability_until_end = delay_law(delay, scenario.horizon - (rows["t"] - ages))
-        assert probability_until_end is not None
-        uniform = np.clip(law / probability_until_end, 0.0, 1.0)
-    # Where both directions of a link share their draws, one stands for both.
-    counted = np.isfinite(uniform) & ~shares_draws(scenario)[directions]
-    order = np.lexsort((rows["message"][counted], directions[counted]))
-    ranks, directions = uniform[counted][order], directions[counted][order]
+    sent, directions, ages = _follow_messages(scenario, run, rows)
+    ranks = censored_ranks(law, sent, ages, scenario.horizon)
     # The first message of each direction has no neighbour before it.
-    first = np.ones(len(ranks), dtype=bool)
+    first = np.ones(len(sent), dtype=bool)
     first[1:] = directions[1:] != directions[:-1]
+    looked_at, centred = np.isfinite(ranks.rank), fill_in(ranks) - 0.5
     sums = [
-        np.bincount(directions, weights, len(indices))
-        for weights in (np.ones(len(ranks)), ranks - 0.5)
+        np.bincount(directions[looked_at], weights[looked_at], len(indices))
+        for weights in (np.ones(len(sent)), centred)
     ]
-    cells = count_cells(ranks[:, None], np.ones((len(ranks), 1), dtype=bool))
-    return DelayCounts(cells, correlate_neighbours(ranks, first), np.array(sums), np.array(0.0))
+    products = correlate_neighbours(fill_in_normal(ranks), first)
+    return DelayCounts(count_ranks(ranks), products, np.array(sums), np.array(0.0))
+
+
+def _follow_messages(
+    scenario: Scenario, run: Run, arrivals: np.ndarray
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return for each of the K messages of a run that are not lost the time (K,) of sending, the
+    index (K,) of its direction, and the seconds (K,) that it takes: inf if it is under way when the
+    run ends. They are in order of direction and number; ``arrivals`` are the rows of the log.
+
+    Where both directions of a link share their draws, one stands for both.
+    """
+    indices, log = direction_indices(scenario), run.log
+    sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
+    width = int(sends["message"].max(initial=0)) + 1
+
+    def keys(rows: np.ndarray, sender: str, receiver: str) -> IntArray:
+        """Return one integer for each message: its direction, and its number in that."""
+        codes: IntArray = in_direction(rows[sender], rows[receiver], indices) * width
+        return codes + np.asarray(rows["message"], dtype=np.int64)
+
+    sent = keys(sends, "node", "peer")
+    # The receiver of a message comes first in the row of its arrival.
+    arrived = keys(arrivals, "peer", "node")
+    followed = ~np.isin(sent, keys(losses, "node", "peer"))
+    followed &= ~shares_draws(scenario)[sent // width]
+    order = np.argsort(sent[followed], kind="stable")
+    sent, times = sent[followed][order], sends["t"][followed][order]
+    ages = np.full(len(sent), np.inf)
+    position = np.searchsorted(sent, arrived)
+    position[position == len(sent)] = 0
+    known = sent[position] == arrived if len(sent) else np.zeros(len(arrived), dtype=bool)
+    ages[position[known]] = arrivals["age"][known]
+    return times, sent // width, ages
 
 
 def _check_fixed(samples: Any, level: float) -> Finding:
@@ -132,7 +175,7 @@ def _check_law(samples: Any, level: float) -> Finding:
     correlated with those of the message before; each of the three tests gets a third of the level.
     """
     counts = samples.delays
-    finding = compare_cells(counts.cells.sum(axis=0), ["all"], level / 3.0, "delays")
+    finding = compare_shares(counts.cells.sum(axis=0), level / 3.0, "delays")
     number, excess = counts.sums.sum(axis=0)
     frequent = np.flatnonzero(number >= MIN_COUNT)
     intervals: list[tuple[Interval, str]] = []
@@ -166,13 +209,19 @@ def _mean_interval(mean: float, count: float, level: float) -> Interval:
 
 
 FIXED = Promise(
-    "messages take the time of the scenario", "the scenario", (), _check_fixed, exact=True
+    "messages take the time of the scenario",
+    "the scenario",
+    (),
+    _check_fixed,
+    exact=True,
+    group=DELAYS,
 )
 LAW = Promise(
     "delays of messages have the law of the scenario, independent of each other",
     "the scenario",
     (),
     _check_law,
+    group=DELAYS,
 )
 
 

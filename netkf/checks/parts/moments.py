@@ -37,6 +37,8 @@ in which the pooled variance is tested.
 """
 MIN_RUNS = 10
 """Runs from whose spread an interval is computed."""
+MIN_EVENTS = 20
+"""Events (losses, ticks), or runs with one, from which their sample variance is used."""
 MIN_COUNT, MIN_COUNT_OF_ANY_LAW = 20, 200
 """Values from which means and variances are tested, and variances of numbers of an unknown law."""
 
@@ -292,6 +294,26 @@ def compare_cells(cells: FloatArray, labels: list[str], level: float, noun: str)
                 intervals.append((distance, f"{label}, {_cell_label(k)}"))
     message = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
     return with_best(intervals, SHARE_TOLERANCE, message, overall_count=CELLS)
+
+
+def compare_shares(cells: FloatArray, level: float, noun: str) -> Finding:
+    """Test the null hypothesis that waiting times have their stated law, from how many are in each
+    of CELLS ``cells`` of equal probability and how many could be, (CELLS, 2).
+
+    Cells which few runs can show are left out. ``noun`` names the waiting times in the message. The
+    interval of the finding misses the truth with at most the probability ``level``.
+    """
+    visible = [k for k, trials in enumerate(cells[:, 1].tolist()) if trials >= 10 * CELLS]
+    if not visible:
+        return nothing_to_see(SHARE_TOLERANCE)
+    intervals = [
+        (_cell_interval(float(cells[k, 0]), cells[k, 1], level / len(visible)), _cell_label(k))
+        for k in visible
+    ]
+    message = f"{cells[0, 1]:,.0f} {noun}, largest difference of a share from 1/{CELLS}"
+    if len(visible) < CELLS:
+        message += f" (runs are too short to show ranks above {(visible[-1] + 1) / CELLS:.2f})"
+    return find_largest(intervals, SHARE_TOLERANCE, message)
 
 
 def _cell_interval(count: float, total: float, level: float) -> Interval:

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from netkf.checks.evidence import Finding, Promise
+from netkf.checks.evidence import LOSSES, MATCHINGS, Assumption, Finding, Promise
 from netkf.checks.laws import find_largest
 from netkf.checks.parts.clock_rows import clock_promises, largest_correlation
 from netkf.checks.parts.delays import delay_promises
-from netkf.checks.parts.events import reversed_directions
+from netkf.checks.parts.events import reversed_directions, shares_draws
 from netkf.checks.parts.moments import (
     CORRELATION_TOLERANCE,
     MIN_COUNT,
+    MIN_EVENTS,
     MIN_RUNS,
     nothing_to_see,
     with_best,
@@ -36,11 +37,10 @@ from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching
 from netkf.network.recorded import RecordedLoss
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.random_links import has_constant_losses, has_recorded_broadcasts
 
 PROBABILITY_TOLERANCE = 0.05
 """Tolerated error of a share of messages or slots."""
-MIN_EVENTS = 20
-"""Runs with at least one event (a loss, a delivery) from which their sample variance is used."""
 
 
 def _stated_loss(scenario: Scenario) -> Any:
@@ -78,7 +78,9 @@ def _check_losses(samples: PartSamples, level: float) -> Finding:
     in_use = np.flatnonzero(sent.sum(axis=0) > 0)
     intervals = [(_loss_interval(scenario, sent, lost, q, in_use, level / 3.0), "all directions")]
     windows = np.flatnonzero(counts.sent.sum(axis=(0, 2)) > 0)
-    for w in windows.tolist() if counts.sent.shape[1] > 1 else ():
+    # Windows show losses that change with time, as those of a user's class may do by design.
+    steady = counts.sent.shape[1] > 1 and has_constant_losses(scenario)
+    for w in windows.tolist() if steady else ():
         window_counts = counts.sent[:, w], counts.lost[:, w]
         interval = _loss_interval(scenario, *window_counts, q, in_use, level / (3.0 * len(windows)))
         label = f"all directions in part {w + 1} of {counts.sent.shape[1]} of the run"
@@ -133,10 +135,30 @@ def _loss_interval(
     if rare:
         limits = _share_of_bounded_runs(excess, sent[:, directions].sum(axis=1), expected, level)
         return deviation_interval(expected, limits)
-    # A spread of at least one message of all: a few rare losses may show none.
-    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, 1.0))
+    # Few runs may show too little spread by chance: at least that of one message, and as stated.
+    stated = float((sent * (q * (1.0 - q)))[:, directions].sum()) * _variance_factor(scenario)
+    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, stated, 1.0))
     estimate = expected + float(excess.sum()) / total
     return deviation_interval(expected, student_interval(estimate, spread / total, runs, level))
+
+
+@lru_cache(maxsize=8)
+def _variance_factor(scenario: Scenario) -> float:
+    """Return the factor by which bursts and shared draws raise the variance of the number of losses
+    over that of independent messages, in long runs; at least 1.
+    """
+    shared = 2.0 if len(scenario.topology.directions) and shares_draws(scenario).any() else 1.0
+    loss = _stated_loss(scenario)
+    if type(loss) is not GilbertElliott or not _one_step_a_message(scenario):
+        return shared
+    q = 1.0 - loss.mean_delivery((0, 1), 1.0)
+    # Correlations of a two-state chain decay geometrically, by the second eigenvalue of its steps.
+    memory = 1.0 - sum(loss.transitions)
+    neighbours = loss_twice(loss) - q**2
+    spread = q * (1.0 - q)
+    if not spread > 0.0 or not memory < 1.0:
+        return shared
+    return shared * max(1.0, 1.0 + 2.0 * neighbours / spread / (1.0 - memory))
 
 
 def _share_of_bounded_runs(
@@ -348,14 +370,13 @@ def _links_apart(samples: PartSamples, level: float) -> list[tuple[Interval, str
     excess = (counts.lost - counts.sent * loss_probabilities(scenario)).reshape(
         -1, counts.sent.shape[2]
     )
-    excess = excess[:, columns]
-    largest = largest_correlation(excess, level / 2.0)
-    if largest is None:
-        return []
-    interval, (a, b) = largest
-    first, second = (_direction_label(scenario, int(columns[k])) for k in (a, b))
-    intervals = [(interval, f"correlation of losses {first} and {second}")]
-    mean = _mean_correlation(excess, _loss_variances(samples)[:, columns], level / 2.0)
+    excess, variances = excess[:, columns], _loss_variances(samples)[:, columns]
+    intervals, largest = [], largest_correlation(excess, variances, level / 2.0)
+    if largest is not None:
+        interval, (a, b) = largest
+        first, second = (_direction_label(scenario, int(columns[k])) for k in (a, b))
+        intervals.append((interval, f"correlation of losses {first} and {second}"))
+    mean = _mean_correlation(excess, variances, level / 2.0)
     if mean is not None:
         # A common cause of losses correlates all pairs a little, which shows best in the mean.
         intervals.append((deviation_interval(0.0, mean), "mean correlation of losses of all links"))
@@ -456,22 +477,59 @@ def _check_matchings(samples: PartSamples, level: float) -> Finding:
     return with_best(intervals, PROBABILITY_TOLERANCE, message)
 
 
-LOSSES = Promise(
+DRAWN, STATED = "losses are drawn, not recorded", "losses state how often messages are lost"
+SAME = "all messages of a link are lost with one probability"
+LOSS_ROW = Promise(
     "messages are lost as often as the scenario says, in each direction",
     "the scenario",
-    (),
+    (DRAWN, STATED),
     _check_losses,
+    group=LOSSES,
 )
 LOSSES_APART = Promise(
-    "messages are lost independently of each other", "the scenario", (), _losses_apart
+    "messages are lost independently of each other",
+    "the scenario",
+    (DRAWN, STATED, SAME),
+    _losses_apart,
+    group=LOSSES,
 )
-BURSTS = Promise("losses follow each other as the scenario says", "the scenario", (), _check_bursts)
-MATCHINGS = Promise(
+BURSTS = Promise(
+    "losses follow each other as the scenario says",
+    "the scenario",
+    (DRAWN, STATED),
+    _check_bursts,
+    group=LOSSES,
+)
+MATCHING_ROW = Promise(
     "links are paired as often as the protocol says, whatever happened before",
     "the scenario",
     (),
     _check_matchings,
+    group=MATCHINGS,
 )
+
+
+def loss_assumptions(scenario: Scenario) -> list[Assumption]:
+    """Return the assumptions of tests of losses, each with whether it holds: there is a law, it is
+    stated, and it is the same for all messages of a link.
+    """
+    channel = scenario.network.channel
+    drawn, evidence = True, "links are up unless a message is lost"
+    if isinstance(_stated_loss(scenario), RecordedLoss):
+        drawn, evidence = False, "a table lists which messages arrive"
+    elif delay_depends_on_message(channel.delay):
+        # Such a delay may lose a message (nan), which the law of losses does not state.
+        drawn, evidence = False, "delays depend on the message, and may lose it"
+    elif has_recorded_broadcasts(scenario):
+        drawn, evidence = False, "a table lists the links that are up; others lose their messages"
+    source, name = "the scenario", type(channel.loss).__name__
+    stated = bool(np.isfinite(loss_probabilities(scenario)).all())
+    same = has_constant_losses(scenario)
+    return [
+        Assumption(DRAWN, source, drawn, evidence),
+        Assumption(STATED, source, stated, "for each link" if stated else f"{name} does not"),
+        Assumption(SAME, source, same, "" if same else f"{name} changes it with the message"),
+    ]
 
 
 def network_promises(samples: PartSamples) -> list[Promise]:
@@ -482,17 +540,12 @@ def network_promises(samples: PartSamples) -> list[Promise]:
     scenario = samples.scenario
     drawn = samples.pairs is not None and scenario.node_filter.talks
     if drawn and pair_probabilities(scenario) is not None:
-        promises.append(MATCHINGS)
-    # A delay that depends on the message may lose it (nan), which the law of losses does not state.
-    losses_are_stated = not delay_depends_on_message(scenario.network.channel.delay)
-    recorded = isinstance(_stated_loss(scenario), RecordedLoss)
-    sent = samples.fates is not None and samples.fates.sent.any()
-    if sent and losses_are_stated and not recorded:
+        promises.append(MATCHING_ROW)
+    if samples.fates is not None and samples.fates.sent.any():
         q = loss_probabilities(scenario)
-        if np.isfinite(q).all():
-            promises.append(LOSSES)
-            if _is_independent(scenario) and ((q > 0.0) & (q < 1.0)).any():
-                promises.append(LOSSES_APART)
-            if type(_stated_loss(scenario)) is GilbertElliott and _one_step_a_message(scenario):
-                promises.append(BURSTS)
+        promises.append(LOSS_ROW)
+        if _is_independent(scenario) and ((q > 0.0) & (q < 1.0)).any():
+            promises.append(LOSSES_APART)
+        if type(_stated_loss(scenario)) is GilbertElliott and _one_step_a_message(scenario):
+            promises.append(BURSTS)
     return promises + delay_promises(samples)

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 
-from netkf.checks.evidence import GAUSSIAN, Assumption, Finding, Promise
+from netkf.checks.evidence import (
+    GAUSSIAN,
+    PLANT,
+    SENSORS,
+    START,
+    Assumption,
+    Finding,
+    Promise,
+)
 from netkf.checks.parts.moments import (
     NoiseMoments,
     compare_cells,
@@ -16,7 +25,7 @@ from netkf.checks.parts.moments import (
     moments,
     total,
 )
-from netkf.checks.parts.network_rows import network_promises
+from netkf.checks.parts.network_rows import loss_assumptions, network_promises
 from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts
 from netkf.checks.parts.samples import PartSamples
 from netkf.checks.parts.sources import is_own_class
@@ -160,25 +169,34 @@ def _fills_evenly(cells: FloatArray) -> bool:
     return not finding.margin[2] < 0.0
 
 
-START_ROWS = (
-    Promise("the state starts with its covariance", "the scenario", (), _start_variance),
-    Promise("the state starts with its mean", "the scenario", (), _start_mean),
+def _noise_rows(group: str, *rows: tuple[str, Callable[..., Finding]]) -> tuple[Promise, ...]:
+    """Return promises of the scenario about one noise, from statements and tests."""
+    return tuple(Promise(text, "the scenario", (), test, group=group) for text, test in rows)
+
+
+# A bias comes first: squares about a wrong mean, and products of such, are wrong too.
+START_ROWS = _noise_rows(
+    START,
+    ("the state starts with its mean", _start_mean),
+    ("the state starts with its covariance", _start_variance),
 )
-PLANT_ROWS = (
-    Promise("the plant's noise has its covariance", "the scenario", (), _step_variance),
-    Promise("the plant follows its equation without a bias", "the scenario", (), _step_mean),
-    Promise("the plant's noise is white", "the scenario", (), _step_correlation),
+PLANT_ROWS = _noise_rows(
+    PLANT,
+    ("the plant follows its equation without a bias", _step_mean),
+    ("the plant's noise has its covariance", _step_variance),
+    ("the plant's noise is white", _step_correlation),
 )
-SENSOR_ROWS = (
-    Promise("noises of the sensors have their covariance", "the scenario", (), _reading_variance),
-    Promise("readings have no bias", "the scenario", (), _reading_mean),
-    Promise(
-        "noises of the sensors are white and independent of each other",
-        "the scenario",
-        (),
-        _reading_correlation,
-    ),
+SENSOR_ROWS = _noise_rows(
+    SENSORS,
+    ("readings have no bias", _reading_mean),
+    ("noises of the sensors have their covariance", _reading_variance),
+    ("noises of the sensors are white and independent of each other", _reading_correlation),
 )
+
+
+def part_assumptions(samples: PartSamples) -> list[Assumption]:
+    """Return the assumptions of the tests of a scenario's parts, each with whether it holds."""
+    return loss_assumptions(samples.scenario)
 
 
 def part_promises(samples: PartSamples) -> tuple[Promise, ...]:

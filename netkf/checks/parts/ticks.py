@@ -8,15 +8,25 @@ can be counted in the same few cells.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
 
-from netkf.checks.parts.moments import CELLS, correlation_interval, count_cells
+from netkf.checks.parts.moments import CELLS
 from netkf.checks.parts.sources import stated_part
-from netkf.checks.statistics import Interval
+from netkf.checks.parts.waiting import (
+    Ranks,
+    WaitingLaw,
+    censored_ranks,
+    correlate_neighbours,
+    count_ranks,
+    exponential_law,
+    fill_in_normal,
+    uniform_law,
+)
 from netkf.core.clock import Entity, generate_ticks
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock, OnReadings, Periodic, Renewal
@@ -33,8 +43,8 @@ class TickCounts(NamedTuple):
     """Counts of the ticks of E clocks in one run.
 
     ticks    : (W, E) ticks in each of W equal windows of the run
-    cells    : (CELLS, 1) numbers of gaps between ticks, transformed by their stated distribution
-               function to uniform numbers, in equal parts of [0, 1)
+    cells    : (CELLS, 2) numbers of gaps between ticks, transformed by their stated distribution
+               function to uniform numbers, in equal parts of [0, 1), and of those looked at
     products : (3,) over pairs of neighbouring gaps, as standard normal numbers u and v: the sum of
                u v, the sum of (u^2 + v^2) / 2, and the number of pairs
     off      : () largest distance in seconds of a tick from the times of a deterministic clock
@@ -179,6 +189,9 @@ def _count_in_windows(
     """
     size = len(group.entities)
     windows = _by_window(times, clock_of_tick, size, horizon)
+    # After its last tick each clock has a gap that the run does not finish.
+    times = np.concatenate([times, np.full(size, np.inf)])
+    clock_of_tick = np.concatenate([clock_of_tick, np.arange(size)])
     order = np.lexsort((times, clock_of_tick))
     sorted_times, sorted_clocks = times[order], clock_of_tick[order]
     is_first = np.ones(len(sorted_times), dtype=bool)
@@ -188,24 +201,27 @@ def _count_in_windows(
     first_row = np.concatenate([[0], np.cumsum(ticks_of_clock)])
     number = np.arange(len(sorted_times)) - first_row[sorted_clocks]
     # Under the null hypothesis the gaps, transformed by their stated law, are uniform in [0, 1).
-    uniform, largest_error = np.full(len(sorted_times), np.nan), 0.0
+    ranks = Ranks(np.full(len(sorted_times), np.nan), np.zeros(len(sorted_times)))
+    largest_error = 0.0
     for clock in dict.fromkeys(group.stated):  # clocks of one law share one object
         rows = np.array([stated is clock for stated in group.stated])[sorted_clocks]
         ticks = TickSample(
-            sorted_times[rows], number[rows], ticks_of_clock[sorted_clocks[rows]], is_first[rows]
+            sorted_times[rows],
+            number[rows],
+            ticks_of_clock[sorted_clocks[rows]] - 1,
+            is_first[rows],
         )
-        uniform[rows] = _as_uniform(clock, ticks, horizon)
-        largest_error = max(largest_error, distance_from_lattice(clock, ticks))
-    present = np.isfinite(uniform)
-    cells = count_cells(np.where(present, uniform, 0.0)[:, None], present[:, None])
-    products = correlate_neighbours(uniform, is_first)
-    return TickCounts(windows, cells, products, np.array(largest_error))
+        law = stated_gaps(clock, [group.entities[k] for k in sorted_clocks[rows].tolist()])
+        ranks.rank[rows], ranks.known[rows] = _rank_gaps(clock, law, ticks, horizon)
+        largest_error = max(largest_error, distance_from_lattice(clock, ticks.finished()))
+    products = correlate_neighbours(fill_in_normal(ranks), is_first)
+    return TickCounts(windows, count_ranks(ranks), products, np.array(largest_error))
 
 
 class TickSample(NamedTuple):
     """K ticks of one run, clock by clock and in order of time.
 
-    times  : (K,) seconds
+    times  : (K,) seconds; inf for the tick after the last of a clock, which the run does not reach
     number : (K,) index of the tick on its clock, from 0
     total  : (K,) number of ticks of its clock in the run
     first  : (K,) bool, the tick is the first of its clock
@@ -222,51 +238,64 @@ class TickSample(NamedTuple):
         before = np.concatenate([[0.0], self.times[:-1]])[: len(self.times)]
         return np.where(self.first, 0.0, before)
 
+    def finished(self) -> TickSample:
+        """Return the ticks that the run reaches."""
+        return TickSample(*(column[np.isfinite(self.times)] for column in self))
 
-def _as_uniform(clock: Any, ticks: TickSample, horizon: float) -> np.ndarray:
-    """Return the gap before each of K ticks as a number (K,) that is uniform in [0, 1) and
-    independent of those before it under the stated law; nan where no law is known.
 
-    The end of a run, at ``horizon`` seconds, censors long gaps, which the transform must allow for.
-    Given the number of ticks in a run, those of a Poisson clock are independent uniform times: with
-    m ticks still to come in the remaining time, a gap exceeds a share v of it with probability (1 -
-    v)^m. For other renewal clocks the law of a gap is conditioned on its end being before that of
-    the run.
+def _rank_gaps(clock: Any, law: WaitingLaw | None, ticks: TickSample, horizon: float) -> Ranks:
+    """Return the gap before each of K ticks as a number that is uniform in [0, 1) and independent
+    of those before it under the stated law; nan where no law is known or the run does not show it.
+
+    Lateness in the jitter of a periodic clock and its random phase are such numbers too.
     """
-    gaps, remaining = ticks.times - ticks.before, horizon - ticks.before
-    if clock.memoryless:
-        return np.asarray(-np.expm1((ticks.total - ticks.number) * np.log1p(-gaps / remaining)))
-    if type(clock) is Renewal:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(gap_law(clock, gaps) / gap_law(clock, remaining))
+    if law is not None:
+        return censored_ranks(law, ticks.before, ticks.times - ticks.before, horizon)
+    uniform = np.full(len(ticks.times), np.nan)
     if type(clock) is Periodic and clock.jitter > 0.0 and not isinstance(clock.phase, str):
         share = (ticks.times - _lattice_times(clock, ticks.number)) / clock.jitter
         # The last tick is left out: jitter could have moved it beyond the end of the run.
-        return np.where(ticks.number < ticks.total - 1, np.clip(share, 0.0, 1.0), np.nan)
-    if type(clock) is Periodic and isinstance(clock.phase, str) and clock.period <= horizon:
+        uniform = np.where(ticks.number < ticks.total - 1, np.clip(share, 0.0, 1.0), np.nan)
+    elif type(clock) is Periodic and isinstance(clock.phase, str) and clock.period <= horizon:
         phases = np.clip(ticks.times / clock.period, 0.0, 1.0)
-        return np.where(ticks.first & (clock.jitter == 0.0), phases, np.nan)
-    return np.full(len(gaps), np.nan)
+        uniform = np.where(ticks.first & (clock.jitter == 0.0), phases, np.nan)
+    return Ranks(uniform, np.full(len(uniform), CELLS))
+
+
+def stated_gaps(clock: Any, entities: Sequence[Entity]) -> WaitingLaw | None:
+    """Return the law of K gaps of a clock, each of the entity (node, link) in ``entities``; None
+    where gaps are constant or their law is unknown.
+    """
+    if clock.memoryless:
+        rates = {entity: clock.mean_rate(entity) for entity in set(entities)}
+        return exponential_law(np.array([rates[entity] for entity in entities]))
+    # By exact type: a class with statements of its own has a law of its own.
+    if type(clock) is not Renewal:
+        return None
+    shape, mean = clock.shape or 1.0, 1.0 / clock.mean_rate(())
+    if clock.distribution == "gamma":
+        return WaitingLaw(
+            lambda t: np.asarray(scipy.special.gammainc(shape, shape * t / mean), dtype=float),
+            lambda p: np.asarray(scipy.special.gammaincinv(shape, p) * mean / shape, dtype=float),
+        )
+    if clock.distribution == "weibull":
+        scale = mean / math.gamma(1.0 + 1.0 / shape)
+        return WaitingLaw(
+            lambda t: -np.expm1(-np.asarray((t / scale) ** shape, dtype=np.float64)),
+            lambda p: np.asarray(scale * (-np.log1p(-p)) ** (1.0 / shape), dtype=np.float64),
+        )
+    if clock.distribution == "uniform" and clock.high != clock.low:
+        low, width = float(clock.low or 0.0), float(clock.high or 0.0) - float(clock.low or 0.0)
+        return uniform_law(low, width)
+    return None
 
 
 def gap_law(clock: Any, gaps: np.ndarray) -> np.ndarray:
     """Return P(gap <= ``gaps``) (K,) of a renewal clock, ``gaps`` in seconds; nan where gaps are
     constant or their law is unknown.
     """
-    # By exact type: a class with statements of its own has a law of its own.
-    if type(clock) is not Renewal:
-        return np.full(len(gaps), np.nan)
-    shape, mean = clock.shape or 1.0, 1.0 / clock.mean_rate(())
-    if clock.distribution == "gamma":
-        return np.asarray(scipy.special.gammainc(shape, shape * gaps / mean))
-    if clock.distribution == "weibull":
-        scale = mean / scipy.special.gamma(1.0 + 1.0 / shape)
-        return np.asarray(-np.expm1(-((gaps / scale) ** shape)))
-    if clock.distribution == "uniform" and clock.high != clock.low:
-        assert clock.low is not None
-        assert clock.high is not None
-        return np.clip((gaps - clock.low) / (clock.high - clock.low), 0.0, 1.0)
-    return np.full(len(gaps), np.nan)
+    law = stated_gaps(clock, ()) if type(clock) is Renewal else None
+    return np.full(len(gaps), np.nan) if law is None else np.asarray(law.cdf(gaps))
 
 
 def relative_variance(clock: Any) -> float:
@@ -324,29 +353,3 @@ def distance_from_lattice(clock: Any, ticks: TickSample) -> float:
         excess = late[starts] - (clock.period + jitter)
         return float(max(spread.max() - jitter, excess.max(), 0.0))
     return float(max(-late.min(), late.max() - jitter, 0.0))
-
-
-def correlate_neighbours(uniform: np.ndarray, first: np.ndarray) -> FloatArray:
-    """Return the sums (3,) from which :func:`correlation_of_neighbours` tests that successive gaps
-    (or delays) are independent: over neighbours u, v of a series ``uniform`` (K,) of uniform
-    numbers, made normal, those of u v and of (u^2 + v^2) / 2, and their number.
-
-    Numbers that are nan, and the pairs of a number marked as ``first`` (K,) of its clock with the
-    one before it, are left out.
-    """
-    normal = scipy.special.ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12))
-    pairs = ~first[1:] & np.isfinite(normal[1:]) & np.isfinite(normal[:-1])
-    u, v = normal[1:][pairs], normal[:-1][pairs]
-    return np.array([u @ v, 0.5 * (u @ u + v @ v), float(len(u))])
-
-
-def correlation_of_neighbours(products: FloatArray, level: float) -> Interval | None:
-    """Return an interval for the correlation of neighbouring numbers from the ``products`` (R, 3)
-    of R runs, see :func:`correlate_neighbours`; None for fewer than 10 CELLS pairs.
-
-    The interval misses the truth with at most the probability ``level``.
-    """
-    total, squares, pairs = products.sum(axis=0)
-    if pairs < 10 * CELLS:
-        return None
-    return correlation_interval(float(total / squares), pairs, level)

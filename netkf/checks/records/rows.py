@@ -7,7 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import Finding, Promise, find_unknown
+from netkf.checks.evidence import (
+    ENGINES,
+    EVENTS,
+    FILES,
+    STARTS,
+    STATES,
+    Finding,
+    Promise,
+    find_unknown,
+)
 from netkf.checks.records.events import event_fault
 from netkf.checks.records.files import FilesUnknownError, files_fault
 from netkf.checks.records.states import sample_fault, start_fault, with_start
@@ -145,13 +154,13 @@ def _files(audits: Sequence[Audit], level: float) -> Finding:
 
 
 PROMISES = tuple(
-    Promise(statement, "the record", (), test, exact=True)
-    for statement, test in (
-        ("events are recorded once, in order, with their numbers", _events),
-        ("states are those that the plant draws, errors are x - xhat", _samples),
-        ("estimates and covariances start as [filter] says", _start),
-        ("both engines make the same events and states", _engines),
-        ("files hold the run, and the summary counts it", _files),
+    Promise(statement, "the record", (), test, exact=True, group=group)
+    for statement, test, group in (
+        ("events are recorded once, in order, with their numbers", _events, EVENTS),
+        ("states are those that the plant draws, errors are x - xhat", _samples, STATES),
+        ("estimates and covariances start as [filter] says", _start, STARTS),
+        ("both engines make the same events and states", _engines, ENGINES),
+        ("files hold the run, and the summary counts it", _files, FILES),
     )
 )
 

@@ -8,19 +8,24 @@ enter second moments.
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
-from netkf.network.channels import GilbertElliott
+from netkf.network.channels import GilbertElliott, identical_per_link
 from netkf.network.clocks import LinkClock
+from netkf.network.matchings import RecordedSlots
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import is_recorded
 
 MAX_CHAINS = 10
 """Independent chains of bursty links whose joint states are enumerated."""
+MESSAGES_ASKED = 64
+"""First messages of a link for which a user's loss is asked if their probability is the same."""
 
 
 class Directions(NamedTuple):
@@ -176,24 +181,66 @@ def directions_of(
     )
 
 
+def nothing_is_lost(scenario: Scenario) -> bool:
+    """Return True if no message of a scenario in slots is lost: its losses say so, and no record
+    decides which links are up.
+    """
+    loss = scenario.network.channel.loss
+    return not has_recorded_broadcasts(scenario) and all(
+        loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
+        for link in scenario.topology.directions
+    )
+
+
+def has_recorded_broadcasts(scenario: Scenario) -> bool:
+    """Return True if a table lists the links that are up in each step of a broadcast: messages on
+    the others are lost, whatever the loss model says.
+    """
+    activation = scenario.network.activation
+    return isinstance(activation, RecordedSlots) and not activation.matching
+
+
 def all_messages_arrive(scenario: Scenario) -> bool:
     """Return True if every message of a scenario in slots arrives in its exchange."""
-    channel = scenario.network.channel
-    delay = channel.delay.fixed
-    return (
-        delay is not None
-        and delay <= scenario.phase_length
-        and all(
-            channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
-            for link in scenario.topology.directions
-        )
-    )
+    delay = scenario.network.channel.delay.fixed
+    return delay is not None and delay <= scenario.phase_length and nothing_is_lost(scenario)
+
+
+def delivery_of(scenario: Scenario, direction: tuple[int, int]) -> float:
+    """Return the probability with which each message on a directed link (sender, receiver) arrives.
+
+    Raises TheoryError if it is unknown before a run, or not the same for all messages.
+    """
+    loss, table = scenario.network.channel.loss, scenario.table_probability(direction)
+    mean = loss.mean_delivery(direction, table)
+    if math.isnan(mean):
+        raise TheoryError("the losses state no probability before a run")
+    if not has_constant_losses(scenario):
+        raise TheoryError("messages of one link are lost with different probabilities")
+    return mean
+
+
+@lru_cache(maxsize=8)
+def has_constant_losses(scenario: Scenario) -> bool:
+    """Return True if all messages of a directed link arrive with one probability; a user's class is
+    asked for its first MESSAGES_ASKED messages.
+    """
+    loss = scenario.network.channel.loss
+    if identical_per_link(loss) or isinstance(loss, GilbertElliott):
+        return True
+    for direction in scenario.topology.directions:
+        table = scenario.table_probability(direction)
+        first = loss.delivery_probability(direction, 0, False, table)
+        for message in range(1, MESSAGES_ASKED):
+            if loss.delivery_probability(direction, message, False, table) != first:
+                return False
+    return True
 
 
 def _require_law(scenario: Scenario) -> None:
     """Raise TheoryError if losses or delays have no law that is known here."""
     channel = scenario.network.channel
-    if is_recorded(channel):
+    if is_recorded(channel) or has_recorded_broadcasts(scenario):
         raise TheoryError("losses or delays are recorded: their law is not known")
     if channel.delay.fixed is None:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
@@ -222,7 +269,7 @@ def _deliveries(
         return np.array([loss.delivery_probability(link, 0, bad, table) for link, table in tables])
 
     if not isinstance(loss, GilbertElliott):
-        return probabilities(False)[None]
+        return np.array([[delivery_of(scenario, link) for link in links]])
     if chains > MAX_CHAINS:
         raise TheoryError(
             f"bursts on {chains} links have 2^{chains} joint states; exact mean squares are "

@@ -10,6 +10,7 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.random_links import delivery_of
 
 MAX_WALK = 40  # steps of a walk
 MAX_VISITED = 20_000  # states of the search for a walk
@@ -42,17 +43,15 @@ def effective_matching(scenario: Scenario) -> FloatArray:
     activation, channel = scenario.network.activation, scenario.network.channel
     if not isinstance(activation, Matching):
         raise TheoryError("the matching is recorded, not drawn")
-    loss, delay = channel.loss, channel.delay.fixed
-    if not loss.independent:
+    delay = channel.delay.fixed
+    if not channel.loss.independent:
         raise TheoryError("losses come in bursts or recorded")
     if delay is None or delay > scenario.phase_length:
         raise TheoryError("messages may be late")
     # The losses must not depend on the matching: then probabilities multiply.
     mean, index = mean_matching(scenario), scenario.topology.index
     for i, j in scenario.topology.links:
-        forth, back = (
-            loss.mean_delivery(d, scenario.table_probability(d)) for d in ((i, j), (j, i))
-        )
+        forth, back = (delivery_of(scenario, d) for d in ((i, j), (j, i)))
         if forth != back or not (channel.symmetric or forth == 1.0):
             raise TheoryError("a swap may become a copy")
         a, b = index[i], index[j]

@@ -14,6 +14,7 @@ import numpy as np
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import model_and_start_rows
+from netkf.theory.common.random_links import nothing_is_lost
 from netkf.theory.information_consensus.errors import effective_weights, step_weights
 
 SOURCE = "Battistelli and Chisci 2014"
@@ -33,17 +34,13 @@ def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
     """Return whether no node counts a reading more than once in its estimate, as weights and
     averaging may make it do, and a text with the largest number of times.
     """
-    weights, channel = step_weights(scenario), scenario.network.channel
+    weights, delay = step_weights(scenario), scenario.network.channel.delay.fixed
     steps = scenario.node_filter.exchange_steps(0)
     # A node that hears nothing counts its own reading in full, whatever the weights.
     _, silent = effective_weights(scenario, [])
     # Each of the steps has its share of the phase; at the end of it a message may be late.
-    delay = channel.delay.fixed
     in_time = delay is not None and (delay == 0.0 or steps * delay < scenario.phase_length)
-    lossless = in_time and all(
-        channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
-        for link in scenario.topology.directions
-    )
+    lossless = in_time and nothing_is_lost(scenario)
     if not lossless:
         max_count = float(silent.max())
         evidence = f"a node counts a reading up to {max_count:.4g} times: its own, in slots in "

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, symmetric
 from netkf.scenario.scenario import Scenario
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
@@ -34,7 +35,13 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
 def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
     """Return P (T, N, n, n) of the sign-of-innovations filters of N nodes at the T times of a run
     in slots, computed by their equations from which nodes' bits arrived.
+
+    Raises TheoryError if a node with a sensor has no hearer, since the log then does not show when
+    it uses its own bits, and if H differs from slot to slot.
     """
+    unheard = [node for node in scenario.sensing_nodes if not scenario.topology.receivers(node)]
+    if unheard:
+        raise TheoryError(f"nobody hears node {unheard[0]}: the log does not show its bits")
     nodes, index, plant = scenario.nodes, scenario.topology.index, scenario.slot_plant
     F, Q = scenario.slot_belief
     sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]

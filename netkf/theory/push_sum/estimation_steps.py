@@ -11,6 +11,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.random_links import delivery_of
 from netkf.theory.numerics.matrices import as_integer
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.limits import PushSumLimits, push_sum_filter, push_sum_limits
@@ -138,7 +139,5 @@ def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
         raise TheoryError(f"the draws of {name} depend on each other: no mean square is known")
     # The first end hears the second by the direction (j, i).
     directions = [[(j, i), (i, j)] for i, j in links]
-    hears = [
-        [loss.mean_delivery(w, scenario.table_probability(w)) for w in pair] for pair in directions
-    ]
+    hears = [[delivery_of(scenario, direction) for direction in pair] for pair in directions]
     return np.array(hears, dtype=np.float64).reshape(-1, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import model_and_start_rows
-from netkf.theory.stochastic_trigger.errors import all_hear_all
+from netkf.theory.stochastic_trigger.errors import UNHEARD, all_hear_all, start_alike
 
 SOURCE = "Han et al. 2015"
 HEARD = "every node hears every other, without losses"
@@ -16,5 +16,14 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     covariances.
     """
     heard = all_hear_all(scenario)
-    evidence = "silence is a decision" if heard else "who misses a message takes it for silence"
-    return model_and_start_rows(scenario, SOURCE, (HEARD, SOURCE, heard, evidence))
+    evidence = "silence is a decision" if heard else UNHEARD
+    alike = start_alike(scenario)
+    start = "with the same mean and covariance"
+    if not alike:
+        start = "silence is about the sender's prediction, which is not the hearer's"
+    return model_and_start_rows(
+        scenario,
+        SOURCE,
+        (HEARD, SOURCE, heard, evidence),
+        ("all filters have one estimate from the start", SOURCE, alike, start),
+    )

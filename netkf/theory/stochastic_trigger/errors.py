@@ -26,14 +26,28 @@ from netkf.theory.numerics.updates import Observation
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
+UNHEARD = "who misses a message takes it for silence, and the log does not show unheard decisions"
+"""Why nothing is said of networks in which some decision is not heard by all."""
 Decisions = set[tuple[int, int]]
 """Slots and the indices of the nodes that sent in them."""
 
 
 def all_hear_all(scenario: Scenario) -> bool:
-    """Return True if every node hears every other, without losses."""
+    """Return True if every node hears every other, without losses, so that the log of a run shows
+    all decisions: one node alone decides too, but sends to nobody.
+    """
     N = len(scenario.nodes)
-    return len(scenario.topology.directions) == N * (N - 1) and all_messages_arrive(scenario)
+    complete = N > 1 and len(scenario.topology.directions) == N * (N - 1)
+    return complete and all_messages_arrive(scenario)
+
+
+def start_alike(scenario: Scenario) -> bool:
+    """Return True if all filters start with the same mean and covariance; hearing everything, they
+    then have the same estimate at all times.
+    """
+    mean, cov = scenario.initial_estimate(scenario.nodes[0])
+    starts = [scenario.initial_estimate(node) for node in scenario.nodes[1:]]
+    return all(np.array_equal(mean, m) and np.array_equal(cov, P) for m, P in starts)
 
 
 def decisions(scenario: Scenario, run: Run) -> Decisions:
@@ -100,7 +114,12 @@ def error_rule(
     """
     require_traced_exchanges(scenario, run)
     if not all_hear_all(scenario):
-        raise TheoryError("who misses a message takes it for silence: errors follow the data")
+        raise TheoryError(UNHEARD)
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters take silence for what their model says, which is not true")
+    if not start_alike(scenario):
+        raise TheoryError(
+            "the filters start with different estimates: silence is about the sender's prediction, "
+            "and hearers take it to be about their own"
+        )
     return ScheduleRule(scenario, errors, run)

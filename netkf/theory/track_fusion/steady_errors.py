@@ -19,6 +19,7 @@ from netkf.linalg.spectra import growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, is_recorded
+from netkf.theory.common.random_links import delivery_of
 from netkf.theory.intermittent.riccati import steady_covariance
 
 MAX_NEIGHBOURS = 10
@@ -97,18 +98,12 @@ def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> 
 
 def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
     """Return the probability with which a node hears each other, by their indices."""
-    topology, channel = scenario.topology, scenario.network.channel
-    delay = channel.delay.fixed
+    topology, delay = scenario.topology, scenario.network.channel.delay.fixed
     if delay is None:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
     if delay > scenario.phase_length:
         return {}
-    return {
-        topology.index[j]: float(
-            channel.loss.mean_delivery((j, node), scenario.table_probability((j, node)))
-        )
-        for j in topology.senders(node)
-    }
+    return {topology.index[j]: delivery_of(scenario, (j, node)) for j in topology.senders(node)}
 
 
 def _fuse_tracks(joint: FloatArray, order: list[int]) -> FloatArray:

@@ -122,7 +122,7 @@ def _clocks_together(folder):
         common = math.sqrt(size) * random.standard_normal((500, 1))
         values = random.standard_normal((500, 6))
         values[:, :2] = common + math.sqrt(1.0 - size) * values[:, :2]
-        return _interval(largest_correlation(values, LEVEL)[0])
+        return _interval(largest_correlation(values, np.ones(values.shape), LEVEL)[0])
 
     return draw
 
