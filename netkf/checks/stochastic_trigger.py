@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,9 @@ def check_rate(samples: RunSamples, level: float) -> Finding:
     if not total > 0.0:
         return find_unknown("no node has a slot in which it decides", RATE_TOLERANCE)
     difference = (sent - expected) / total
-    spread = float(difference.std(ddof=1)) / np.sqrt(len(difference))
+    # Rare messages may show no variance: at least that of one message, and of as many as expected.
+    variance = max(float((sent - expected).var(ddof=1)), total, 1.0 / len(sent))
+    spread = math.sqrt(variance / len(sent)) / total
     ratio = student_interval(1.0 + float(difference.mean()), spread, len(difference), level)
     distance = deviation_interval(1.0, ratio)
     text = f"messages sent over those expected given the past, {sent.sum():,.0f} sent"
