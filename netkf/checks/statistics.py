@@ -471,7 +471,10 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
     widest = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
     # Student's statistic of the direction with the largest mean must exceed Hotelling's limit.
     spread = float(deviations.max()) / math.sqrt(count)
-    detectable = spread * noncentrality(max(count - 1.0, 1.0), reach * math.sqrt(count))
+    shift = spread * noncentrality(max(count - 1.0, 1.0), reach * math.sqrt(count))
+    # Matrices that are too large by a factor have deviations larger by that factor.
+    largest = float(values[-1])
+    detectable = shift / (1.0 - shift / largest) if shift < largest else math.nan
     return Interval(float(values[-1]), low, float(values[-1]) + reach * widest, detectable)
 
 

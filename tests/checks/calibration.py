@@ -5,7 +5,8 @@
 accused at each level. The confidence is that of all intervals of a verdict together, so that at
 most one healthy scenario in a hundred may be accused at 99 %, and one in five at 80 %; exact rows
 never.
-``--seeds`` repeats each scenario with as many seeds.
+``--seeds`` repeats each scenario with as many seeds, ``--any`` draws filters, tables and networks
+of all kinds.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from netkf.checks.check import Verdict, judge_replicas, run_replica, with_check_
 from netkf.checks.evidence import BROKEN, Evidence
 from netkf.core.errors import NetkfError
 from netkf.scenario.scenario import Scenario
+from tests.checks.any_scenario import draw_any
 from tests.checks.healthy import draw_scenario
 
 LEVELS = (0.01, 0.2)
@@ -63,11 +65,13 @@ def _main() -> int:
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--runs", type=int, default=30)
+    parser.add_argument("--any", action="store_true", help="of any_scenario, not of healthy")
     options = parser.parse_args()
     judged, refused, accused = 0, 0, dict.fromkeys(LEVELS, 0)
     with tempfile.TemporaryDirectory() as folder:
         for number in range(options.first, options.first + options.count):
-            scenario = draw_scenario(number, Path(folder))
+            draw = draw_any if options.any else draw_scenario
+            scenario = draw(number, Path(folder))
             # Seeds of their own: rows about streams of one name would else share one outcome.
             for seed in range(1000 * number, 1000 * number + options.seeds):
                 try:

@@ -19,6 +19,7 @@ from netkf.parts import Bernoulli, ExponentialDelay, Filter, Hybrid, Poisson, nu
 from netkf.scenario.reading import from_table
 from netkf.theory.common.stacked_errors import integration_steps
 from netkf.theory.intermittent.scalar_law import scalar_law
+from tests.checks.any_scenario import draw_any
 from tests.checks.calibration import accusations
 from tests.checks.healthy import draw_scenario
 from tests.checks.test_check import (
@@ -266,6 +267,14 @@ def test_directions_without_any_error_are_not_judged(table, driven, tmp_path):
 def test_scenarios_drawn_at_random_are_not_accused(scenario_number, tmp_path):
     """One for each filter; the same for hundreds in ``python -m tests.checks.calibration``."""
     assert not accusations(draw_scenario(scenario_number, tmp_path), 12, 0, levels=(0.01,))
+
+
+@pytest.mark.parametrize("number", [16, 20, 43, 155, 202, 260])
+def test_scenarios_of_all_kinds_are_not_accused(number, tmp_path):
+    """One node that nobody hears, H that varies, rare messages: each was accused once. More are
+    drawn by ``python -m tests.checks.calibration --any``.
+    """
+    assert not accusations(draw_any(number, tmp_path), 10, 0, levels=(0.01,))
 
 
 @pytest.mark.parametrize(("table", "slots"), [(GOSSIP, 2.0), (DIFFUSION, 3.0), (PUSH_SUM, 3.0)])
