@@ -53,7 +53,7 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: boo
             lines.append(INDENT + textwrap.shorten(_summarise_row(row), WIDTH, placeholder=" ..."))
     lines += [*_computed_lines(folded), "", *_legend_lines(verdict), *_summary_lines(verdict)]
     if not full:
-        lines.append("--all shows the evidence of all rows")
+        lines.append("detectable: an error that would have been seen; --all shows all evidence")
     return "\n".join([*lines, *_broken_again(broken, command)])
 
 
@@ -136,9 +136,8 @@ def _summarise_row(row: Evidence) -> str:
     if row.verdict == NOT_PROMISED or not row.low < row.high:
         return _describe_row(row)
     needed = f"needs about {row.needed:,} runs; " if row.needed is not None else ""
-    limit = f"; an error of {row.detectable:.2g} would have been seen"
-    limit = limit if row.detectable > 0.0 else f"; {row.evidence}"
-    return f"{needed}off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}{limit}"
+    limit = f"detectable {row.detectable:.2g}" if row.detectable > 0.0 else row.evidence
+    return f"{needed}off by {row.off:.3g}, at most {max(0.0, -row.low):.3g}; {limit}"
 
 
 def _describe_limits(row: Evidence) -> str:

@@ -9,7 +9,7 @@ import pytest
 
 import netkf
 from netkf.checks import evidence
-from netkf.checks.check import judge_replicas, run_replica, with_check_times
+from netkf.checks.check import Verdict, judge_replicas, run_replica, with_check_times
 from netkf.checks.evidence import (
     BROKEN,
     HOLDS,
@@ -24,6 +24,7 @@ from netkf.checks.laws import find_largest
 from netkf.checks.mode_sequences import sensing_neighbours
 from netkf.checks.parts.clock_rows import largest_correlation
 from netkf.checks.parts.network_rows import _mean_correlation
+from netkf.checks.report import verdict_text
 from netkf.checks.statistics import Interval
 from netkf.parts import Bernoulli, Hybrid
 from netkf.scenario.reading import from_table
@@ -102,6 +103,26 @@ def test_one_mistake_is_one_broken_row():
         assert rows[k].verdict == NOT_PROMISED
         assert f'follows from the broken row "{root}"' in rows[k].assumptions
         assert rows[k].seen == 2.0
+
+
+def test_a_verdict_fits_on_two_screens_unless_all_is_asked_for():
+    """Broken rows say all; others have one line each, and rows that look at no run one together."""
+    wide = Finding((0.0, -0.5, 0.0), 0.1, "evidence " * 40, detectable=0.25)
+    off = Finding((-2.0, -3.0, -1.0), 0.1, "evidence " * 40)
+    promises = [promise(f"row {k}", wide) for k in range(36)]
+    promises += [promise(f"computed {k}", wide, group=evidence.COMPUTED) for k in range(4)]
+    promises += [promise("wrong", off, exact=True), promise("too", off)]
+    rows = tuple(fold_followers(judge(promises, None, [], 20, 0.01)))
+    verdict = Verdict("it", 20, 0, 0.99, rows)
+    short, full = verdict_text(verdict, full=False), verdict_text(verdict)
+    assert len(short.splitlines()) <= 100
+    assert len(full.splitlines()) > 150
+    assert short.count("no run can break these") == 1
+    assert "computed 3 [source]: undecided" in " ".join(short.split())
+    assert short.count("detectable 0.25") == 36
+    assert 'follows from the broken row "wrong"' in short
+    assert short.splitlines()[2].startswith("BROKEN       wrong")
+    assert "BROKEN: wrong  [source]: seen 2, expected 0" in short
 
 
 def rare_losses(random, q, windows, links, sent):
