@@ -53,7 +53,6 @@ from netkf.algorithms.kernels.slots import (
     whiten_reading,
 )
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.starts import require_common_start
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, store
@@ -507,6 +506,8 @@ class ConsensusInnovations(Filter):
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
+    every_reading: ClassVar[bool] = True
+    common_start: ClassVar[bool] = True
     needs_network: ClassVar[bool] = True
     slot_kernel = staticmethod(pseudo_slots)
 
@@ -532,11 +533,16 @@ class ConsensusInnovations(Filter):
         rows, gains = gain_sequence(states[0].design).table(first, count)
         return (arrays[0]._replace(table_row=rows, gains=gains),)
 
-    def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError unless all estimates of a ``netkf.Scenario`` have the same mean and
-        covariance at the start, from which gains are computed.
+    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+        """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, or held
+        back by a trigger, which makes P too small; else nothing.
         """
-        require_common_start(scenario, "from which gains are computed", "hcmci")
+        if scenario.delivers_all and scenario.filter.algorithm is self:
+            return ()
+        return (
+            "consensus-innovations: gains and P count all messages; P is too small where some do "
+            "not arrive",
+        )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return n, the size of a message in numbers of 64 bits: an estimate of the

@@ -173,6 +173,7 @@ class ConstantGain(Filter):
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
+    every_reading: ClassVar[bool] = True
     slot_kernel = staticmethod(constant_gain_slots)
 
     def slot_arrays(
@@ -265,17 +266,18 @@ class ConstantGain(Filter):
         return usable(gain_rate(state.gain, state.model.H) if state.loop is not None else 0.0)
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``: sensors whose H or
-        rows vary, another number of gains than of nodes, or a gain that is not n x p for the p rows
-        of a node.
+        """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``: recorded sensors
+        in continuous time, another number of gains than of nodes, or a gain that is not n x p for
+        the p rows of a node.
         """
         for k, sensor in enumerate(scenario.sensors):
-            if sensor.varying or isinstance(getattr(sensor, "path", None), SourceFile):
+            # A node may have several rows at one instant, and a gain weighs one reading.
+            if not scenario.slotted and isinstance(getattr(sensor, "path", None), SourceFile):
                 raise ScenarioError(
-                    f"sensors[{k}]",
-                    "must have a fixed H and all its rows for the constant-gain filter",
-                    None,
-                    "use linear sensors, or another filter",
+                    f"sensors[{k}].kind",
+                    "must not be recorded for the constant-gain filter in continuous time",
+                    "recorded",
+                    "use linear sensors, slots, or another filter",
                 )
         nodes, n = scenario.nodes, scenario.plant.n
         if isinstance(self.gain, tuple) and len(self.gain) != len(nodes):

@@ -12,8 +12,9 @@ from netkf.linalg.arrays import FloatArray
 
 FORWARDED = (
     "schedule", "clocks", "predicts", "first_slot", "pairwise", "one_way", "inverts", "talks",
-    "pooled", "needs_samples", "newest_only", "fixed_sensors", "randomised", "needs_network",
-    "paper", "combination", "P_by_design", "slot_kernel", "unrolled",
+    "pooled", "needs_samples", "newest_only", "fixed_sensors", "every_reading", "common_start",
+    "ways_between_all", "reads_what_it_sends", "inverts_under_clocks", "randomised",
+    "needs_network", "paper", "combination", "P_by_design", "slot_kernel", "unrolled",
     "shift_payload", "accepts", "max_measurement_interval", "steps", "exchange_steps",
     "redraws_links", "sends_in_slots", "payload_numbers", "slot_stopping", "decides_in_slots",
     "moves_estimates", "carried_estimates", "slot_arrays", "slot_gains", "stopped", "conserved",

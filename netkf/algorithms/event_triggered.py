@@ -438,13 +438,7 @@ class EventTriggeredCi(Filter):
         """Return a note for the user where messages of a ``netkf.Scenario`` may be lost or late,
         which makes P too small; else nothing.
         """
-        channel = scenario.network.channel
-        lossless = all(
-            channel.loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
-            for link in scenario.topology.directions
-        )
-        # A random delay (``fixed`` is None) may bring a message too late for its slot.
-        if lossless and channel.delay.fixed is not None:
+        if scenario.delivers_all:
             return ()
         return (
             "event-triggered: messages may be lost, and a sender takes its neighbours to have "

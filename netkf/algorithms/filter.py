@@ -201,7 +201,7 @@ class Filter(Component):
     """The contract of node algorithms: how readings and messages change a node's state.
 
     The base class is a Kalman filter on the node's own readings; a filter that talks defines at
-    least ``absorb``. Class variables say where it runs:
+    least ``absorb``. Class variables say where it runs and what it needs:
 
     schedule  phases of a slot in their order, of "predict", "sense" and "exchange"; None: not in
               slots. "predict" comes first if samples show filtered estimates, after "sense" if they
@@ -213,6 +213,7 @@ class Filter(Component):
     pairwise  in slots nodes exchange in pairs (a matching), else all with all neighbours
     one_way   in slots links may go one way, and the graph need not be connected
     inverts   covariances must never be singular
+    inverts_under_clocks  the same, in continuous time only
     talks     nodes exchange messages
     pooled    one filter reads the sensors of all nodes at once, and its estimate is every node's
     needs_samples  it cannot use increment sensors
@@ -221,7 +222,14 @@ class Filter(Component):
     unrolled       ``slot_kernel`` is compiled for each n up to 4, with unrolled loops: only where
                    that makes runs a tenth faster
     newest_only    of several messages of one sender at one instant the newest counts
-    fixed_sensors  it adds up information, so the H of a sensor must not vary
+    fixed_sensors  it computes with H before there are readings, so H must not vary: no nonlinear
+                   sensors, regressors or columns phi
+    every_reading  in slots its gains and P count a reading of every sensor in every slot, so that
+                   no row of a recorded sensor may be missing
+    common_start   all nodes must begin with the same mean and the same covariance
+    ways_between_all  a directed graph must lead from every node to every other one
+    reads_what_it_sends  a node uses of its readings only what it sends, so that every node with a
+                   sensor must be heard by another one
     needs_network  its nodes are given ``NodeInfo.network``
     randomised     in slots ``emit`` is given a number ``Exchange.uniform``, from the stream
                    "trigger" of the node, which nothing else draws from
@@ -240,11 +248,16 @@ class Filter(Component):
     pairwise: ClassVar[bool] = False
     one_way: ClassVar[bool] = False
     inverts: ClassVar[bool] = False
+    inverts_under_clocks: ClassVar[bool] = False
     talks: ClassVar[bool] = True
     pooled: ClassVar[bool] = False
     needs_samples: ClassVar[bool] = False
     newest_only: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = False
+    every_reading: ClassVar[bool] = False
+    common_start: ClassVar[bool] = False
+    ways_between_all: ClassVar[bool] = False
+    reads_what_it_sends: ClassVar[bool] = False
     randomised: ClassVar[bool] = False
     needs_network: ClassVar[bool] = False
     paper: ClassVar[str] = ""
@@ -463,7 +476,9 @@ class Filter(Component):
         return None
 
     def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where the rest of a ``netkf.Scenario`` does not fit this filter."""
+        """Raise ScenarioError where settings of this filter do not fit a ``netkf.Scenario``. What
+        it needs of sensors, start and network it declares by class variables instead.
+        """
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return notes on this filter in a ``netkf.Scenario`` for the user, one line each."""

@@ -344,6 +344,7 @@ class OneBit(Filter):
     clocks: ClassVar[tuple[str, ...]] = ()
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
+    reads_what_it_sends: ClassVar[bool] = True
     slot_kernel = staticmethod(one_bit_slots)
 
     def decides_in_slots(self) -> bool:

@@ -604,6 +604,9 @@ class PushSum(Filter):
     # Until others hear of its samples, a node counts them as if all nodes had taken them.
     P_by_design: ClassVar[tuple[str, str]] = ("", "smaller")
     fixed_sensors: ClassVar[bool] = True
+    every_reading: ClassVar[bool] = True
+    inverts_under_clocks: ClassVar[bool] = True
+    ways_between_all: ClassVar[bool] = True
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("nodes",)
     first_slot: ClassVar[int] = 1
@@ -864,8 +867,8 @@ class PushSum(Filter):
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots: the
-        leader is no node, gamma or delta is missing or averaging would not contract, a sensor
-        varies, or P_inf does not exist.
+        leader is no node, gamma or delta is missing or averaging would not contract, or P_inf does
+        not exist.
         """
         if not scenario.slotted:
             return
@@ -878,22 +881,28 @@ class PushSum(Filter):
         if self.running_sums and self.stop != "never":
             rule = "must be never with running sums, which a node that stops would freeze"
             raise ScenarioError("filter.stop", rule, self.stop, 'write stop = "never"')
-        for k, sensor in enumerate(scenario.sensors):
-            if sensor.varying:
-                raise ScenarioError(
-                    f"sensors[{k}]",
-                    "must have a fixed H for the push-sum filter, which adds them up beforehand",
-                    None,
-                    "use linear sensors or another filter",
-                )
         # P (12) may have no solution, as for an unstable plant that the sensors do not see.
-        F, Q = scenario.slot_belief
-        if self.asymptotic and asymptotic_root(F, Q, scenario.node_infos[0].information) is None:
+        if self.asymptotic:
+            self._check_limit(*scenario.slot_belief, scenario.node_infos[0].information)
+
+    def _check_limit(self, F: FloatArray, Q: FloatArray, information: FloatArray) -> None:
+        """Raise ScenarioError unless P_inf exists and gives gains to the readings: F and Q (n, n),
+        and the ``information`` (n, n) of all sensors.
+        """
+        root = asymptotic_root(F, Q, information)
+        if root is None:
             raise ScenarioError(
                 "filter.asymptotic",
                 "needs a steady covariance of the centralised filter, and there is none",
                 True,
                 "add sensors, or set it to false",
+            )
+        if information.any() and not (root.T @ information).any():
+            raise ScenarioError(
+                "filter.asymptotic",
+                "needs process noise: without it P_inf is 0, and so are all gains",
+                True,
+                "set it to false",
             )
 
     def _check_leader(self, scenario: Any) -> None:
@@ -919,8 +928,8 @@ class PushSum(Filter):
             )
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return one line each: delta is below rho(L); settings of slots are not used
-        under clocks.
+        """Return one line each: delta is below rho(L); mass may be lost; settings of slots are not
+        used under clocks.
         """
         if not scenario.slotted:
             fields = dataclasses.fields(self)
@@ -930,13 +939,20 @@ class PushSum(Filter):
             reason = "not used under clocks, where push-sum keeps running sums"
             return (f"{', '.join(changed_settings)}: {reason}",) if changed_settings else ()
         # Contraction is enough to run; the theorems ask for more.
-        radius = scenario.topology.laplacian_radius
-        if self.delta >= radius:
-            return ()
-        return (
-            f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging contracts, "
-            "but P Theorems 3, 5 and 6 ask for more than rho(L)",
-        )
+        notes, radius = [], scenario.topology.laplacian_radius
+        if self.delta < radius:
+            notes.append(
+                f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging "
+                "contracts, but P Theorems 3, 5 and 6 ask for more than rho(L)"
+            )
+        one_way = not scenario.network.channel.symmetric and not scenario.delivers_all
+        is_silent = scenario.filter.algorithm is not self  # behind a trigger
+        if (one_way or is_silent) and not (self.running_sums or self.asymptotic):
+            notes.append(
+                "push-sum: where only one direction of a link delivers, mass is lost or counted "
+                "twice, and estimates and P may be far off; running_sums = true keeps all mass"
+            )
+        return tuple(notes)
 
 
 def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Message]) -> PushSumState:

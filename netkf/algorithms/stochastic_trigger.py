@@ -415,6 +415,8 @@ class ScheduledReadings(Filter):
     one_way: ClassVar[bool] = True
     randomised: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
+    every_reading: ClassVar[bool] = True
+    reads_what_it_sends: ClassVar[bool] = True
     slot_kernel = staticmethod(scheduled_slots)
 
     def decides_in_slots(self) -> bool:
@@ -444,6 +446,17 @@ class ScheduledReadings(Filter):
                 z=aligned((p, LANES)),
                 row=aligned((n, LANES)),
             ),
+        )
+
+    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+        """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, which
+        makes P too small; else nothing.
+        """
+        if scenario.delivers_all:
+            return ()
+        return (
+            "event-triggered: messages may be lost, and a node takes that for silence; P may then "
+            "be too small",
         )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:

@@ -52,8 +52,6 @@ from netkf.algorithms.kernels.tracks import (
 )
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.starts import require_common_start
-from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, one_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -473,6 +471,8 @@ class BarShalomCampo(Filter):
     first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
+    every_reading: ClassVar[bool] = True
+    common_start: ClassVar[bool] = True
     needs_network: ClassVar[bool] = True  # for the compiled slots alone
     slot_kernel = staticmethod(track_slots)
     unrolled: ClassVar[bool] = True
@@ -526,21 +526,6 @@ class BarShalomCampo(Filter):
         """
         tracks: TrackArrays = arrays[0]
         return tracks.xhat
-
-    def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError unless all tracks of a ``netkf.Scenario`` have the same start and
-        each sensor a fixed H.
-        """
-        why = "where cross-covariances begin"
-        require_common_start(scenario, why, INTERSECTION)
-        for k, sensor in enumerate(scenario.sensors):
-            if sensor.varying:
-                raise ScenarioError(
-                    f"sensors[{k}]",
-                    "must have a fixed H, from which other nodes compute cross-covariances",
-                    None,
-                    f"use a sensor with a fixed H, or {INTERSECTION}",
-                )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message in numbers of 64 bits: n, a track; sensors do not change and

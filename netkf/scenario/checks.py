@@ -17,13 +17,13 @@ from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.combination import (
-    check_invertible,
     check_nonlinear,
     check_regressor,
     check_weights,
 )
-from netkf.scenario.compatibility import check_activation, check_readings, check_time
+from netkf.scenario.compatibility import check_activation, check_time, filter_name
 from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.preconditions import check_preconditions
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import explain_time_mismatch, kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
@@ -47,11 +47,11 @@ def check_scenario(scenario: DerivedScenario) -> None:
     _check_plant(scenario)
     _check_sensors(scenario)
     check_time(scenario)
-    check_readings(scenario)
     _check_network(scenario)
     _check_filter(scenario)
     check_records(scenario)
     check_sampling(scenario)
+    check_preconditions(scenario)
     if scenario.slotted:
         _check_slots(scenario)
     elif uses_grid(scenario):
@@ -217,12 +217,12 @@ def _check_network(scenario: DerivedScenario) -> None:
                 raise error.under(key) from None
     if not node_filter.talks:
         return
-    name = kind_name(scenario.filter.algorithm)
+    name = filter_name(scenario)
     if network.activation is None:
         example = "broadcast" if scenario.slotted else "poisson"
         raise ScenarioError(
             "network.activation",
-            f"is missing, and the {name} filter talks",
+            f"is missing, and the {name} talks",
             None,
             f'add activation = {{ kind = "{example}", ... }}',
         )
@@ -232,7 +232,7 @@ def _check_network(scenario: DerivedScenario) -> None:
     elif topology.directed and not node_filter.one_way:
         raise ScenarioError(
             "network.graph.directed",
-            f"must be false for the {name} filter, whose links work both ways in slots",
+            f"must be false for the {name}, whose links work both ways in slots",
             True,
             "give an undirected graph",
         )
@@ -241,7 +241,7 @@ def _check_network(scenario: DerivedScenario) -> None:
         smallest_component = sorted(topology.components[-1])
         raise ScenarioError(
             "network.graph",
-            f"must be connected for the {name} filter",
+            f"must be connected for the {name}",
             f"{len(topology.components)} parts, one of them {smallest_component}",
             "add links, or connected = true for a random graph",
         )
@@ -306,8 +306,6 @@ def _check_filter(scenario: DerivedScenario) -> None:
         require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
     _check_believed_noise(scenario)
     check_weights(scenario)
-    if filtering.algorithm.inverts:
-        check_invertible(scenario)
     _check_degrees(scenario)
 
 
@@ -434,7 +432,7 @@ def _check_slots(scenario: DerivedScenario) -> None:
         form = "matching" if node_filter.pairwise else "broadcast"
         raise ScenarioError(
             "network.activation.kind",
-            f"must be a {form} for the {kind_name(scenario.filter.algorithm)} filter",
+            f"must be a {form} for the {filter_name(scenario)}",
             _describe_activation(activation),
             "choose another activation or another filter",
         )

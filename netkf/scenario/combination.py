@@ -1,16 +1,13 @@
-"""Checks of regressor and nonlinear sensors, of weights, and of filters that invert covariances."""
+"""Checks of regressor and nonlinear sensors, and of weights."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.linalg.arrays import is_definite
-from netkf.linalg.spectra import hidden_mode, outputs_of
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.registry import kind_name
 from netkf.scenario.shapes import require_shape
 
 
@@ -66,31 +63,3 @@ def check_weights(scenario: DerivedScenario) -> None:
                 float(weights[sender, receiver]),
                 "add the link; rows are senders, columns receivers",
             )
-
-
-def check_invertible(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a filter's covariance P may be singular.
-
-    P is nonsingular if noise reaches every state (in slots: Q has full rank; in continuous time:
-    (A, Q) is controllable), or if all initial P are nonsingular and prediction keeps them so (in
-    slots: F has full rank).
-    """
-    n = scenario.plant.n
-    initial_covs = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    initially = all(map(is_definite, initial_covs))
-    if scenario.slotted:
-        F, Q = scenario.slot_belief
-        nonsingular = is_definite(Q) or (initially and np.linalg.matrix_rank(F) == n)
-    else:
-        A, Q = scenario.belief
-        # (A, Q) is controllable if and only if (A', Q) is observable.
-        nonsingular = initially or hidden_mode(A.T, outputs_of(Q)) is None
-    if not nonsingular:
-        name = kind_name(scenario.filter.algorithm)
-        raise ScenarioError(
-            "filter.cov",
-            f"must be positive definite for the {name} filter, which inverts covariances, where "
-            "the noise does not drive every state",
-            None,
-            "give filter.cov, or a positive definite Q",
-        )

@@ -217,6 +217,16 @@ class DerivedScenario(ScenarioModel):
             model_is_true = np.array_equal(self.belief[0], self.diffusion.A)
         return model_is_true and frame < self.horizon
 
+    @property
+    def delivers_all(self) -> bool:
+        """True if every message is sure to arrive, after a time known beforehand."""
+        channel = self.network.channel
+        # A random delay (``fixed`` is None) may bring a message too late for its slot.
+        return channel.delay.fixed is not None and all(
+            channel.loss.mean_delivery(link, self.table_probability(link)) == 1.0
+            for link in self.topology.directions
+        )
+
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
         """Return exp(-A age) ``offset`` (n,): the offset of states ``age`` seconds earlier.
 

@@ -19,7 +19,8 @@ MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 PHASES = ("predict", "sense", "exchange")
 FLAGS = (
     *("predicts", "pairwise", "one_way", "inverts", "talks", "pooled"),
-    *("needs_samples", "newest_only"),
+    *("needs_samples", "newest_only", "inverts_under_clocks", "fixed_sensors", "every_reading"),
+    *("common_start", "ways_between_all", "reads_what_it_sends"),
 )
 
 

@@ -1,0 +1,196 @@
+"""What filters need of sensors, start and network, checked before anything runs.
+
+A filter declares its needs as class variables (``algorithms.filter.Filter``), for a user's class
+and a built-in one alike; here is the only place that checks them, in slots and in continuous time.
+``compatibility`` checks the times, clocks and links that it runs under.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import breadth_first_order
+
+from netkf.algorithms.flow import FlowFilter
+from netkf.core.errors import ScenarioError
+from netkf.linalg.arrays import FloatArray, is_definite
+from netkf.linalg.spectra import hidden_mode, outputs_of
+from netkf.plants.sensors import LinearSensor
+from netkf.rng.streams import Streams
+from netkf.scenario.compatibility import SAMPLING, filter_name
+from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.model import takes_samples
+from netkf.scenario.records import sensed_slots
+from netkf.scenario.registry import kind_name
+
+ANOTHER = 'use another filter, as kind = "diffusion"'
+
+
+def check_preconditions(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError at the first need of the filter that a scenario does not meet; it names
+    the key, the filter, the value and a remedy.
+    """
+    filtering = scenario.node_filter
+    if not scenario.slotted:
+        _check_increments(scenario)
+    if filtering.fixed_sensors:
+        _check_fixed_sensors(scenario)
+    if filtering.every_reading and scenario.slotted:
+        _check_every_reading(scenario)
+    if filtering.common_start:
+        _check_common_start(scenario)
+    if filtering.inverts or (filtering.inverts_under_clocks and not scenario.slotted):
+        _check_invertible(scenario)
+    if filtering.ways_between_all and scenario.topology.directed:
+        _check_ways(scenario)
+    if filtering.reads_what_it_sends:
+        _check_heard(scenario)
+
+
+def _check_increments(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if a filter over a diffusion cannot use samples, or only samples."""
+    name = filter_name(scenario)
+    for k, sensor in enumerate(scenario.sensors):
+        if isinstance(scenario.filter.algorithm, FlowFilter) and takes_samples(sensor):
+            raise ScenarioError(
+                f"sensors[{k}].sampling"
+                if isinstance(sensor, LinearSensor)
+                else f"sensors[{k}].kind",
+                f"must be continuous for the {name}, a FlowFilter, which takes no samples",
+                None,
+                "remove it, or derive the class from netkf.parts.Filter",
+            )
+        if scenario.node_filter.needs_samples and not takes_samples(sensor):
+            raise ScenarioError(
+                f"sensors[{k}].sampling",
+                f"is missing, and the {name} uses samples, no continuous increments",
+                None,
+                f"add {SAMPLING}",
+            )
+
+
+def _check_fixed_sensors(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if the H of a sensor varies from reading to reading."""
+    for k, sensor in enumerate(scenario.sensors):
+        if sensor.varying:
+            raise ScenarioError(
+                f"sensors[{k}]",
+                f"must have a fixed H for the {filter_name(scenario)}, which computes with it "
+                "before there are readings",
+                f"kind {kind_name(sensor, 'sensor')!r}, whose H varies",
+                f"use linear sensors, or {ANOTHER}",
+            )
+
+
+def _check_every_reading(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if a recorded sensor has no row, or a part of one, for a slot in which
+    filters read.
+    """
+    nowhere = np.full(scenario.plant.n, np.nan)
+    for node, placed_sensors in scenario.placed_sensors.items():
+        for placed in placed_sensors:
+            sensor = scenario.sensors[placed.entry]
+            if sensor.is_random:
+                continue
+            path = scenario.slot_path(Streams(scenario.seed, 0), node, placed)
+            for slot in sensed_slots(scenario):
+                reading = path.reading(slot, nowhere)
+                if len(reading) != len(sensor.R) or np.isnan(reading).any():
+                    raise ScenarioError(
+                        f"sensors[{placed.entry}].path",
+                        f"must have one whole row of node {node} for each slot for the "
+                        f"{filter_name(scenario)}, whose gains and P count all readings",
+                        f"none for slot {slot} at {slot * scenario.slot_plant.period:g} s",
+                        f"add the row, or {ANOTHER}",
+                    )
+
+
+def _check_common_start(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError unless all nodes start with the same mean and the same covariance."""
+    starts = [scenario.initial_estimate(node) for node in scenario.nodes]
+    for k, key in enumerate(("mean", "cov")):
+        different = next(
+            (i for i, start in enumerate(starts) if not np.array_equal(start[k], starts[0][k])), 0
+        )
+        if different:
+            raise ScenarioError(
+                f"filter.{key}",
+                f"must be that of all nodes for the {filter_name(scenario)}, which computes how "
+                "their errors correlate",
+                f"another one for node {scenario.nodes[different]} than for {scenario.nodes[0]}",
+                f"give one mean and cov, or {ANOTHER}",
+            )
+
+
+def _check_invertible(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if a filter's covariance P may be singular.
+
+    P is nonsingular if noise reaches every state (in slots: Q has full rank; in continuous time:
+    (A, Q) is controllable), or if all initial P are nonsingular and prediction keeps them so (in
+    slots: F has full rank).
+    """
+    n = scenario.plant.n
+    initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
+    singular = next((node for node, P in initial.items() if not is_definite(P)), None)
+    if scenario.slotted:
+        F, Q = scenario.slot_belief
+        nonsingular = is_definite(Q) or (singular is None and np.linalg.matrix_rank(F) == n)
+    else:
+        A, Q = scenario.belief
+        # (A, Q) is controllable if and only if (A', Q) is observable.
+        nonsingular = singular is None or hidden_mode(A.T, outputs_of(Q)) is None
+    if not nonsingular:
+        value = "a singular F" if singular is None else _describe_cov(initial[singular], singular)
+        raise ScenarioError(
+            "filter.cov",
+            f"must be positive definite for the {filter_name(scenario)}, which inverts "
+            "covariances, where the noise does not drive every state",
+            value,
+            "give filter.cov, or a positive definite Q",
+        )
+
+
+def _describe_cov(P: FloatArray, node: int) -> str:
+    """Return a singular covariance (n, n) of ``node`` as the value in a message."""
+    least = float(np.linalg.eigvalsh(P)[0])
+    return f"a singular one at node {node} (least eigenvalue {least:.3g})"
+
+
+def _check_ways(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError unless messages can get from every node to every other one."""
+    topology, N = scenario.topology, len(scenario.nodes)
+    pairs = np.array([[topology.index[end] for end in way] for way in topology.directions])
+    rows, columns = pairs.reshape(-1, 2).T
+    links = scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(N, N))
+    # Strongly connected: node 0 reaches all, and all reach node 0.
+    for one_way, text in (
+        (links, "no way from node {0} to {1}"),
+        (links.T, "no way from node {1} to {0}"),
+    ):
+        reached = breadth_first_order(one_way.tocsr(), 0, return_predecessors=False)
+        missed = np.setdiff1d(np.arange(N), reached)
+        if missed.size:
+            raise ScenarioError(
+                "network.graph",
+                f"must lead from every node to every other for the {filter_name(scenario)}, whose "
+                "sums otherwise gather at some nodes",
+                text.format(scenario.nodes[0], scenario.nodes[missed[0]]),
+                f"add edges, or {ANOTHER}",
+            )
+
+
+def _check_heard(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if no node hears one that has a sensor: its readings would not be used,
+    not even by itself.
+    """
+    heard = {sender for sender, _ in scenario.topology.directions}
+    for k, sensor in enumerate(scenario.sensors):
+        for node in sensor.nodes:
+            if node not in heard:
+                raise ScenarioError(
+                    f"sensors[{k}].nodes",
+                    f"must be nodes that others hear for the {filter_name(scenario)}, whose nodes "
+                    "use only the readings that they send",
+                    node,
+                    f"add a link from it, or {ANOTHER}",
+                )
