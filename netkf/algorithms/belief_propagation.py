@@ -372,7 +372,6 @@ class BeliefPropagation(Filter):
 
     paper: ClassVar[str] = "belief_propagation"
     combination: ClassVar[str] = "beliefs"
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
     inverts: ClassVar[bool] = True

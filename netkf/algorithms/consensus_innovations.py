@@ -503,7 +503,6 @@ class ConsensusInnovations(Filter):
     paper: ClassVar[str] = "consensus_innovations"
     combination: ClassVar[str] = "pseudo-states"
     clocks: ClassVar[tuple[str, ...]] = ()
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
     every_reading: ClassVar[bool] = True

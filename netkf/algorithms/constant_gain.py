@@ -170,7 +170,6 @@ class ConstantGain(Filter):
     combination: ClassVar[str] = "constant gain"
     P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
     every_reading: ClassVar[bool] = True

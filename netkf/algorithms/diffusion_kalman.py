@@ -130,7 +130,6 @@ class DiffusionKalman(Filter):
     combination: ClassVar[str] = "readings, then estimates"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     slot_kernel = staticmethod(diffusion_kalman_slots)
     unrolled: ClassVar[bool] = True

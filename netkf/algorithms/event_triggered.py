@@ -391,7 +391,6 @@ class EventTriggeredCi(Filter):
     paper: ClassVar[str] = "event_triggered"
     P_by_design: ClassVar[tuple[str, str]] = ("larger", "")
     clocks: ClassVar[tuple[str, ...]] = ()
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
     slot_kernel = staticmethod(triggered_ci_slots)

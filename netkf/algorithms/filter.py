@@ -196,6 +196,15 @@ FORMER = {
 """Methods of the deprecated FlowFilter and SlotFilter, and their replacements in Filter."""
 
 
+class FirstSlot:
+    """The first slot with an exchange, where a class does not say it: that of built-in filters."""
+
+    def __get__(self, filtering: Any, cls: Any) -> int:
+        """Return 0 for filters that predict and broadcast, else 1: slot 0 has no reading."""
+        traits: Any = cls if filtering is None else filtering
+        return 0 if traits.predicts and not traits.pairwise else 1
+
+
 @dataclass(frozen=True, eq=False)
 class Filter(Component):
     """The contract of node algorithms: how readings and messages change a node's state.
@@ -209,7 +218,10 @@ class Filter(Component):
     clocks    what may make its nodes transmit in continuous time, of CLOCKS; (): nothing
     predicts  a sample in slots is the prediction with which the slot begins, else the estimate
               after the slot's exchanges
-    first_slot  the first slot in which nodes exchange
+    first_slot  the first slot in which nodes exchange. Messages are numbered from it, and losses
+                belong to numbers: filters meet the same losses if their first slots and exchanges
+                are the same. By default it is that of built-in filters: 0 for filters that predict
+                and broadcast, else 1
     pairwise  in slots nodes exchange in pairs (a matching), else all with all neighbours
     one_way   in slots links may go one way, and the graph need not be connected
     inverts   covariances must never be singular
@@ -244,7 +256,7 @@ class Filter(Component):
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = CLOCKS
     predicts: ClassVar[bool] = False
-    first_slot: ClassVar[int] = 0
+    first_slot: ClassVar[int] = FirstSlot()  # type: ignore[assignment]
     pairwise: ClassVar[bool] = False
     one_way: ClassVar[bool] = False
     inverts: ClassVar[bool] = False

@@ -114,7 +114,6 @@ class Gossip(Filter):
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "sense", "predict")
     clocks: ClassVar[tuple[str, ...]] = ("links",)
     predicts: ClassVar[bool] = True
-    first_slot: ClassVar[int] = 1
     pairwise: ClassVar[bool] = True
     slot_kernel = staticmethod(gossip_slots)
     unrolled: ClassVar[bool] = True

@@ -253,7 +253,6 @@ class InformationConsensus(Filter):
     combination: ClassVar[str] = "intersection"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
-    first_slot: ClassVar[int] = 1
     inverts: ClassVar[bool] = True
     slot_kernel = staticmethod(consensus_slots)
 

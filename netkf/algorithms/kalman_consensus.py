@@ -166,7 +166,6 @@ class Kcf(Filter):
     combination: ClassVar[str] = "predictions"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
     slot_kernel = staticmethod(kcf_slots)

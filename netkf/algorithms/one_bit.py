@@ -342,7 +342,6 @@ class OneBit(Filter):
     paper: ClassVar[str] = "one_bit"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     reads_what_it_sends: ClassVar[bool] = True
     slot_kernel = staticmethod(one_bit_slots)

@@ -609,7 +609,6 @@ class PushSum(Filter):
     ways_between_all: ClassVar[bool] = True
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("nodes",)
-    first_slot: ClassVar[int] = 1
     needs_samples: ClassVar[bool] = True
     slot_kernel = staticmethod(push_sum_slots)
 

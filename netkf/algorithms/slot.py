@@ -19,7 +19,7 @@ import numpy as np
 
 from netkf.algorithms.baselines import Central as SlotCentral
 from netkf.algorithms.baselines import Local as SlotLocal
-from netkf.algorithms.filter import Reading
+from netkf.algorithms.filter import FirstSlot, Reading
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kernels.root_update import lower_root
@@ -89,7 +89,7 @@ class SlotFilter(Component):
     """
 
     programme: ClassVar[tuple[str, ...]] = ("exchange", "sense")
-    first_slot: ClassVar[int] = 0
+    first_slot: ClassVar[int] = FirstSlot()  # type: ignore[assignment]
     predicts: ClassVar[bool] = True
     pairwise: ClassVar[bool] = False
     one_way: ClassVar[bool] = False

@@ -411,7 +411,6 @@ class ScheduledReadings(Filter):
     paper: ClassVar[str] = "stochastic_trigger"
     combination: ClassVar[str] = "scheduled readings"
     clocks: ClassVar[tuple[str, ...]] = ()
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     randomised: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True

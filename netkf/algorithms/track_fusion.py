@@ -180,7 +180,6 @@ class PairFusion(Filter):
 
     paper: ClassVar[str] = "track_fusion"
     clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
     inverse: ClassVar[bool] = False
@@ -468,7 +467,6 @@ class BarShalomCampo(Filter):
     paper: ClassVar[str] = "track_fusion"
     combination: ClassVar[str] = "tracks"
     clocks: ClassVar[tuple[str, ...]] = ()
-    first_slot: ClassVar[int] = 1
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
     every_reading: ClassVar[bool] = True

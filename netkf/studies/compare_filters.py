@@ -70,6 +70,8 @@ class ComparedFilter:
     transmissions, bytes : of replica 0, a broadcast counts once; nan if it cannot run
     status        : "complete", how many runs diverged, or why it cannot run there
     predicts      : True if its samples in slots are predictions, not filtered
+    same_losses   : False if its messages and those of the first filter that ran meet other losses
+                    and delays in slots, because their exchanges are other ones
     """
 
     filter: str
@@ -79,6 +81,7 @@ class ComparedFilter:
     bytes: float
     status: str
     predicts: bool = False
+    same_losses: bool = True
 
     @property
     def ran(self) -> bool:
@@ -97,6 +100,7 @@ class ComparedFilter:
                 row[f"{name}_{part}"] = getattr(quantity, part)
         row |= {"consistency": self.consistency, "transmissions": self.transmissions}
         row |= {"bytes": self.bytes, "predicts": self.predicts}
+        row |= {"same_losses": self.same_losses}
         return row | {"status": self.status}
 
 
@@ -177,6 +181,7 @@ def compare_filters(
             if progress is not None:
                 progress(k + 1, len(candidates))
     first = next(iter(values))
+    scenarios = {one.label: one.scenario for one in candidates if one.scenario is not None}
     # Bonferroni: all differences from the first filter hold together.
     level = (1.0 - confidence) / (len(QUANTITIES) * max(1, len(values) - 1))
     rows = []
@@ -198,12 +203,32 @@ def compare_filters(
         row = _make_row(label, values[label], base, traffic[label], scenario.plant.n, level)
         rows.append(
             dataclasses.replace(
-                row, predicts=scenario_of_filter.slotted and scenario_of_filter.node_filter.predicts
+                row,
+                predicts=scenario_of_filter.slotted and scenario_of_filter.node_filter.predicts,
+                same_losses=_meet_same_losses(scenario_of_filter, scenarios[first]),
             )
         )
     return FilterComparison(
         scenario=scenario.name, runs=count, seed=root, confidence=confidence, rows=tuple(rows)
     )
+
+
+def _meet_same_losses(scenario: Scenario, other: Scenario) -> bool:
+    """Return True unless messages of two filters in one slot meet different losses or delays.
+
+    In slots messages of a link are numbered from the first exchange on, and losses and delays
+    belong to numbers.
+    """
+    filters = scenario.node_filter, other.node_filter
+    is_ideal = scenario.delivers_all or not all(one.talks for one in filters)
+    if is_ideal or not scenario.slotted:
+        return True
+    first, second = (
+        (one.first_slot, [one.exchange_steps(k) for k in range(phases)])
+        for one in filters
+        for phases in [(one.schedule or ()).count("exchange")]
+    )
+    return first == second
 
 
 def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:

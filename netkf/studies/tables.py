@@ -182,6 +182,12 @@ def format_filters(comparison: FilterComparison) -> str:
         lines.append(
             f"note: samples of {', '.join(predicting)} are predictions, the others are filtered"
         )
+    others = [shorten(row.filter) for row in ran if not row.same_losses]
+    if others:
+        lines.append(
+            f"note: {', '.join(others)}: other exchanges than those of {shorten(ran[0].filter)}, "
+            "and so other losses and delays of the same law"
+        )
     return "\n".join(lines)
 
 
