@@ -41,6 +41,7 @@ from netkf.algorithms.track_fusion import BarShalomCampo, InverseIntersection, O
 from netkf.core.clock import Clock
 from netkf.core.fields import (
     boolean,
+    choice,
     covariance,
     integer,
     matrix,
@@ -49,6 +50,7 @@ from netkf.core.fields import (
     probability,
     setting,
     square,
+    text,
     vector,
 )
 from netkf.network.channels import (
@@ -217,6 +219,7 @@ __all__ = [
     "UnknownDiffusion",
     "UnknownPlant",
     "boolean",
+    "choice",
     "covariance",
     "integer",
     "kinds",
@@ -226,5 +229,6 @@ __all__ = [
     "probability",
     "setting",
     "square",
+    "text",
     "vector",
 ]

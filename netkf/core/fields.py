@@ -305,6 +305,10 @@ def one_of(*names: str) -> Rule:
     return Rule(f"must be one of {listed}", convert, "choose one of them", {"enum": [*names]})
 
 
+choice = one_of
+"""``one_of`` under the name that users' classes know, ``netkf.parts.choice``."""
+
+
 def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
     """Return the rule ``second`` for values for which ``is_second`` is True, ``first`` for others.
 
