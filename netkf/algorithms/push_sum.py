@@ -927,8 +927,8 @@ class PushSum(Filter):
             )
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return one line each: delta is below rho(L); mass may be lost; settings of slots are not
-        used under clocks.
+        """Return one line each: delta is below rho(L); settings of slots are not used
+        under clocks.
         """
         if not scenario.slotted:
             fields = dataclasses.fields(self)
@@ -938,20 +938,13 @@ class PushSum(Filter):
             reason = "not used under clocks, where push-sum keeps running sums"
             return (f"{', '.join(changed_settings)}: {reason}",) if changed_settings else ()
         # Contraction is enough to run; the theorems ask for more.
-        notes, radius = [], scenario.topology.laplacian_radius
-        if self.delta < radius:
-            notes.append(
-                f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging "
-                "contracts, but P Theorems 3, 5 and 6 ask for more than rho(L)"
-            )
-        one_way = not scenario.network.channel.symmetric and not scenario.delivers_all
-        is_silent = scenario.filter.algorithm is not self  # behind a trigger
-        if (one_way or is_silent) and not (self.running_sums or self.asymptotic):
-            notes.append(
-                "push-sum: where only one direction of a link delivers, mass is lost or counted "
-                "twice, and estimates and P may be far off; running_sums = true keeps all mass"
-            )
-        return tuple(notes)
+        radius = scenario.topology.laplacian_radius
+        if self.delta >= radius:
+            return ()
+        return (
+            f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging contracts, "
+            "but P Theorems 3, 5 and 6 ask for more than rho(L)",
+        )
 
 
 def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Message]) -> PushSumState:
