@@ -882,7 +882,8 @@ class PushSum(Filter):
             raise ScenarioError("filter.stop", rule, self.stop, 'write stop = "never"')
         # P (12) may have no solution, as for an unstable plant that the sensors do not see.
         if self.asymptotic:
-            self._check_limit(*scenario.slot_belief, scenario.node_infos[0].information)
+            F, Q = scenario.slot_belief
+            self._check_limit(F, Q, scenario.node_infos[0].information)
 
     def _check_limit(self, F: FloatArray, Q: FloatArray, information: FloatArray) -> None:
         """Raise ScenarioError unless P_inf exists and gives gains to the readings: F and Q (n, n),
