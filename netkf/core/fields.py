@@ -14,10 +14,11 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
+from netkf.core.contracts import hold_to_contract, is_netkf_class
 from netkf.core.errors import ScenarioError
 from netkf.core.stamps import TimeBase
 from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
@@ -97,9 +98,24 @@ class Component:
     former_names: ClassVar[Mapping[str, str]] = {}
     """Deprecated names of methods that users' classes may still define, by their present names."""
 
+    def __new__(cls, *values: Any, **named: Any) -> Self:
+        """Return a new object; raises ScenarioError for settings without a name that must have one,
+        and for names that are none.
+        """
+        # Not of classes with an __init__ of their own, which that of a dataclass is not: it has no
+        # file.
+        code = getattr(cls.__init__, "__code__", None)
+        if (values or named) and code is not None and code.co_filename == "<string>":
+            _check_settings(cls, values, named)
+        return super().__new__(cls)
+
     def __init_subclass__(cls) -> None:
-        """Give a method that has a former name both names, whichever the class defines."""
+        """Hold the methods of a user's class to the contract (``core.contracts``), and give a
+        method that has a former name both names, whichever the class defines.
+        """
         super().__init_subclass__()
+        if not is_netkf_class(cls):
+            hold_to_contract(cls)
         own_attributes = vars(cls)
         for name, former in cls.former_names.items():
             # Both names refer to one function, so super() reaches the base class under either.
@@ -129,6 +145,22 @@ class Component:
     def __hash__(self) -> int:
         """Return a hash that equal components share: values may be arrays, which have none."""
         return hash((type(self), len(dataclasses.fields(self))))
+
+
+def _check_settings(cls: type, values: Sequence[Any], named: Mapping[str, Any]) -> None:
+    """Raise ScenarioError if settings of a component's class cannot be given so: ``values`` without
+    names, and those that are ``named``.
+    """
+    fields = [f for f in dataclasses.fields(cls) if f.init]
+    unnamed = [f.name for f in fields if not f.kw_only]
+    listed = ", ".join(f"{f.name}=..." for f in fields)
+    remedy = f"write {cls.__name__}({listed})"
+    if len(values) > len(unnamed):
+        rule = f"takes {', '.join(unnamed) or 'no setting'} without a name"
+        raise ScenarioError(cls.__name__, rule, values[len(unnamed)], remedy)
+    for name, value in named.items():
+        if name not in {f.name for f in fields}:
+            raise ScenarioError(f"{cls.__name__}.{name}", "is no setting", value, remedy)
 
 
 def _are_equal(a: Any, b: Any) -> bool:

@@ -14,7 +14,12 @@ from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.imports import unload_namesake
-from netkf.scenario.plugins import describe_error, find_unimportable_class, user_components
+from netkf.scenario.plugins import (
+    describe_error,
+    find_unimportable_class,
+    unguarded_line,
+    user_components,
+)
 from netkf.scenario.scenario import Scenario
 
 Task = Callable[[Scenario, int, int], Any]
@@ -94,6 +99,11 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
     if name is not None:
         message = f"workers cannot import the class {name} of a notebook, a prompt or a function"
         raise EngineError(f"{message}; put it into a module (a .py file), or use workers=1")
+    line = unguarded_line(scenario)
+    if line:
+        message = f"each worker would run the script again, because of its class on line {line[0]}"
+        remedy = f'put line {line[1]} under if __name__ == "__main__":, or use workers=1'
+        raise EngineError(f"{message}; {remedy}")
     try:
         payload = pickle.dumps(scenario, protocol=pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError) as error:

@@ -382,6 +382,11 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
         rule = f"cannot go together with {names[1]}"
         raise ScenarioError(names[0], rule, values[names[0]], "give one of them")
     if executor is not None:
+        client = getattr(executor, "scheduler", None)
+        if client is not None and hasattr(executor, "scatter"):  # a Dask client has submit(), too
+            address = getattr(client, "address", "tcp://HOST:PORT")
+            remedy = f'give scheduler="{address}" in its place'
+            raise ScenarioError("executor", "must not be a Dask client", executor, remedy)
         if not hasattr(executor, "submit"):
             remedy = "give a ThreadPoolExecutor, a ProcessPoolExecutor, or one like them"
             raise ScenarioError(

@@ -21,6 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from netkf.core.contracts import ContractError, place_of_error
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.stamps import TimeBase
 
@@ -82,8 +83,14 @@ def _replace_import_path(entries: list[str]) -> Iterator[None]:
 
 def _import_error(kind: str, error: BaseException) -> ScenarioError:
     """Return the error for a class "package.module:Class" that could not be imported."""
-    rule = f"could not be imported ({type(error).__name__}: {quote(str(error))})"
+    if isinstance(error, ContractError):
+        return ScenarioError("kind", str(error), kind, "write what the contract asks for")
+    rule = f"could not be imported ({type(error).__name__}: {quote(str(error), 300)})"
+    is_missing = isinstance(error, ModuleNotFoundError) and error.name == kind.partition(":")[0]
     remedy = "put the module beside the scenario file or on the Python path"
+    if not is_missing:
+        place = place_of_error(error)
+        remedy = f"correct the module, {place}" if place else "correct the module"
     return ScenarioError("kind", rule, kind, remedy)
 
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import inspect
 import sys
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType, FunctionType
 from typing import Any
 
+from netkf.core.contracts import ContractError, is_netkf_class, last_call, place_of, place_of_error
+from netkf.core.errors import quote
 from netkf.core.fields import Component
 
 
@@ -26,11 +32,6 @@ def user_components(value: Any) -> list[Component]:
     return [*own, *(component for item in items for component in user_components(item))]
 
 
-def is_netkf_class(cls: type) -> bool:
-    """Return True if a class is netkf's own."""
-    return cls.__module__.partition(".")[0] == "netkf"
-
-
 def find_unimportable_class(scenario: Any, in_script: bool = True) -> str | None:
     """Return the name of a user's class in a scenario that other processes cannot import.
 
@@ -46,6 +47,37 @@ def find_unimportable_class(scenario: Any, in_script: bool = True) -> str | None
         if in_main or "<locals>" in cls.__qualname__:
             return cls.__name__
     return None
+
+
+def unguarded_line(scenario: Any) -> tuple[int, int] | None:
+    """Return the line of a class of the running script (``__main__``) in a scenario, and the line
+    of the script that is being executed, if that is not under ``if __name__ == "__main__":``; else
+    None.
+
+    Worker processes run a script again to find its classes, and with it whatever is not guarded.
+    """
+    classes = [type(one) for one in user_components(scenario) if type(one).__module__ == "__main__"]
+    file = getattr(sys.modules.get("__main__"), "__file__", None)
+    frame: FrameType | None = sys._getframe()
+    while frame is not None and not (
+        frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") == "__main__"
+    ):
+        frame = frame.f_back
+    if not classes or file is None or frame is None or frame.f_code.co_filename != file:
+        return None
+    try:
+        body = ast.parse(Path(file).read_bytes()).body
+        defined = inspect.getsourcelines(classes[0])[1]
+    except (OSError, SyntaxError, ValueError, TypeError):
+        return None
+    line = frame.f_lineno
+    guarded = any(
+        isinstance(one, ast.If)
+        and "__name__" in ast.dump(one.test)
+        and one.lineno <= line <= (one.end_lineno or line)
+        for one in body
+    )
+    return None if guarded else (defined, line)
 
 
 def find_module_files(scenario: Component) -> dict[str, Path | None]:
@@ -70,24 +102,67 @@ def _is_file_of(path: Path, module_name: str) -> bool:
 
 
 def explain_user_error(scenario: Any, error: Exception) -> str | None:
-    """Return the message ``module:Class failed in method: error`` for an error in a user's class,
-    which tells the user that the mistake is in their code.
+    """Return the message ``module:Class failed in method (file, line n): error`` for an error in a
+    user's class, which tells the user that the mistake is in their code.
 
-    ``scenario`` is a scenario or a tuple of components. The class is the one whose method stands
-    deepest in the traceback, else (without "in method") the first of users' classes. Returns None
-    if all classes are netkf's own.
+    ``scenario`` is a scenario or a tuple of components. The method is the deepest one of a user's
+    class in the traceback, at the deepest line in its file; without one it is the method that
+    returned last, and its result is told. Returns None if all classes are netkf's own.
     """
     components = user_components(scenario)
     if not components:
         return None
-    failed, where = components[0], ""
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        for component in components:
-            if frame.f_locals.get("self") is component:
-                failed, where = component, f" in {frame.f_code.co_name}"
-                break
-    cls = type(failed)
-    return f"{cls.__module__}:{cls.__qualname__} failed{where}: {describe_error(error)}"
+    text = describe_error(error)
+    methods = {
+        function.__code__: (type(component), name)
+        for component in components
+        for cls in reversed(type(component).__mro__)
+        if not is_netkf_class(cls)
+        for name, member in vars(cls).items()
+        for function in [inspect.unwrap(member) if callable(member) else member]
+        if isinstance(function, FunctionType)
+    }
+    found: tuple[type, str, FrameType, int] | None = None
+    for frame, line in _frames_of(error):
+        if frame.f_code in methods:
+            found = (*methods[frame.f_code], frame, line)
+        elif found is not None and frame.f_code.co_filename == found[2].f_code.co_filename:
+            found = (*found[:2], frame, line)
+    if found is not None:
+        cls, name, frame, line = found
+        return f"{_name_of(cls)} failed in {name} ({place_of(frame.f_code, line)}): {text}"
+    if isinstance(error, ContractError):
+        return f"{_name_of(type(components[0]))}: {error}"
+    call = last_call()
+    if call is None or not any(isinstance(part, call.cls) for part in components):
+        return f"{_name_of(type(components[0]))} failed: {text}"
+    where = f"{call.function.__name__} ({place_of(call.function.__code__)})"
+    return f"{_name_of(call.cls)} failed after {where} returned {quote(call.result)}: {text}"
+
+
+def _frames_of(error: BaseException) -> Iterator[tuple[FrameType, int]]:
+    """Yield frame and line of each call that led to an error, or to the errors that caused it."""
+    # SimPy raises a copy of an error of a process, whose cause is the error itself.
+    chain: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in chain:
+        chain.append(cause)
+        cause = cause.__cause__
+    for one in chain:
+        yield from traceback.walk_tb(one.__traceback__)
+
+
+def _name_of(cls: type) -> str:
+    """Return "module:Class", as scenario files name a class."""
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def describe_failure(error: BaseException) -> str:
+    """Return what an exception of a user's class says, with its file and line, on one line."""
+    if isinstance(error, ContractError):
+        return str(error)
+    place = place_of_error(error)
+    return f"failed with {describe_error(error)}" + (f" ({place})" if place else "")
 
 
 def describe_error(error: BaseException) -> str:

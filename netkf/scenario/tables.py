@@ -15,13 +15,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from netkf.core.contracts import is_netkf_class
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file
 from netkf.network.channels import Channel
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
-from netkf.scenario.plugins import describe_error, explain_user_error, is_netkf_class
+from netkf.scenario.plugins import describe_error, explain_user_error
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
 from netkf.scenario.stamps import Time
 from netkf.scenario.writing import as_table, part_as_table

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from netkf.core.clock import Clock
-from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
+from netkf.scenario.plugins import describe_failure
 from netkf.testing.noise import (
     NoiseLabels,
     check_independent,
@@ -469,20 +469,24 @@ def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
     """Return the smallest number of states, up to MAX_STATES, that ``h`` and ``jacobian`` accept;
     raises AssertionError, which names the class by ``name``, if there is none.
     """
+    failure = ""
     for n in range(1, MAX_STATES + 1):
-        if _accepts_state_size(sensor, n):
-            return n
-    return fail(name, f"h and jacobian must read a state of at most {MAX_STATES} components")
+        try:
+            if _accepts_state_size(sensor, n):
+                return n
+        except Exception as error:  # of a user's class
+            failure = f"; for a state of {n} the class {describe_failure(error)}"
+    rule = f"h and jacobian must read a state of at most {MAX_STATES} components{failure}"
+    return fail(name, rule)
 
 
 def _accepts_state_size(sensor: NonlinearSensor, n: int) -> bool:
-    """Return True if ``h`` and ``jacobian`` of a sensor accept states of n components."""
-    try:
-        sensor.check_state(n)
-        sensor.h(np.ones(n), sensor.nodes[0])
-        return np.shape(sensor.jacobian(np.ones(n), sensor.nodes[0]))[-1:] == (n,)
-    except (ScenarioError, IndexError, ValueError):
-        return False
+    """Return True if ``h`` and ``jacobian`` of a sensor accept states of n components; they may
+    raise what they like for others.
+    """
+    sensor.check_state(n)
+    sensor.h(np.ones(n), sensor.nodes[0])
+    return np.shape(sensor.jacobian(np.ones(n), sensor.nodes[0]))[-1:] == (n,)
 
 
 def _derivative_error(sensor: NonlinearSensor, node: int, x: FloatArray, J: FloatArray) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
-from netkf.scenario.plugins import describe_error
+from netkf.scenario.plugins import describe_error, describe_failure
 
 Leaves = dict[str, Any]
 """Copies of the numbers, texts and arrays in a value, by their paths such as ``.P[0]``."""
@@ -316,7 +316,7 @@ class WatchedPart:
         except Exception as error:
             singular = isinstance(error, np.linalg.LinAlgError)
             remedy = "; set inverts = True where covariances must not be singular"
-            text = f"{where}: failed with {describe_error(error)}{remedy if singular else ''}"
+            text = f"{where}: {describe_failure(error)}{remedy if singular else ''}"
             raise AssertionError(text) from error
         demand(
             global_generator_states() == before,
@@ -391,7 +391,7 @@ def guard_user_code(where: str) -> Iterator[None]:
     except AssertionError:
         raise
     except Exception as error:
-        raise AssertionError(f"{where}: failed with {describe_error(error)}") from error
+        raise AssertionError(f"{where}: {describe_failure(error)}") from error
     demand(
         global_generator_states() == before,
         where,

@@ -1,0 +1,240 @@
+"""Mistakes in users' classes: one line that names the class, the method, the file and the line."""
+
+import importlib
+import re
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+import netkf
+from netkf import parts
+from netkf.cli.main import main
+from netkf.testing import check_channel, check_clock, check_filter, check_sensor
+
+HEAD = "from dataclasses import dataclass\nimport numpy as np\nfrom netkf.parts import *\n"
+START = """
+format = 1
+name = "own"
+horizon = 2.0
+probe = 1.0
+"""
+SLOTS = (
+    START
+    + """
+plant = { kind = "linear", F = [[0.9]], Q = [[1.0]], period = 1.0, cov = [[1.0]] }
+sensors = [SENSOR]
+network = { graph = { GRAPH }, activation = { kind = "broadcast" } }
+filter = { FILTER }
+"""
+)
+CLOCKS = (
+    START
+    + """
+plant = { PLANT, A = [[-0.1]], B = [[1.0]], cov = [[1.0]] }
+sensors = [{ nodes = [0], H = [[1.0]], R = [[0.5]], sampling = { kind = "periodic", period = 0.5 } }]
+network = { graph = { GRAPH }, activation = { CLOCK }, channel = { CHANNEL } }
+filter = { FILTER }
+"""
+)
+PARTS = {
+    "SENSOR": "{ nodes = [0], H = [[1.0]], R = [[0.5]] }",
+    "GRAPH": 'kind = "cycle", nodes = 3',
+    "FILTER": 'kind = "hybrid", epsilon = 0.3',
+    "PLANT": 'kind = "diffusion"',
+    "CLOCK": 'kind = "poisson", rate = 5.0, at = "nodes"',
+    "CHANNEL": "",
+}
+SAME = "def absorb(self, state, messages, exchange): return state"
+NEEDED = {
+    "FILTER": ('kind = "{}"', "Filter"),
+    "SENSOR": ('{{ nodes = [0], R = [[0.5]], kind = "{}" }}', "NonlinearSensor"),
+    "GRAPH": ('kind = "{}", nodes = 3', "Cycle"),
+    "CLOCK": ('kind = "{}", rate = 5.0, at = "nodes"', "Poisson"),
+    "LOSS": ('loss = {{ kind = "{}", delivery = 0.5 }}', "Bernoulli"),
+    "DELAY": ('delay = {{ kind = "{}" }}', "Delay"),
+    "PLANT": ('kind = "{}"', "Diffusion"),
+}
+NO_RESULT = "returned nothing; it must return a value"
+MISTAKES = {
+    "absorb takes too little": ("FILTER", "def absorb(self, state, messages): return state",
+                                r"F\.absorb \(FILE, line 6\) must take \(state, messages, exchange\)"),
+    "absorb returns nothing": ("FILTER", "def absorb(self, state, messages, exchange): pass",
+                               rf"F\.absorb \(FILE, line 6\) {NO_RESULT}"),
+    "absorb fails": ("FILTER", "def absorb(self, state, messages, exchange):\n    return state.foo",
+                     r"F failed in absorb \(FILE, line 7\): AttributeError: 'State' object"),
+    "a helper of absorb fails": (
+        "FILTER", "def absorb(self, state, messages, exchange):\n    return [1 / 0 for _ in 'ab']",
+        r"F failed in absorb \(FILE, line 7\): ZeroDivisionError"),
+    "absorb returns a number": ("FILTER", "def absorb(self, state, messages, exchange): return 3",
+                                r"F failed after absorb \(FILE, line 6\) returned 3: "),
+    "update takes too little": ("FILTER", f"def update(self, state): return state\n{SAME}",
+                                r"F\.update \(FILE, line 6\) must take \(state, reading\), not \(state\)"),
+    "update returns nothing": ("FILTER", f"def update(self, state, reading): pass\n{SAME}",
+                               rf"F\.update \(FILE, line 6\) {NO_RESULT}"),
+    "predict returns nothing": ("FILTER", f"def predict(self, state, gap): pass\n{SAME}",
+                                rf"F\.predict \(FILE, line 6\) {NO_RESULT}"),
+    "init returns nothing": ("FILTER", f"def init(self, model, mean, cov, node): pass\n{SAME}",
+                             rf"F\.init \(FILE, line 6\) {NO_RESULT}"),
+    "emit returns the state only": ("FILTER", f"def emit(self, state, exchange): return state\n{SAME}",
+                                    r"F\.emit \(FILE, line 6\) must return a tuple of 2, not State"),
+    "estimate returns nothing": ("FILTER", f"def estimate(self, state): pass\n{SAME}",
+                                 rf"F\.estimate \(FILE, line 6\) {NO_RESULT}"),
+    "weight fails": ("FILTER", f"def weight(self, degree, peer_degree): return 1 / 0\n{SAME}",
+                     r"F failed in weight \(FILE, line 6\): ZeroDivisionError"),
+    "weight is a text": ("FILTER", f"def weight(self, degree, peer_degree): return 'x'\n{SAME}",
+                         r"F failed after weight \(FILE, line 6\) returned 'x': TypeError"),
+    "nothing is defined": ("FILTER", "pass", "must define absorb"),
+    "h returns nothing": ("SENSOR", "def h(self, x, node): pass\n"
+                          "def jacobian(self, x, node): return np.eye(1)",
+                          rf"F\.h \(FILE, line 6\) {NO_RESULT}"),
+    "h takes too little": ("SENSOR", "def h(self, x): return x\n"
+                           "def jacobian(self, x, node): return np.eye(1)",
+                           r"F\.h \(FILE, line 6\) must take \(x, node\), not \(x\)"),
+    "jacobian fails": ("SENSOR", "def h(self, x, node): return x\n"
+                       "def jacobian(self, x, node): return x[5]",
+                       r"F failed in jacobian \(FILE, line 7\): IndexError"),
+    "a sensor defines half": ("SENSOR", "def h(self, x, node): return x", "must define jacobian"),
+    "a sensor defines nothing": ("SENSOR", "pass", "must define h, jacobian"),
+    "build returns nothing": ("GRAPH", "def build(self, seed): pass",
+                              rf"F\.build \(FILE, line 6\) {NO_RESULT}"),
+    "build fails": ("GRAPH", "def build(self, seed): return 1 / 0",
+                    r"F failed in build \(FILE, line 6\): ZeroDivisionError"),
+    "mean_rate fails": ("CLOCK", "def mean_rate(self, entity): raise KeyError('x')",
+                        r"F failed in mean_rate \(FILE, line 6\): KeyError: 'x'"),
+    "mean_rate takes nothing": ("CLOCK", "def mean_rate(self): return 1.0",
+                                r"F\.mean_rate \(FILE, line 6\) must take \(entity\), not \(\)"),
+    "check of a loss fails": ("LOSS", "def check(self, topology): return 1 / 0",
+                              r"F failed in check \(FILE, line 6\): ZeroDivisionError"),
+    "mean_delivery returns nothing": ("LOSS", "def mean_delivery(self, link, table): pass",
+                                      rf"F\.mean_delivery \(FILE, line 6\) {NO_RESULT}"),
+    "draw fails": ("DELAY", "def draw(self, random): return 1 / 0",
+                   r"F failed in draw \(FILE, line 6\): ZeroDivisionError"),
+    "draw takes nothing": ("DELAY", "def draw(self): return 1.0",
+                           r"F\.draw \(FILE, line 6\) must take \(.+\), not \(\)"),
+    "a plant returns no truth": ("PLANT", "def sampled_truth(self, *arguments): pass",
+                                 rf"F\.sampled_truth \(FILE, line 6\) {NO_RESULT}"),
+}  # fmt: skip
+
+
+def write(folder, name, part, body):
+    module = f"own_{abs(hash(name))}"
+    base = NEEDED[part][1]
+    source = f"{HEAD}@dataclass(frozen=True, eq=False)\nclass F({base}):\n"
+    (folder / f"{module}.py").write_text(source + textwrap.indent(body, "    ") + "\n")
+    return module
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_one_line_names_class_method_file_and_line(name, tmp_path, monkeypatch, capsys):
+    part, body, words = MISTAKES[name]
+    module = write(tmp_path, name, part, body)
+    monkeypatch.chdir(tmp_path)
+    text = NEEDED[part][0].format(f"{module}:F")
+    key = "CHANNEL" if part in ("LOSS", "DELAY") else part
+    pattern = words.replace("FILE", rf"{module}\.py")
+    for template in (SLOTS, CLOCKS):
+        if key not in template:
+            continue
+        values = {**PARTS, key: text}
+        if template is SLOTS and part != "FILTER":
+            values["FILTER"] = 'kind = "kcf", epsilon = 0.1'
+        table = template
+        for one, value in values.items():
+            table = re.sub(rf"\b{one}\b", lambda _, value=value: value, table)
+        (tmp_path / "own.toml").write_text(table)
+        for engine in ("simpy", "auto"):
+            out = str(tmp_path / f"out{engine}{template is SLOTS}")
+            arguments = [
+                "run",
+                "own.toml",
+                "--trust",
+                "--no-plot",
+                "--engine",
+                engine,
+                "--out",
+                out,
+            ]
+            assert main(arguments) == 2
+            printed = capsys.readouterr().err
+            lines = [line for line in printed.splitlines() if "compiling" not in line]
+            assert len(lines) == 1, printed
+            assert re.search(pattern, lines[0]), lines[0]
+            if "must define" in words or "must take" in words:
+                with pytest.raises(netkf.ScenarioError, match=pattern):
+                    netkf.load("own.toml")
+
+
+CHECKERS = {"FILTER": check_filter, "LOSS": check_channel, "CLOCK": check_clock,
+            "SENSOR": check_sensor}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["absorb fails", "absorb returns nothing", "weight fails",
+                                  "emit returns the state only", "jacobian fails", "h returns nothing"])  # fmt: skip
+def test_checkers_name_the_line_too(name, tmp_path, monkeypatch):
+    part, body, _ = MISTAKES[name]
+    module = write(tmp_path, name, part, body)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    cls = importlib.import_module(module).F
+    settings = {"nodes": (0,), "R": [[0.5]]} if part == "SENSOR" else {}
+    with pytest.raises(AssertionError, match=rf"{module}\.py, line [67]"):
+        CHECKERS[part](cls(**settings))
+
+
+def test_settings_without_a_name_and_unknown_ones():
+    with pytest.raises(
+        netkf.ScenarioError, match=r"^Poisson: takes no setting without a name; got 2"
+    ):
+        parts.Poisson(2.0)
+    with pytest.raises(
+        netkf.ScenarioError, match=r"^Gossip: takes no setting without a name; got 3"
+    ):
+        parts.Gossip(3)
+    with pytest.raises(netkf.ScenarioError, match=r"^Poisson.rat: is no setting; got 2"):
+        parts.Poisson(rat=2.0)
+    assert parts.Bernoulli(0.5).delivery == 0.5
+
+
+def test_a_dask_client_is_no_executor(ring):
+    class Client:
+        class scheduler:
+            address = "tcp://127.0.0.1:1234"
+
+        def submit(self): ...
+        def scatter(self): ...
+
+    with pytest.raises(
+        netkf.ScenarioError, match=r'Dask client; .*scheduler="tcp://127.0.0.1:1234"'
+    ):
+        netkf.monte_carlo(ring, runs=2, executor=Client())
+
+
+def test_a_script_without_a_guard_is_run_once(tmp_path):
+    script = f"""{HEAD}
+import dataclasses, netkf
+print("here")
+@dataclass(frozen=True, eq=False)
+class Own(Filter):
+    def absorb(self, state, messages, exchange):
+        return state
+scenario = netkf.load("own.toml")
+scenario = dataclasses.replace(
+    scenario, filter=dataclasses.replace(scenario.filter, algorithm=Own()))
+try:
+    netkf.monte_carlo(scenario, runs=4, workers=2)
+except netkf.EngineError as error:
+    print(error)
+"""
+    table = SLOTS.replace("FILTER", 'kind = "local"')
+    for one, value in PARTS.items():
+        table = re.sub(rf"\b{one}\b", lambda _, value=value: value, table)
+    (tmp_path / "own.toml").write_text(table)
+    (tmp_path / "script.py").write_text(script)
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100
+    )
+    first, message = done.stdout.splitlines()
+    assert first == "here"
+    assert re.search(r'line 15 under if __name__ == "__main__":', message), message
+    assert done.stderr == ""
