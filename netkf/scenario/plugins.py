@@ -102,7 +102,7 @@ def _is_file_of(path: Path, module_name: str) -> bool:
 
 
 def explain_user_error(scenario: Any, error: Exception) -> str | None:
-    """Return the message ``module:Class failed in method (file, line n): error`` for an error in a
+    """Return the message ``module:Class failed in method: error; file, line n`` for an error in a
     user's class, which tells the user that the mistake is in their code.
 
     ``scenario`` is a scenario or a tuple of components. The method is the deepest one of a user's
@@ -130,7 +130,7 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
             found = (*found[:2], frame, line)
     if found is not None:
         cls, name, frame, line = found
-        return f"{_name_of(cls)} failed in {name} ({place_of(frame.f_code, line)}): {text}"
+        return f"{_name_of(cls)} failed in {name}: {text}; {place_of(frame.f_code, line)}"
     if isinstance(error, ContractError):
         return f"{_name_of(type(components[0]))}: {error}"
     call = last_call()
