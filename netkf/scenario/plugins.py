@@ -119,7 +119,8 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
         for cls in reversed(type(component).__mro__)
         if not is_netkf_class(cls)
         for name, member in vars(cls).items()
-        for function in [inspect.unwrap(member) if callable(member) else member]
+        for one in [getattr(member, "fget", member)]  # of a property
+        for function in [inspect.unwrap(one) if callable(one) else one]
         if isinstance(function, FunctionType)
     }
     found: tuple[type, str, FrameType, int] | None = None
