@@ -432,7 +432,9 @@ def _look_again(
     level_now = level_of_look(level, look) if may_continue or earlier is not None else level
     spent = (earlier.spent if earlier is not None else 0.0) + level_now
     verdict = judge_replicas(scenario, results, seed, 1.0 - level_now)
-    rows = keep_decisions(earlier.rows, verdict.rows) if earlier is not None else verdict.rows
+    rows = verdict.rows
+    if earlier is not None:  # a broken row that is kept may be the root of one that is new
+        rows = tuple(fold_followers(keep_decisions(earlier.rows, verdict.rows)))
     confident = 1.0 - max(spent, level) if may_continue else 1.0 - spent
     return dataclasses.replace(
         verdict, rows=rows, confidence=confident, results=tuple(results), looks=look, spent=spent
