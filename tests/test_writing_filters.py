@@ -136,7 +136,7 @@ def test_a_filter_without_covariance_runs_from_the_command_line(folder, capsys):
     assert len(rows) == 6
     for _, error, *others in rows:
         assert float(error) < 1.0
-        assert others == ["-"] * 4
+        assert others == ["-"] * 2
     run = netkf.simulate(netkf.load(folder / "averaging.toml"))
     assert run.status == "complete"
     assert np.isnan(run.P).all()

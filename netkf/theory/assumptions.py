@@ -75,7 +75,9 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     """
     if not concerns_hybrid_paper(scenario):
         # Of what H assumes, this decides about errors of every filter.
-        rows = [*_graph_rows(scenario), *_plant_rows(scenario), *start_rows(scenario, ANY)]
+        rows = [*_plant_rows(scenario), *start_rows(scenario, ANY)]
+        if scenario.filter.algorithm.talks:
+            rows = [_reach_row(scenario), *_weight_rows(scenario), *rows]
         return [
             (name, ANY if source.startswith("H ") else source, holds, evidence)
             for name, source, holds, evidence in rows
@@ -101,8 +103,29 @@ def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
             + (", directed" if topology.directed else ""),
         )
     ]
-    weights = paper_function(scenario, "assumptions", "weight_rows")
-    return [*rows, *weights(scenario)] if weights is not None else rows
+    return [*rows, *_weight_rows(scenario)]
+
+
+def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the assumptions of the filter's paper on its weights, as rows of the table."""
+    rows = paper_function(scenario, "assumptions", "weight_rows")
+    return [] if rows is None else list(rows(scenario))
+
+
+def _reach_row(scenario: Scenario) -> AssumptionRow:
+    """Return the assumption, as a row of the table, that what a node knows can reach all others."""
+    import networkx
+
+    topology = scenario.topology
+    graph = networkx.DiGraph(topology.directions)
+    graph.add_nodes_from(topology.nodes)
+    parts = networkx.number_strongly_connected_components(graph)
+    evidence = f"{len(topology.nodes)} nodes, {len(topology.links)} links" + (
+        ", directed" if topology.directed else ""
+    )
+    if parts > 1:
+        evidence += f"; {parts} groups of nodes that reach each other both ways"
+    return ("every node can hear of every other, over others", ANY, parts == 1, evidence)
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:

@@ -513,7 +513,7 @@ def test_the_first_start_says_that_it_compiles(ring, monkeypatch, capsys, tmp_pa
     monkeypatch.setattr(compiling, "_cache_folder", lambda chosen: tmp_path)
     for scenario in (ring, gossip, ring):
         netkf.simulate(scenario, engine="compiled")
-    assert capsys.readouterr().err.count("netkf: compiling, once") == 2
+    assert capsys.readouterr().err.count("netkf: compiling ") == 2
     monkeypatch.setattr(compiling, "_announced", set())
     netkf.simulate(ring, engine="simpy")
     assert capsys.readouterr().err == ""
@@ -556,13 +556,12 @@ def test_a_block_of_rows_is_recorded_like_one_row_after_the_other():
 
 
 def test_code_compiled_from_sources_long_gone_is_removed(tmp_path):
-    for k in range(6):
-        (tmp_path / f"netkf-{k}").mkdir()
-        os.utime(tmp_path / f"netkf-{k}", (k, k))
+    names = [f"netkf-{k:016x}" for k in range(6)]
+    for k, name in enumerate(names):
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (k, k))
     (tmp_path / "other").mkdir()
     folder = compiling._cache_folder.__wrapped__(str(tmp_path))
     assert folder.parent == tmp_path
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        *(f"netkf-{k}" for k in range(3, 6)),
-        "other",
-    ]
+    left = sorted({path.name for path in tmp_path.iterdir()} - {folder.name})
+    assert left == [*names[3:], "other"]
