@@ -18,6 +18,7 @@ ELSEWHERE = {
     "netkf.parts.Network",
     "netkf.parts.Filtering",
     "netkf.parts.Belief",
+    "netkf.parts.Time",
 }
 FORMER = {"netkf.parts.SlotLocal", "netkf.parts.SlotCentral"}
 
