@@ -9,7 +9,8 @@ pseudo-state y = G x, of which its pseudo-observation ``H_i' R_i^-1 z_i`` shows 
 
 then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G^+ G) xhat+)``
 (``kernels.pseudo_states`` computes both steps). The gains are those of the Gauss-Markov theorem: B
-and M minimise the mean square error of yhat+, and K that of xhat+. They follow from the joint
+and M minimise the mean square error of yhat+, and K that of xhat+; where several do, they are those
+of least norm (``optimal_gain``). They follow from the joint
 covariance of the errors of all nodes, in which nothing depends on data, and which is computed as if
 no message were lost and no reading were missing (``GainSequence``). ``pseudo_slots`` simulates many
 runs in the compiled engine, in place of the methods of ``ConsensusInnovations``; the types of its
@@ -303,14 +304,21 @@ def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatAr
     """Return the gain ``E[e theta'] E[theta theta']^+`` (n, k) that corrects errors e (n, inputs)
     by differences theta (k, inputs), both given by their coefficients of independent inputs with
     variance 1; ``terms`` (k,) are the sums of the variances of the terms of each difference.
+
+    Where differences depend on each other many gains are optimal, and estimates from which a
+    message is missing depend on the choice. It is that of least norm for differences in units of
+    the standard deviation of their terms, so that neither units nor the order of states and nodes
+    matter. Singular values of these differences up to NEGLIGIBLE count as rounding; around it they
+    lose their weight steeply, but without a jump.
     """
     # Relative to its terms the difference of equal estimates is rounding, and counts as 0 below.
     scale = np.divide(1.0, np.sqrt(terms), out=np.zeros_like(terms), where=terms > 0.0)
     # E[e theta'] = e theta' for errors given by independent unit inputs; the pseudo-inverse comes
     # from the singular values of theta, which has half the condition of E[theta theta'].
     U, S, V = np.linalg.svd(scale[:, None] * theta, full_matrices=False)
-    significant = S > NEGLIGIBLE
-    return np.asarray((e @ V[significant].T / S[significant]) @ (U[:, significant].T * scale))
+    # 1 / S for all that is larger than NEGLIGIBLE, and 0 for all that is smaller.
+    inverse = S**7 / (S**8 + NEGLIGIBLE**8)
+    return np.asarray((e @ V.T * inverse) @ (U.T * scale))
 
 
 @lru_cache(maxsize=8)

@@ -5,6 +5,7 @@ import pytest
 
 import netkf
 from netkf import theory
+from netkf.algorithms.consensus_innovations import optimal_gain
 from netkf.algorithms.filter import Exchange, Reading
 from netkf.theory.common.errors import error_law
 from tests.algorithms.test_literature import (
@@ -155,6 +156,69 @@ def test_theory_follows_it_and_p_is_the_covariance_without_losses(lossy, tmp_pat
     close(error_law(scenario, run).P, run.P, 1e-9)
     gap = np.abs(np.linalg.eigvalsh(run.P - Sigma)).max()
     assert gap > 1e-3 if lossy else gap < 1e-10
+
+
+def test_of_many_optimal_gains_the_one_of_least_norm_is_used():
+    """Differences that depend on each other, in units of their terms; continuous in all of them."""
+    random = np.random.default_rng(5)
+    e, few = random.standard_normal((2, 9)), random.standard_normal((3, 9))
+    mixing, terms = random.standard_normal((6, 3)), random.uniform(0.1, 50.0, 6)
+    theta, unit = mixing @ few, np.sqrt(terms)
+    gain = optimal_gain(e, theta, terms)
+    # Any optimal gain: that of the three, which are independent. Least squares finds the shortest.
+    best = e @ few.T @ np.linalg.inv(few @ few.T)
+    shortest = np.linalg.lstsq((mixing / unit[:, None]).T, best.T)[0].T / unit
+    np.testing.assert_allclose(gain, shortest, rtol=1e-10, atol=1e-12)
+    # Other units and another order of the differences.
+    factor, order = random.uniform(1e-3, 1e3, 6), random.permutation(6)
+    again = optimal_gain(e, (factor[:, None] * theta)[order], (factor**2 * terms)[order])
+    np.testing.assert_allclose(again, (gain / factor)[:, order], rtol=1e-9, atol=1e-12)
+    # A fourth direction that becomes smaller and smaller: nothing jumps.
+    more = np.outer(random.standard_normal(6), random.standard_normal(9))
+    sizes = np.geomspace(1e-2, 1e-10, 4001)
+    gains = np.array([optimal_gain(e, theta + size * more, terms) for size in sizes])
+    jumps = np.abs(np.diff(gains, axis=0)).max(axis=(1, 2)) / np.abs(gains[1:]).max(axis=(1, 2))
+    assert jumps.max() < 0.05
+    np.testing.assert_allclose(gains[-1], gain, rtol=1e-6, atol=1e-8)
+
+
+def test_estimates_without_some_messages_know_no_units_and_no_order(tmp_path):
+    """A star whose leaves all know what the hub has told them: which of them it hears does not
+    matter, but by which gains it hears those that are left does.
+    """
+    F, H = np.array([[0.95, 0.2], [-0.1, 0.9]]), np.array([[1.0, 0.5]])
+    Q, cov = np.array([[0.2, 0.05], [0.05, 0.1]]), np.array([[2.0, 0.3], [0.3, 1.0]])
+    slots = [float(k) for k in range(8)]
+
+    def errors(unit, place, engine):
+        T, V = np.diag(unit), np.diag(1.0 / unit)
+        plant = {"kind": "linear", "F": T @ F @ V, "Q": T @ Q @ T, "cov": T @ cov @ T}
+        plant = {k: v if k == "kind" else v.tolist() for k, v in plant.items()} | {"period": 1.0}
+        links = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (3, 4)]
+        # The links keep their losses: they are listed in the same order.
+        ups = ["slot,phase,step,node,peer"]
+        random = np.random.default_rng(2)
+        for slot in slots:
+            up = [link for link in links if random.random() < 0.6]
+            ups += [f"{slot:.0f},0,0,{place[i]},{place[j]}" for i, j in up]
+        (tmp_path / "links.csv").write_text("\n".join(ups) + "\n")
+        graph = {"kind": "edges", "edges": [[place[i], place[j]] for i, j in links]}
+        network = {"graph": graph, "activation": {"kind": "recorded", "path": "links.csv"}}
+        sensors = [{"nodes": [place[0]], "H": (H @ V).tolist(), "R": [[0.3]]}]
+        more = {"plant": plant, "sensors": sensors, "network": network, "horizon": 8.0}
+        scenario = scenario_of(FILTER, tmp_path, probe=slots, **more)
+        run = netkf.simulate(scenario, engine=engine)
+        Sigma = theory.error_covariance(scenario, run)[:, place]
+        return V @ Sigma @ V, (V @ (run.P @ V))[:, place]
+
+    ones, same = np.ones(2), [0, 1, 2, 3, 4]
+    Sigma, P = errors(ones, same, "compiled")
+    assert np.abs(Sigma - P).max() > 1e-3
+    for unit, place in ((np.array([3.7, 0.013]), same), (ones, [3, 0, 4, 1, 2])):
+        for engine in ("compiled", "simpy"):
+            other = errors(unit, place, engine)
+            np.testing.assert_allclose(other[0], Sigma, rtol=1e-8, atol=1e-9)
+            np.testing.assert_allclose(other[1], P, rtol=1e-8, atol=1e-9)
 
 
 def test_a_pseudo_state_that_hides_a_direction(tmp_path):
