@@ -19,6 +19,7 @@ import scipy.linalg
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval_for
 from netkf.algorithms.models import FlowModel, SlotModel
+from netkf.algorithms.modes import rate_groups
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
@@ -39,6 +40,9 @@ from netkf.scenario.sampling import (
     sample_times,
     uses_grid,
 )
+
+MAX_DECAY = float(np.log(1e8))
+"""Largest decay of a mode, as a logarithm, over which an offset of states is predicted back."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -228,7 +232,8 @@ class DerivedScenario(ScenarioModel):
         )
 
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
-        """Return exp(-A age) ``offset`` (n,): the offset of states ``age`` seconds earlier.
+        """Return exp(-A age) ``offset`` (n,): the offset of states ``age`` seconds earlier, without
+        the modes that have decayed to 1e-8 of it since.
 
         When the origin of states moves (``exact_errors``), engines shift the estimates in messages
         under way by it, which refer to the time of sending. In slots this is ``offset`` itself:
@@ -236,7 +241,13 @@ class DerivedScenario(ScenarioModel):
         """
         if self.slotted:
             return offset
-        return np.asarray(scipy.linalg.expm(-age * self.diffusion.A) @ offset)
+        groups = rate_groups(self.diffusion.A)
+        # exp(-A age) of each group of modes. What has decayed by more than MAX_DECAY since then is
+        # left out: pulled back it would swallow the digits of all else, and soon it is gone.
+        decayed = groups.rates * age
+        factors = np.where(decayed < MAX_DECAY, np.exp(np.minimum(decayed, MAX_DECAY)), 0.0)
+        kept = np.asarray(scipy.linalg.expm(-age * groups.kept))
+        return np.asarray(kept @ (factors @ (groups.projectors @ offset)))
 
     def observation_matrices(
         self, node: int, believed: bool = False

@@ -93,6 +93,25 @@ def test_frames_change_no_error(kind, mixed, monkeypatch):
     np.testing.assert_allclose(run.xhat, plain.xhat, rtol=1e-9, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["covariance-intersection", "push-sum"])
+def test_frames_move_messages_beside_modes_that_decay_fast(kind):
+    """An offset pulled back over a delay must not grow with a mode that nobody misses."""
+    made = scenario(kind, SENSORS, growth=0.4, horizon=60.0)
+    network = {"graph": {"kind": "cycle", "nodes": 4}}
+    network["activation"] = {"kind": "poisson", "rate": 1.0, "at": "nodes"}
+    network["channel"] = {
+        "loss": {"kind": "bernoulli", "delivery": 0.5},
+        "delay": {"kind": "constant", "seconds": 1.5},
+    }
+    made = made.replace({"network": network, "plant.A": [[0.4, 5.0], [0.0, -60.0]]})
+    runs = [netkf.simulate(made, engine=engine) for engine in ("compiled", "simpy")]
+    for run in runs:
+        assert run.status == "complete"
+        assert np.abs(run.x[-1]).max() > 1e8
+        assert np.abs(run.error).max() < 20.0
+    np.testing.assert_allclose(runs[0].error, runs[1].error, rtol=0.0, atol=1e-9)
+
+
 def test_errors_so_large_that_they_round_each_other_are_known():
     """Blind nodes below the threshold: errors of 1e20 leave rounding where a sensor takes them."""
     run = netkf.simulate(scenario("hybrid", SENSORS, horizon=300.0), engine="simpy")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from netkf.engines.compiled.combination_state import CombinationState
 from netkf.engines.compiled.late_readings import History, remember
-from netkf.engines.compiled.running_totals import Totals
+from netkf.engines.compiled.running_totals import Totals, predict_total
 from netkf.engines.compiled.state import READINGS, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -49,16 +49,18 @@ def _shift_totals(
     scenario: Scenario, state: Simulation, totals: Totals, now: float, offset: FloatArray
 ) -> None:
     """Move the running sums of push-sum (weight, U (n, n), parts of u) to a new origin: add ``U
-    offset`` to the ``u`` of all that nodes have sent or heard or that are under way; ``offset``
-    (n,) is first predicted from ``now`` (seconds) back to the time that each sum refers to.
+    offset`` to the ``u`` of all that nodes have sent or heard, predicted to ``now`` (seconds), and
+    that is under way; ``offset`` (n,) is first predicted back to the time that this was sent.
     """
-    projectors = totals.projectors
+    # Predicted forward: back to a time long ago an offset would grow with the modes that decay.
     for times, values in ((totals.sent_at, totals.sent), (totals.heard_at, totals.heard)):
         for k, time in enumerate(times.tolist()):
-            _shift_total(values[k], scenario.move_back(offset, now - time), projectors)
+            predict_total(totals, values, k, now - time)
+            _shift_total(values[k], offset, totals.projectors)
+        times[:] = now
     for m in state.heap[: state.in_flight]:
         moved = scenario.move_back(offset, now - state.pool["sent"][m])
-        _shift_total(totals.offered[m], moved, projectors)
+        _shift_total(totals.offered[m], moved, totals.projectors)
 
 
 def _shift_total(total: FloatArray, offset: FloatArray, projectors: FloatArray) -> None:
