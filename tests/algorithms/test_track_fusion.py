@@ -334,3 +334,26 @@ def test_tracks_that_start_apart_are_refused(tmp_path):
     mean = [[float(k), 0.0] for k in range(5)]
     with pytest.raises(netkf.ScenarioError, match="must be that of all nodes"):
         scenario_of({**TRACKS, "mean": mean}, tmp_path)
+
+
+@pytest.mark.parametrize("F", [[[0.947, 0.251], [-0.049, 0.563]], [[1.01, 0.2], [0.0, 0.03]]])
+@pytest.mark.parametrize("rule", ["ci", "ici"])
+def test_roots_that_rounding_has_made_thin_are_not_fused_as_if_they_were(rule, F, tmp_path):
+    """Without plant noise the covariance of a mode that decays is below the rounding of the others:
+    two estimates then seem to know more than all readings together.
+    """
+    plant = {"kind": "linear", "F": F, "Q": [[0.0, 0.0], [0.0, 0.0]], "period": 1.0}
+    plant |= {"cov": [[1.0, 0.0], [0.0, 1.0]]}
+    sensors = [{"nodes": [0], "H": [[1.0, 0.5]], "R": [[0.1]]}]
+    sensors += [{"nodes": [1], "H": [[0.2, 1.0]], "R": [[0.3]]}]
+    network = {"graph": {"kind": "path", "nodes": 2}, "activation": {"kind": "broadcast"}}
+    more = {"plant": plant, "sensors": sensors, "network": network, "horizon": 401.0}
+    more["probe"] = [1.0, 20.0, 60.0, 100.0, 200.0, 400.0]
+    central = netkf.simulate(scenario_of({"kind": "central"}, tmp_path, **more), engine="compiled")
+    scenario = scenario_of({"kind": "track-fusion", "rule": rule}, tmp_path, **more)
+    for engine in ("compiled", "simpy"):
+        run = netkf.simulate(scenario, engine=engine)
+        assert run.status == "complete"
+        ratio = np.trace(run.P, axis1=-2, axis2=-1) / np.trace(central.P, axis1=-2, axis2=-1)
+        assert ratio.min() > 1.0 - 1e-9
+        assert ratio.max() < 1.5

@@ -18,6 +18,7 @@ import math
 
 import numpy as np
 
+from netkf.algorithms.kernels.root_update import NEGLIGIBLE, SINGULAR, TINY
 from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -37,13 +38,16 @@ def common_basis(
 ) -> None:
     """Write an orthogonal U, ``W = own U`` (n, n each) and b (n,) with ``own own' = W W'`` and
     ``other other' = W diag(b) W'``: a basis in which both covariances are diagonal, with variances
-    1 and b. ``own`` and ``other`` (n, n) are lower triangular, regular roots.
+    1 and b. ``own`` and ``other`` (n, n) are lower triangular roots, which are made regular: the
+    diagonal of ``own`` is changed (``regular_diagonal``).
     """
     n = len(b)
+    for i in range(n):
+        own[i, i] = regular_diagonal(own, i)
     # T = own^-1 other, by forward substitution.
     for j in range(n):
         for i in range(n):
-            value = other[i, j] if j <= i else 0.0
+            value = other[i, j] if j < i else regular_diagonal(other, i) if j == i else 0.0
             for m in range(j, i):
                 value -= own[i, m] * U[m, j]
             U[i, j] = value / own[i, i] if j <= i else 0.0
@@ -62,6 +66,21 @@ def common_basis(
             W[i, j] = 0.0
             for m in range(i + 1):
                 W[i, j] += own[i, m] * U[m, j]
+
+
+@kernel
+def regular_diagonal(root: FloatArray, i: int) -> float:
+    """Return entry ``i`` of the diagonal of a lower triangular ``root`` (n, n), in size at least
+    SINGULAR (2^-25) times the length of its row: what is smaller is rounding, and two such roots would be
+    thin in directions that rounding tells apart, and their fusion far too sure. P gets no smaller.
+    """
+    # As in ``intersection.invert_lanes``, the floor grows with the whole root.
+    square = TINY
+    for k in range(len(root)):
+        share = 1.0 if k == i else NEGLIGIBLE
+        for j in range(k + 1):
+            square += share * root[k, j] * root[k, j]
+    return math.copysign(max(abs(root[i, i]), SINGULAR * math.sqrt(square)), root[i, i])
 
 
 @kernel
