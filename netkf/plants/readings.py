@@ -335,7 +335,8 @@ class RecordedSamples:
 
 class RecordedReadings:
     """The readings of one node in slots: ``slots`` has the rows k of each; ``matrix`` gives the H
-    of a row. All rows of a slot are one stacked reading.
+    of a row, of n states (0: a function that linearises it). All rows of a slot are one stacked
+    reading.
     """
 
     def __init__(self, rows: NodeRows, slots: dict[int, list[int]], matrix: Matrix, n: int) -> None:
@@ -348,7 +349,7 @@ class RecordedReadings:
         the p' values that are there.
         """
         parts = [self._matrix(k, np.isfinite(self._rows.y[k])) for k in self._slots.get(slot, ())]
-        if parts and callable(parts[0]):
+        if not self._n:
             return Stacked(parts)
         return np.concatenate([np.zeros((0, self._n)), *parts])
 
@@ -416,12 +417,11 @@ class Stacked:
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the readings ``y`` (p,) linearised at the estimate ``xhat`` (n,), and H (p, n)."""
-        ends = np.cumsum([part.size for part in self._parts])[:-1]
-        pairs = [
-            part(values, xhat) for part, values in zip(self._parts, np.split(y, ends), strict=True)
-        ]
-        stacked = [np.concatenate(items) for items in zip(*pairs, strict=True)]
-        return stacked[0], stacked[1]
+        pairs, first = [(y[:0], np.zeros((0, len(xhat))))], 0
+        for part in self._parts:
+            pairs.append(part(y[first : first + part.size], xhat))
+            first += part.size
+        return np.concatenate([z for z, _ in pairs]), np.concatenate([H for _, H in pairs])
 
 
 def take_from_record(sensor: Any, record: ReadingTable) -> None:

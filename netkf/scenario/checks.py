@@ -322,6 +322,13 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
             "add or remove some",
         )
     for k, sensor in enumerate(sensors):
+        if sensor.record is not None and sensor.record.has_noise:
+            raise ScenarioError(
+                "filter.model.R",
+                f"must be left out, for rows of {sensor.record.path.name} bring their own noise",
+                R,
+                f"give another R as sensors[{k}].R in rows without noise, or rename the columns",
+            )
         p = len(sensor.R)
         reason = f"a reading of sensors[{k}] has {p} components"
         if isinstance(R, tuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -12,6 +13,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.slots import SlotLinks
+from netkf.algorithms.models import SlotModel
 from netkf.engines.compiled.slot_messages import (
     INDEPENDENT,
     NODE_WAKEUP,
@@ -19,7 +21,7 @@ from netkf.engines.compiled.slot_messages import (
     UNIFORM_MAXIMAL,
     Stages,
 )
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.channels import GilbertElliott, identical_per_link
@@ -251,6 +253,7 @@ class SlotSetup:
         models: Sequence[Any] = scenario.slot_models
         if self.algorithm.pooled:
             infos, models = infos[:1], [scenario.pooled_slot_model]
+        models = [_widened(model, rows) for model, rows in zip(models, self.rows, strict=True)]
         self.infos = infos
         self.states = [
             self.algorithm.init(model, *scenario.initial_estimate(info.node), info)
@@ -439,6 +442,18 @@ class SlotSetup:
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_SLOT_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
+
+
+def _widened(model: SlotModel, rows: int) -> SlotModel:
+    """Return the model of a filter with H and R of as many ``rows`` as its largest reading has, by
+    which filters size their arrays: a recorded sensor may have several rows in a slot. Rows of
+    zeros and unit noise carry no information.
+    """
+    added = rows - len(model.H)
+    if added <= 0:
+        return model
+    H = np.concatenate([model.H, np.zeros((added, model.H.shape[1]))])
+    return dataclasses.replace(model, H=H, R=block_diagonal([model.R, np.eye(added)]))
 
 
 BLOCK_BYTES = 1 << 24
