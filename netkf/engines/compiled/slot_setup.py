@@ -253,7 +253,9 @@ class SlotSetup:
         models: Sequence[Any] = scenario.slot_models
         if self.algorithm.pooled:
             infos, models = infos[:1], [scenario.pooled_slot_model]
-        models = [_widened(model, rows) for model, rows in zip(models, self.rows, strict=True)]
+        models = [
+            _widened(model, rows) for model, rows in zip(models, self.rows.tolist(), strict=True)
+        ]
         self.infos = infos
         self.states = [
             self.algorithm.init(model, *scenario.initial_estimate(info.node), info)
