@@ -181,7 +181,7 @@ class Poisson(LinkClock):
             if entity not in entities or entity in listed:
                 again = f"names a {what} again"
                 rule = again if entity in listed else f"must name a {what} of the graph"
-                raise ScenarioError(f"rates[{k}]", rule, list(entry[:-1]), "remove or correct it")
+                raise ScenarioError(f"rates[{k}]", rule, list(entry[:-1]), "correct it")
             listed.add(entity)
         # Without a default rate each entity needs one of its own.
         unlisted = sorted(entities - listed)

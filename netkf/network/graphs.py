@@ -413,7 +413,7 @@ class Edges(Graph):
         for k, (i, j) in enumerate(self.edges):
             if i == j:
                 rule = "a link must join two nodes"
-                raise ScenarioError(f"edges[{k}]", rule, [i, j], "leave it out")
+                raise ScenarioError(f"edges[{k}]", rule, [i, j], "name the other node")
         named = {node for edge in self.edges for node in edge}
         nodes = named if self.nodes is None else range(self.nodes)
         if not nodes:

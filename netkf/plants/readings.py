@@ -143,7 +143,7 @@ class ReadingTable:
                 name for name, pair in self._noise.items() if pair == (min(i, j), max(i, j))
             )
             rule = f"{self.columns.where(k)}: {name} is missing, and y{i} has a value"
-            remedy = "write it, or leave all noises of the row empty and give R for the sensor"
+            remedy = "write it, 0 where two values do not correlate"
             raise ScenarioError("path", rule, None, remedy)
         R[without] = np.nan
         self._require_definite(R, ~without & self.present.any(axis=1))
@@ -200,7 +200,7 @@ class ReadingTable:
             if wrong.size:
                 rule = f"{columns.where(wrong[0])}: {name} has no row in H"
                 value = str(entries[wrong[0]])
-                raise ScenarioError("path", rule, value, "give H a row for it, or empty the entry")
+                raise ScenarioError("path", rule, value, "give H and R a row for it")
         require_start(columns, np.flatnonzero(own))
         # A stamp may lie before the origin by its rounding.
         begun = columns["t"] >= -columns.half_digits

@@ -35,6 +35,8 @@ MAX_ENTRIES = 100_000_000
 MAX_STEPS = 100_000_000  # steps of one run; more suggest a wrong unit of time
 MAX_TICKS = 1e9  # ticks of one clock; more suggest a wrong unit of time
 MAX_CONSTANTS = 1e15  # time constants of one run; more have no exact count in floating point
+UNIX = "where it is a Unix time, set [time] origin and count it from there"
+"""What to do where a long horizon is the time of the end of a log."""
 MAX_GROWTH = 1e7  # exponent g of growth by e^g; a run needs a new frame each time g rises by seven
 
 
@@ -72,7 +74,7 @@ def _check_times(scenario: DerivedScenario) -> None:
             "plant.period",
             f"must make at most {MAX_STEPS:,} slots to the horizon",
             scenario.slot_plant.period,
-            "lengthen it or shorten the horizon",
+            f"lengthen it or shorten the horizon; {UNIX}",
         )
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
@@ -84,7 +86,7 @@ def _check_times(scenario: DerivedScenario) -> None:
                 "probe",
                 f"must ask for at most {MAX_SAMPLES:,} samples",
                 probe,
-                "lengthen the period",
+                f"lengthen the period or shorten the horizon; {UNIX}",
             )
         _check_entries(scenario, horizon / probe)
         return
@@ -94,7 +96,7 @@ def _check_times(scenario: DerivedScenario) -> None:
             "probe",
             f"times must lie in [0, {horizon:g}]",
             outside[0].item(),
-            "leave it out or lengthen the horizon",
+            "lengthen the horizon, or leave it out",
         )
     if (np.diff(probe) <= 0.0).any():
         raise ScenarioError("probe", "times must be strictly increasing", probe, "sort them")
@@ -109,7 +111,7 @@ def _check_entries(scenario: DerivedScenario, samples: float) -> None:
             "probe",
             f"must ask for at most {MAX_ENTRIES:,} entries of covariances",
             f"{samples:,.0f} samples of {nodes:,} nodes with {n} x {n} entries",
-            "lengthen the period, or take fewer nodes",
+            f"lengthen the period, shorten the horizon or take fewer nodes; {UNIX}",
         )
 
 
