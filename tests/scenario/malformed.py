@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import copy
 import functools
+import gzip
 import io
 import os
 import random
@@ -140,10 +141,13 @@ FILTERS: tuple[dict[str, Any], ...] = (
 
 
 class Case(NamedTuple):
-    """A command line without ``netkf``, and the text of its file if it is not one of scenarios/."""
+    """A command line without ``netkf``, the text of its file if it is not one of scenarios/, and
+    the content of the table that it names.
+    """
 
     arguments: list[str]
     text: str | None
+    table: bytes | None = None
 
 
 class Ended(NamedTuple):
@@ -159,6 +163,8 @@ class Ended(NamedTuple):
 def draw(seed: int) -> Case:
     """Return the case of a seed."""
     rng = random.Random(seed)
+    if seed % 5 == 4:
+        return draw_table(rng)
     if seed % 2:
         return draw_comparison(rng)
     base = rng.choice(scenario_files())
@@ -217,6 +223,87 @@ def draw_comparison(rng: random.Random) -> Case:
     }
     name = rng.choice(("theory", "run", "run", "check", "compare-filters"))
     return Case([name, "case.toml", *more[name]], to_toml(table))
+
+
+ENTRIES = (
+    *(
+        "",
+        "nan",
+        "inf",
+        "-1",
+        "0",
+        "1e400",
+        "1e31",
+        "0x1",
+        "1_0",
+        "\x00",
+        "é",
+        "#",
+        '"',
+        "'",
+        "1,5",
+    ),
+    *("1;5", "2009-07-22T15:10:04Z", "2009-07-22", "2009-07-22T15:10:60", "15:10", "9" * 400),
+    *("1e999999999", "-1e-999999999", "1.5.2", "+", "1 2", "٣", "a" * LONG, "1248275404.538"),
+)
+STAMPS = (0, 1, -1, 1e9, 1.5, "1", "2009-07-22T15:10:04.5Z", "x", "nan", "1e99999999", 1e300, True)
+
+
+def draw_table(rng: random.Random) -> Case:
+    """Return a case with a table of readings as people have them, most with a mistake."""
+    kind = rng.choice(("recorded", "recorded", "range", "bearing", "range-bearing"))
+    p = rng.choice((1, 2)) if kind == "recorded" else 1 + (kind == "range-bearing")
+    noises = ([], [f"R{k}" for k in range(p)], [f"R{i}{j}" for i in range(p) for j in range(i, p)])
+    names = ["t", "node", *(f"y{k}" for k in range(p)), *rng.choice(noises)]
+    names += rng.choice(([], [], ["to"], ["phi0", "phi1"], ["y7"]))
+    rows = [
+        [
+            str(0.5 * rng.randrange(9)),
+            str(rng.randrange(3)),
+            *(str(rng.random()) for _ in names[2:]),
+        ]
+        for _ in range(rng.choice((0, 1, 5, 20)))
+    ]
+    for _ in range(rng.choice((0, 1, 1, 2))):
+        row = rng.choice([names, *rows])
+        row[rng.randrange(len(row))] = rng.choice((*ENTRIES, *names))
+    if rng.random() < 0.2 and rows:
+        rng.choice(rows).append("1")
+    sign = rng.choice(",;\t|")
+    lines = [sign.join(row) for row in (names, *rows)]
+    if rng.random() < 0.3:
+        lines.insert(rng.randrange(len(lines) + 1), "# t,node,y0")
+    text = rng.choice(("\n", "\r\n", "\r")).join(lines)
+    text = mangled(text, rng) if rng.random() < 0.2 else text
+    encoding = rng.choice(("utf-8", "utf-8", "utf-8", "utf-8-sig", "utf-16", "latin-1"))
+    content = text.encode(encoding, "replace")
+    content = gzip.compress(content) if rng.random() < 0.2 else content
+    content = content[: rng.randrange(len(content) + 1)] if rng.random() < 0.1 else content
+    slots = {"F": [[1.0, 0.1], [0.0, 0.9]], "Q": [[0.1, 0.0], [0.0, 0.1]], "period": 0.5}
+    clocks = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}
+    sensor: dict[str, Any] = {"kind": kind, "path": "table.csv"}
+    sensor["R"] = [[0.2 * (i == j) for j in range(p)] for i in range(p)]
+    sensor |= {"H": [[1.0, 0.5], [0.0, 1.0]][:p]} if kind == "recorded" else {}
+    if rng.random() < 0.3:
+        del sensor["R"]
+    in_slots = rng.random() < 0.5
+    table = {
+        **{"format": 1, "name": "table", "horizon": 4.0, "probe": 0.5},
+        "plant": {"kind": "unknown", **(slots if in_slots else clocks)},
+        "sensors": [sensor],
+        "network": {
+            "graph": {"kind": "grid", "rows": 1, "columns": 3},
+            "activation": {"kind": "broadcast" if in_slots else "readings"},
+        },
+        "filter": {"kind": rng.choice(("central", "local", "intermittent", "diffusion"))},
+    }
+    if rng.random() < 0.4:
+        key = rng.choice(("origin", "origin", "unit", "zone"))
+        units = ("s", "ms", "ns", "h", 1)
+        table["time"] = {key: rng.choice(units if key == "unit" else STAMPS)}
+    name = rng.choice(("theory", "run", "run"))
+    more = {"theory": ["--json"], "run": ["--no-plot", "--out", "out"]}
+    return Case([name, "case.toml", *more[name]], to_toml(table), content)
 
 
 @functools.cache
@@ -433,6 +520,8 @@ def write(case: Case, folder: Path) -> None:
     shutil.rmtree(folder / "runs", ignore_errors=True)
     if case.text is not None:
         (folder / "case.toml").write_bytes(case.text.encode("utf-8", "surrogatepass"))
+    if case.table is not None:
+        (folder / "table.csv").write_bytes(case.table)
 
 
 def attempt(arguments: list[str]) -> tuple[int, str, str]:
