@@ -98,7 +98,9 @@ def read_columns(
                 else:
                     numbers.append(entries.number(column, may_miss))
                 if sheet.header[column] == "t":
-                    half_digits.append(source.stamps.half_digit(row[column].replace(",", ".")))
+                    half_digits.append(
+                        source.stamps.half_digit(row[column].replace(",", ".").strip())
+                    )
     columns = Columns(source, np.array(lines, dtype=np.int64), np.array(half_digits))
     table = np.array(numbers, dtype=np.float64).reshape(len(lines), len(names))
     columns.update(zip(names, np.ascontiguousarray(table.T), strict=True))

@@ -10,6 +10,7 @@ import datetime
 import re
 from dataclasses import dataclass
 from decimal import Context, Decimal, InvalidOperation
+from functools import lru_cache
 
 UNITS = {"s": 0, "ms": -3, "us": -6, "ns": -9}
 """The exponent of ten of each unit of stamps, in seconds."""
@@ -17,6 +18,7 @@ EXACT = Context(prec=80, traps=[InvalidOperation])
 """Arithmetic of stamps: far more digits than they have."""
 EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _FRACTION = re.compile(r"[Tt ](?:\d{2}:\d{2}:\d{2}|\d{6})[.,](\d+)")
+_PLAIN = re.compile(r"[+-]?\d+(?:\.(\d*))?")
 _SECOND = datetime.timedelta(seconds=1)
 
 
@@ -48,9 +50,18 @@ class TimeBase:
         """Return half of the last digit of the stamp ``text``, in seconds: how far the instant may
         be from it if it was rounded. An origin that has as few digits adds its own.
         """
-        exponents = [_last_digit(self.exact(text)), _last_digit(self.origin)]
-        shares = exponents[:1] if not self.origin else [exponents[0], min(exponents)]
-        return float(sum(0.5 * 10.0**exponent for exponent in shares))
+        plain = _PLAIN.fullmatch(text)
+        if plain is not None:
+            return self._half_digit(UNITS[self.unit] - len(plain.group(1) or ""))
+        return self._half_digit(_last_digit(self.exact(text)))
+
+    @lru_cache(maxsize=64)  # noqa: B019 - bases are few and small
+    def _half_digit(self, exponent: int) -> float:
+        """Return half of the last digit of a stamp that is 10 to this ``exponent``, with that of
+        the origin.
+        """
+        own = 0.5 * 10.0**exponent
+        return own + 0.5 * 10.0 ** min(exponent, _last_digit(self.origin)) if self.origin else own
 
     def exact(self, text: str) -> Decimal:
         """Return the stamp in seconds, not counted from the origin; raises ValueError."""

@@ -193,7 +193,7 @@ class ReadingTable:
 
     def _make_rows(self, node: int) -> NodeRows:
         """Return the readings of ``node`` (id), see ``rows``."""
-        columns, own = self.columns, np.array(self.nodes) == node
+        columns, own = self.columns, self.columns["node"] == node
         for name in self._surplus:
             entries = columns[name]
             wrong = np.flatnonzero(own & np.isfinite(entries) & (entries != 0.0))
@@ -306,7 +306,7 @@ class RecordedSamples:
     """
 
     def __init__(self, rows: NodeRows, matrix: Matrix) -> None:
-        self._rows, self._matrix = rows, matrix
+        self._rows, self._matrix, self._is_uniform = rows, matrix, rows.is_uniform
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, Any]:
         """Return ``y`` (p',) and ``H`` (p', n), or a function that linearises the reading, of
@@ -323,7 +323,13 @@ class RecordedSamples:
         """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the numbers ``ks``, with
         zeros behind the values that are there; the states x (S, n) are not used.
         """
-        y, H = np.zeros((len(ks), self._rows.y.shape[1])), []
+        rows, p = self._rows, self._rows.y.shape[1]
+        if self._is_uniform and rows.phi.shape[1]:
+            return rows.y[list(ks)], rows.phi[list(ks), None]
+        if self._is_uniform:
+            H_of_all = self._matrix(0, np.ones(p, dtype=bool))
+            return rows.y[list(ks)], np.broadcast_to(H_of_all, (len(ks), *H_of_all.shape))
+        y, H = np.zeros((len(ks), p)), []
         for index, k in enumerate(ks):
             values, matrix = self.reading(k, x)
             y[index, : len(values)] = values

@@ -79,7 +79,7 @@ def _check_times(scenario: DerivedScenario) -> None:
     if not isinstance(probe, np.ndarray):
         if probe > horizon:
             raise ScenarioError(
-                "probe", f"must be at most the horizon {horizon:g}", probe, "shorten the period"
+                "probe", f"must be at most the horizon {horizon:.15g}", probe, "shorten the period"
             )
         if horizon / probe > MAX_SAMPLES:
             raise ScenarioError(
@@ -94,7 +94,7 @@ def _check_times(scenario: DerivedScenario) -> None:
     if outside.size:
         raise ScenarioError(
             "probe",
-            f"times must lie in [0, {horizon:g}]",
+            f"times must lie in [0, {horizon:.15g}]",
             outside[0].item(),
             "lengthen the horizon, or leave it out",
         )
@@ -426,9 +426,9 @@ def _check_slots(scenario: DerivedScenario) -> None:
     if times_off_slots:
         raise ScenarioError(
             "probe",
-            f"times must be multiples of the plant's period {plant.period:g}",
+            f"times must be multiples of the plant's period {plant.period:.15g}",
             times_off_slots[0],
-            "sample at slots only",
+            "sample at slots only, with all digits of the period",
         )
     activation = scenario.network.activation
     if not node_filter.talks:
