@@ -91,7 +91,10 @@ class ReadingTable:
         others = [f"phi{k}" for k in range(self.regressors)] + ["to"] * self.has_anchors
         required = ("t", "node", *values, *others, *self._noise)
         gaps = {*values, *self._noise, *self._surplus}
-        return read_columns(self.path, required, tuple(self._surplus), gaps)
+        columns = read_columns(self.path, required, tuple(self._surplus), gaps)
+        for name in ("node", "to")[: 1 + self.has_anchors]:
+            columns.integers(name)  # a mistake is found now
+        return columns
 
     @cached_property
     def nodes(self) -> list[int]:
