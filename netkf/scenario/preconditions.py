@@ -70,14 +70,16 @@ def _check_increments(scenario: DerivedScenario) -> None:
 
 
 def _check_fixed_sensors(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the H of a sensor varies from reading to reading."""
+    """Raise ScenarioError if the H or the R of a sensor varies from reading to reading."""
     for k, sensor in enumerate(scenario.sensors):
         if sensor.varying:
+            irregular = sensor.linear and sensor.record is not None
+            varies = "H or R varies, or a value is missing" if irregular else "H varies"
             raise ScenarioError(
                 f"sensors[{k}]",
                 f"must have a fixed H for the {filter_name(scenario)}, which computes with it "
                 "before there are readings",
-                f"kind {kind_name(sensor, 'sensor')!r}, whose H varies",
+                f"kind {kind_name(sensor, 'sensor')!r}, whose {varies}",
                 f"use linear sensors, or {ANOTHER}",
             )
 
@@ -96,12 +98,13 @@ def _check_every_reading(scenario: DerivedScenario) -> None:
             for slot in sensed_slots(scenario):
                 reading = path.reading(slot, nowhere)
                 if len(reading) != len(sensor.R) or np.isnan(reading).any():
+                    seen = "several" if len(reading) > len(sensor.R) else "none"
                     raise ScenarioError(
                         f"sensors[{placed.entry}].path",
                         f"must have one whole row of node {node} for each slot for the "
                         f"{filter_name(scenario)}, whose gains and P count all readings",
-                        f"none for slot {slot} at {slot * scenario.slot_plant.period:g} s",
-                        f"add the row, or {ANOTHER}",
+                        f"{seen} for slot {slot} at {slot * scenario.slot_plant.period:g} s",
+                        f"give one row a slot, or {ANOTHER}",
                     )
 
 
