@@ -37,11 +37,12 @@ from netkf.checks.looks import (
     level_of_look,
     next_runs,
 )
+from netkf.checks.nonlinear import CHECKS as WITHOUT_PAPER
 from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.rows import gaussian_noises, part_assumptions, part_promises
 from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
 from netkf.checks.points import check_slots, probe_times
-from netkf.checks.records.rows import Audit, audit_run, record_promises
+from netkf.checks.records.rows import Audit, audit_record, audit_run, record_promises
 from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
@@ -55,7 +56,6 @@ from netkf.runs.simulate import LOAD_REMEDY, choose_engine, simulate
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
-from netkf.theory.common.evidence import NONLINEAR
 from netkf.trace.run import Run
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Verdict(NotebookTable):
 def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
     if not scenario.is_linear:
-        raise TheoryError(f"nothing is promised here: {NONLINEAR}")
+        return WITHOUT_PAPER
     promised = promised_filter(scenario.filter.algorithm)
     # Without messages the equations of a Kalman filter are all that is promised.
     if promised.combination == "none":
@@ -176,7 +176,15 @@ def run_replica(
     audit = audit_run(scenario, run, seed, replica, chosen)
     if diverged:
         return ReplicaResult(None, difference, expected, audit=audit)
-    summary, parts = find_checks(scenario).summarise(scenario, run), summarise_parts(scenario, run)
+    try:
+        summary = find_checks(scenario).summarise(scenario, run)
+        parts = summarise_parts(scenario, run)
+    except Exception:
+        # Events that contradict each other cannot be replayed: their record says what is wrong.
+        audit = audit_record(scenario, run, seed, replica)
+        if not audit.events and not audit.samples:
+            raise
+        return ReplicaResult(None, difference, expected, audit=audit)
     return ReplicaResult(summary, difference, parts=parts, audit=audit)
 
 
@@ -337,10 +345,23 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
         return []
     (row,) = judge([SAME_AS_BASE], results, assumptions=[], runs=len(results), level=1.0)
     listed = ", ".join(overridden)
-    if row.verdict == BROKEN and set(overridden) <= set(LINK_WEIGHTS):
+    by_design = set(overridden) <= set(LINK_WEIGHTS) and not _transposes(scenario)
+    if row.verdict == BROKEN and by_design:
         reason = f"it differs by design: {listed} is its own; {row.evidence}"
         return [dataclasses.replace(row, verdict=NOT_PROMISED, assumptions=reason)]
     return [dataclasses.replace(row, evidence=f"{row.evidence}; its own: {listed}")]
+
+
+def _transposes(scenario: Scenario) -> bool:
+    """Return True if the weights of a user's filter are those of its base with rows and columns
+    exchanged: a mistake, and no design.
+    """
+    own, base = (
+        chosen.filter.algorithm.pair_weights for chosen in (scenario, with_base_filter(scenario))
+    )
+    if own is None or base is None or np.array_equal(own, base):
+        return False
+    return np.array_equal(own, np.transpose(base))
 
 
 def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:

@@ -70,6 +70,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     np.savez_compressed(results, **columns)
     with write_atomically(directory / RESULTS) as part:
         part.write_bytes(results.getvalue())
+        _require_same(part, columns, scenario)
     with write_atomically(directory / "verdict.csv") as part:
         verdict.table.to_csv(part, index=False)
     write_text(directory / "verdict.txt", text + "\n")
@@ -87,6 +88,19 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
         "files": file_digests(directory, [RESULTS, "scenario.toml"]),
     }
     write_sealed(directory / VERDICT, document)
+
+
+def _require_same(path: Path, columns: dict[str, Any], scenario: Scenario) -> None:
+    """Raise ScenarioError unless the results that are read back from the file ``path``, to which
+    runs may be added later, are those that were written.
+    """
+    again = _result_columns(tuple(_read_results(path, scenario)))
+    for name in sorted(columns.keys() | again.keys()):
+        one, other = columns.get(name), again.get(name)
+        same = one is not None and other is not None and one.dtype.kind == other.dtype.kind
+        if not same or not np.array_equal(one, other, equal_nan=one.dtype.kind == "f"):
+            rule = f"reads back another {name} than was written"
+            raise ScenarioError(RESULTS, rule, None, "report it; the verdict is not kept")
 
 
 def clear_unfinished(directory: Path, scenario: Scenario) -> bool:

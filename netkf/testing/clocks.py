@@ -14,6 +14,7 @@ from netkf.checks.parts.ticks import (
     TickSample,
     distance_from_lattice,
     gap_law,
+    lattice_ranks,
     ticks_on_lattice,
 )
 from netkf.core.clock import ClockPosition, Entity
@@ -285,9 +286,26 @@ def _check_stated_law(watched: WatchedPart, gaps: FloatArray, times: FloatArray)
             f"{distance:.3g} s beside one of them",
             remedy,
         )
+        _check_phases(lattice_ranks(stated, ticks, math.inf), number == 0, where, parent, remedy)
     uniform = gap_law(stated, gaps.reshape(-1)).reshape(gaps.shape)
     if np.isfinite(uniform).all():
         _check_uniform(uniform, where, f"gaps must have the law of {parent}", remedy)
+
+
+def _check_phases(
+    uniform: FloatArray, is_first: np.ndarray, where: str, parent: str, remedy: str
+) -> None:
+    """Check that the numbers ``uniform`` (K,) of K ticks, nan for some, which are uniform in [0, 1]
+    under the law of a periodic clock, are: those of first ticks (``is_first``, (K,)), which tell
+    the phase, and those of others, which tell the jitter.
+    """
+    for rows, noun in ((is_first, "phases"), (~is_first, "jitter")):
+        values = uniform[rows & np.isfinite(uniform)]
+        if len(values):
+            limit = math.sqrt(0.5 * math.log(2.0 * FAMILIES / LEVEL) / len(values))
+            distance = kolmogorov_distance(values)
+            text = f"{noun} at a distance of {distance:.3g} from it"
+            demand(distance <= limit, where, f"must have the law of {parent}", text, remedy)
 
 
 def _read_chain(part: Any, entity: Entity, seed: int, run: int, stream: int) -> FloatArray:

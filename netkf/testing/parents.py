@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
+
 from netkf.algorithms.filter import STEPS
 from netkf.algorithms.registry import base_filter, built_in_class, own_attributes
+from netkf.core.errors import ScenarioError
+from netkf.linalg.arrays import FloatArray
 from netkf.testing.clocked import ClockTrial
 from netkf.testing.shifts import estimate_differences
 from netkf.testing.slotted import SlotTrial, trial_slots
@@ -17,6 +22,8 @@ from netkf.testing.watching import WatchedPart, fail
 
 TOLERANCE = 1e-6
 """Largest relative difference that another order of operations may cause."""
+UNEQUAL = np.array([[0.5, 0.3, 0.2], [0.2, 0.5, 0.3], [0.3, 0.2, 0.5]])
+"""Weights of three nodes whose rows and columns sum to 1, and are not the same."""
 
 
 class Difference(NamedTuple):
@@ -46,10 +53,15 @@ def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
     overrides = own_attributes(part)
     if same_as_parent is False or parent_class is None or not overrides:
         return
-    parent = WatchedPart(base_filter(part))
-    worst = largest_difference(watched.unchecked(), parent.unchecked())
+    child, parent = watched.unchecked(), WatchedPart(base_filter(part)).unchecked()
+    worst = largest_difference(child, parent)
+    # Weights that are equal, or of the same matrix by rows and columns, say nothing of the order.
+    if isinstance(getattr(parent.part, "weights", None), str):
+        child, parent = (_with_weights(one, UNEQUAL) for one in (child, parent))
+        worst = max(filter(None, (worst, largest_difference(child, parent))), default=None)
     if worst is None or worst.relative <= TOLERANCE:
         return
+    _forbid_transposed(watched.name, child, parent)
     size = f"{worst.quantity} differs by {worst.relative:.3g} of its size {worst.where}"
     rule = f"must have the numbers of {parent_class.__name__}, which it derives from"
     remedy = "say same_as_parent=False if it differs by design"
@@ -59,6 +71,29 @@ def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
         warnings.warn(message, UserWarning, stacklevel=4)
         return
     fail(f"{watched.name}.{overrides[0]}", rule, text, remedy)
+
+
+def _with_weights(watched: WatchedPart, weights: FloatArray) -> WatchedPart:
+    """Return a filter with the matrix ``weights`` (N, N) in place of its own, as it is watched."""
+    changed = dataclasses.replace(watched.part, weights=weights)
+    return WatchedPart(changed).unchecked()
+
+
+def _forbid_transposed(name: str, child: WatchedPart, parent: WatchedPart) -> None:
+    """Raise AssertionError if a filter has the numbers of its ``parent`` with the rows and columns
+    of the matrix of weights exchanged, which is a mistake also where it differs by design.
+    """
+    weights = getattr(parent.part, "weights", None)
+    if not isinstance(weights, np.ndarray) or np.array_equal(weights, weights.T):
+        return
+    try:
+        difference = largest_difference(child, _with_weights(parent, weights.T))
+    except ScenarioError:  # columns that do not sum to 1 are no weights
+        return
+    if difference is not None and difference.relative <= TOLERANCE:
+        rule = "must give node i's weight for node l in entry [l, i]"
+        remedy = "exchange rows and columns"
+        fail(f"{name}.weights", rule, "the weights that node l gives to node i", remedy)
 
 
 def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | None:

@@ -365,3 +365,23 @@ class OtherShape(Renewal):
 class OffBeat(Periodic):
     def ticks(self, entity, origin, index, now, random, count):
         return 0.01 + super().ticks(entity, origin, index, now, random, count)
+
+
+@says(
+    CLOCKS,
+    "EarlyJitter.ticks: must have the law of Periodic",
+    period=0.3,
+    jitter=0.2,
+    phase="random",
+)
+class EarlyJitter(Periodic):
+    def ticks(self, entity, origin, index, now, random, count):
+        lattice = Periodic(period=self.period, phase=self.phase)
+        times = lattice.ticks(entity, origin, index, now, random, count)
+        return times + self.jitter * random.random(count) ** 2
+
+
+@says(CLOCKS, "OnePhase.ticks: must have the law of Periodic", period=0.3, phase="random")
+class OnePhase(Periodic):
+    def origin(self, entity, random):
+        return 0.5 * super().origin(entity, random)

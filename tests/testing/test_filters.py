@@ -144,3 +144,40 @@ def test_methods_of_a_former_contract_are_refused_where_the_class_is_made():
         with pytest.raises(TypeError, match=rf"Former.{name} must take \({arguments}\)"):
             type("Former", (parts.Gossip,), {name: former})
     type("Any", (parts.Gossip,), {"absorb": lambda self, state, *rest: state})
+
+
+@dataclass(frozen=True, eq=False)
+class Transposed(parts.DiffusionFilter):
+    """Takes columns for rows in the matrix of its weights."""
+
+    @property
+    def pair_weights(self):
+        weights = super().pair_weights
+        return None if weights is None else weights.T
+
+
+@dataclass(frozen=True, eq=False)
+class TransposedKalman(parts.DiffusionKalman):
+    """The same, where a class also writes down a step that changes nothing."""
+
+    @property
+    def pair_weights(self):
+        weights = super().pair_weights
+        return None if weights is None else weights.T
+
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages, exchange)
+
+
+@pytest.mark.parametrize("cls", [Transposed, TransposedKalman])
+@pytest.mark.parametrize(
+    "settings", [{}, {"weights": [[0.6, 0.1, 0.3], [0.3, 0.6, 0.1], [0.1, 0.3, 0.6]]}]
+)
+def test_weights_by_rows_in_place_of_columns_are_a_mistake(cls, settings):
+    """Whatever weights the class is made with, and whatever else it defines anew."""
+    with pytest.raises(AssertionError, match=r"weights: must give node i's weight for node l in"):
+        check_filter(cls, **settings)
+
+
+def test_weights_of_ones_own_are_no_mistake():
+    assert check_filter(parts.DiffusionKalman(weights=[[0.5, 0.5], [0.5, 0.5]])) is None

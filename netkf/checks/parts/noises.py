@@ -20,6 +20,7 @@ from netkf.checks.parts.sources import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.nonlinear import NonlinearSensor
 from netkf.rng.normals import StreamNormals
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor, takes_samples
@@ -162,7 +163,8 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
 
 
 class SensorLaw(NamedTuple):
-    """One sensor on one node: H (p, n), None if it varies, and the Cholesky factor (p, p) of R.
+    """One sensor on one node: H (p, n), None if it varies or the readings are not linear, and the
+    Cholesky factor (p, p) of R.
 
     ``sampled`` is True for a sensor that takes samples under a continuous plant.
     """
@@ -263,9 +265,22 @@ def _whitened_noises(
     x = _typical_states(scenario, random, count)
     if not count:
         return np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
-    y, H = path.several(range(count), x)
-    expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
+    sensor = scenario.located_sensors[law.placed_sensor.entry]
+    if isinstance(sensor, NonlinearSensor):
+        y = np.array([_reading_of(path, k, x[k]) for k in range(count)])
+        expected = np.array([sensor.h(state, law.node) for state in x], dtype=np.float64)
+    else:
+        y, H = path.several(range(count), x)
+        expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
     return np.linalg.solve(law.root, (y - expected).T).T, _standardise(x, _state_sizes(scenario, x))
+
+
+def _reading_of(path: Any, k: int, x: FloatArray) -> FloatArray:
+    """Return reading number ``k`` (p,) of a sensor that is not linear where the state is x (n,);
+    samples in continuous time come with a function that linearises them.
+    """
+    reading = path.reading(k, x)
+    return np.asarray(reading[0] if isinstance(reading, tuple) else reading)
 
 
 def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:

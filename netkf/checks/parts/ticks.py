@@ -251,15 +251,48 @@ def _rank_gaps(clock: Any, law: WaitingLaw | None, ticks: TickSample, horizon: f
     """
     if law is not None:
         return censored_ranks(law, ticks.before, ticks.times - ticks.before, horizon)
-    uniform = np.full(len(ticks.times), np.nan)
-    if type(clock) is Periodic and clock.jitter > 0.0 and not isinstance(clock.phase, str):
-        share = (ticks.times - _lattice_times(clock, ticks.number)) / clock.jitter
-        # The last tick is left out: jitter could have moved it beyond the end of the run.
-        uniform = np.where(ticks.number < ticks.total - 1, np.clip(share, 0.0, 1.0), np.nan)
-    elif type(clock) is Periodic and isinstance(clock.phase, str) and clock.period <= horizon:
-        phases = np.clip(ticks.times / clock.period, 0.0, 1.0)
-        uniform = np.where(ticks.first & (clock.jitter == 0.0), phases, np.nan)
+    uniform = lattice_ranks(clock, ticks, horizon)
     return Ranks(uniform, np.full(len(uniform), CELLS))
+
+
+def lattice_ranks(clock: Any, ticks: TickSample, horizon: float) -> np.ndarray:
+    """Return K independent uniform numbers (K,) that a periodic clock shows in its K ticks, nan for
+    ticks that show none and for other clocks.
+
+    With a given phase they are the shares of the jitter. With a random phase, the first tick shows
+    the phase plus jitter, and pairs of neighbouring ticks after it show differences of jitter, in
+    which the phase cancels.
+    """
+    uniform = np.full(len(ticks.times), np.nan)
+    if type(clock) is not Periodic:
+        return uniform
+    period, jitter = clock.period, clock.jitter
+    # The last tick is left out: jitter could have moved it beyond the end of the run.
+    inner = (ticks.number < ticks.total - 1) & (jitter > 0.0)
+    if not isinstance(clock.phase, str):
+        late = ticks.times[inner] - _lattice_times(clock, ticks.number[inner])
+        uniform[inner] = np.clip(late / jitter, 0.0, 1.0) if jitter > 0.0 else np.nan
+        return uniform
+    if period + jitter <= horizon:  # the first tick is never beyond the end
+        uniform[ticks.first] = _sum_of_uniforms(ticks.times[ticks.first], period, jitter)
+    # Ticks 1 and 2, 3 and 4, ...
+    second = np.flatnonzero(inner & (ticks.number > 0) & (ticks.number % 2 == 0))
+    if len(second):
+        gaps = ticks.times[second] - ticks.times[second - 1] - period
+        share = np.clip(gaps / jitter, -1.0, 1.0)
+        uniform[second] = 0.5 + share - 0.5 * share * np.abs(share)
+    return uniform
+
+
+def _sum_of_uniforms(times: np.ndarray, period: float, jitter: float) -> np.ndarray:
+    """Return P(phase + delay <= ``times``) (K,) of a phase uniform up to ``period`` and a delay
+    uniform up to ``jitter``, which may be 0.
+    """
+    if jitter == 0.0:
+        return np.clip(times / period, 0.0, 1.0)
+    squares = [np.maximum(times - end, 0.0) ** 2 for end in (0.0, period, jitter, period + jitter)]
+    area = squares[0] - squares[1] - squares[2] + squares[3]
+    return np.asarray(np.clip(area / (2.0 * period * jitter), 0.0, 1.0))
 
 
 def stated_gaps(clock: Any, entities: Sequence[Entity]) -> WaitingLaw | None:

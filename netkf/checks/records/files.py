@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ import numpy as np
 
 from netkf.core.errors import NetkfError
 from netkf.engines.base import Engine
+from netkf.linalg.arrays import FloatArray
 from netkf.runs.documents import DamagedError
-from netkf.runs.run import run_to_directory
+from netkf.runs.run import run_to_directory, save
 from netkf.runs.stored import MANIFEST_FORM, StoredRun, read_checked_document, read_run
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -28,23 +30,32 @@ class FilesUnknownError(Exception):
 
 def files_fault(scenario: Scenario, run: Run, engine: Engine) -> str:
     """Return one line about the first difference between a ``run`` in memory and the files that
-    ``netkf run`` writes of it: tables, manifest, counts and averages of the summary; empty without
-    one. The run is simulated again, by ``engine``, into a directory that is removed.
+    ``netkf run`` and ``netkf.save`` write of it: tables, manifest, counts and averages of the
+    summary; empty without one. The run is simulated again, by ``engine``; the directories are
+    removed.
 
     Raises FilesUnknownError if files cannot be written.
     """
     seeded = dataclasses.replace(scenario, seed=run.seed)
     try:
         with tempfile.TemporaryDirectory(prefix="netkf-check-") as folder:
-            directory = Path(folder) / "run"
-            run_to_directory(seeded, directory, engine, replica=run.replica)
-            manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
-            stored = read_run(directory, seeded, manifest)
-            return _tables_fault(run, stored) or _summary_fault(run, stored)
+            by_run, by_save = Path(folder) / "run", Path(folder) / "saved"
+            run_to_directory(seeded, by_run, engine, replica=run.replica)
+            save(run, seeded, by_save)
+            return _directory_fault(run, seeded, by_run) or _directory_fault(run, seeded, by_save)
     except DamagedError as error:
         return f"the files cannot be read back: {error}"
     except (NetkfError, OSError) as error:
         raise FilesUnknownError(str(error)) from None
+
+
+def _directory_fault(run: Run, scenario: Scenario, directory: Path) -> str:
+    """Return a fault of the files of ``run`` in a directory; raises DamagedError if they cannot be
+    read.
+    """
+    manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
+    stored = read_run(directory, scenario, manifest)
+    return _tables_fault(run, stored) or _summary_fault(run, stored)
 
 
 def _tables_fault(run: Run, stored: StoredRun) -> str:
@@ -110,6 +121,9 @@ def _summary_fault(run: Run, stored: StoredRun) -> str:
     for name, value in expected.items():
         if summary["messages"].get(name) != value:
             return f"summary.json: messages.{name} {summary['messages'].get(name)}, not {value}"
+    totals = {name: entry["total"] for name, entry in summary.get("conserved", {}).items()}
+    if totals != {name: now for name, (_, now) in run.sums.items()}:
+        return "summary.json: conserved sums are not those of the run"
     rows = {row["node"]: row for row in summary["nodes"]}
     if list(rows) != list(run.nodes):
         return "summary.json: its nodes are not those of the run"
@@ -140,25 +154,33 @@ def _transmissions(run: Run) -> dict[int, int]:
 
 
 def _averages_fault(run: Run, summary: dict[str, Any], rows: dict[int, Any]) -> str:
-    """Return a fault of the averages over time: the RMS error and the mean trace of P, of each node
-    and of all. Errors are averaged over the samples before rounding blurs them.
+    """Return a fault of the averages over time: the RMS error, the mean trace of P and, where P is
+    well conditioned, the mean NEES, of each node and of all. Errors are averaged over the samples
+    before rounding blurs them.
     """
     after = run.times > 0.0
     after = after if after.any() else np.ones(len(run.times), dtype=bool)
     blurred_from = summary.get("rounding_from")
     exact = after & (run.times < (np.inf if blurred_from is None else blurred_from))
     with np.errstate(all="ignore"):
-        square = (run.error**2).sum(axis=2)[exact]
-        mean_square = square.mean(axis=0) if len(square) else np.full(len(run.nodes), np.nan)
-        trace = np.trace(run.P[after], axis1=2, axis2=3).mean(axis=0)
-    for k, node in enumerate(run.nodes):
-        for name, value in (("rms_error", np.sqrt(mean_square[k])), ("mean_trace", trace[k])):
-            if not _equal(rows[node][name], value):
-                return f"summary.json: {name} of node {node} {rows[node][name]}, not {value:.9g}"
-    for name, value in (
-        ("rms_error", np.sqrt(mean_square.mean())),
-        ("mean_trace", trace.mean()),
-    ):
-        if not _equal(summary["overall"][name], value):
-            return f"summary.json: {name} of all nodes {summary['overall'][name]}, not {value:.9g}"
+        square, nees = (_mean(values[exact]) for values in ((run.error**2).sum(axis=2), _nees(run)))
+        trace = _mean(np.trace(run.P, axis1=2, axis2=3)[after])
+    columns = {"rms_error": square, "mean_trace": trace, "mean_nees": nees}
+    for place in (*range(len(run.nodes)), None):
+        row = summary["overall"] if place is None else rows[run.nodes[place]]
+        who = "all nodes" if place is None else f"node {run.nodes[place]}"
+        for name, values in columns.items():
+            value = float(values.mean() if place is None else values[place])
+            value = math.sqrt(value) if name == "rms_error" else value
+            unknown = name == "mean_nees" and math.isnan(value)
+            if not unknown and not _equal(row[name], value):
+                return f"summary.json: {name} of {who} {row[name]}, not {value:.9g}"
+        ratio = None if row.get("bound") is None else row["mean_trace"] / row["bound"]
+        if ratio is not None and not _equal(row["ratio"], ratio):
+            return f"summary.json: ratio of {who} {row['ratio']}, not {ratio:.9g}"
     return ""
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    """Return the means (N,) of ``values`` (T, N) over time; nan without a sample."""
+    return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)

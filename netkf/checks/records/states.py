@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from netkf.algorithms.registry import own_attributes
 from netkf.checks.rounding import EPS
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
@@ -20,8 +21,12 @@ TRUTH_TOLERANCE, START_TOLERANCE = 1e-8, 1e-9
 """Tolerated differences of states from those drawn again, relative to the largest state so far, and
 of starting estimates and covariances, relative to their largest entry.
 """
+METROPOLIS = "metropolis"
+"""The value of ``filter.weights`` for weights that depend on the numbers of links."""
 ROUNDINGS = 1e4
 """Relative errors EPS of a state from which others grow as the plant does."""
+COINCIDENT = 4
+"""Events of each kind at whose instants samples are taken besides."""
 SUM_ROUNDINGS = 64.0
 """The same of x - xhat, from the sizes of x and xhat."""
 
@@ -115,17 +120,45 @@ def _error_fault(run: Run) -> str:
     return f"the error of node {run.nodes[i]} at {run.times[k]:g} s is not x - xhat"
 
 
-def with_start(scenario: Scenario, horizon: float) -> Scenario:
-    """Return the scenario with a sample at time 0 besides the others, cut at ``horizon`` (s)."""
-    times = scenario.times[scenario.times <= horizon]
-    return dataclasses.replace(
-        scenario, horizon=horizon, probe=np.unique(np.concatenate([[0.0], times]))
-    )
+def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None) -> Scenario:
+    """Return the scenario with a sample at time 0 besides the others, cut at ``horizon`` (s).
+
+    In continuous time samples are also taken at the instants of some events of the ``log`` of a
+    run, which come before them: absorptions, ticks and readings.
+    """
+    times = [np.zeros(1), scenario.times]
+    if not scenario.slotted and log is not None:
+        for kind in ("absorb", "tick", "sense"):
+            instants = log["t"][(log["kind"] == CODES[kind]) & (log["t"] < horizon)]
+            times.append(instants[:: max(1, len(instants) // COINCIDENT)][:COINCIDENT])
+    probe = np.unique(np.concatenate(times))
+    return dataclasses.replace(scenario, horizon=horizon, probe=probe[probe <= horizon])
+
+
+def weight_fault(scenario: Scenario) -> str:
+    """Return one line about the first link whose weight is not that of [filter]: entry [l, i] of a
+    matrix is the weight that node i gives to what node l sends, a Metropolis weight is one over one
+    plus the larger number of nodes that either end hears. Empty without a fault, and for weights of
+    other kinds.
+    """
+    weights, nodes = getattr(scenario.filter.algorithm, "weights", None), scenario.nodes
+    heard = {node: {j for j, i in scenario.topology.directions if i == node} for node in nodes}
+    for sender, receiver in scenario.topology.directions:
+        if isinstance(weights, np.ndarray):
+            expected = float(weights[nodes.index(sender), nodes.index(receiver)])
+        elif weights == METROPOLIS:
+            expected = 1.0 / (1.0 + max(len(heard[sender]), len(heard[receiver])))
+        else:
+            return ""
+        seen = scenario.weight(receiver, sender)
+        if not abs(seen - expected) <= START_TOLERANCE:
+            return f"node {receiver} gives node {sender} the weight {seen:.6g}, not {expected:.6g}"
+    return ""
 
 
 def start_fault(scenario: Scenario, run: Run) -> str:
-    """Return one line about the first node whose estimate or covariance at time 0 is not that of
-    the scenario; empty without one. ``run`` has a sample at time 0.
+    """Return one line about the first node whose estimate or covariance at time 0, or a weight, is
+    not that of the scenario; empty without one. ``run`` has a sample at time 0.
     """
     plant, start = scenario.plant, scenario.filter
     for k, node in enumerate(scenario.nodes):
@@ -140,4 +173,4 @@ def start_fault(scenario: Scenario, run: Run) -> str:
             gap = np.abs(seen - expected).max()
             if not gap <= START_TOLERANCE * np.abs(expected).max():
                 return f"the {name} of node {node} at time 0 is {gap:.3g} off that of [filter]"
-    return ""
+    return "" if own_attributes(scenario.filter.algorithm) else weight_fault(scenario)

@@ -24,6 +24,9 @@ def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
         return difference
     if run.status != twin.status or not np.array_equal(run.times, twin.times):
         return f"{run.status} after {len(run.times)} samples, {twin.status} after {len(twin.times)}"
+    for name, (_, total) in twin.sums.items():
+        if not abs(run.sums[name][1] - total) <= STATE_TOLERANCE * abs(total):
+            return f"the sum of {name} over all nodes {run.sums[name][1]:.9g}, {total:.9g}"
     for name, gap, allowed in _gaps(scenario, run, twin):
         wrong = ~(gap <= allowed)
         if wrong.any():

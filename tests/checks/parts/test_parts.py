@@ -117,6 +117,8 @@ def with_network(table, **changes):
 
 GAMMAS = with_network(TICKS, activation=GAMMA)
 PERIODIC = with_network(TICKS, activation={"kind": "periodic", "period": 0.4})
+JITTER = {"kind": "periodic", "period": 0.3, "jitter": 0.2, "phase": "random"}
+JITTERED = with_network(TICKS, activation=JITTER)
 IN_BURSTS = with_network(TICKS, channel={"loss": BURSTS})
 LATE = with_network(TICKS, channel={"delay": {"kind": "exponential", "mean": 0.2}})
 DELAYED = with_network(TICKS, channel={"delay": {"kind": "constant", "seconds": 0.2}})
@@ -136,6 +138,7 @@ HEALTHY = {
         {"network.channel": {"delay": {"kind": "uniform", "low": 0.1, "high": 0.6}}},
     ),
     "periodic": (TICKS, {"network.activation": {"kind": "periodic", "period": 0.3, "jitter": 0.1}}),
+    "jitter after random phases": (TICKS, {"network.activation": JITTER}),
     "random phases": (
         TICKS,
         {"network.activation": {"kind": "periodic", "period": 0.3, "phase": "random"}},
@@ -195,6 +198,8 @@ WRONG = {
     "LateFirst": (TICKS, "network.activation", "clocks tick at the rates"),
     "OtherShape": (GAMMAS, "network.activation", "ticks follow the law of their clocks"),
     "OffBeat": (PERIODIC, "network.activation", "clocks tick at the times"),
+    "EarlyJitter": (JITTERED, "network.activation", "ticks follow the law of their clocks"),
+    "OnePhase": (JITTERED, "network.activation", "ticks follow the law of their clocks"),
     "LongerBursts": (IN_BURSTS, "network.channel.loss", "losses follow each other"),
     "FirstLost": (TICKS, "network.channel.loss", "messages are lost as often as"),
     "Slow": (LATE, "network.channel.delay", "delays of messages have the law"),
@@ -203,7 +208,8 @@ WRONG = {
 }
 
 
-SUBTLE = {"Biased", "Louder", "Lossier", "OneWay", "Lazier", "LateFirst", "LongerBursts", "Slow"}
+SUBTLE = {"Biased", "Louder", "Lossier", "OneWay", "Lazier", "LateFirst", "LongerBursts", "Slow",
+          "EarlyJitter", "OnePhase"}  # fmt: skip
 """Which take 60 runs to be found, the others less than 20."""
 
 

@@ -230,3 +230,21 @@ class Sooner(ConstantDelay):
 
     def message_delay(self, link, message, drawn):
         return 0.99 * drawn
+
+
+@dataclass(frozen=True, eq=False)
+class EarlyJitter(Periodic):
+    """Delays its ticks by small shares of the jitter more often than by large ones."""
+
+    def ticks(self, entity, origin, index, now, random, count):
+        lattice = Periodic(period=self.period, phase=self.phase, at=self.at)
+        times = lattice.ticks(entity, origin, index, now, random, count)
+        return times + self.jitter * random.random(count) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class OnePhase(Periodic):
+    """Draws its phases from the first half of the period."""
+
+    def origin(self, entity, random):
+        return 0.5 * super().origin(entity, random)
