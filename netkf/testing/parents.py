@@ -132,6 +132,8 @@ def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Tria
     if any(part.talks for part in parts):
         clocks = [clock for clock in child.part.clocks if clock in parent.part.clocks]
     systems = make_systems(any(part.inverts for part in parts))
+    if isinstance(getattr(child.part, "weights", None), np.ndarray):
+        systems = [system._replace(spread=1.0) for system in systems]
     for system in systems:
         if slots is not None:
             pair = SlotTrial(child, system), SlotTrial(parent, system)

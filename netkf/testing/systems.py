@@ -17,6 +17,8 @@ class System(NamedTuple):
                 in continuous time
     H, R      : (p, n) and (p, p), matrix and covariance of the noise of the sensor
     mean, cov : (n,) and (n, n), mean and covariance of x(0)
+    spread    : difference between the first estimates of a node and of the one before: where all
+                nodes hear the same readings, weights of estimates show only if these differ
     """
 
     M: FloatArray
@@ -25,6 +27,7 @@ class System(NamedTuple):
     R: FloatArray
     mean: FloatArray
     cov: FloatArray
+    spread: float = 0.0
 
 
 def make_systems(inverts: bool) -> list[System]:

@@ -98,7 +98,8 @@ class Trial(ABC):
             place=node,
             network=NetworkInfo(information, neighbours),
         )
-        state = self.watched.call("init", models[node], self.system.mean, self.system.cov, info)
+        mean = self.system.mean + node * self.system.spread
+        state = self.watched.call("init", models[node], mean, self.system.cov, info)
         self.record_estimate(node, state, "init")
         return state
 
