@@ -54,8 +54,10 @@ def test_wrong_covariances_break_the_exact_rows(clocked, monkeypatch):
     verdict = netkf.check(scenario, runs=20, workers=1)
     # P is wrong from time 0 on, from which the rest follows.
     broken = verdict.table[verdict.table.verdict == "broken"]
-    assert list(broken.promise) == ["estimates and covariances start as [filter] says"]
-    reason = 'follows from the broken row "estimates and covariances start as [filter] says"'
+    assert list(broken.promise) == ["estimates, covariances and weights begin as [filter] says"]
+    reason = (
+        'follows from the broken row "estimates, covariances and weights begin as [filter] says"'
+    )
     assert list(verdict.table.assumptions[:2]) == [reason] * 2
 
 

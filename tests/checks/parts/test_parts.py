@@ -199,7 +199,6 @@ WRONG = {
     "OtherShape": (GAMMAS, "network.activation", "ticks follow the law of their clocks"),
     "OffBeat": (PERIODIC, "network.activation", "clocks tick at the times"),
     "EarlyJitter": (JITTERED, "network.activation", "ticks follow the law of their clocks"),
-    "OnePhase": (JITTERED, "network.activation", "ticks follow the law of their clocks"),
     "LongerBursts": (IN_BURSTS, "network.channel.loss", "losses follow each other"),
     "FirstLost": (TICKS, "network.channel.loss", "messages are lost as often as"),
     "Slow": (LATE, "network.channel.delay", "delays of messages have the law"),
@@ -209,7 +208,7 @@ WRONG = {
 
 
 SUBTLE = {"Biased", "Louder", "Lossier", "OneWay", "Lazier", "LateFirst", "LongerBursts", "Slow",
-          "EarlyJitter", "OnePhase"}  # fmt: skip
+          "EarlyJitter"}  # fmt: skip
 """Which take 60 runs to be found, the others less than 20."""
 
 

@@ -240,11 +240,3 @@ class EarlyJitter(Periodic):
         lattice = Periodic(period=self.period, phase=self.phase, at=self.at)
         times = lattice.ticks(entity, origin, index, now, random, count)
         return times + self.jitter * random.random(count) ** 2
-
-
-@dataclass(frozen=True, eq=False)
-class OnePhase(Periodic):
-    """Draws its phases from the first half of the period."""
-
-    def origin(self, entity, random):
-        return 0.5 * super().origin(entity, random)
