@@ -357,7 +357,7 @@ def _transposes(scenario: Scenario) -> bool:
     exchanged: a mistake, and no design.
     """
     own, base = (
-        chosen.filter.algorithm.pair_weights for chosen in (scenario, with_base_filter(scenario))
+        chosen.node_filter.pair_weights for chosen in (scenario, with_base_filter(scenario))
     )
     if own is None or base is None or np.array_equal(own, base):
         return False

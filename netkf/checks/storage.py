@@ -96,9 +96,9 @@ def _require_same(path: Path, columns: dict[str, Any], scenario: Scenario) -> No
     """
     again = _result_columns(tuple(_read_results(path, scenario)))
     for name in sorted(columns.keys() | again.keys()):
-        one, other = columns.get(name), again.get(name)
-        same = one is not None and other is not None and one.dtype.kind == other.dtype.kind
-        if not same or not np.array_equal(one, other, equal_nan=one.dtype.kind == "f"):
+        one, other = (np.asarray(part.get(name, ())) for part in (columns, again))
+        is_real = one.dtype.kind == other.dtype.kind == "f"
+        if not np.array_equal(one, other, equal_nan=is_real):
             rule = f"reads back another {name} than was written"
             raise ScenarioError(RESULTS, rule, None, "report it; the verdict is not kept")
 

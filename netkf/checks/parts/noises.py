@@ -267,12 +267,13 @@ def _whitened_noises(
         return np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
     sensor = scenario.located_sensors[law.placed_sensor.entry]
     if isinstance(sensor, NonlinearSensor):
-        y = np.array([_reading_of(path, k, x[k]) for k in range(count)])
+        y = np.array([_reading_of(path, k, x[k]) for k in range(count)], dtype=np.float64)
         expected = np.array([sensor.h(state, law.node) for state in x], dtype=np.float64)
     else:
         y, H = path.several(range(count), x)
         expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
-    return np.linalg.solve(law.root, (y - expected).T).T, _standardise(x, _state_sizes(scenario, x))
+    noises = np.asarray(np.linalg.solve(law.root, (y - expected).T).T, dtype=np.float64)
+    return noises, _standardise(x, _state_sizes(scenario, x))
 
 
 def _reading_of(path: Any, k: int, x: FloatArray) -> FloatArray:
