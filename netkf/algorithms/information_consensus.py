@@ -56,6 +56,7 @@ from netkf.algorithms.kernels.slots import (
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.starts import check_information, information_notes
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of, positive
 from netkf.linalg.arrays import FloatArray
@@ -256,6 +257,17 @@ class InformationConsensus(Filter):
     inverts: ClassVar[bool] = True
     slot_kernel = staticmethod(consensus_slots)
 
+    def check_scenario(self, scenario: Any) -> None:
+        """Raise ScenarioError if rounding of information would take the first covariance of a
+        ``netkf.Scenario`` in slots.
+        """
+        if scenario.slotted:
+            check_information(scenario)
+
+    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+        """Return a line on rounding of information in slots, if there is much."""
+        return information_notes(scenario) if scenario.slotted else ()
+
     @abstractmethod
     def recipe(self, nodes: int) -> Recipe:
         """Return the recipe for a network of N ``nodes``: from which information pairs begin, and
@@ -381,8 +393,10 @@ class Hcmci(InformationConsensus):
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if a ``netkf.Scenario`` has clocks and the variant is not
-        "information", or if a novelty weight is given to that variant, which does not use it.
+        "information", if a novelty weight is given to that variant, which does not use it, or if
+        rounding of information would take the first covariance.
         """
+        super().check_scenario(scenario)
         if not scenario.slotted and self.consensus != INFORMATION:
             raise ScenarioError(
                 "filter.consensus",

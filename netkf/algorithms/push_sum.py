@@ -71,6 +71,7 @@ from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, MassStep, has
 from netkf.algorithms.models import SlotModel, first_root
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
+from netkf.algorithms.starts import check_information, information_notes
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, field, integer, number, one_of, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
@@ -866,8 +867,8 @@ class PushSum(Filter):
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots: the
-        leader is no node, gamma or delta is missing or averaging would not contract, or P_inf does
-        not exist.
+        leader is no node, gamma or delta is missing or averaging would not contract, rounding of
+        information would take the first covariance, or P_inf does not exist.
         """
         if not scenario.slotted:
             return
@@ -880,6 +881,7 @@ class PushSum(Filter):
         if self.running_sums and self.stop != "never":
             rule = "must be never with running sums, which a node that stops would freeze"
             raise ScenarioError("filter.stop", rule, self.stop, 'write stop = "never"')
+        check_information(scenario)
         # P (12) may have no solution, as for an unstable plant that the sensors do not see.
         if self.asymptotic:
             F, Q = scenario.slot_belief
@@ -928,8 +930,8 @@ class PushSum(Filter):
             )
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return one line each: delta is below rho(L); settings of slots are not used
-        under clocks.
+        """Return one line each: delta is below rho(L); rounding of information; settings of slots
+        are not used under clocks.
         """
         if not scenario.slotted:
             fields = dataclasses.fields(self)
@@ -940,9 +942,11 @@ class PushSum(Filter):
             return (f"{', '.join(changed_settings)}: {reason}",) if changed_settings else ()
         # Contraction is enough to run; the theorems ask for more.
         radius = scenario.topology.laplacian_radius
+        notes = information_notes(scenario)
         if self.delta >= radius:
-            return ()
+            return notes
         return (
+            *notes,
             f"filter.delta = {self.delta:g} is below rho(L) = {radius:.6g}: averaging contracts, "
             "but P Theorems 3, 5 and 6 ask for more than rho(L)",
         )

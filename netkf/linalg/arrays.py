@@ -60,17 +60,18 @@ def is_semidefinite(matrix: FloatArray, tolerance: float = 1e-10) -> bool:
     return bool(values[0] >= -tolerance * max(abs(values[-1]), np.finfo(float).tiny))
 
 
-def is_definite(matrix: FloatArray) -> bool:
-    """Return True if a symmetric ``matrix`` (n, n) is positive definite beyond rounding, whatever
-    the units of its rows.
+def is_definite(matrices: FloatArray) -> NDArray[np.bool_]:
+    """Return a mask (...) of those finite symmetric ``matrices`` (..., n, n) that are positive
+    definite beyond rounding, whatever the units of their rows.
     """
-    sizes = np.diagonal(matrix)
-    if not (sizes > 0.0).all():
-        return False
-    roots = np.sqrt(sizes)
+    n = matrices.shape[-1]
+    sizes = np.diagonal(matrices, axis1=-2, axis2=-1)
+    positive = np.asarray((sizes > 0.0).all(axis=-1))
+    roots = np.sqrt(np.where(positive[..., None], sizes, 1.0))
     # With a diagonal of 1 the largest eigenvalue is at most n.
-    least = np.linalg.eigvalsh(matrix / roots[:, None] / roots)[0]
-    return bool(least > 8.0 * len(matrix) * np.finfo(float).eps)
+    scaled = np.where(positive[..., None, None], matrices, np.eye(n))
+    least = np.linalg.eigvalsh(scaled / roots[..., :, None] / roots[..., None, :])[..., 0]
+    return np.asarray(positive & (least > 8.0 * n * np.finfo(float).eps))
 
 
 def square_root(matrix: FloatArray) -> FloatArray:

@@ -134,10 +134,10 @@ def _check_invertible(scenario: DerivedScenario) -> None:
     """
     n = scenario.plant.n
     initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
-    singular = next((node for node, P in initial.items() if not is_definite(P)), None)
+    singular = next((node for node, P in initial.items() if not bool(is_definite(P))), None)
     if scenario.slotted:
         F, Q = scenario.slot_belief
-        nonsingular = is_definite(Q) or (singular is None and np.linalg.matrix_rank(F) == n)
+        nonsingular = bool(is_definite(Q)) or (singular is None and np.linalg.matrix_rank(F) == n)
     else:
         A, Q = scenario.belief
         # (A, Q) is controllable if and only if (A', Q) is observable.

@@ -25,7 +25,7 @@ from netkf.core.notebook import NotebookTable
 from netkf.engines.base import Engine
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
-from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.linalg.arrays import FloatArray, block_diagonal, is_definite
 from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, simulate
@@ -133,7 +133,7 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
     if sigma is None:
         return expected
     usable = np.asarray(np.isfinite(P).all(axis=(-2, -1)))
-    usable[usable] = np.linalg.matrix_rank(P[usable]) == P.shape[-1]
+    usable[usable] = is_definite(P[usable])
     scaled = np.linalg.solve(P[usable], sigma[usable])
     expected[usable] = np.trace(scaled, axis1=-2, axis2=-1)
     return expected

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import solve_inplace
 
@@ -58,6 +58,5 @@ def _is_regular(P: FloatArray) -> np.ndarray:
     rounding: NEES is nan for the others.
     """
     regular = np.asarray(np.isfinite(P).all(axis=(1, 2)))
-    ranks = np.linalg.matrix_rank(P[regular], hermitian=True)
-    regular[regular] = np.asarray(ranks) == P.shape[-1]
+    regular[regular] = is_definite(P[regular])
     return regular

@@ -32,7 +32,7 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "Q is positive definite",
             "G II-A, R Theorem 9",
-            *judge_plant(scenario, is_definite(plant.Q), positive),
+            *judge_plant(scenario, bool(is_definite(plant.Q)), positive),
         ),
         true_model_row(scenario, "G (10), R (15)", "same F, Q and R"),
     ]

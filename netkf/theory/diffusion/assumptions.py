@@ -120,7 +120,7 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "the filters' Q and r are positive definite",
             "D Algorithm 1",
-            is_definite(Q),
+            bool(is_definite(Q)),
             f"least eigenvalue of Q {smallest:.3g}; they are the true ones"
             if same
             else f"least eigenvalue of Q {smallest:.3g}; {UNKNOWN_LAW}"
