@@ -143,7 +143,12 @@ def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
         return state, None
     n, projectors = len(state.xhat), state.model.groups.projectors
     # The mass (w, U, parts of u): U = (w / N) P^-1 with P^-1 = S^-T S^-1 for the root S.
-    inverse = scipy.linalg.solve_triangular(state.root, np.eye(n), lower=True)
+    try:
+        inverse = scipy.linalg.solve_triangular(
+            state.root, np.eye(n), lower=True, check_finite=False
+        )
+    except np.linalg.LinAlgError:  # P has fallen to 0: its inverse ends the run as diverged
+        inverse = np.full((n, n), np.inf)
     U = (state.weight / state.nodes) * (inverse.T @ inverse)
     mass = np.concatenate([[state.weight], U.reshape(-1), _parts(projectors, U, state.xhat)])
     sent = state.sent + mass / (state.receivers + 1)
