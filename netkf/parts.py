@@ -68,6 +68,7 @@ from netkf.network.channels import (
     UniformDelay,
 )
 from netkf.network.clocks import LinkClock, OnReadings, Periodic, Poisson, RecordedClock, Renewal
+from netkf.network.graph_files import EdgelistGraph, GmlGraph, GraphFile, GraphmlGraph
 from netkf.network.graphs import (
     Complete,
     CsvGraph,
@@ -145,6 +146,7 @@ __all__ = [
     "Diffusion",
     "DiffusionFilter",
     "DiffusionKalman",
+    "EdgelistGraph",
     "Edges",
     "ErdosRenyi",
     "Estimate",
@@ -156,8 +158,11 @@ __all__ = [
     "FlowFilter",
     "Geometric",
     "GilbertElliott",
+    "GmlGraph",
     "Gossip",
     "Graph",
+    "GraphFile",
+    "GraphmlGraph",
     "Grid",
     "Hcmci",
     "Hybrid",

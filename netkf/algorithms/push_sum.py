@@ -73,7 +73,7 @@ from netkf.algorithms.registry import built_in
 from netkf.algorithms.running_sums import Offer, RunningSums
 from netkf.algorithms.starts import check_information, information_notes
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import boolean, field, integer, number, one_of, positive
+from netkf.core.fields import boolean, field, integer, node_id, number, one_of, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
@@ -593,7 +593,7 @@ class PushSum(Filter):
 
     gamma: int = field(integer(low=1, high=MAX_STEPS), default=None)
     delta: float = field(positive, default=None)
-    leader: int = field(integer(low=0), default=0)
+    leader: int = field(node_id(low=0), default=0)
     asymptotic: bool = field(boolean, default=False)
     links: str = field(one_of("fresh", "held"), default="fresh")
     stop: str = field(one_of(*RULES), default="never")

@@ -21,14 +21,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
-from netkf.core.fields import MAX_MAGNITUDE, SourceFile
+from netkf.core.errors import ScenarioError, suggest_nearest
+from netkf.core.fields import MAX_MAGNITUDE, MAX_NAME, SourceFile
 from netkf.linalg.arrays import FloatArray
 
 MAX_BYTES = 256 << 20  # of a table, unpacked; it limits the memory that reading takes
 MAX_ID = 2**53  # larger integers are not exact as floating-point numbers
 STAMPS = ("t", "from", "until")
 """The columns that hold times, in every table."""
+NODES = ("node", "peer", "sender", "receiver", "to")
+"""The columns that hold nodes, by id or by name, in every table."""
 SEPARATORS = ",;\t"
 _FOREIGN = {
     b"PK": "it is a zip file or a spreadsheet; save the table as CSV",
@@ -57,10 +59,12 @@ class Columns(dict[str, FloatArray]):
 
     def integers(self, name: str) -> list[int]:
         """Return the column ``name`` as K integers, ids or counts; raises ScenarioError, with the
-        line, for a value that is not an integer from 0 to MAX_ID.
+        line, for a value that is not an integer from 0 to MAX_ID. Names of nodes are below 0 until
+        the graph is known, see SourceFile.
         """
         column = self[name]
-        wrong = np.flatnonzero((column != np.round(column)) | (column < 0) | (column > MAX_ID))
+        low = -len(self.source.unknown)
+        wrong = np.flatnonzero((column != np.round(column)) | (column < low) | (column > MAX_ID))
         if wrong.size:
             rule = f"{self.where(int(wrong[0]))}: {name} must hold integers from 0 to 2^53"
             raise ScenarioError("path", rule, float(column[wrong[0]]), "correct it")
@@ -72,9 +76,11 @@ def read_columns(
     required: tuple[str, ...],
     optional: tuple[str, ...] = (),
     gaps: Collection[str] = (),
+    nodes: Collection[str] = NODES,
 ) -> Columns:
     """Return the named columns, optional ones only if they are there. Entries of columns in
-    ``gaps`` may be empty or nan, and are nan then.
+    ``gaps`` may be empty or nan, and are nan then; those of columns in ``nodes`` may be names, and
+    are ids then.
 
     Raises ScenarioError, with the file and the line, for a missing column, a row of another length
     than the header, or an entry that is not a finite number, or no stamp in a column of STAMPS.
@@ -87,13 +93,18 @@ def read_columns(
             if sheet.header.count(name) > 1:
                 rule = f"{source.name} must have one column {name}"
                 raise ScenarioError("path", rule, sheet.header, "rename the others")
-        places = [(sheet.header.index(name), name in STAMPS, name in gaps) for name in names]
         entries = _Entries(source, sheet)
+        places = [
+            (sheet.header.index(name), name in nodes, name in STAMPS, name in gaps)
+            for name in names
+        ]
         for line, row in sheet.rows:
             entries.begin(line, row)
             lines.append(line)
-            for column, is_stamp, may_miss in places:
-                if is_stamp:
+            for column, is_node, is_stamp, may_miss in places:
+                if is_node:
+                    numbers.append(entries.node(column, may_miss))
+                elif is_stamp:
                     numbers.append(entries.stamp(column))
                 else:
                     numbers.append(entries.number(column, may_miss))
@@ -159,6 +170,26 @@ class _Entries:
             remedy = "write a decimal point, no commas" if "," in text else "correct the entry"
             raise self._refusal(column, "must be a finite number", remedy)
         return self._limited(column, value)
+
+    def node(self, column: int, may_miss: bool) -> float:
+        """Return the id of the node in the column with this index, or the negative number that
+        stands for its name until the graph is known; raises ScenarioError if it is neither.
+        """
+        name, source = self._row[column].strip(), self._source
+        if source.node_ids and name in source.node_ids:
+            return source.node_ids[name]
+        if not name or _is_number(name):
+            number = self.number(column, may_miss)
+            if number < 0.0:
+                raise self._refusal(column, "must be an integer from 0 to 2^53", "correct it")
+            return number
+        if source.node_ids is None and len(name) <= MAX_NAME and name.isprintable():
+            return source.unknown.setdefault(name, -1 - len(source.unknown))
+        raise self._refusal(
+            column,
+            "must name a node of the graph",
+            f"{suggest_nearest(name, source.node_ids or ())}correct it, or the graph",
+        )
 
     def stamp(self, column: int) -> float:
         """Return the time in the column with this index, in simulated seconds; raises ScenarioError
@@ -282,6 +313,23 @@ class _Lines:
                 yield line
             elif is_first:
                 self.comments[self.number] = line
+
+
+def read_content(source: SourceFile) -> bytes:
+    """Return the bytes of a file, unpacked if it is compressed by gzip; raises ScenarioError if it
+    cannot be read or has more than MAX_BYTES.
+    """
+    try:
+        with source.full.open("rb") as packed:
+            is_packed = packed.read(2) == b"\x1f\x8b"
+            packed.seek(0)
+            return _Bounded(gzip.GzipFile(fileobj=packed) if is_packed else packed).readall() or b""
+    except _TooLargeError:
+        rule = f"{source.name} must have at most {MAX_BYTES >> 20} MiB"
+        raise ScenarioError("path", rule, None, "leave out attributes") from None
+    except (OSError, EOFError, zlib.error) as error:
+        rule = f"{source.name} cannot be read"
+        raise ScenarioError("path", rule, str(error), "correct the file") from None
 
 
 @contextmanager

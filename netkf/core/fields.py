@@ -36,12 +36,14 @@ class Rule:
                  of _SpecificError and ScenarioError are
     remedy       text that tells the user how to correct a value that breaks the rule
     schema       JSON Schema that accepts every value of a file that obeys the rule; empty: any
+    of_nodes     whether texts in the value are names of nodes, for which scenarios put their ids
     """
 
     requirement: str
     convert: Callable[[Any], Any]
     remedy: str = ""
     schema: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
+    of_nodes: bool = False
 
     def __call__(self, key: str, value: object) -> Any:
         """Return the converted value; raises ScenarioError at ``key`` if it breaks the rule."""
@@ -496,7 +498,7 @@ def list_of(rule: Rule, items: str, min_length: int = 1) -> Rule:
     not_empty = "" if min_length == 0 else " that is not empty"
     schema = {"type": "array", "items": dict(rule.schema), "minItems": min_length}
     requirement = f"must be a list of {items}{not_empty}"
-    return Rule(requirement, convert, f"write a list of {items}", schema)
+    return Rule(requirement, convert, f"write a list of {items}", schema, rule.of_nodes)
 
 
 def tuple_of(*rules: Rule, description: str) -> Rule:
@@ -517,18 +519,47 @@ def tuple_of(*rules: Rule, description: str) -> Rule:
         "minItems": len(rules),
         "maxItems": len(rules),
     }
-    return Rule(f"must be {description}", convert, f"write {description}", schema)
+    of_nodes = any(rule.of_nodes for rule in rules)
+    return Rule(f"must be {description}", convert, f"write {description}", schema, of_nodes)
+
+
+MAX_NAME = 200  # characters of the name of a node
+
+
+def node_id(low: int | None = None, high: int | None = None) -> Rule:
+    """Return the rule for a node: its integer id from ``low`` to ``high``, or its name, a text. A
+    scenario replaces names by ids (netkf.scenario.names).
+    """
+    ids = integer(low, high)
+
+    def convert(value: Any) -> int | str:
+        """Return the id as an int, or the name; raise TypeError or ValueError for others."""
+        if not isinstance(value, str):
+            node: int = ids.convert(value)
+            return node
+        if not value.strip() or len(value) > MAX_NAME or not value.isprintable():
+            raise ValueError
+        return value.strip()
+
+    schema = {"anyOf": [dict(ids.schema), {"type": "string", "minLength": 1}]}
+    return Rule(ids.requirement, convert, ids.remedy, schema, of_nodes=True)
 
 
 @dataclass(frozen=True, repr=False)
 class SourceFile:
     """A file that a scenario refers to: its path ``name`` as written, relative to ``folder``, and
     what the ``stamps`` in it mean.
+
+    node_ids  the ids of nodes by name, None before a graph is known
+    unknown   names in the file that were read before that, with the number -1, -2, ... that stands
+              for each until then
     """
 
     name: str
     folder: Path
     stamps: TimeBase = TimeBase()
+    node_ids: Mapping[str, int] | None = dataclasses.field(default=None, compare=False)
+    unknown: dict[str, int] = dataclasses.field(default_factory=dict, compare=False)
 
     def __repr__(self) -> str:
         """Return the quoted path as written, without the folder."""

@@ -19,8 +19,8 @@ from netkf.core.fields import (
     SourceFile,
     either,
     field,
-    integer,
     list_of,
+    node_id,
     number,
     one_of,
     positive,
@@ -89,8 +89,8 @@ def _accumulate(now: float, gaps: FloatArray) -> FloatArray:
 
 
 _rate = number(above=0.0, high=1e9)
-_link_rate = tuple_of(integer(), integer(), _rate, description="a triple [i, j, rate]")
-_node_rate = tuple_of(integer(), _rate, description="a pair [i, rate]")
+_link_rate = tuple_of(node_id(), node_id(), _rate, description="a triple [i, j, rate]")
+_node_rate = tuple_of(node_id(), _rate, description="a pair [i, rate]")
 
 
 def _one_rate(value: Any) -> tuple[float, ...]:
@@ -106,6 +106,7 @@ _entity_rate = Rule(
     _one_rate,
     _link_rate.remedy,
     {"anyOf": [dict(_link_rate.schema), dict(_node_rate.schema)]},
+    of_nodes=True,
 )
 
 
@@ -130,9 +131,8 @@ class Poisson(LinkClock):
         length, rule = (2, _node_rate) if self.at == "nodes" else (3, _link_rate)
         for k, entry in enumerate(self.rates):
             if len(entry) != length:
-                printed = [
-                    int(value) if value.is_integer() else value for value in map(float, entry)
-                ]
+                rate = entry[-1]
+                printed = [*entry[:-1], int(rate) if float(rate).is_integer() else rate]
                 remedy = f'{rule.remedy}, because at = "{self.at}"'
                 raise ScenarioError(f"rates[{k}]", rule.requirement, printed, remedy)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,16 +19,21 @@ from netkf.core.fields import (
     Component,
     SourceFile,
     boolean,
+    either,
     field,
     integer,
     list_of,
+    matrix,
+    node_id,
     number,
     positive,
     probability,
     source_file,
     tuple_of,
+    vector,
 )
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
+from netkf.linalg.arrays import FloatArray
 from netkf.network.spectra import largest_laplacian_eigenvalue
 
 if TYPE_CHECKING:
@@ -51,6 +57,7 @@ class Topology:
     notes     : one line for each group of nodes or links that were left out
     left_out  : nodes that the graph's table names but that have no link
     tables    : use of the rows of the graph's tables, by the rest of their key path
+    names     : id of each node that the graph's file names by a text
     """
 
     nodes: tuple[int, ...]
@@ -61,6 +68,16 @@ class Topology:
     notes: tuple[str, ...] = ()
     left_out: frozenset[int] = frozenset()
     tables: Mapping[str, RowUse] = dataclasses.field(default_factory=dict)
+    names: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+    @cached_property
+    def _labels(self) -> dict[int, str]:
+        """The name of each node that has one, by id."""
+        return {node: name for name, node in self.names.items()}
+
+    def label(self, node: int) -> str:
+        """Return the name of a node as the graph's file has it: a text, or its id."""
+        return self._labels.get(node, str(node))
 
     @cached_property
     def index(self) -> dict[int, int]:
@@ -160,6 +177,9 @@ def demand_nodes(source: SourceFile, lines: Mapping[int, int], topology: Topolog
 class Graph(Component):
     """The contract of a graph kind; ``seed`` is the root seed for the random ones."""
 
+    may_name_nodes: ClassVar[bool] = False
+    """Whether nodes may have names, texts in place of ids."""
+
     @abstractmethod
     def build(self, seed: int) -> Topology:
         """Return the nodes and links; ``seed`` is the root seed, for random graphs without one of
@@ -181,8 +201,13 @@ def _from_networkx(graph: networkx.Graph[Any], **more: Any) -> Topology:
 
 
 _count = integer(low=1, high=MAX_NODES)
-_node = integer(low=0, high=2**53)
+_node = node_id(low=0, high=2**53)
 _node_pair = tuple_of(_node, _node, description="a pair of node ids")
+
+
+def _is_list(value: Any) -> bool:
+    """Return True for a list of nodes, False for their number."""
+    return isinstance(value, (list, tuple))
 
 
 def _check_size(nodes: int, links: int) -> None:
@@ -395,47 +420,220 @@ def _probability_within(radius: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Edges(Graph):
-    """A list of links; ``nodes = N`` names the nodes 0 .. N - 1, otherwise the links do."""
+    """A list of links between nodes, by id or by name.
+
+    edges     pairs of nodes, from the first to the second if ``directed``
+    nodes     N names the nodes 0 .. N - 1; a list names all nodes, also those without a link;
+              by default they are those of the links
+    delivery  probability that a message of each of the ``edges`` arrives, for ``per-link`` losses;
+              in both directions unless ``directed``
+    positions (x, y) of each node of the list ``nodes``
+    """
+
+    may_name_nodes: ClassVar[bool] = True
 
     edges: tuple[Link, ...] = field(list_of(_node_pair, "pairs of node ids", min_length=0))
-    nodes: int | None = field(_count, default=None)
+    nodes: int | tuple[Any, ...] | None = field(
+        either(_count, list_of(_node, "node ids"), _is_list), default=None
+    )
     directed: bool = field(boolean, default=False)
+    delivery: FloatArray | None = field(vector, default=None)
+    positions: FloatArray | None = field(matrix, default=None)
 
     def build(self, seed: int) -> Topology:
         """Return the links as given; raises ScenarioError for a pair that is no link (equal ends,
-        or an unknown node). ``seed`` is not used.
+        or an unknown node), and for delivery or positions that do not fit. ``seed`` is not used.
         """
+        listed: Iterable[Any] = self.nodes if isinstance(self.nodes, tuple) else ()
+        named = [node for edge in self.edges for node in edge]
+        ids = assign_ids([*listed, *named])
+        if isinstance(self.nodes, int):
+            ids = {k: k for k in range(self.nodes)}
+        elif self.nodes is not None:
+            ids = {node: ids[node] for node in self.nodes}
         for k, edge in enumerate(self.edges):
-            if self.nodes is not None and max(edge) >= self.nodes:
-                rule = f"node ids must be 0 .. {self.nodes - 1}"
-                remedy = "correct the pair or raise nodes"
+            if self.nodes is not None and not ids.keys() >= set(edge):
+                rule, remedy = "must join two of nodes", "correct the pair or add to nodes"
+                if isinstance(self.nodes, int):
+                    rule = f"node ids must be 0 .. {self.nodes - 1}"
+                    remedy = "correct the pair or raise nodes"
                 raise ScenarioError(f"edges[{k}]", rule, list(edge), remedy)
-        for k, (i, j) in enumerate(self.edges):
-            if i == j:
+            if edge[0] == edge[1]:
                 rule = "a link must join two nodes"
-                raise ScenarioError(f"edges[{k}]", rule, [i, j], "name the other node")
-        named = {node for edge in self.edges for node in edge}
-        nodes = named if self.nodes is None else range(self.nodes)
-        if not nodes:
+                raise ScenarioError(f"edges[{k}]", rule, list(edge), "leave it out")
+        if not ids:
             raise ScenarioError("edges", "must name at least one node", [], "add nodes = N")
-        if self.directed:
-            return Topology(tuple(sorted(nodes)), tuple(sorted(set(self.edges))), directed=True)
-        return _make_topology(nodes, self.edges)
+        return self._topology(ids)
+
+    def _topology(self, ids: dict[Any, int]) -> Topology:
+        """Return the topology of nodes with the ``ids``, by label."""
+        links = [(ids[i], ids[j]) for i, j in self.edges]
+        delivery = self._delivery(links)
+        if not self.directed:
+            links = [(min(link), max(link)) for link in links]
+        repeated = len(links) - len(set(links))
+        notes = (f"edges: {repeated} of {len(links)} pairs are listed again",) if repeated else ()
+        return Topology(
+            tuple(sorted(ids.values())),
+            tuple(sorted(set(links))),
+            directed=self.directed,
+            delivery=delivery,
+            positions=self._positions(ids),
+            notes=notes,
+            names={name: k for name, k in ids.items() if str(k) != str(name)},
+        )
+
+    def _delivery(self, links: list[Link]) -> dict[Link, float] | None:
+        """Return the delivery probability of each direction of the ``links``, None without any."""
+        if self.delivery is None:
+            return None
+        are_probabilities = ((self.delivery >= 0.0) & (self.delivery <= 1.0)).all()
+        if len(self.delivery) != len(links) or not are_probabilities:
+            rule = f"must be {len(links)} probabilities, one for each of edges"
+            raise ScenarioError("delivery", rule, self.delivery.tolist(), "add or correct them")
+        delivery: dict[Link, float] = {}
+        for k, (link, p) in enumerate(zip(links, self.delivery.tolist(), strict=True)):
+            for direction in (link,) if self.directed else (link, link[::-1]):
+                if delivery.setdefault(direction, p) != p:
+                    rule = f"says {delivery[direction]:g} and {p:g} of one link"
+                    remedy = "list each link once"
+                    raise ScenarioError(f"delivery[{k}]", rule, list(self.edges[k]), remedy)
+        return delivery
+
+    def _positions(self, ids: dict[Any, int]) -> dict[int, tuple[float, float]] | None:
+        """Return the coordinates (x, y) of each node by id, None without any."""
+        if self.positions is None:
+            return None
+        if self.nodes is None or self.positions.shape != (len(ids), 2):
+            rule = "must be one pair (x, y) for each node of nodes"
+            got = "{} x {}".format(*self.positions.shape)
+            raise ScenarioError("positions", rule, got, "list the nodes, and a place for each")
+        points = zip(ids.values(), self.positions.tolist(), strict=True)
+        return {node: (x, y) for node, (x, y) in points}
 
 
-class _Table(NamedTuple):
-    """The delivery probability of each direction listed in a table, 1 without such a column, and
-    the use of its rows.
+def assign_ids(labels: Iterable[Any]) -> dict[Any, int]:
+    """Return the id of each node by its label, in the order of first labels: integers, also as
+    text, keep theirs, and other labels get the smallest integers that are free.
+    """
+    ids = {label: _as_integer(label) for label in labels}
+    taken = {k for k in ids.values() if k is not None}
+    free = (k for k in itertools.count() if k not in taken)
+    return {label: next(free) if k is None else k for label, k in ids.items()}
+
+
+def _as_integer(label: Any) -> int | None:
+    """Return the node id that a label is, as a number or a text, else None."""
+    text = str(label)
+    is_id = text.isascii() and text.isdecimal() and len(text) < 17 and str(int(text)) == text
+    return int(text) if is_id and int(text) <= 2**53 else None
+
+
+@dataclass(frozen=True)
+class LinkTable:
+    """The links of a file: the delivery ``probability`` of each direction that it lists, 1 where it
+    has none.
+
+    rows   : the use of the file's rows
+    alone  : nodes that the file has without a link
+    names  : id of each node that the file names by a text
     """
 
+    rows: RowUse
     probability: dict[Link, float]
     has_probabilities: bool
-    rows: RowUse
+    directed: bool
+    alone: frozenset[int] = frozenset()
+    names: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+    def topology(self, minimum: float | None, positions: SourceFile | None) -> Topology:
+        """Return the network of the links that reach the ``minimum`` probability, in both
+        directions if links are undirected, with the places of the table ``positions``.
+
+        Raises ScenarioError if no link is left, or if the table does not fit.
+        """
+        if minimum is not None and not self.has_probabilities:
+            raise ScenarioError(
+                "minimum",
+                "needs a column delivery_probability in the table",
+                minimum,
+                "add the column or leave minimum out",
+            )
+        named = {node for link in self.probability for node in link}
+        delivery = self._with_reverse_links()
+        links = self._links(delivery, minimum or 0.0)
+        if not links and not self.alone:
+            raise ScenarioError(
+                "path" if minimum is None else "minimum",
+                "no link of the table is left",
+                minimum,
+                "lower minimum or add rows",
+            )
+        # Pairs listed from i to j only, in a table that lists others both ways.
+        one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
+        if self.has_probabilities and links.intersection(one_way):
+            raise ScenarioError(
+                "path",
+                f"{self.rows.path}: some links are listed in both directions and others in one, so "
+                "the probability of the other direction is not known",
+                _list_directions(one_way, self._label),
+                "list every link twice, or every link once (then the row counts both ways), or set "
+                "directed = true",
+            )
+        nodes = {node for link in links for node in link} | self.alone
+        isolated = named - nodes
+        _check_size(len(nodes), len(links))
+        points, place_rows = _place_nodes(positions, nodes, isolated, self.names)
+        return Topology(
+            tuple(sorted(nodes)),
+            tuple(sorted(links if self.directed else {(min(p), max(p)) for p in links})),
+            directed=self.directed,
+            delivery=self._delivery(delivery, links) if self.has_probabilities else None,
+            positions=points,
+            notes=(
+                *_isolated_note(list(map(self._label, sorted(isolated))), minimum or 0.0),
+                *_one_way_note(one_way if self.has_probabilities else [], self._label),
+            ),
+            left_out=frozenset(isolated),
+            tables={"": self.rows} | ({} if place_rows is None else {".positions": place_rows}),
+            names=self.names,
+        )
+
+    def _label(self, node: int) -> str:
+        """Return the name of a node in the file."""
+        return next((name for name, k in self.names.items() if k == node), str(node))
+
+    def _with_reverse_links(self) -> dict[Link, float]:
+        """Return the probabilities with the reverse of each row added, for a table that lists every
+        undirected link once; unchanged if links are directed or any is listed both ways.
+        """
+        probability = self.probability
+        if self.directed or any((j, i) in probability for i, j in probability):
+            return probability
+        return probability | {(j, i): p for (i, j), p in probability.items()}
+
+    def _links(self, delivery: dict[Link, float], minimum: float) -> set[Link]:
+        """Return the directions (sender, receiver) whose probability in ``delivery`` reaches the
+        minimum, in both directions if the graph is undirected.
+        """
+        return {
+            (i, j)
+            for (i, j), p in delivery.items()
+            if p >= minimum and (self.directed or delivery.get((j, i), 0.0) >= minimum)
+        }
+
+    def _delivery(self, delivery: dict[Link, float], links: set[Link]) -> dict[Link, float]:
+        """Return the delivery probability of each direction (sender, receiver) of the ``links``, 0
+        where the table ``delivery`` does not list it.
+        """
+        pairs = links if self.directed else links | {(j, i) for i, j in links}
+        return {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
 
 
 @dataclass(frozen=True, eq=False)
 class CsvGraph(Graph):
-    """A graph whose links are the rows of a table ``sender,receiver[,delivery_probability]``.
+    """A graph whose links are the rows of a table ``sender,receiver[,delivery_probability]``, with
+    ids or names of nodes.
 
     ``minimum`` keeps a link only if it reaches that probability, in both directions if the graph
     is undirected; nodes without a link are left out, and a note names them. If the table of an
@@ -444,6 +642,8 @@ class CsvGraph(Graph):
     unless ``minimum`` drops those links. ``positions`` is a table whose first three columns are
     node, x and y.
     """
+
+    may_name_nodes: ClassVar[bool] = True
 
     path: SourceFile = field(source_file)
     minimum: float | None = field(number(low=0.0, high=1.0), default=None)
@@ -454,123 +654,57 @@ class CsvGraph(Graph):
         """Return the links of the table that reach the minimum, with their delivery probabilities;
         raises ScenarioError if the table is wrong or no link is left. ``seed`` is not used.
         """
-        table = self._table()
-        named = {node for link in table.probability for node in link}
-        delivery, has_probabilities, _ = self._add_reverse_links(table)
-        links = self._links(delivery)
-        # Pairs listed from i to j only, in a table that lists others both ways.
-        one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
-        if has_probabilities and links.intersection(one_way):
-            raise ScenarioError(
-                "path",
-                f"{self.path.name}: some links are listed in both directions and others in one, so "
-                "the probability of the other direction is not known",
-                _list_directions(one_way),
-                "list every link twice, or every link once (then the row counts both ways), or set "
-                "directed = true",
-            )
-        nodes = {node for link in links for node in link}
-        isolated = named - nodes
-        positions, place_rows = self._positions(nodes, isolated)
-        return Topology(
-            tuple(sorted(nodes)),
-            tuple(sorted(links if self.directed else {(min(p), max(p)) for p in links})),
-            directed=self.directed,
-            delivery=self._delivery(delivery, links) if has_probabilities else None,
-            positions=positions,
-            notes=(
-                *_isolated_note(isolated, self.minimum or 0.0),
-                *_one_way_note(one_way if has_probabilities else []),
-            ),
-            left_out=frozenset(isolated),
-            tables={"": table.rows} | ({} if place_rows is None else {".positions": place_rows}),
-        )
+        return self._read().topology(self.minimum, self.positions)
 
-    def _table(self) -> _Table:
-        """Return the rows of the file as delivery probabilities by direction (sender, receiver);
-        raises ScenarioError for wrong or repeated rows.
-        """
+    def _read(self) -> LinkTable:
+        """Return the links of the file; raises ScenarioError for wrong or contradictory rows."""
         columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
-        senders, receivers = columns.integers("sender"), columns.integers("receiver")
+        listed = list(zip(columns.integers("sender"), columns.integers("receiver"), strict=True))
+        # Numbers below 0 stand for names.
+        names = {code: name for name, code in self.path.unknown.items()}
+        ids = assign_ids(names.get(node, node) for pair in listed for node in pair)
+        pairs = [(ids[names.get(i, i)], ids[names.get(j, j)]) for i, j in listed]
         has_probabilities = "delivery_probability" in columns
-        ones = [1.0] * len(senders)
+        ones = [1.0] * len(pairs)
         values = columns["delivery_probability"].tolist() if has_probabilities else ones
-        for row, (i, j, p) in enumerate(zip(senders, receivers, values, strict=True)):
+        for row, ((i, j), p) in enumerate(zip(pairs, values, strict=True)):
             if i == j or not 0.0 <= p <= 1.0:
                 rule = f"{columns.where(row)}: rows must join two nodes with a probability"
-                raise ScenarioError("path", rule, [i, j, p], "correct the row")
-        pairs = list(zip(senders, receivers, strict=True))
+                ends = [names.get(node, node) for node in listed[row]]
+                raise ScenarioError("path", rule, [*ends, p], "correct the row")
         rule = "each direction must be listed once, with one probability"
         first = first_rows(columns, pairs, values, rule)
         probability = {pair: values[row] for pair, row in first.items()}
         use = count_rows(self.path.name, pairs, probability.__contains__)
-        return _Table(probability, has_probabilities, use)
+        texts = {name: ids[name] for name in names.values()}
+        return LinkTable(use, probability, has_probabilities, self.directed, names=texts)
 
-    def _add_reverse_links(self, table: _Table) -> _Table:
-        """Return the table with the reverse of each row added, for a table that lists every
-        undirected link once; unchanged if links are directed or any is listed both ways.
 
-        Raises ScenarioError if ``minimum`` needs probabilities that the table does not have.
-        """
-        if self.minimum is not None and not table.has_probabilities:
-            raise ScenarioError(
-                "minimum",
-                "needs a column delivery_probability in the table",
-                self.minimum,
-                "add the column or leave minimum out",
-            )
-        probability = table.probability
-        if self.directed or any((j, i) in probability for i, j in probability):
-            return table
-        reverse = {(j, i): p for (i, j), p in probability.items()}
-        return table._replace(probability=probability | reverse)
-
-    def _links(self, delivery: dict[Link, float]) -> set[Link]:
-        """Return the directions (sender, receiver) whose probability in ``delivery`` reaches the
-        minimum, in both directions if the graph is undirected. Raises ScenarioError if there are
-        none.
-        """
-        minimum = 0.0 if self.minimum is None else self.minimum
-        links = {
-            (i, j)
-            for (i, j), p in delivery.items()
-            if p >= minimum and (self.directed or delivery.get((j, i), 0.0) >= minimum)
-        }
-        if not links:
-            raise ScenarioError(
-                "path" if self.minimum is None else "minimum",
-                "no link of the table is left",
-                self.minimum,
-                "lower minimum or add rows",
-            )
-        return links
-
-    def _delivery(self, delivery: dict[Link, float], links: set[Link]) -> dict[Link, float]:
-        """Return the delivery probability of each direction (sender, receiver) of the ``links``, 0
-        where the table ``delivery`` does not list it.
-        """
-        pairs = links if self.directed else links | {(j, i) for i, j in links}
-        return {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
-
-    def _positions(
-        self, nodes: set[int], left_out: set[int]
-    ) -> tuple[dict[int, tuple[float, float]] | None, RowUse | None]:
-        """Return the coordinates (x, y) of ``nodes`` (ids) by node, and the use of the table's
-        rows; None for both without a file. Rows of nodes that are ``left_out`` count as used.
-        """
-        if self.positions is None:
-            return None, None
-        try:
-            points, row_nodes = _read_positions(self.positions)
-        except ScenarioError as error:
-            # These errors name "path", which here is the key of the other table.
-            raise ScenarioError("positions", error.rule, error.value, error.remedy) from None
-        missing = sorted(nodes - points.keys())
-        if missing:
-            rule = f"{self.positions.name} must place every node"
-            raise ScenarioError("positions", rule, missing, "add their rows")
-        use = count_rows(self.positions.name, row_nodes, (nodes | left_out).__contains__)
-        return {node: points[node] for node in sorted(nodes)}, use
+def _place_nodes(
+    source: SourceFile | None, nodes: set[int], left_out: set[int], names: Mapping[str, int]
+) -> tuple[dict[int, tuple[float, float]] | None, RowUse | None]:
+    """Return the coordinates (x, y) of ``nodes`` (ids) by node, and the use of the table's rows;
+    None for both without a file. Rows of nodes that are ``left_out`` count as used.
+    """
+    if source is None:
+        return None, None
+    try:
+        points, row_nodes = _read_positions(source)
+        # Nodes that the graph does not have may be placed too.
+        ids = {code: names.get(name, code) for name, code in source.unknown.items()}
+    except ScenarioError as error:
+        # These errors name "path", which here is the key of the other table.
+        raise ScenarioError("positions", error.rule, error.value, error.remedy) from None
+    points = {ids.get(node, node): point for node, point in points.items()}
+    row_nodes = [ids.get(node, node) for node in row_nodes]
+    missing = sorted(nodes - points.keys())
+    if missing:
+        labels = {node: name for name, node in names.items()}
+        rule = f"{source.name} must place every node"
+        listed = [labels.get(node, node) for node in missing]
+        raise ScenarioError("positions", rule, listed, "add their rows")
+    use = count_rows(source.name, row_nodes, (nodes | left_out).__contains__)
+    return {node: points[node] for node in sorted(nodes)}, use
 
 
 def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]], list[int]]:
@@ -581,32 +715,31 @@ def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]],
     if len(names) < 3:
         rule = f"{source.name} must have the columns node, x, y"
         raise ScenarioError("path", rule, list(names), "add what is missing")
-    columns = read_columns(source, names)
+    columns = read_columns(source, names, nodes=names[:1])
     points = list(zip(columns[names[1]].tolist(), columns[names[2]].tolist(), strict=True))
     ids = columns.integers(names[0])
     first = first_rows(columns, ids, points, "a node must have one position")
     return {node: points[row] for node, row in first.items()}, ids
 
 
-def _isolated_note(nodes: set[int], minimum: float) -> tuple[str, ...]:
-    """Return a note on ``nodes`` (ids) that are left out because they have no link whose
+def _isolated_note(nodes: Sequence[str], minimum: float) -> tuple[str, ...]:
+    """Return a note on ``nodes`` (names) that are left out because they have no link whose
     probability reaches ``minimum``, none if there are no such nodes.
     """
     if not nodes:
         return ()
-    listed = ", ".join(map(str, sorted(nodes)))
     plural = "" if len(nodes) == 1 else "s"
-    return (f"node{plural} {listed} left out: no link reaches the minimum {minimum:g}",)
+    return (f"node{plural} {', '.join(nodes)} left out: no link reaches the minimum {minimum:g}",)
 
 
-def _one_way_note(pairs: list[Link]) -> tuple[str, ...]:
+def _one_way_note(pairs: list[Link], label: Callable[[int], str]) -> tuple[str, ...]:
     """Return a note on links that are left out because they are listed in one direction, if any."""
     if not pairs:
         return ()
-    return (f"links listed in one direction only left out: {_list_directions(pairs)}",)
+    return (f"links listed in one direction only left out: {_list_directions(pairs, label)}",)
 
 
-def _list_directions(pairs: list[Link], max_listed: int = 3) -> str:
+def _list_directions(pairs: list[Link], label: Callable[[int], str], max_listed: int = 3) -> str:
     """Return the first ``max_listed`` directions and the number of the others as text."""
-    text = ", ".join(f"{i} to {j}" for i, j in pairs[:max_listed])
+    text = ", ".join(f"{label(i)} to {label(j)}" for i, j in pairs[:max_listed])
     return text if len(pairs) <= max_listed else f"{text} and {len(pairs) - max_listed} more"

@@ -21,9 +21,9 @@ from netkf.core.fields import (
     SourceFile,
     definite_covariance,
     field,
-    integer,
     list_of,
     matrix,
+    node_id,
     source_file,
 )
 from netkf.core.repeated_rows import first_rows
@@ -231,7 +231,7 @@ class RecordedSensor(Sensor):
     path: SourceFile = field(source_file)
     H: FloatArray = field(matrix, default=None)
     R: FloatArray = field(definite_covariance, default=None)
-    nodes: tuple[int, ...] = field(list_of(integer(), "node ids"), default=None)
+    nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"), default=None)
 
     def __post_init__(self) -> None:
         """Take nodes, H and R from the table where they are not given; raise ScenarioError if H or
@@ -245,6 +245,9 @@ class RecordedSensor(Sensor):
             # The first phi' stands for H where one is needed at once.
             if record.regressors and len(rows.t) and H is self.H:
                 object.__setattr__(self, "H", readonly_array(rows.phi[:1]))
+        if record.regressors and self.H is None:
+            # No rows, or names of nodes that are not known yet.
+            object.__setattr__(self, "H", readonly_array(np.zeros((1, len(record.regressors)))))
         given: FloatArray | None = self.H
         if given is None:
             remedy = "add H = ..., or columns phi0, ... to the table"

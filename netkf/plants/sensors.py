@@ -25,9 +25,9 @@ from netkf.core.fields import (
     Component,
     definite_covariance,
     field,
-    integer,
     list_of,
     matrix,
+    node_id,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -51,7 +51,7 @@ class Sensor(Component):
     that are recorded.
     """
 
-    nodes: tuple[int, ...] = field(list_of(integer(), "node ids"))
+    nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"))
 
     linear: ClassVar[bool] = True
     """Whether readings are linear in the state."""

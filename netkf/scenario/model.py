@@ -34,12 +34,14 @@ from netkf.core.fields import (
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
+from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
 from netkf.plants.linear import LinearPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.names import bind_names
 from netkf.scenario.stamps import Time, restamp
 
 
@@ -52,7 +54,7 @@ class Network(Component):
     channel     losses and delays of messages
     """
 
-    graph: Graph = field(instance_of(Graph))
+    graph: Graph = field(graph_rule)
     activation: LinkClock | SlotActivation | None = field(
         instance_of(LinkClock, SlotActivation), default=None
     )
@@ -144,14 +146,22 @@ class ScenarioModel(Component):
     time: Time = field(instance_of(Time), default=Time())
 
     def __post_init__(self) -> None:
-        """Check the fields, and read tables anew that were read without ``time``; raises
-        ScenarioError for a mistake in either.
+        """Check the fields, and read tables anew that were read without ``time`` or names of nodes;
+        raises ScenarioError for a mistake in either.
         """
         super().__post_init__()
         for name in ("plant", "sensors", "network", "filter"):
             value = getattr(self, name)
             try:
                 object.__setattr__(self, name, restamp(value, self.time.stamps))
+            except ScenarioError as error:
+                raise error.under(name) from None
+        # Only graphs that are read, or made in Python, have nodes with names.
+        names = self.topology.names if self.network.graph.may_name_nodes else {}
+        for name in ("sensors", "network", "filter"):
+            value = getattr(self, name)
+            try:
+                object.__setattr__(self, name, bind_names(value, names))
             except ScenarioError as error:
                 raise error.under(name) from None
 

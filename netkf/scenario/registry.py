@@ -13,7 +13,7 @@ from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
-from netkf.network import channels, clocks, graphs, matchings, recorded
+from netkf.network import channels, clocks, graph_files, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.nonlinear import BearingSensor, RangeBearingSensor, RangeSensor
@@ -81,6 +81,9 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "geometric": graphs.Geometric,
         "edges": graphs.Edges,
         "csv": graphs.CsvGraph,
+        "graphml": graph_files.GraphmlGraph,
+        "gml": graph_files.GmlGraph,
+        "edgelist": graph_files.EdgelistGraph,
     },
     "activation": {
         "poisson": clocks.Poisson,

@@ -19,6 +19,7 @@ from netkf.core.contracts import is_netkf_class
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file
 from netkf.network.channels import Channel
+from netkf.network.graph_files import as_graph
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
@@ -200,7 +201,8 @@ def _build_object(
         if rules[name] is source_file and isinstance(value, str):
             values[name] = SourceFile(value, origin.folder, origin.stamps)
         elif isinstance(value, SourceFile):
-            values[name] = dataclasses.replace(value, stamps=origin.stamps)
+            # It may have been read with names of nodes of another graph.
+            values[name] = SourceFile(value.name, value.folder, origin.stamps)
     if any(map(_has_missing_class, values.values())):
         # No object can be made yet, but mistakes in other fields are found before any import.
         for name, value in values.items():
@@ -332,7 +334,7 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
     """
     table = _as_dict(value)
     builders: dict[str, Callable[[Any], Any]] = {
-        "graph": partial(_build_component, "graph", origin),
+        "graph": lambda graph: _build_component("graph", origin, as_graph(graph)),
         "activation": partial(_build_activation, origin, time),
         "channel": partial(_build_channel, origin),
     }

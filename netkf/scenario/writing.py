@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,13 +23,29 @@ from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import Filtering, Network
+from netkf.scenario.names import map_nodes
 from netkf.scenario.registry import FAMILIES, FORMER, name_of
+
+
+class _Style(NamedTuple):
+    """How tables are written: with keys at their defaults or without, and with ``names`` of nodes,
+    by id.
+    """
+
+    with_defaults: bool = False
+    names: Mapping[int, str] = MappingProxyType({})
+
+
+def _style_of(scenario: DerivedScenario, with_defaults: bool = False) -> _Style:
+    """Return the style of the tables of a scenario, with the names of its nodes."""
+    names = scenario.topology.names
+    return _Style(with_defaults, {node: name for name, node in names.items()})
 
 
 def as_table(scenario: DerivedScenario) -> dict[str, Any]:
     """Return the tables of a scenario file, without values that are equal to their defaults."""
     return _scenario_table(
-        scenario, scenario.plant, scenario.network, scenario.filter, with_defaults=False
+        scenario, scenario.plant, scenario.network, scenario.filter, _style_of(scenario)
     )
 
 
@@ -48,7 +66,7 @@ def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
     )
     # A second Scenario of these parts would build and check the whole network again.
     resolved_plant = _resolve_plant(scenario)
-    return _scenario_table(scenario, resolved_plant, network, filtering, with_defaults=True)
+    return _scenario_table(scenario, resolved_plant, network, filtering, _style_of(scenario, True))
 
 
 def _resolve_plant(scenario: DerivedScenario) -> Plant:
@@ -62,20 +80,20 @@ def _scenario_table(
     plant: Plant,
     network: Network,
     filtering: Filtering,
-    with_defaults: bool,
+    style: _Style,
 ) -> dict[str, Any]:
     """Return the tables of a scenario file, with these components instead of the scenario's own.
 
-    ``with_defaults``: keys at their defaults are written too.
+    By ``style`` keys at their defaults are written too.
     """
-    table = _field_values(scenario, with_defaults)
+    table = _field_values(scenario, style)
     table.pop("time", None)
-    if time := _field_values(scenario.time, with_defaults):
+    if time := _field_values(scenario.time, style):
         table["time"] = time
-    table["plant"] = _kind_table("plant", plant, with_defaults)
-    table["sensors"] = [_sensor_table(sensor, with_defaults) for sensor in scenario.sensors]
-    table["network"] = _network_table(network, with_defaults)
-    table["filter"] = _filter_table(filtering, with_defaults)
+    table["plant"] = _kind_table("plant", plant, style)
+    table["sensors"] = [_sensor_table(sensor, style) for sensor in scenario.sensors]
+    table["network"] = _network_table(network, style)
+    table["filter"] = _filter_table(filtering, style)
     return {"format": 1, **table}
 
 
@@ -86,69 +104,70 @@ def part_as_table(part: Component) -> dict[str, Any]:
     a Belief.
     """
     if isinstance(part, Network):
-        return _network_table(part, with_defaults=False)
+        return _network_table(part, _Style())
     if isinstance(part, Channel):
-        return _channel_table(part, with_defaults=False)
+        return _channel_table(part, _Style())
     if isinstance(part, Filtering):
-        return _filter_table(part, with_defaults=False)
+        return _filter_table(part, _Style())
     if isinstance(part, Sensor):
-        return _sensor_table(part, with_defaults=False)
+        return _sensor_table(part, _Style())
     families = (family for family, base in FAMILIES.items() if isinstance(part, base))
     family = next(families, "filter" if isinstance(part, FORMER["filter"]) else None)
     if family == "sampling" and isinstance(part, FAMILIES["activation"]):
         family = "activation"  # every clock of links is of both families
     if family is None:
-        return _field_values(part, with_defaults=False)
-    return _kind_table(family, part, with_defaults=False)
+        return _field_values(part, _Style())
+    return _kind_table(family, part, _Style())
 
 
-def _network_table(network: Network, with_defaults: bool) -> dict[str, Any]:
+def _network_table(network: Network, style: _Style) -> dict[str, Any]:
     """Return the table ``network``."""
-    table = {"graph": _kind_table("graph", network.graph, with_defaults)}
+    table = {"graph": _kind_table("graph", network.graph, style)}
     if network.activation is not None:
-        table["activation"] = _kind_table("activation", network.activation, with_defaults)
-    return {**table, "channel": _channel_table(network.channel, with_defaults)}
+        table["activation"] = _kind_table("activation", network.activation, style)
+    return {**table, "channel": _channel_table(network.channel, style)}
 
 
-def _channel_table(channel: Channel, with_defaults: bool) -> dict[str, Any]:
+def _channel_table(channel: Channel, style: _Style) -> dict[str, Any]:
     """Return the table ``network.channel``; all of its own keys are written."""
-    table = _field_values(channel, with_defaults=True)
-    table["loss"] = _kind_table("loss", channel.loss, with_defaults)
-    table["delay"] = _kind_table("delay", channel.delay, with_defaults)
+    table = _field_values(channel, style._replace(with_defaults=True))
+    table["loss"] = _kind_table("loss", channel.loss, style)
+    table["delay"] = _kind_table("delay", channel.delay, style)
     return table
 
 
-def _sensor_table(sensor: Sensor, with_defaults: bool) -> dict[str, Any]:
+def _sensor_table(sensor: Sensor, style: _Style) -> dict[str, Any]:
     """Return the table of a sensor with its sampling clock."""
-    table = _kind_table("sensor", sensor, with_defaults)
+    table = _kind_table("sensor", sensor, style)
     clock = getattr(sensor, "sampling", None)
     if clock is not None:
-        clock_table = _kind_table("sampling", clock, with_defaults)
+        clock_table = _kind_table("sampling", clock, style)
         # Fields of clocks of links, which a sampling clock must not have.
         table["sampling"] = {k: v for k, v in clock_table.items() if k not in ("at", "rates")}
     return table
 
 
-def _filter_table(filtering: Filtering, with_defaults: bool) -> dict[str, Any]:
+def _filter_table(filtering: Filtering, style: _Style) -> dict[str, Any]:
     """Return the table ``filter``: the algorithm's keys, the initial estimate and the model."""
-    table = _kind_table("filter", filtering.algorithm, with_defaults)
-    for name, value in _field_values(filtering, with_defaults).items():
+    table = _kind_table("filter", filtering.algorithm, style)
+    for name, value in _field_values(filtering, style).items():
         if name in ("mean", "cov"):
             table[name] = value
-    model = _field_values(filtering.model, with_defaults)
+    model = _field_values(filtering.model, style)
     return {**table, "model": model} if model else table
 
 
-def _kind_table(family: str, part: Component, with_defaults: bool) -> dict[str, Any]:
+def _kind_table(family: str, part: Component, style: _Style) -> dict[str, Any]:
     """Return the table of a component of a family of registry.KINDS, with its key ``kind``."""
     kind, choice = split_choice(name_of(family, part))
-    return {"kind": kind, **choice, **_field_values(part, with_defaults)}
+    return {"kind": kind, **choice, **_field_values(part, style)}
 
 
-def _field_values(part: Component, with_defaults: bool) -> dict[str, Any]:
+def _field_values(part: Component, style: _Style) -> dict[str, Any]:
     """Return the fields of a component as TOML values by name.
 
-    Fields that are None are left out, and without ``with_defaults`` those equal to their defaults.
+    Fields that are None are left out, and unless the ``style`` is with defaults those equal to
+    them.
     """
     table: dict[str, Any] = {}
     for field in dataclasses.fields(part):
@@ -158,19 +177,22 @@ def _field_values(part: Component, with_defaults: bool) -> dict[str, Any]:
         is_default = field.default is not dataclasses.MISSING and (
             value is field.default or (not isinstance(value, np.ndarray) and value == field.default)
         )
-        if value is not None and (with_defaults or not is_default):
-            table[field.name] = _toml_value(value, with_defaults)
+        rule = field.metadata.get("rule")
+        if style.names and rule is not None and rule.of_nodes:
+            value = map_nodes(value, lambda node: style.names.get(node, node))
+        if value is not None and (style.with_defaults or not is_default):
+            table[field.name] = _toml_value(value, style)
     return table
 
 
-def _toml_value(value: Any, with_defaults: bool) -> Any:
+def _toml_value(value: Any, style: _Style) -> Any:
     """Return the value of a field with lists for arrays and tuples, and tables for filters."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, tuple):
-        return [_toml_value(item, with_defaults) for item in value]
+        return [_toml_value(item, style) for item in value]
     if isinstance(value, Filter):  # a filter inside another one
-        return _kind_table("filter", value, with_defaults)
+        return _kind_table("filter", value, style)
     return value
 
 

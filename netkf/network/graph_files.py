@@ -1,0 +1,210 @@
+"""Graphs in the formats that networkx reads, and graphs of networkx itself."""
+
+from __future__ import annotations
+
+import io
+import math
+import numbers
+import sys
+from abc import abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from netkf.core.csv_files import read_content
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import Rule, SourceFile, boolean, field, number, source_file
+from netkf.core.repeated_rows import count_rows
+from netkf.network.graphs import Edges, Graph, Link, LinkTable, Topology, assign_ids
+
+if TYPE_CHECKING:
+    import networkx
+
+PROBABILITY = "delivery_probability"
+"""The attribute of an edge that is the probability that its messages arrive."""
+
+
+@dataclass(frozen=True, eq=False)
+class GraphFile(Graph):
+    """The contract of a graph that networkx reads from a file, with ids or names of nodes.
+
+    Links are directed if the file says so. Edges may have an attribute ``delivery_probability``;
+    ``minimum`` and ``positions`` are those of CsvGraph.
+    """
+
+    may_name_nodes: ClassVar[bool] = True
+
+    path: SourceFile = field(source_file)
+    minimum: float | None = field(number(low=0.0, high=1.0), default=None)
+    positions: SourceFile | None = field(source_file, default=None)
+
+    @abstractmethod
+    def read(self, content: bytes) -> networkx.Graph[Any]:
+        """Return the graph in the ``content`` of a file; may raise whatever networkx raises."""
+
+    def build(self, seed: int) -> Topology:
+        """Return the links of the file that reach the minimum, with their delivery probabilities;
+        raises ScenarioError if the file is wrong or no link is left. ``seed`` is not used.
+        """
+        content = read_content(self.path)
+        try:
+            graph = self.read(content)
+        except Exception as error:  # of many kinds, also from parsers below networkx
+            rule = f"{self.path.name} cannot be read by networkx"
+            reason = f"{type(error).__name__}: {error}"
+            raise ScenarioError("path", rule, reason, "correct the file or the kind") from None
+        try:
+            table = _read_links(graph, self.path.name)
+        except ScenarioError as error:
+            rule = f"{self.path.name}: {error.rule}"
+            raise ScenarioError("path", rule, error.value, error.remedy) from None
+        return table.topology(self.minimum, self.positions)
+
+
+@dataclass(frozen=True, eq=False)
+class GraphmlGraph(GraphFile):
+    """A graph from a GraphML file."""
+
+    def read(self, content: bytes) -> networkx.Graph[Any]:
+        """Return the graph of a GraphML document."""
+        import networkx
+
+        graph: networkx.Graph[Any] = networkx.read_graphml(io.BytesIO(content))
+        return graph
+
+
+@dataclass(frozen=True, eq=False)
+class GmlGraph(GraphFile):
+    """A graph from a GML file; nodes are known by their labels, or without these by their ids."""
+
+    def read(self, content: bytes) -> networkx.Graph[Any]:
+        """Return the graph of a GML document."""
+        import networkx
+
+        text = content.decode("utf-8-sig")
+        label = "label" if "label" in text else "id"
+        try:
+            graph: networkx.Graph[Any] = networkx.parse_gml(text, label=label)
+        except networkx.NetworkXError:
+            # Some nodes have no label, or several have one.
+            graph = networkx.parse_gml(text, label="id")
+        return graph
+
+
+@dataclass(frozen=True, eq=False)
+class EdgelistGraph(GraphFile):
+    """A graph from an edge list of networkx: two nodes a line, then maybe attributes, as in
+    ``lab roof {"delivery_probability": 0.9}``. The file does not say if links are ``directed``.
+    """
+
+    directed: bool = field(boolean, default=False)
+
+    def read(self, content: bytes) -> networkx.Graph[Any]:
+        """Return the graph of an edge list."""
+        import networkx
+
+        # A graph with parallel edges, so that a link that is listed again is seen.
+        cls = networkx.MultiDiGraph if self.directed else networkx.MultiGraph
+        lines = content.decode("utf-8-sig").splitlines()
+        graph: networkx.Graph[Any] = networkx.parse_edgelist(lines, create_using=cls)
+        listed = sum(bool(line.split("#")[0].strip()) for line in lines)
+        if graph.number_of_edges() != listed:
+            # networkx passes over lines that have no two nodes.
+            raise ValueError(f"{listed - graph.number_of_edges()} lines without two nodes")
+        return graph
+
+
+def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
+    """Return the links of a networkx graph, which was read from the file ``path``.
+
+    Raises ScenarioError, at no key, for an edge that is no link, and for two values of one link.
+    """
+    ids = assign_ids(graph.nodes)
+    if len(set(ids.values())) < len(ids):
+        twice = sorted(
+            str(label) for label in ids if str(label) in ids and not isinstance(label, str)
+        )
+        raise ScenarioError("", "two nodes have the same name", twice, "rename one")
+    directed, edges = graph.is_directed(), list(graph.edges(data=PROBABILITY))
+    has_probabilities = any(p is not None for *_, p in edges)
+    pairs: list[Link] = []
+    probability: dict[Link, float] = {}
+    for first, second, value in edges:
+        ends, p = [str(first), str(second)], 1.0 if value is None else value
+        if first == second:
+            raise ScenarioError("", "a link must join two nodes", ends, "correct the edge")
+        if has_probabilities and not _is_probability(value):
+            rule = f"every edge must have a {PROBABILITY} from 0 to 1, or none"
+            raise ScenarioError("", rule, [*ends, value], "correct the edge")
+        link = ids[first], ids[second]
+        link = link if directed else (min(link), max(link))
+        pairs.append(link)
+        if probability.setdefault(link, float(p)) != p:
+            rule = "two edges say different things of one link"
+            got = [*ends, probability[link], p]
+            raise ScenarioError("", rule, got, "correct one of the two edges")
+    alone = frozenset(ids.values()) - {node for link in pairs for node in link}
+    names = {str(label): k for label, k in ids.items() if str(k) != str(label)}
+    use = count_rows(path, pairs, probability.__contains__)
+    return LinkTable(use, probability, has_probabilities, directed, alone, names)
+
+
+def _is_probability(value: Any) -> bool:
+    """Return True for a number from 0 to 1."""
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return is_number and 0.0 <= float(value) <= 1.0
+
+
+def from_networkx(graph: networkx.Graph[Any]) -> Edges:
+    """Return the nodes and links of a networkx graph, with the attribute ``delivery_probability``
+    of its edges, and the places of nodes with an attribute ``pos``, or ``x`` and ``y``.
+
+    Nodes are named by their texts; integers are ids. Raises ScenarioError, at no key, for an edge
+    that is no link, and for two values of one link.
+    """
+    table = _read_links(graph, "graph")
+    labels = {k: name for name, k in table.names.items()}
+    nodes = tuple(labels.get(k, k) for k in assign_ids(graph.nodes).values())
+    links = list(table.probability)
+    return Edges(
+        edges=tuple((labels.get(i, i), labels.get(j, j)) for i, j in links),
+        nodes=nodes,
+        directed=table.directed,
+        delivery=list(table.probability.values()) if table.has_probabilities else None,
+        positions=_positions(graph.nodes.values()),
+    )
+
+
+def _positions(attributes: Iterable[dict[str, Any]]) -> list[list[float]] | None:
+    """Return (x, y) of each node from its attributes, None unless all nodes have a place."""
+    points = []
+    for node in attributes:
+        point = node.get("pos", (node.get("x"), node.get("y")))
+        try:
+            x, y = map(float, point)
+        except (TypeError, ValueError):
+            return None
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return None
+        points.append([x, y])
+    return points or None
+
+
+def as_graph(value: Any) -> Any:
+    """Return a networkx graph as Edges, and other values as they are."""
+    # networkx takes a second to import: who has a graph of it has imported it.
+    networkx = sys.modules.get("networkx")
+    is_networkx = networkx is not None and isinstance(value, networkx.Graph)
+    return from_networkx(value) if is_networkx else value
+
+
+def _convert_graph(value: Any) -> Graph:
+    """Return a Graph, made from a graph of networkx if it is one; raises TypeError for others."""
+    graph = as_graph(value)
+    if not isinstance(graph, Graph):
+        raise TypeError
+    return graph
+
+
+graph_rule = Rule("must be a graph", _convert_graph, 'write a table { kind = "...", ... }')
+"""The rule for the graph of a network, which may be a graph of networkx."""

@@ -1,0 +1,84 @@
+"""Names of nodes, in fields and tables of a scenario: it replaces them by ids."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from netkf.core.errors import ScenarioError, suggest_nearest
+from netkf.core.fields import Component, SourceFile
+from netkf.network.graphs import Graph
+
+Names = Mapping[str, int]
+"""The ids of nodes by name."""
+
+
+def bind_names(value: Any, names: Names) -> Any:
+    """Return a component, or a tuple of components, with ids in place of ``names`` of nodes, in its
+    fields and in the tables that it reads; the same object if it has none. Graphs, which know
+    their own names, are left as they are.
+
+    Raises ScenarioError for a name that the graph does not have.
+    """
+    if isinstance(value, SourceFile):
+        # A table that was read with other names, or without those that it has, is read again.
+        is_read = value.node_ids == names or not (names or value.node_ids or value.unknown)
+        return value if is_read else dataclasses.replace(value, node_ids=names, unknown={})
+    if isinstance(value, tuple) and value and isinstance(value[0], Component):
+        items = tuple(_bind_at(f"[{k}]", item, names) for k, item in enumerate(value))
+        return value if all(a is b for a, b in zip(items, value, strict=True)) else items
+    if not isinstance(value, Component) or isinstance(value, Graph):
+        return value
+    changed = {}
+    for field in dataclasses.fields(value):
+        if not field.init:
+            continue
+        item = getattr(value, field.name)
+        rule = field.metadata.get("rule")
+        if rule is not None and rule.of_nodes:
+            bound = _bind_field(field.name, item, names)
+        else:
+            bound = _bind_at(field.name, item, names)
+        if bound is not item:
+            changed[field.name] = bound
+    return dataclasses.replace(value, **changed) if changed else value
+
+
+def _bind_at(key: str, value: Any, names: Names) -> Any:
+    """Return ``bind_names(value, names)``; put ``key`` before the keys of its errors."""
+    try:
+        return bind_names(value, names)
+    except ScenarioError as error:
+        raise error.under(key) from None
+
+
+def _bind_field(key: str, value: Any, names: Names) -> Any:
+    """Return the value of a field of nodes with ids for names; None, the default, for nodes that
+    were taken from a table that is read again.
+    """
+
+    def find(name: Any) -> Any:
+        """Return the id of a node."""
+        if not isinstance(name, str):
+            return name
+        if name in names:
+            return names[name]
+        if name.isdecimal() and str(int(name)) == name:
+            return int(name)
+        remedy = f"{suggest_nearest(name, names)}correct it, or name the nodes in the graph"
+        raise ScenarioError(key, "must name a node of the graph", name, remedy)
+
+    if isinstance(value, tuple) and any(isinstance(item, int) and item < 0 for item in value):
+        return None
+    return map_nodes(value, find)
+
+
+def map_nodes(value: Any, change: Callable[[Any], Any]) -> Any:
+    """Return the value of a field of nodes with ``change`` applied to each node: a node, a tuple of
+    nodes, or a tuple of tuples of nodes and a number. The same object if nothing changes.
+    """
+    if isinstance(value, tuple):
+        items = tuple(map_nodes(item, change) for item in value)
+        return value if all(a is b for a, b in zip(items, value, strict=True)) else items
+    return value if isinstance(value, float) else change(value)
