@@ -15,8 +15,8 @@ from netkf.cli.options import (
     print_json,
     print_notes,
 )
-from netkf.core.errors import ScenarioError
-from netkf.core.printable import shorten
+from netkf.core.errors import ScenarioError, quote
+from netkf.core.printable import MAX_NAME, shorten
 
 if TYPE_CHECKING:
     from netkf.studies.why import Why
@@ -29,7 +29,10 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("directory", type=Path, metavar="DIR", help="run directory")
     parser.add_argument(
-        "--node", type=int, metavar="I", help="id of the node (default: the worst node)"
+        "--node",
+        type=_parse_node,
+        metavar="I",
+        help="id or name of the node (default: the worst node)",
     )
     parser.add_argument(
         "--at",
@@ -59,6 +62,14 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     add_trust(parser, "DIR")
     parser.add_argument("--out", type=Path, help="directory for the answer and its table")
     add_json(parser)
+
+
+def _parse_node(text: str) -> str:
+    """Return the id or the name of a node; raises ArgumentTypeError for a text that is neither."""
+    if not text.strip() or len(text) > MAX_NAME:
+        rule = f"must be the id or the name of a node, of at most {MAX_NAME} characters"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return text.strip()
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -22,7 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.errors import ScenarioError, suggest_nearest
-from netkf.core.fields import MAX_MAGNITUDE, MAX_NAME, SourceFile
+from netkf.core.fields import MAX_MAGNITUDE, SourceFile
+from netkf.core.printable import MAX_NAME
 from netkf.linalg.arrays import FloatArray
 
 MAX_BYTES = 256 << 20  # of a table, unpacked; it limits the memory that reading takes
@@ -68,7 +69,9 @@ class Columns(dict[str, FloatArray]):
         if wrong.size:
             rule = f"{self.where(int(wrong[0]))}: {name} must hold integers from 0 to 2^53"
             raise ScenarioError("path", rule, float(column[wrong[0]]), "correct it")
-        return [int(value) for value in column]
+        # Ids of nodes that have names are printed as these.
+        named = {int(node): node for node in (self.source.node_ids or {}).values()}
+        return [named.get(int(value), int(value)) for value in column]
 
 
 def read_columns(

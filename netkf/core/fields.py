@@ -20,6 +20,7 @@ import numpy as np
 
 from netkf.core.contracts import hold_to_contract, is_netkf_class
 from netkf.core.errors import ScenarioError
+from netkf.core.printable import MAX_NAME
 from netkf.core.stamps import TimeBase
 from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
 
@@ -521,9 +522,6 @@ def tuple_of(*rules: Rule, description: str) -> Rule:
     }
     of_nodes = any(rule.of_nodes for rule in rules)
     return Rule(f"must be {description}", convert, f"write {description}", schema, of_nodes)
-
-
-MAX_NAME = 200  # characters of the name of a node
 
 
 def node_id(low: int | None = None, high: int | None = None) -> Rule:

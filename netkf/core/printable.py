@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+MAX_NAME = 200
+"""Longest name of a node, in characters."""
+
 
 def printable(text: str, keep: str = "\n\t") -> str:
     """Return a text with control and format characters escaped as in ``repr``, except ``keep``.

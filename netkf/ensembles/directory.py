@@ -204,7 +204,13 @@ class _DirectoryWriter:
         self.blocks = BlockCheckpoints(directory, scenario)
         name, seed = scenario.name, scenario.seed
         self._manifest = Manifest(
-            directory=directory, name=name, seed=seed, replica=0, engine=plan.engine, runs=plan.runs
+            directory=directory,
+            name=name,
+            seed=seed,
+            replica=0,
+            engine=plan.engine,
+            runs=plan.runs,
+            node_names=scenario.topology.names,
         )
         self._known: list[int] = []
         self._done = self.simulated = 0

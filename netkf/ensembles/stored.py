@@ -15,6 +15,7 @@ from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of
 from netkf.ensembles.statistics import MESSAGES, merge
 from netkf.linalg.arrays import FloatArray
+from netkf.network.graphs import name_rows
 from netkf.runs.documents import COUNT, NUMBER, DamagedError, check_files
 from netkf.runs.files import scenario_digest
 from netkf.runs.parquet_files import column_names, read_numbers
@@ -81,6 +82,7 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
         return StoredEnsemble(**values, **stored, summary={})
     check_files(directory, manifest, ["ensemble.parquet", "summary.json"])
     summary = read_checked_document(directory, "summary.json", FORM)
+    name_rows(summary["nodes"])
     samples = _read_samples(directory / "ensemble.parquet", scenario)
     rows = [*summary["nodes"], summary["overall"]]
     if [row["node"] for row in summary["nodes"]] != list(scenario.nodes):

@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.ensembles.statistics import MESSAGES, RunStatistics
 from netkf.linalg.arrays import FloatArray
+from netkf.network.graphs import node_columns
 from netkf.runs.summary import CONFIDENCE, PromisedTraces, nees_bounds, summary_notes
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
@@ -31,7 +32,7 @@ def summarise_ensemble(
     rows = [_make_row(*values) for values in zip(mean, error, bound, strict=True)]
     messages = statistics.messages.mean[0].tolist()
     messages_se = statistics.messages.standard_error()[0].tolist()
-    nodes = [{"node": node, **row} for node, row in zip(scenario.nodes, rows[:-1], strict=True)]
+    nodes = [node_columns(node) | row for node, row in zip(scenario.nodes, rows[:-1], strict=True)]
     summary: dict[str, Any] = {
         "runs": statistics.runs,
         "diverged": int(statistics.totals[1]),

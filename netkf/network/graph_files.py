@@ -7,6 +7,7 @@ import math
 import numbers
 import sys
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -120,11 +121,9 @@ def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
     Raises ScenarioError, at no key, for an edge that is no link, and for two values of one link.
     """
     ids = assign_ids(graph.nodes)
-    if len(set(ids.values())) < len(ids):
-        twice = sorted(
-            str(label) for label in ids if str(label) in ids and not isinstance(label, str)
-        )
-        raise ScenarioError("", "two nodes have the same name", twice, "rename one")
+    twice = [name for name, count in Counter(map(str, ids)).items() if count > 1]
+    if twice:
+        raise ScenarioError("", "two nodes have one name", twice[0], "rename one of them")
     directed, edges = graph.is_directed(), list(graph.edges(data=PROBABILITY))
     has_probabilities = any(p is not None for *_, p in edges)
     pairs: list[Link] = []

@@ -46,6 +46,45 @@ MAX_NODES, MAX_LINKS = 200_000, 1_000_000
 MAX_DRAWN = 400_000  # nodes and links of all graphs drawn in search of a connected one
 
 
+class NamedNode(int):
+    """The id of a node that the graph's file names: an integer that is printed as the ``name``."""
+
+    name: str
+
+    def __new__(cls, node: int, name: str) -> NamedNode:
+        """Return the id ``node`` with its name."""
+        named = super().__new__(cls, node)
+        named.name = name
+        return named
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __repr__(self) -> str:
+        return repr(self.name)
+
+    def __format__(self, spec: str) -> str:
+        """Return the name, or the id by a format of numbers."""
+        return format(int(self), spec) if spec else self.name
+
+    def __reduce__(self) -> tuple[type[NamedNode], tuple[int, str]]:
+        return NamedNode, (int(self), self.name)
+
+
+def node_columns(node: int) -> dict[str, Any]:
+    """Return a node in a row of a document: its id ``node`` and, if it has one, its ``name``."""
+    return {"node": node} | ({"name": node.name} if isinstance(node, NamedNode) else {})
+
+
+def name_rows(rows: Iterable[dict[str, Any]]) -> None:
+    """Put named ids in the place of ``node`` in rows of a document that was read, in place, where
+    they have a ``name``.
+    """
+    for row in rows:
+        if isinstance(row.get("name"), str):
+            row["node"] = NamedNode(row["node"], row["name"])
+
+
 @dataclass(frozen=True, eq=False)
 class Topology:
     """The nodes and links of one network.
@@ -70,14 +109,26 @@ class Topology:
     tables: Mapping[str, RowUse] = dataclasses.field(default_factory=dict)
     names: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
-    @cached_property
-    def _labels(self) -> dict[int, str]:
-        """The name of each node that has one, by id."""
-        return {node: name for name, node in self.names.items()}
+    def __post_init__(self) -> None:
+        """Put named ids in the place of the ids of nodes that have names."""
+        if not self.names:
+            return
+        named = {k: NamedNode(k, name) for name, k in self.names.items()}
+        links = tuple((named.get(i, i), named.get(j, j)) for i, j in self.links)
+        object.__setattr__(self, "names", {node.name: node for node in named.values()})
+        object.__setattr__(self, "nodes", tuple(named.get(k, k) for k in self.nodes))
+        object.__setattr__(self, "links", links)
 
-    def label(self, node: int) -> str:
-        """Return the name of a node as the graph's file has it: a text, or its id."""
-        return self._labels.get(node, str(node))
+    def named(self, node: int) -> int:
+        """Return the id of a ``node`` so that it is printed as its name."""
+        return self.nodes[self.index[node]]
+
+    def find(self, name: str) -> int | None:
+        """Return the id of the node with a name, which may be an id as text; None if no node has
+        it.
+        """
+        node = self.names.get(name, _as_integer(name))
+        return self.named(node) if node in self.index else None
 
     @cached_property
     def index(self) -> dict[int, int]:

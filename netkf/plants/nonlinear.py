@@ -27,6 +27,7 @@ from netkf.core.fields import (
     integer,
     list_of,
     matrix,
+    node_id,
     one_of,
     source_file,
 )
@@ -270,7 +271,7 @@ class PositionedSensor(NonlinearSensor):
     states     which components of the state are the target's position
     """
 
-    nodes: tuple[int, ...] = field(list_of(integer(), "node ids"), default=None)
+    nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"), default=None)
     R: FloatArray = field(definite_covariance, default=None)
     positions: str | FloatArray = field(either(one_of(GRAPH), matrix, has_depth(1)), default=GRAPH)
     states: tuple[int, ...] = field(list_of(integer(low=0), "numbers of states"), default=(0, 1))

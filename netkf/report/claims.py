@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -198,7 +199,7 @@ def _explain_worst(
 
     ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent.
     """
-    worst = samples.explained
+    worst, topology = samples.explained, source.scenario.topology
     received = messages[messages["receiver"] == worst.node]
     sentences = []
     if samples.start is not None:
@@ -207,7 +208,7 @@ def _explain_worst(
         # Messages that arrived later did not influence the sample.
         cutoff = float(source.cutoffs(np.array([worst.time]))[0])
         sentences.append(
-            _describe_last_messages(received, worst, cutoff)
+            _describe_last_messages(received, worst, cutoff, lambda k: str(topology.named(k)))
             + _judge_age(source, run, received, worst)
             + _compare_delivery(messages, received)
         )
@@ -262,12 +263,14 @@ def _judge_error(source: ReportSource, run: StoredRun, worst: WorstSample) -> li
     ]
 
 
-def _describe_last_messages(received: np.ndarray, worst: WorstSample, cutoff: float) -> str:
+def _describe_last_messages(
+    received: np.ndarray, worst: WorstSample, cutoff: float, label: Callable[[int], str]
+) -> str:
     """Return a sentence on the last message that the node of the worst sample had received from
     each neighbour by then, and on how many messages were lost or late since.
 
     ``received`` are the MESSAGE rows (M,) of all messages sent to that node, lost ones included;
-    only arrivals until ``cutoff`` (seconds) count.
+    only arrivals until ``cutoff`` (seconds) count. ``label`` returns the name of a node.
     """
     # For each sender the seconds since its last message that arrived was sent, inf without one.
     ages, missing = [], 0
@@ -280,7 +283,8 @@ def _describe_last_messages(received: np.ndarray, worst: WorstSample, cutoff: fl
         ages.append((max(0.0, worst.time - last_sent), sender))
     heard = sorted((entry for entry in ages if math.isfinite(entry[0])), reverse=True)
     oldest = [
-        f"node {sender} ({format_number(age)} s before)" for age, sender in heard[:MAX_LISTED]
+        f"node {label(sender)} ({format_number(age)} s before)"
+        for age, sender in heard[:MAX_LISTED]
     ]
     listed = "it had last heard " + ", ".join(oldest) if oldest else "it had heard no node"
     if len(heard) > MAX_LISTED:

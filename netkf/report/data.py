@@ -83,6 +83,7 @@ def run_data(
         "broadcasts": _is_broadcast(run),
         "n": run.x.shape[1],
         "nodes": list(run.nodes),
+        "names": [str(node) for node in run.nodes],
         "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],
         "positions": layout,
         "knowledge": source.knowledge,

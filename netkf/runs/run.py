@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 import traceback
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -221,7 +221,12 @@ def _create_output(
     channel = scenario.network.channel
     is_recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
     manifest = Manifest(
-        directory=directory, name=scenario.name, seed=seed, replica=replica, engine=engine
+        directory=directory,
+        name=scenario.name,
+        seed=seed,
+        replica=replica,
+        engine=engine,
+        node_names=scenario.topology.names,
     )
     # Written first, so that the directory of a process that is killed says "interrupted".
     manifest.write("interrupted", {})
@@ -282,7 +287,9 @@ def _event_totals(recorder: Recorder) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """The manifest.json of a directory of ``runs`` runs, numbered from ``replica`` on."""
+    """The manifest.json of a directory of ``runs`` runs, numbered from ``replica`` on, of a network
+    whose nodes have ``node_names``: ids by name.
+    """
 
     directory: Path
     name: str
@@ -290,6 +297,7 @@ class Manifest:
     replica: int
     engine: str
     runs: int = 1
+    node_names: Mapping[str, int] = field(default_factory=dict)
 
     def write(
         self,
@@ -313,6 +321,7 @@ class Manifest:
             "runs": {"wanted": self.runs, "done": int(completed_runs)},
             "engine": self.engine,
             "status": status,
+            **({"node_names": dict(self.node_names)} if self.node_names else {}),
             **totals,
         }
         if status == "failed" and error is not None:

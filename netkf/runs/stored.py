@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.network.graphs import name_rows
 from netkf.runs.documents import (
     COUNT,
     NUMBER,
@@ -147,6 +148,7 @@ def read_run(
     """
     check_files(directory, manifest, [*TABLE_FILES, "summary.json"])
     summary = read_checked_document(directory, "summary.json", SUMMARY_FORM)
+    name_rows(summary["nodes"])
     # In the directory of an ensemble the manifest and the summary are about all of its runs.
     is_single_run = replica is None
     if replica is None:

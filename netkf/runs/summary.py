@@ -14,6 +14,7 @@ from scipy.special import gammaincinv
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.network.graphs import node_columns
 from netkf.runs.labels import limit_label, mismatch_note, nees_note
 from netkf.runs.transmissions import Transmissions
 from netkf.scenario.scenario import Scenario
@@ -300,7 +301,7 @@ def _average_rows(
         overall = _averages(*(np.array([column.mean()]) for column in columns))
     # by_node: for each name a list of N values; overall: of one.
     nodes = [
-        {"node": node, **{name: values[k] for name, values in by_node.items()}}
+        node_columns(node) | {name: values[k] for name, values in by_node.items()}
         for k, node in enumerate(scenario.nodes)
     ]
     return nodes, {name: value for name, (value,) in overall.items()}

@@ -157,7 +157,7 @@ class ScenarioModel(Component):
             except ScenarioError as error:
                 raise error.under(name) from None
         # Only graphs that are read, or made in Python, have nodes with names.
-        names = self.topology.names if self.network.graph.may_name_nodes else {}
+        names = self.topology.names if self.network.graph.may_name_nodes else None
         for name in ("sensors", "network", "filter"):
             value = getattr(self, name)
             try:

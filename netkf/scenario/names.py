@@ -14,17 +14,18 @@ Names = Mapping[str, int]
 """The ids of nodes by name."""
 
 
-def bind_names(value: Any, names: Names) -> Any:
+def bind_names(value: Any, names: Names | None) -> Any:
     """Return a component, or a tuple of components, with ids in place of ``names`` of nodes, in its
     fields and in the tables that it reads; the same object if it has none. Graphs, which know
-    their own names, are left as they are.
+    their own names, are left as they are. ``names`` is None if nodes cannot have any.
 
     Raises ScenarioError for a name that the graph does not have.
     """
     if isinstance(value, SourceFile):
         # A table that was read with other names, or without those that it has, is read again.
-        is_read = value.node_ids == names or not (names or value.node_ids or value.unknown)
-        return value if is_read else dataclasses.replace(value, node_ids=names, unknown={})
+        ids = names or {}
+        is_read = value.node_ids == ids or not (ids or value.node_ids or value.unknown)
+        return value if is_read else dataclasses.replace(value, node_ids=ids, unknown={})
     if isinstance(value, tuple) and value and isinstance(value[0], Component):
         items = tuple(_bind_at(f"[{k}]", item, names) for k, item in enumerate(value))
         return value if all(a is b for a, b in zip(items, value, strict=True)) else items
@@ -37,7 +38,10 @@ def bind_names(value: Any, names: Names) -> Any:
         item = getattr(value, field.name)
         rule = field.metadata.get("rule")
         if rule is not None and rule.of_nodes:
-            bound = _bind_field(field.name, item, names)
+            # Nodes that were taken from a table are taken again, when it is read again.
+            codes = set(getattr(getattr(value, "path", None), "unknown", {}).values())
+            is_taken = isinstance(item, tuple) and bool(codes.intersection(item))
+            bound = None if is_taken else _bind_field(field.name, item, names)
         else:
             bound = _bind_at(field.name, item, names)
         if bound is not item:
@@ -45,7 +49,7 @@ def bind_names(value: Any, names: Names) -> Any:
     return dataclasses.replace(value, **changed) if changed else value
 
 
-def _bind_at(key: str, value: Any, names: Names) -> Any:
+def _bind_at(key: str, value: Any, names: Names | None) -> Any:
     """Return ``bind_names(value, names)``; put ``key`` before the keys of its errors."""
     try:
         return bind_names(value, names)
@@ -53,25 +57,21 @@ def _bind_at(key: str, value: Any, names: Names) -> Any:
         raise error.under(key) from None
 
 
-def _bind_field(key: str, value: Any, names: Names) -> Any:
-    """Return the value of a field of nodes with ids for names; None, the default, for nodes that
-    were taken from a table that is read again.
-    """
-
-    def find(name: Any) -> Any:
-        """Return the id of a node."""
-        if not isinstance(name, str):
-            return name
-        if name in names:
-            return names[name]
-        if name.isdecimal() and str(int(name)) == name:
-            return int(name)
-        remedy = f"{suggest_nearest(name, names)}correct it, or name the nodes in the graph"
-        raise ScenarioError(key, "must name a node of the graph", name, remedy)
-
-    if isinstance(value, tuple) and any(isinstance(item, int) and item < 0 for item in value):
-        return None
-    return map_nodes(value, find)
+def _bind_field(key: str, value: Any, names: Names | None) -> Any:
+    """Return the value of a field of nodes, such as a list of them, with ids for names."""
+    if isinstance(value, tuple):
+        items = tuple(_bind_field(f"{key}[{k}]", item, names) for k, item in enumerate(value))
+        return value if all(a is b for a, b in zip(items, value, strict=True)) else items
+    if not isinstance(value, str):
+        return value
+    if names is None:
+        raise ScenarioError(key, "must be an integer", value, "give the id of a node")
+    if value in names:
+        return names[value]
+    if value.isascii() and value.isdecimal() and str(int(value)) == value:
+        return int(value)
+    remedy = f"{suggest_nearest(value, names)}correct it, or name the nodes in the graph"
+    raise ScenarioError(key, "must name a node of the graph", value, remedy)
 
 
 def map_nodes(value: Any, change: Callable[[Any], Any]) -> Any:

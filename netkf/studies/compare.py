@@ -19,6 +19,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, number
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import shorten
+from netkf.network.graphs import name_rows
 from netkf.runs.documents import (
     COUNT,
     FINAL_STATUSES,
@@ -179,6 +180,7 @@ def read_directory(directory: Path) -> RunDirectory:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
         summary = _read(directory, "summary.json", SUMMARY)
+        name_rows(summary["nodes"])
         if SEAL in manifest:  # a digest of the manifest itself; older versions wrote none
             with add_file_name("manifest.json"):
                 check_seal(manifest)

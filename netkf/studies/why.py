@@ -16,6 +16,7 @@ from netkf.core.fields import integer, number
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.network.deliveries import MessageKey
+from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
 from netkf.studies.explanation import GOOD_ENOUGH, Explanation, InformationSource, Missing, WhatIf
 from netkf.studies.information import (
@@ -76,7 +77,7 @@ class Why(Explanation):
 
 def why(
     run: Run | str | Path,
-    node: int,
+    node: int | str,
     at: float,
     *,
     scenario: Scenario | None = None,
@@ -86,9 +87,9 @@ def why(
     replays: int | None = None,
     trust: bool = False,
 ) -> Why:
-    """Explain the estimate of ``node`` at ``at`` seconds in a run: which messages it had used, how
-    old its information was, which messages were missing, and, by replays of the run, its covariance
-    with missing messages delivered.
+    """Explain the estimate of ``node`` (id or name) at ``at`` seconds in a run: which messages it
+    had used, how old its information was, which messages were missing, and, by replays of the run,
+    its covariance with missing messages delivered.
 
     ``run`` is a run in memory or the directory of one; of an ensemble with all traces ``replica``
     (default 0) names one. ``scenario`` is only needed for a run that does not know its own.
@@ -100,7 +101,8 @@ def why(
     Raises ScenarioError for a node, time or run that does not exist, and for a run without events.
     """
     run, run_scenario = _check_run(run, scenario, replica, trust)
-    at = _check_instant(run, run_scenario, node, at)
+    node = _check_node(run_scenario, node)
+    at = _check_instant(run, run_scenario, at)
     # Keyword names are those of the command line: --most, --below, --replays.
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
@@ -184,14 +186,20 @@ def _default_replays(events: int) -> int:
     return min(MAX_REPLAYS, max(MIN_REPLAYS, MAX_EVENTS // max(1, events)))
 
 
-def _check_instant(run: Run, scenario: Scenario, node: int, at: float) -> float:
-    """Return the time ``at`` (seconds) that is asked about, in slots the start of its slot; raises
-    ScenarioError if the run has no such time or no such ``node`` (id).
-    """
-    if node not in scenario.topology.index:
+def _check_node(scenario: Scenario, node: int | str) -> int:
+    """Return the id of the ``node`` with this id or name; raises ScenarioError if there is none."""
+    found = scenario.topology.find(str(node))
+    if found is None:
         listed = ", ".join(map(str, scenario.nodes[:8]))
         listed += ", ..." if len(scenario.nodes) > 8 else ""
         raise ScenarioError("node", "must be a node of the scenario", node, f"nodes: {listed}")
+    return found
+
+
+def _check_instant(run: Run, scenario: Scenario, at: float) -> float:
+    """Return the time ``at`` (seconds) that is asked about, in slots the start of its slot; raises
+    ScenarioError if the run has no such time.
+    """
     time: float = number(low=0.0, high=scenario.horizon)("at", at)
     if run.status not in ("complete", "diverged") and not time <= max(run.times, default=-1.0):
         rule = f"lies beyond what was kept of a run that ended as {run.status}"
@@ -251,7 +259,7 @@ class _Evidence:
         full_flow = find_flow(self.scenario, replayer.full_log, full)
         self._full_search = replayer.full_log, search_back(full_flow, node)
         self.missing: dict[MessageKey, Missing] = {
-            self.messages.key(m): _describe_missing(self.messages, m)
+            self.messages.key(m): _describe_missing(self.messages, m, self.scenario.topology)
             for m in np.flatnonzero(~was_used).tolist()
         }
 
@@ -302,15 +310,20 @@ class _Evidence:
         last, unheard = self._find_last_message(node)
         path_nodes: tuple[int, ...] = ()
         if newest_by_budget[0] is not None:
-            path_nodes = route(self._reach, newest_by_budget[0].segment, 0)
+            path = route(self._reach, newest_by_budget[0].segment, 0)
+            path_nodes = tuple(map(self.scenario.topology.named, path))
         # The fewest missing messages with which a newer reading would have come, if any.
         budget = next((b for b, r in enumerate(with_more, 1) if _is_newer(r, reading)), None)
         missing: tuple[Missing, ...] = ()
         if budget is not None:
             newest = newest_by_budget[budget]
             assert newest is not None
-            path = self._reach.messages_from(newest.segment, budget)
-            missing = tuple(_describe_missing(self.messages, m) for m in path if self._flow.cost[m])
+            unused = self._reach.messages_from(newest.segment, budget)
+            missing = tuple(
+                _describe_missing(self.messages, m, self.scenario.topology)
+                for m in unused
+                if self._flow.cost[m]
+            )
         return InformationSource(
             node=node,
             sensor=node in self.scenario.placed_sensors,
@@ -358,12 +371,13 @@ def _is_newer(reading: float, than: float) -> bool:
     return reading > than or (math.isnan(than) and not math.isnan(reading))
 
 
-def _describe_missing(messages: Messages, m: int) -> Missing:
+def _describe_missing(messages: Messages, m: int, topology: Topology) -> Missing:
     """Return message ``m`` (its index), which was not used, as tables and texts name it: its ids
     and number, why it was not used, and its times in seconds.
     """
+    sender, receiver, number = messages.key(m)
     return Missing(
-        messages.key(m),
+        MessageKey(topology.named(sender), topology.named(receiver), number),
         OUTCOMES[int(messages.outcome[m])],
         float(messages.sent[m]),
         float(messages.arrived[m]),

@@ -22,7 +22,7 @@ FILES = {
     "header.csv": "sender,receiver\n",
     "renamed.csv": "from,to\n0,1\n",
     "row.csv": "sender,receiver\n0,1\n2\n",
-    "word.csv": "sender,receiver\n0,1\nzero,two\n",
+    "word.csv": "sender,receiver\n0,1\nzero,1\n",
     "hole.csv": "sender,receiver,delivery_probability\n0,1,\n",
     "nan.csv": "sender,receiver,delivery_probability\n0,1,nan\n",
     "half.csv": "sender,receiver\n0,1.5\n",
@@ -393,7 +393,7 @@ GRAPHS = [
     ("csv-header", listed("header.csv"), f"{G}.path", "no link of the table is left"),
     ("csv-columns", listed("renamed.csv"), f"{G}.path", "got ['from', 'to']"),
     ("csv-row", listed("row.csv"), f"{G}.path", "row.csv line 3 must have 2 entries; got ['2']"),
-    ("csv-word", listed("word.csv"), f"{G}.path", "word.csv line 3: sender must be a finite"),
+    ("csv-word", listed("word.csv"), "sensors[0].nodes[1]", "node ids here are 0, 1, zero"),
     ("csv-hole", listed("hole.csv"), f"{G}.path", "hole.csv line 2: delivery_probability must"),
     ("csv-nan", listed("nan.csv"), f"{G}.path", "finite number; got 'nan'"),
     (

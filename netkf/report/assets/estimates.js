@@ -70,7 +70,7 @@ const Estimates = (() => {
 
     function drawIntervals(context, width, height, nodes, x, a) {
       const span = app.range === "run" ? wholeRange(run, a) : rangeNow(run, nodes, x, a);
-      const axes = frame(context, width, height, [[-0.7, run.N - 0.3], span], ["", "x" + a], run.nodes);
+      const axes = frame(context, width, height, [[-0.7, run.N - 0.3], span], ["", "x" + a], run.names);
       if (x) {
         context.strokeStyle = Theme.colours.green;
         context.lineWidth = 2;

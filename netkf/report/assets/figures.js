@@ -54,13 +54,13 @@ const Figures = (() => {
       if (run.truth) {
         const all = overNodes(run, run.samples.sq_error);
         series.push({ label: name + "all nodes, root mean square; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
-        if (i >= 0) series.push({ label: name + "error of node " + run.nodes[i], x, y: root(column(run, run.samples.sq_error, i)), colour, width: 2.5 });
+        if (i >= 0) series.push({ label: name + "error of node " + run.names[i], x, y: root(column(run, run.samples.sq_error, i)), colour, width: 2.5 });
       } else {
         const all = overNodes(run, traces(run));
         series.push({ label: name + "square root of trace P, all nodes; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
       }
-      if (!run.truth && i >= 0) series.push({ label: name + "distance of node " + run.nodes[i] + "'s estimate from the mean of all nodes'", x, y: apart(run, i), colour, width: 2.5 });
-      if (i >= 0) series.push({ label: name + "square root of trace P of node " + run.nodes[i], x, y: root(column(run, traces(run), i)), colour: r ? "orange" : "green", width: 2, dash: "dashed" });
+      if (!run.truth && i >= 0) series.push({ label: name + "distance of node " + run.names[i] + "'s estimate from the mean of all nodes'", x, y: apart(run, i), colour, width: 2.5 });
+      if (i >= 0) series.push({ label: name + "square root of trace P of node " + run.names[i], x, y: root(column(run, traces(run), i)), colour: r ? "orange" : "green", width: 2, dash: "dashed" });
       if (i >= 0 && run.samples.bound) series.push({ label: name + "square root of the bound H(12) on the mean of trace P", x, y: root(column(run, run.samples.bound, i)), colour: "ink", width: 2, dash: r ? "dashed" : "solid" });
     });
     for (const [label, value] of Object.entries(runs[0].limits)) lines.push({ label: label + ", square root:", y: Math.sqrt(value), colour: "purple", dash: lines.length ? "dotted" : "dashed" });
@@ -75,7 +75,7 @@ const Figures = (() => {
     runs.forEach((run, r) => {
       const i = app.nodeOf(run);
       if (!run.truth || i < 0) return;
-      series.push({ label: letter(runs, r) + "NEES of node " + run.nodes[i], x: run.samples.t, y: column(run, run.samples.nees, i), colour: COLOURS[r], width: 1.8, dash: r ? "dashed" : "solid" });
+      series.push({ label: letter(runs, r) + "NEES of node " + run.names[i], x: run.samples.t, y: column(run, run.samples.nees, i), colour: COLOURS[r], width: 1.8, dash: r ? "dashed" : "solid" });
     });
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
     return { title: "Does P fit the error?", unit: "NEES", timed: true, series, band: runs[0].samples.nees_interval,
@@ -102,7 +102,7 @@ const Figures = (() => {
         parts.set(at, [sum + v.nis[k], count + 1]);
       });
       const at = [...parts.keys()].sort((a, b) => a - b), name = letter(runs, r), [mean, low, high] = v.means[i];
-      const whose = i < 0 ? "of all nodes together" : "of node " + run.nodes[i];
+      const whose = i < 0 ? "of all nodes together" : "of node " + run.names[i];
       series.push({ label: name + "each reading " + whose, x, y: rows.map((k) => v.nis[k]), colour: COLOURS[r], dots: true });
       series.push({ label: name + "mean of each " + Format.number(wide) + " s", x: at.map((k) => (k + 0.5) * wide), y: at.map((k) => parts.get(k)[0] / parts.get(k)[1]), colour: r ? "orange" : "ink", width: 2 });
       lines.push({ label: name + "mean of all (where P is exact " + Format.number(low) + " .. " + Format.number(high) + "):", y: mean, colour: r ? "orange" : "purple", dash: "dotted" });
@@ -120,7 +120,7 @@ const Figures = (() => {
       const i = readingsOf(run, app.nodeOf(run)), found = i === null ? null : run.innovations.correlations[i];
       if (!found) return;
       band = band || [-found.band, found.band];
-      series.push({ label: letter(runs, r) + (i < 0 ? "all readings" : "readings of node " + run.nodes[i]), x: found.values.map((_, k) => k + 1), y: found.values, colour: COLOURS[r], points: true, dash: r ? "dashed" : "solid" });
+      series.push({ label: letter(runs, r) + (i < 0 ? "all readings" : "readings of node " + run.names[i]), x: found.values.map((_, k) => k + 1), y: found.values, colour: COLOURS[r], points: true, dash: r ? "dashed" : "solid" });
     });
     return series.length ? { title: "Are innovations white?", unit: "autocorrelation", xlabel: "lag (readings)", series, band, note: "Beyond the band a prediction misses what earlier readings said." } : null;
   }
@@ -134,7 +134,7 @@ const Figures = (() => {
         return row.length ? row.reduce((a, b) => a + b, 0) / row.length : NaN;
       });
       series.push({ label: letter(runs, r) + "mean of all nodes", x, y: mean, colour: COLOURS[r], width: 1, dash: "dotted" });
-      if (i >= 0) series.push({ label: letter(runs, r) + "node " + run.nodes[i], x, y: column(run, run.samples.age, i), colour: COLOURS[r], width: 2 });
+      if (i >= 0) series.push({ label: letter(runs, r) + "node " + run.names[i], x, y: column(run, run.samples.age, i), colour: COLOURS[r], width: 2 });
     });
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
     return { title: "Age of information", unit: "seconds", timed: true, series,

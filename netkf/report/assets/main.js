@@ -123,7 +123,7 @@ function nodeTable(run, r) {
 function messageTable(run, r) {
   const rows = app.filtered(run, State.messagesAt(run, app.time, app.persist())).slice(0, 200).map((row) => {
     const m = run.messages;
-    return [run.nodes[m.sender[row]], run.nodes[m.receiver[row]], m.number[row], Format.time(m.sent[row]),
+    return [run.names[m.sender[row]], run.names[m.receiver[row]], m.number[row], Format.time(m.sent[row]),
       State.outcomeAt(run, row, app.time), m.outcome[row] === State.LOST ? "-" : Format.number(m.age[row])];
   });
   const name = app.runs.length > 1 ? "AB"[r] + ": messages" : "Messages";
@@ -198,7 +198,7 @@ function focusRun(r) {
   app.focus = r;
   find("run").value = String(r);
   const run = app.run;
-  options(find("node"), run.nodes.map((node, i) => [String(i), String(node) + (run.sensing[i] ? " (sensor)" : "")]));
+  options(find("node"), run.names.map((node, i) => [String(i), String(node) + (run.sensing[i] ? " (sensor)" : "")]));
   if (app.nodeOf(run) < 0) app.nodeId = run.nodes[0];
   find("node").value = String(app.nodeOf(run));
   app.picks = run.nodes.slice(0, 6).map((_, i) => i);
@@ -207,7 +207,7 @@ function focusRun(r) {
 }
 
 function buildPicks(run) {
-  find("picks").replaceChildren(...run.nodes.map((node, i) => {
+  find("picks").replaceChildren(...run.names.map((node, i) => {
     const box = Format.element("input", { type: "checkbox" });
     box.checked = app.picks.includes(i);
     box.addEventListener("change", () => {

@@ -77,7 +77,7 @@ const Network = (() => {
         context.strokeStyle = Theme.colours.ink;
         context.stroke();
         if (chosen) mark(context, x, y);
-        if (named || chosen) Theme.write(context, String(run.nodes[i]), x + radius + 3, y - radius - 2);
+        if (named || chosen) Theme.write(context, String(run.names[i]), x + radius + 3, y - radius - 2);
       }
     }
 

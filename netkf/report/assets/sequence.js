@@ -93,7 +93,7 @@ const Sequence = (() => {
   }
 
   function describe(run, chosen, found, start, end) {
-    const names = chosen.map((i) => run.nodes[i]).join(", ");
+    const names = chosen.map((i) => run.names[i]).join(", ");
     return "Sequence chart of nodes " + names + " from " + Format.time(start) + " to " +
       Format.time(end) + " seconds, " + found.length + " messages; the table of messages has them in words";
   }
@@ -123,7 +123,7 @@ const Sequence = (() => {
     for (const i of chosen) {
       const line = i === app.nodeOf(run) ? "lifeline chosen" : "lifeline";
       const name = make("text", { x: x.get(i), y: 16, "text-anchor": "middle", class: i === app.nodeOf(run) ? "chosen" : "" },
-        (run.sensing[i] ? "\u25a0 " : "\u25cf ") + run.nodes[i]);
+        (run.sensing[i] ? "\u25a0 " : "\u25cf ") + run.names[i]);
       name.addEventListener("click", (event) => { event.stopPropagation(); app.setNode(i); });
       svg.append(name, make("line", { x1: x.get(i), x2: x.get(i), y1: TOP - 8, y2: HEIGHT - BOTTOM, class: line }));
     }
@@ -135,7 +135,7 @@ const Sequence = (() => {
         const px = x.get(events.node[k]), y = at.y(events.t[k]);
         const words = name === "reading" ? "reading" : events.names[events.kind[k]];
         const tick = make("line", { x1: px - 6, x2: px + 6, y1: y, y2: y, class: name },
-          make("title", {}, words + " of node " + run.nodes[events.node[k]] + " at " + Format.time(events.t[k]) + " s"));
+          make("title", {}, words + " of node " + run.names[events.node[k]] + " at " + Format.time(events.t[k]) + " s"));
         svg.append(tick);
         if (name === "mark" && words !== "swap") svg.append(make("text", { x: px + 8, y: y + 4 }, words));
       }
@@ -178,8 +178,8 @@ const Sequence = (() => {
     const m = run.messages, outcome = State.OUTCOMES[m.outcome[row]];
     const age = m.outcome[row] === State.DELIVERED || m.outcome[row] === State.LATE
       ? ", age " + Format.number(m.age[row]) + " s" : "";
-    return "message " + m.number[row] + " from node " + run.nodes[m.sender[row]] + " to node " +
-      run.nodes[m.receiver[row]] + ", sent at " + Format.time(m.sent[row]) + " s, " + outcome + age;
+    return "message " + m.number[row] + " from node " + run.names[m.sender[row]] + " to node " +
+      run.names[m.receiver[row]] + ", sent at " + Format.time(m.sent[row]) + " s, " + outcome + age;
   }
 
   function drawClock(svg, at, t, wide, end) {

@@ -142,14 +142,14 @@ const Why = (() => {
 
   function show(box, title, run, app) {
     const node = app.nodeOf(run), t = app.time, k = State.sampleAt(run, t);
-    title.textContent = "Why: node " + run.nodes[node] + " at " + Format.time(t) + " s";
+    title.textContent = "Why: node " + run.names[node] + " at " + Format.time(t) + " s";
     const found = explain(run, node, t), parts = [lead(run, node, k, found, t)];
     if (!found.complete) parts.push(Format.element("p", { class: "note" }, thinned(run)));
     if (found.links.length) parts.push(linkTable(run, found.links, t));
     if (found.readings.length) parts.push(readingTable(run, node, found.readings, t));
     parts.push(lostList(run, found.links));
     parts.push(Format.element("p", {}, "What it would have been had these messages come, replayed: ",
-      Format.element("code", {}, "netkf why " + quoted(run.label) + " --node " + run.nodes[node] + " --at " + Format.time(t))));
+      Format.element("code", {}, "netkf why " + quoted(run.label) + " --node " + run.names[node] + " --at " + Format.time(t))));
     box.replaceChildren(...parts);
   }
 
@@ -177,8 +177,8 @@ const Why = (() => {
     if (oldest) {
       const silent = found.links.filter((link) => link.newest < 0).length;
       const others = silent > 1 ? " and " + (silent - 1) + (silent > 2 ? " others" : " other") : "";
-      parts.push(silent ? "It had never heard node " + run.nodes[oldest.sender] + others + "."
-        : "Oldest link: node " + run.nodes[oldest.sender] + ", heard as of " + Format.number(Math.max(0, t - oldest.sent)) + " s before.");
+      parts.push(silent ? "It had never heard node " + run.names[oldest.sender] + others + "."
+        : "Oldest link: node " + run.names[oldest.sender] + ", heard as of " + Format.number(Math.max(0, t - oldest.sent)) + " s before.");
       parts.push(lost + (lost === 1 ? " message" : " messages") + " to it lost or late since it last heard each sender.");
     } else parts.push("No message was ever sent to it.");
     if (run.knowledge === "slot") parts.push("A sample knows of all rounds of the slot that begins with it.");
@@ -195,7 +195,7 @@ const Why = (() => {
       const kinds = link.missing.map((row) => m.outcome[row]);
       const of = (outcome) => kinds.filter((kind) => kind === outcome).length;
       const none = link.newest < 0;
-      return ["node " + run.nodes[link.sender], none ? "never" : Format.time(link.sent),
+      return ["node " + run.names[link.sender], none ? "never" : Format.time(link.sent),
         none ? "-" : Format.time(m.ended[link.newest]), none ? "-" : Format.number(Math.max(0, t - link.sent)),
         of(State.LOST), of(State.LATE), kinds.length - of(State.LOST) - of(State.LATE)];
     });
@@ -205,10 +205,10 @@ const Why = (() => {
 
   function readingTable(run, node, readings, t) {
     const came = readings.filter((reading) => Number.isFinite(reading.at));
-    const none = readings.filter((reading) => !Number.isFinite(reading.at)).map((reading) => run.nodes[reading.node]);
-    const rows = came.map((reading) => ["node " + run.nodes[reading.node], Format.time(reading.at),
+    const none = readings.filter((reading) => !Number.isFinite(reading.at)).map((reading) => run.names[reading.node]);
+    const rows = came.map((reading) => ["node " + run.names[reading.node], Format.time(reading.at),
       Format.number(Math.max(0, t - reading.at)),
-      reading.node === node ? "its own sensor" : reading.way.map((i) => run.nodes[i]).join(" \u2192 ")]);
+      reading.node === node ? "its own sensor" : reading.way.map((i) => run.names[i]).join(" \u2192 ")]);
     const parts = rows.length ? [Format.table("Newest readings that can have reached it (seconds)",
       ["sensor of", "read at", "age", "way"], rows)] : [];
     if (none.length) parts.push(Format.element("p", {}, "No reading of node " + none.join(", ") + " can have reached it yet."));
