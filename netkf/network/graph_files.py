@@ -12,10 +12,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+
 from netkf.core.csv_files import read_content
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Rule, SourceFile, boolean, field, number, source_file
 from netkf.core.repeated_rows import count_rows
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Edges, Graph, Link, LinkTable, Topology, assign_ids
 
 if TYPE_CHECKING:
@@ -105,9 +108,10 @@ class EdgelistGraph(GraphFile):
         import networkx
 
         # A graph with parallel edges, so that a link that is listed again is seen.
-        cls = networkx.MultiDiGraph if self.directed else networkx.MultiGraph
+        blank: networkx.Graph[Any]
+        blank = networkx.MultiDiGraph() if self.directed else networkx.MultiGraph()
         lines = content.decode("utf-8-sig").splitlines()
-        graph: networkx.Graph[Any] = networkx.parse_edgelist(lines, create_using=cls)
+        graph: networkx.Graph[Any] = networkx.parse_edgelist(lines, create_using=blank)
         listed = sum(bool(line.split("#")[0].strip()) for line in lines)
         if graph.number_of_edges() != listed:
             # networkx passes over lines that have no two nodes.
@@ -124,7 +128,8 @@ def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
     twice = [name for name, count in Counter(map(str, ids)).items() if count > 1]
     if twice:
         raise ScenarioError("", "two nodes have one name", twice[0], "rename one of them")
-    directed, edges = graph.is_directed(), list(graph.edges(data=PROBABILITY))
+    directed = graph.is_directed()
+    edges: list[tuple[Any, Any, Any]] = list(graph.edges(data=PROBABILITY))
     has_probabilities = any(p is not None for *_, p in edges)
     pairs: list[Link] = []
     probability: dict[Link, float] = {}
@@ -164,18 +169,19 @@ def from_networkx(graph: networkx.Graph[Any]) -> Edges:
     table = _read_links(graph, "graph")
     labels = {k: name for name, k in table.names.items()}
     nodes = tuple(labels.get(k, k) for k in assign_ids(graph.nodes).values())
-    links = list(table.probability)
+    edges: Any = tuple((labels.get(i, i), labels.get(j, j)) for i, j in table.probability)
+    probabilities = np.array(list(table.probability.values()))
     return Edges(
-        edges=tuple((labels.get(i, i), labels.get(j, j)) for i, j in links),
+        edges=edges,
         nodes=nodes,
         directed=table.directed,
-        delivery=list(table.probability.values()) if table.has_probabilities else None,
+        delivery=probabilities if table.has_probabilities else None,
         positions=_positions(graph.nodes.values()),
     )
 
 
-def _positions(attributes: Iterable[dict[str, Any]]) -> list[list[float]] | None:
-    """Return (x, y) of each node from its attributes, None unless all nodes have a place."""
+def _positions(attributes: Iterable[dict[str, Any]]) -> FloatArray | None:
+    """Return (x, y) (N, 2) of each node from its attributes, None unless all nodes have a place."""
     points = []
     for node in attributes:
         point = node.get("pos", (node.get("x"), node.get("y")))
@@ -186,7 +192,7 @@ def _positions(attributes: Iterable[dict[str, Any]]) -> list[list[float]] | None
         if not (math.isfinite(x) and math.isfinite(y)):
             return None
         points.append([x, y])
-    return points or None
+    return np.array(points) if points else None
 
 
 def as_graph(value: Any) -> Any:

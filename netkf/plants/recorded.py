@@ -245,10 +245,11 @@ class RecordedSensor(Sensor):
             # The first phi' stands for H where one is needed at once.
             if record.regressors and len(rows.t) and H is self.H:
                 object.__setattr__(self, "H", readonly_array(rows.phi[:1]))
-        if record.regressors and self.H is None:
-            # No rows, or names of nodes that are not known yet.
-            object.__setattr__(self, "H", readonly_array(np.zeros((1, len(record.regressors)))))
         given: FloatArray | None = self.H
+        if given is None and record.regressors:
+            # No rows, or names of nodes that are not known yet.
+            given = readonly_array(np.zeros((1, record.regressors)))
+            object.__setattr__(self, "H", given)
         if given is None:
             remedy = "add H = ..., or columns phi0, ... to the table"
             raise ScenarioError("H", "is missing", None, remedy)

@@ -102,6 +102,26 @@ def test_names_in_all_tables_and_fields_are_the_run_with_ids(named, tmp_path):
     assert sampled.sensors[0].sampling.recorded_times(1).tolist() == [1.2, 3.0]
 
 
+def test_names_in_a_table_of_regressors_and_of_ranges(named, folder):
+    (folder / "phi.csv").write_text("t,node,y0,phi0\n1,lab,2,0.5\n2,roof,1,0.25\n")
+    (folder / "far.csv").write_text("t,node,to,y0\n1,lab,roof,2\n2,roof,cellar,1\n")
+    for nodes in ({}, {"nodes": ["roof", "lab"]}):
+        table = {"kind": "recorded", "path": "phi.csv", "R": [[0.5]], **nodes}
+        (sensor,) = named.replace({"sensors": [table]}).sensors
+        assert sorted(sensor.nodes) == [0, 1]
+        assert sensor.H[0, 0] in (0.5, 0.25)
+    plane = {
+        "kind": "unknown",
+        "A": [[0.0, 0.0]] * 2,
+        "B": [[1.0]] * 2,
+        "cov": [[1.0, 0.0], [0.0, 1.0]],
+    }
+    ranges = {"kind": "range", "path": "far.csv", "R": [[0.1]]}
+    scenario = named.replace({"sensors": [ranges], "plant": plane})
+    assert scenario.sensors[0].nodes == (0, 1)
+    assert scenario.located_sensors[0].positions.tolist() == [[0, 1], [5, 5]]
+
+
 @pytest.mark.parametrize("kind", ["graphml", "gml", "edgelist", "networkx"])
 def test_graphs_that_networkx_reads_are_the_table_of_links(kind, named, folder):
     graph = network()
