@@ -24,6 +24,7 @@ from netkf.core.fields import (
     list_of,
     matrix,
     node_id,
+    one_of,
     source_file,
 )
 from netkf.core.repeated_rows import first_rows
@@ -40,10 +41,10 @@ from netkf.plants.readings import (
     take_from_record,
 )
 from netkf.plants.sensors import Sensor
-from netkf.plants.truth import TOLERANCE, RecordedTruth, demand_rows
+from netkf.plants.truth import TOLERANCE, RecordedTruth, demand_states
 
-Table = dict[int, FloatArray]
-"""Recorded values by slot."""
+INTERPOLATIONS = ("linear", "hold")
+"""What recorded states are between the rows of their table."""
 NO_TIMES = np.empty(0)
 
 
@@ -68,11 +69,15 @@ class UnknownPlant(LinearPlant):
 class RecordedPlant(LinearPlant):
     """The state is read from a table ``t,x0,x1,...``, one row a slot, t in seconds; ``F``, ``Q``,
     ``mean`` and ``cov`` are the filters' model of it.
+
+    With ``interpolate`` rows have any times, and the state of a slot is that at its start, between
+    two rows "linear", or the earlier one ("hold").
     """
 
     is_random: ClassVar[bool] = False
 
     path: SourceFile = field(source_file)
+    interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
 
     def __post_init__(self) -> None:
         """Check the fields and read the table; raises ScenarioError for a mistake in either."""
@@ -80,11 +85,14 @@ class RecordedPlant(LinearPlant):
         _ = self.table  # a mistake in the file is found on construction
 
     @cached_property
-    def table(self) -> Table:
+    def table(self) -> SlotStates:
         """The states (n,) by slot number; raises ScenarioError for a mistake in the file."""
-        table, states = self._states
+        if self.interpolate is not None:
+            truth = _recorded_truth(*self._states, self.n, self.interpolate)
+            return InterpolatedStates(truth, self.period)
+        columns, states = self._states
         rule = "there may be one row a slot, or equal ones"
-        first = first_rows(table, self.row_keys, states.tolist(), rule)
+        first = first_rows(columns, self._slots, states.tolist(), rule)
         return {slot: states[row] for slot, row in first.items() if slot >= 0}
 
     @cached_property
@@ -93,21 +101,67 @@ class RecordedPlant(LinearPlant):
         return _read_states(self.path, self.n)
 
     @cached_property
-    def row_keys(self) -> list[int]:
+    def _slots(self) -> list[int]:
         """The slot number of each row, in the order of the table; rows of one slot are equal."""
         columns = self._states[0]
         require_start(columns, np.arange(len(columns.lines)))
         return [slot_number(columns, row, self.period) for row in range(len(columns.lines))]
 
+    @property
+    def row_times(self) -> FloatArray:
+        """The times (K,) of all rows in seconds, in the order of the table."""
+        return self._states[0]["t"]
+
+    @property
+    def row_keys(self) -> list[int]:
+        """What each row is about, in the order of the table: its slot or, with ``interpolate``, its
+        place among the times of the table.
+        """
+        return self._slots if self.interpolate is None else _time_keys(self.row_times)
+
+    def used_keys(self, slots: Iterable[int]) -> set[int]:
+        """Return the ``row_keys`` of the rows that say the states of these ``slots``."""
+        if not isinstance(self.table, InterpolatedStates):
+            return set(slots)
+        return {key for slot in slots for key in self.table.rows_at(slot)}
+
     def require_slots(self, slots: Iterable[int]) -> None:
         """Raise ScenarioError if the table has no state for one of the ``slots`` (numbers)."""
-        _demand_rows(self.path, self.table, slots, self.period, "state")
+        missing = next((slot for slot in slots if slot not in self.table), None)
+        if missing is not None:
+            time = f"slot {missing}, t = {missing * self.period:g}"
+            remedy = "add the row or shorten the horizon"
+            if self.interpolate is None:
+                remedy = 'add the row, or write interpolate = "linear" or "hold"'
+            rule = f"{self.path.name} has no state for {time}"
+            raise ScenarioError("path", rule, None, remedy)
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return the states of the table, nan in slots without a row; nothing is drawn from
+        """Return the states of the table, nan in slots without one; nothing is drawn from
         ``random``, and a recorded path has no ``frames``.
         """
         return RecordedPath(self.table, np.full(self.n, math.nan))
+
+
+class InterpolatedStates:
+    """The states of slots of ``period`` seconds in the ``truth`` of a table with rows at any
+    times.
+    """
+
+    def __init__(self, truth: RecordedTruth, period: float) -> None:
+        self._truth, self._period = truth, period
+
+    def rows_at(self, slot: int) -> tuple[int, ...]:
+        """Return the indices of the times of the table that say the state of a slot."""
+        return self._truth.rows_at(slot * self._period)
+
+    def __contains__(self, slot: int) -> bool:
+        """Return True if the state of a slot is known."""
+        return bool(self.rows_at(slot))
+
+    def get(self, slot: int, otherwise: FloatArray) -> FloatArray:
+        """Return the state (n,) of a slot, ``otherwise`` (n,) if it is unknown."""
+        return self._truth.local(slot * self._period) if slot in self else otherwise
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,57 +184,76 @@ class UnknownDiffusion(Diffusion):
 
 @dataclass(frozen=True, eq=False)
 class RecordedDiffusion(Diffusion):
-    """The state is read from a table ``t,x0,x1,...``, t in seconds, and exists at its rows only;
-    ``A``, ``B``, ``mean`` and ``cov`` are the filters' model of it.
+    """The state is read from a table ``t,x0,x1,...``, t in seconds, and exists at its rows only, or
+    with ``interpolate`` between them too: "linear", or the last one ("hold"); ``A``, ``B``,
+    ``mean`` and ``cov`` are the filters' model of it.
     """
 
     is_random: ClassVar[bool] = False
 
     path: SourceFile = field(source_file)  # type: ignore[assignment]
+    interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
 
     def __post_init__(self) -> None:
         """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
-        _ = self.table  # a mistake in the file is found on construction
+        _ = self.recorded_truth  # a mistake in the file is found on construction
 
     @cached_property
-    def table(self) -> tuple[FloatArray, FloatArray]:
-        """Increasing times (K,) in seconds and states (K, n); raises ScenarioError for two states
-        at one time.
+    def recorded_truth(self) -> RecordedTruth:
+        """The true state of a run as engines read it, nan where it is unknown; raises ScenarioError
+        for two states at one time.
         """
-        table, states = self._states
-        rule = "there may be one row a time, or equal ones"
-        first = first_rows(table, self.row_keys, states.tolist(), rule)
-        rows = [first[key] for key in range(len(first))]
-        return table["t"][rows], states[rows]
+        return _recorded_truth(*self._states, self.n, self.interpolate)
 
     @cached_property
     def _states(self) -> tuple[Columns, FloatArray]:
         """The columns of the file and the states (K, n) of its rows."""
         return _read_states(self.path, self.n)
 
-    @cached_property
-    def row_keys(self) -> list[int]:
-        """The index of each row's time among all times of the table, in the order of the table;
-        rows of one time, up to TOLERANCE seconds, are equal.
-        """
-        times = self._states[0]["t"]
-        order = np.argsort(times, kind="stable")
-        keys = np.zeros(len(order), dtype=np.int64)
-        keys[order[1:]] = np.cumsum(np.diff(times[order]) > TOLERANCE)
-        return [int(key) for key in keys]
+    @property
+    def row_times(self) -> FloatArray:
+        """The times (K,) of all rows in seconds, in the order of the table."""
+        return self._states[0]["t"]
 
     @property
-    def recorded_truth(self) -> RecordedTruth:
-        """The true state of a run as engines read it: that of the table, nan at other times."""
-        return RecordedTruth(*self.table, self.n)
+    def row_keys(self) -> list[int]:
+        """The place of each row's time among all times of the table, in the order of the table."""
+        return _time_keys(self.row_times)
+
+    def used_keys(self, times: FloatArray) -> set[int]:
+        """Return the ``row_keys`` of the rows that say the states at ``times`` (K,) in seconds."""
+        return {key for time in times.tolist() for key in self.recorded_truth.rows_at(time)}
 
     def require_times(self, times: FloatArray, what: str) -> None:
         """Raise ScenarioError if the table has no state at one of the ``times`` (K,), in seconds.
 
         ``what`` names the use of the states in the message.
         """
-        demand_rows(self.path, self.table[0], times, what)
+        demand_states(self.path, self.recorded_truth, times, what)
+
+
+def _time_keys(times: FloatArray) -> list[int]:
+    """Return the index of each of the ``times`` (K,) among all that differ by more than TOLERANCE
+    seconds, in increasing order.
+    """
+    order = np.argsort(times, kind="stable")
+    keys = np.zeros(len(order), dtype=np.int64)
+    keys[order[1:]] = np.cumsum(np.diff(times[order]) > TOLERANCE)
+    return [int(key) for key in keys]
+
+
+def _recorded_truth(
+    columns: Columns, states: FloatArray, n: int, interpolate: str | None
+) -> RecordedTruth:
+    """Return the truth of a table with ``states`` (K, n) at the times "t" of its ``columns``.
+
+    Raises ScenarioError for two states at one time.
+    """
+    rule = "there may be one row a time, or equal ones"
+    first = first_rows(columns, _time_keys(columns["t"]), states.tolist(), rule)
+    rows = [first[key] for key in range(len(first))]
+    return RecordedTruth(columns["t"][rows], states[rows], n, interpolate)
 
 
 def _read_states(source: SourceFile, n: int) -> tuple[Columns, FloatArray]:
@@ -190,6 +263,10 @@ def _read_states(source: SourceFile, n: int) -> tuple[Columns, FloatArray]:
     return table, np.stack([table[name] for name in names], axis=1)
 
 
+SlotStates = dict[int, FloatArray] | InterpolatedStates
+"""Recorded states by slot."""
+
+
 class RecordedPath:
     """The truth of a run from a table: states (n,) by slot number, ``otherwise`` (n,) in slots that
     it lacks.
@@ -197,7 +274,7 @@ class RecordedPath:
 
     frame_slots: int | None = None
 
-    def __init__(self, states: Table, otherwise: FloatArray) -> None:
+    def __init__(self, states: SlotStates, otherwise: FloatArray) -> None:
         self._states, self._otherwise = states, otherwise
 
     def state(self, slot: int) -> FloatArray:
@@ -304,15 +381,3 @@ class RecordedSensor(Sensor):
         record = self.record
         rows, slots, n = record.rows(node), record.slots(node, period), self.H.shape[1]
         return RecordedReadings(rows, slots, self._matrix_function(node), n)
-
-
-def _demand_rows(
-    source: SourceFile, table: Table, slots: Iterable[int], period: float, what: str
-) -> None:
-    """Raise ScenarioError if one of the ``slots`` has no row in ``table``, read from ``source``;
-    ``what`` names its content and ``period`` (seconds) turns a slot into a time in the message.
-    """
-    missing = next((slot for slot in slots if slot not in table), None)
-    if missing is not None:
-        rule = f"{source.name} has no {what} for slot {missing}, t = {missing * period:g}"
-        raise ScenarioError("path", rule, None, "add the row or shorten the horizon")

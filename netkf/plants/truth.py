@@ -258,20 +258,38 @@ def _bridge_gap(
 
 
 class RecordedTruth:
-    """Known states (K, n) at recorded ``times`` (K,) in seconds, which increase; nan at other times
-    than these, up to 1e-9 s.
+    """Known states (K, n) at recorded ``times`` (K,) in seconds, which increase. Between these, up
+    to 1e-9 s, states are nan unless ``interpolate`` is "linear", or "hold": the last one counts.
     """
 
     frame_times = np.empty(0)
 
-    def __init__(self, times: FloatArray, states: FloatArray, n: int) -> None:
-        self._times, self._states = times, states
+    def __init__(
+        self, times: FloatArray, states: FloatArray, n: int, interpolate: str | None = None
+    ) -> None:
+        self.times, self._states, self._interpolate = times, states, interpolate
         self._missing = np.full(n, math.nan)
 
+    def rows_at(self, time: float) -> tuple[int, ...]:
+        """Return the indices of the rows that say the state at ``time`` (seconds): one, or the two
+        on either side of it; none if the state is unknown.
+        """
+        k = nearest_row(self.times, time)
+        if k is not None:
+            return (k,)
+        after = int(np.searchsorted(self.times, time))
+        if self._interpolate is None or not 0 < after < len(self.times):
+            return ()
+        return (after - 1,) if self._interpolate == "hold" else (after - 1, after)
+
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) at ``time`` (seconds); nan at a time without a row."""
-        k = nearest_row(self._times, time)
-        return self._missing if k is None else np.asarray(self._states[k])
+        """Return x (n,) at ``time`` (seconds); nan where it is unknown."""
+        rows = self.rows_at(time)
+        if len(rows) < 2:
+            return np.asarray(self._states[rows[0]]) if rows else self._missing
+        first, last = rows
+        share = (time - self.times[first]) / (self.times[last] - self.times[first])
+        return np.asarray((1.0 - share) * self._states[first] + share * self._states[last])
 
     absolute = local
 
@@ -295,12 +313,19 @@ def nearest_row(times: FloatArray, time: float) -> int | None:
     return k if k < len(times) and times[k] <= time + TOLERANCE else None
 
 
-def demand_rows(source: SourceFile, times: FloatArray, needed: FloatArray, use: str) -> None:
-    """Raise ScenarioError for the first of the ``needed`` times (M,) that is not among the
-    ``times`` (K,) of the table in the file ``source``, all in seconds; ``use`` says in the message
-    what the state is for.
+def demand_states(source: SourceFile, truth: RecordedTruth, needed: FloatArray, use: str) -> None:
+    """Raise ScenarioError for the first of the ``needed`` times (M,), in seconds, at which the
+    ``truth`` of the table in the file ``source`` is unknown; ``use`` says in the message what the
+    state is for.
     """
     for time in needed.tolist():
-        if nearest_row(times, time) is None:
-            rule = f"{source.name} has no state for {use}, t = {time:.9g}"
-            raise ScenarioError("path", rule, None, "add the row, or ask for no state then")
+        if truth.rows_at(time):
+            continue
+        times = truth.times
+        remedy = "add the row, or ask for no state then"
+        if len(times) and times[0] < time < times[-1]:
+            remedy = 'add the row, or write interpolate = "linear" or "hold"'
+        elif len(times):
+            remedy += f"; the rows are from t = {times[0]:.9g} to {times[-1]:.9g}"
+        rule = f"{source.name} has no state for {use}, t = {time:.9g}"
+        raise ScenarioError("path", rule, None, remedy)

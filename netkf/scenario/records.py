@@ -9,10 +9,10 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.repeated_rows import RowUse, count_rows
+from netkf.linalg.arrays import FloatArray
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sensors import Sensor
-from netkf.plants.truth import TOLERANCE
 from netkf.rng.streams import Streams
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.sampling import all_sample_times, sample_times
@@ -122,28 +122,22 @@ def count_state_rows(scenario: DerivedScenario) -> RowUse | None:
     """Return the use of the rows of recorded states; None if states are not recorded."""
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion):
-        used = _used_states(scenario, plant)
-        return count_rows(plant.path.name, plant.row_keys, used.__contains__)
-    if isinstance(plant, RecordedPlant):
-        slots = _state_slots(scenario)
-        return count_rows(plant.path.name, plant.row_keys, slots.__contains__)
-    return None
+        used = plant.used_keys(_state_times(scenario))
+    elif isinstance(plant, RecordedPlant):
+        used = plant.used_keys(_state_slots(scenario))
+    else:
+        return None
+    return count_rows(plant.path.name, plant.row_keys, used.__contains__)
 
 
-def _used_states(scenario: DerivedScenario, plant: RecordedDiffusion) -> set[int]:
-    """Return the indices of the states of a recorded diffusion that replica 0 uses.
-
-    These are the states at probe times and, if a sensor draws its readings, at sample times, up to
-    TOLERANCE seconds.
+def _state_times(scenario: DerivedScenario) -> FloatArray:
+    """Return the times (K,) at which replica 0 needs states of a recorded diffusion: the probe
+    times and, if a sensor draws its readings, the sample times.
     """
     times = [scenario.times]
     if any(sensor.is_random for sensor in scenario.sensors):
         times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))
-    needed_times, row_times = np.unique(np.concatenate(times)), plant.table[0]
-    # A row is used if a needed time lies in [t - TOLERANCE, t + TOLERANCE].
-    first = np.searchsorted(needed_times, row_times - TOLERANCE)
-    end = np.searchsorted(needed_times, row_times + TOLERANCE, side="right")
-    return {int(k) for k in np.flatnonzero(first < end)}
+    return np.unique(np.concatenate(times))
 
 
 def _state_slots(scenario: DerivedScenario) -> set[int]:

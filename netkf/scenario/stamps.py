@@ -136,7 +136,5 @@ def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
     if isinstance(scenario.network.activation, RecordedClock):
         yield scenario.network.activation.rows
     plant = scenario.plant
-    if isinstance(plant, RecordedDiffusion):
-        yield plant.table[0]
-    elif isinstance(plant, RecordedPlant):
-        yield plant.period * np.array(list(plant.table), dtype=np.float64)
+    if isinstance(plant, RecordedDiffusion | RecordedPlant):
+        yield plant.row_times
