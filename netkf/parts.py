@@ -68,6 +68,7 @@ from netkf.network.channels import (
     UniformDelay,
 )
 from netkf.network.clocks import LinkClock, OnReadings, Periodic, Poisson, RecordedClock, Renewal
+from netkf.network.contacts import Contacts
 from netkf.network.graph_files import EdgelistGraph, GmlGraph, GraphFile, GraphmlGraph
 from netkf.network.graphs import (
     Complete,
@@ -139,6 +140,7 @@ __all__ = [
     "ConsensusInnovations",
     "ConstantDelay",
     "ConstantGain",
+    "Contacts",
     "CovarianceIntersection",
     "CsvGraph",
     "Cycle",

@@ -10,6 +10,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.linalg.arrays import FloatArray
+from netkf.network.contacts import Contacts
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sensors import Sensor
@@ -147,8 +148,12 @@ def _state_slots(scenario: DerivedScenario) -> set[int]:
 
 
 def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:
-    """Return one line if recorded exchanges are in slots without exchanges, else nothing."""
+    """Return lines on recorded exchanges in slots without exchanges, and on contacts that overlap
+    or are missing.
+    """
     activation = scenario.network.activation
+    if isinstance(activation, Contacts):
+        return activation.notes(scenario.topology)
     if not isinstance(activation, RecordedSlots) or not scenario.slotted:
         return ()
     used_slots = exchange_slots(scenario)

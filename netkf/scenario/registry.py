@@ -13,7 +13,7 @@ from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
-from netkf.network import channels, clocks, graph_files, graphs, matchings, recorded
+from netkf.network import channels, clocks, contacts, graph_files, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.nonlinear import BearingSensor, RangeBearingSensor, RangeSensor
@@ -90,6 +90,7 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "renewal": clocks.Renewal,
         "periodic": clocks.Periodic,
         "recorded": clocks.RecordedClock,
+        "contacts": contacts.Contacts,
         "readings": clocks.OnReadings,
     },
     "loss": {

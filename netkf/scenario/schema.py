@@ -17,6 +17,7 @@ from netkf.algorithms.filter import Filter
 from netkf.algorithms.registry import split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
+from netkf.network.contacts import Contacts
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
 from netkf.scenario.registry import KINDS, list_kinds
 from netkf.scenario.scenario import Scenario
@@ -42,6 +43,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Channel, "delay"): {"$ref": "#/$defs/delay"},
     (Filtering, "model"): {"$ref": "#/$defs/model"},
     (Filter, "inner"): {"$ref": "#/$defs/filter"},
+    (Contacts, "clock"): {"$ref": "#/$defs/activation"},
 }
 """Schemas of keys (class, key) whose values are tables of components."""
 SAMPLING: Schema = {"anyOf": [{"const": "continuous"}, {"$ref": "#/$defs/sampling"}]}

@@ -16,6 +16,7 @@ from netkf.core.fields import MAX_SECONDS, Component, Rule, SourceFile, field, o
 from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import RecordedClock
+from netkf.network.contacts import Contacts
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sampling import RecordedSampling
 
@@ -135,6 +136,8 @@ def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
             yield from map(clock.recorded_times, clock.listed)
     if isinstance(scenario.network.activation, RecordedClock):
         yield scenario.network.activation.rows
+    if isinstance(scenario.network.activation, Contacts):
+        yield np.array([begin for _, begin, _ in scenario.network.activation.row_keys])
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion | RecordedPlant):
         yield plant.row_times

@@ -362,7 +362,11 @@ def _build_activation(origin: Origin, time: str, value: Any) -> Any:
         if len(prefixes) > 1:
             return NOT_IMPORTED
         time = prefixes[0] if prefixes else ""
-    return _build_component(f"{time}activation", origin, value)
+    table = _as_dict(value)
+    if isinstance(table.get("clock"), (Mapping, Component)):
+        builder = partial(_build_component, "activation", origin)
+        table["clock"] = _call_under("clock", builder, table["clock"])
+    return _build_component(f"{time}activation", origin, table)
 
 
 def _build_channel(origin: Origin, value: Any) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 
 from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.network.clocks import RecordedClock
+from netkf.network.contacts import Contacts
 from netkf.network.graphs import Link
 from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedDelay, RecordedLoss
@@ -103,6 +104,9 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
     if isinstance(activation, RecordedClock):
         what = f"{activation.at.removesuffix('s')} and time"
         tables["network.activation"] = what, activation.path.name, activation.row_keys
+    if isinstance(activation, Contacts):
+        what = f"{activation.at.removesuffix('s')} and interval"
+        tables["network.activation"] = what, activation.path.name, activation.row_keys
     if isinstance(activation, RecordedSlots):
         tables["network.activation"] = "slot and link", activation.path.name, activation.row_keys
     for key, component in (("loss", channel.loss), ("delay", channel.delay)):
@@ -145,6 +149,9 @@ def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
     if isinstance(activation, RecordedClock):
         end = scenario.horizon if talks else 0.0
         return count_rows(activation.path.name, activation.row_keys, lambda key: 0.0 < key[1] < end)
+    if isinstance(activation, Contacts):
+        end, path = scenario.horizon if talks else 0.0, activation.path.name
+        return count_rows(path, activation.row_keys, lambda key: key[1] < end and key[2] > 0.0)
     if isinstance(activation, RecordedSlots):
         slots = exchange_slots(scenario) if talks else range(0)
         return count_rows(activation.path.name, activation.row_keys, lambda key: key[0] in slots)

@@ -18,6 +18,7 @@ from netkf.algorithms.filter import Filter
 from netkf.algorithms.registry import split_choice
 from netkf.core.fields import Component, SourceFile
 from netkf.network.channels import Channel
+from netkf.network.clocks import LinkClock
 from netkf.network.graphs import RandomGraph
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
@@ -191,6 +192,9 @@ def _toml_value(value: Any, style: _Style) -> Any:
         return value.tolist()
     if isinstance(value, tuple):
         return [_toml_value(item, style) for item in value]
+    if isinstance(value, LinkClock):  # the clock of links in contact, whose ``at`` is theirs
+        table = _kind_table("activation", value, style)
+        return {key: item for key, item in table.items() if key != "at"}
     if isinstance(value, Filter):  # a filter inside another one
         return _kind_table("filter", value, style)
     return value

@@ -1,4 +1,4 @@
-"""A recorded truth between its rows, linear or held, against numpy.interp, in both kinds of time."""
+"""A recorded truth between its rows, linear or held, against numpy.interp, in slots and without."""
 
 import numpy as np
 import pytest
