@@ -119,6 +119,23 @@ class Contacts(LinkClock):
         inside[begun] = times[begun] <= ends[last[begun]]
         return inside
 
+    def time_in_contact(self, entity: Entity, times: FloatArray) -> FloatArray:
+        """Return how long (K,) a link has been in contact from 0 until each of ``times`` (K,), in
+        seconds.
+        """
+        begins, ends = self._intervals.get(entity, (np.empty(0), np.empty(0)))
+        begins, ends = np.maximum(begins, 0.0), np.maximum(ends, 0.0)
+        lengths = np.clip(times[:, None] - begins, 0.0, ends - begins)
+        return np.asarray(lengths.sum(axis=1))
+
+    def distance(self, entity: Entity, times: FloatArray) -> float:
+        """Return the largest distance in seconds of one of ``times`` (K,) from the contacts of a
+        link; infinite if it has none.
+        """
+        begins, ends = self._intervals.get(entity, (np.empty(0), np.empty(0)))
+        off = np.maximum(begins - times[:, None], times[:, None] - ends)
+        return float(np.maximum(off.min(axis=1, initial=math.inf), 0.0).max(initial=0.0))
+
     def ticks(
         self,
         entity: Entity,

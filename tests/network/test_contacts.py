@@ -155,6 +155,41 @@ def test_theory_takes_contacts_for_no_poisson_process(make):
     assert row["holds"] is False or row["holds"] == False  # noqa: E712
 
 
+class Leaky(Contacts):
+    """Ticks outside of its contacts too."""
+
+    def ticks(self, entity, origin, index, now, random, count):
+        return self.clock.ticks(entity, origin, index, now, random, count)
+
+
+class Fast(Contacts):
+    """Ticks half as often again in its contacts."""
+
+    def ticks(self, entity, origin, index, now, random, count):
+        faster = Contacts(path=self.path, clock=Poisson(rate=4.5))
+        return faster.ticks(entity, origin, index, now, random, count)
+
+
+@pytest.mark.parametrize(
+    ("cls", "broken"),
+    [
+        (Contacts, []),
+        (Leaky, ["links tick in their contacts only"]),
+        (Fast, ["clocks tick at the rates of the scenario"]),
+    ],
+)
+def test_check_knows_the_intervals(cls, broken, make):
+    _, contacts = make({"kind": "poisson", "rate": 3.0})
+    clock = cls(path=contacts.network.activation.path, clock=Poisson(rate=3.0))
+    verdict = netkf.check(contacts.replace({"network.activation": clock}), runs=40)
+    table = verdict.table.set_index("promise")["verdict"].str.lower()
+    rows = ["links tick in their contacts only", "clocks tick at the rates of the scenario"]
+    assert set(rows) <= set(table.index)
+    assert [row for row in rows if table[row] == "broken"][: len(broken)] == broken
+    if not broken:
+        assert not (table == "broken").any()
+
+
 WRONG = {
     "ends first": ("from,until,node,peer\n3,2,0,1\n", {}, "line 2: until must be after from"),
     "no link": ("from,until,node,peer\n1,2,0,3\n", {}, "line 2: every pair must be a link"),

@@ -34,6 +34,7 @@ from netkf.checks.statistics import (
     with_drawn,
 )
 from netkf.linalg.arrays import FloatArray
+from netkf.network.contacts import Contacts
 from netkf.scenario.scenario import Scenario
 
 RATE_TOLERANCE, DISPERSION_TOLERANCE = 0.05, 0.25
@@ -459,6 +460,7 @@ NETWORK_SENTENCES = {
     "lattice": "clocks tick at the times of the scenario",
     "law": "ticks follow the law of their clocks, and do not depend on those before",
 }
+CONTACT_SENTENCE = "links tick in their contacts only"
 SAMPLING_SENTENCES = {
     "rates": "sensors sample at the rates of the scenario",
     "exponential": "gaps between samples are exponential, and independent of those before",
@@ -479,6 +481,10 @@ def clock_promises(samples: PartSamples) -> list[Promise]:
     ):
         if counts is not None:
             clocks = group(samples)
+            in_contacts = isinstance(samples.scenario.network.activation, Contacts)
+            if in_contacts and group is _network_clocks:
+                test = partial(_check_lattice, group)
+                promises.append(Promise(CONTACT_SENTENCE, "the scenario", (), test, True))
             if np.isfinite(clocks.rates).all():
                 promises += _promises(clocks, group, sentences, about)
     return promises

@@ -29,7 +29,8 @@ from netkf.checks.parts.waiting import (
 )
 from netkf.core.clock import Entity, generate_ticks
 from netkf.linalg.arrays import FloatArray
-from netkf.network.clocks import LinkClock, OnReadings, Periodic, Renewal
+from netkf.network.clocks import LinkClock, OnReadings, Periodic, Poisson, Renewal
+from netkf.network.contacts import Contacts
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -77,8 +78,28 @@ def network_clocks(scenario: Scenario) -> ClockGroup:
         return ClockGroup((), (), ())
     entities = tuple(clock.entities(scenario.topology))
     stated = (stated_part(clock, "activation"),) * len(entities)
+    if isinstance(clock, Contacts):
+        entities, stated = _clocks_in_contact(clock, entities, scenario.horizon)
     labels = tuple(f"clock {'-'.join(map(str, entity))}" for entity in entities)
     return ClockGroup(entities, stated, labels)
+
+
+def _clocks_in_contact(
+    clock: Contacts, entities: tuple[Entity, ...], horizon: float
+) -> tuple[tuple[Entity, ...], tuple[Any, ...]]:
+    """Return the links that are in contact before the ``horizon`` (seconds), and the law of each:
+    a Poisson clock that ticks in contacts only is one in the time of its contacts; stretched to the
+    length of a run it has a rate that is smaller by the share of contacts.
+    """
+    end = np.array([horizon])
+    lengths = {entity: float(clock.time_in_contact(entity, end)[0]) for entity in entities}
+    met = tuple(entity for entity in entities if lengths[entity] > 0.0)
+    if type(clock.clock) is not Poisson:
+        return met, (clock,) * len(met)
+    rates = [clock.clock.mean_rate(entity) * lengths[entity] / horizon for entity in met]
+    # Clocks of one law share one object.
+    laws = {rate: Poisson(rate=rate, at=clock.at) for rate in rates}
+    return met, tuple(laws[rate] for rate in rates)
 
 
 @lru_cache(maxsize=8)
@@ -112,8 +133,31 @@ def count_ticks(scenario: Scenario, run: Run) -> TickCounts | None:
     if clock.at == "links":
         # Both nodes share the clock of a link, whose entity has the smaller id first.
         ids = [tuple(sorted(pair)) for pair in ids]
+    if isinstance(clock, Contacts):
+        return _count_in_contacts(clock, group, ids, rows["t"], scenario.horizon)
     clock_of_tick = np.array([index[entity] for entity in ids], dtype=np.int64)
     return _count_in_windows(group, rows["t"], clock_of_tick, scenario.horizon)
+
+
+def _count_in_contacts(
+    clock: Contacts, group: ClockGroup, ids: list[Entity], times: np.ndarray, horizon: float
+) -> TickCounts:
+    """Return the counts of links that tick in contacts only, from the entities ``ids`` and the
+    ``times`` (K,) in seconds of the K ticks of a run: in the time of contacts, stretched to the
+    ``horizon``; ``off`` is the largest distance of a tick from a contact of its link.
+    """
+    of_entity: dict[Entity, list[int]] = {}
+    for row, entity in enumerate(ids):
+        of_entity.setdefault(entity, []).append(row)
+    distances = (clock.distance(entity, times[rows]) for entity, rows in of_entity.items())
+    off = max(distances, default=0.0)
+    end, inner, owners = np.array([horizon]), [np.empty(0)], [np.empty(0, dtype=np.int64)]
+    for k, entity in enumerate(group.entities):
+        met = clock.time_in_contact(entity, times[of_entity.get(entity, [])])
+        inner.append(met * (horizon / clock.time_in_contact(entity, end)[0]))
+        owners.append(np.full(len(met), k))
+    counts = _count_in_windows(group, np.concatenate(inner), np.concatenate(owners), horizon)
+    return counts._replace(off=np.array(off))
 
 
 def count_samples(scenario: Scenario, streams: Streams) -> TickCounts | None:
