@@ -153,7 +153,8 @@ def _count_in_contacts(
     off = max(distances, default=0.0)
     end, inner, owners = np.array([horizon]), [np.empty(0)], [np.empty(0, dtype=np.int64)]
     for k, entity in enumerate(group.entities):
-        met = clock.time_in_contact(entity, times[of_entity.get(entity, [])])
+        ticks = times[of_entity.get(entity, [])]
+        met = clock.time_in_contact(entity, ticks[clock.in_contact(entity, ticks)])
         inner.append(met * (horizon / clock.time_in_contact(entity, end)[0]))
         owners.append(np.full(len(met), k))
     counts = _count_in_windows(group, np.concatenate(inner), np.concatenate(owners), horizon)
