@@ -386,7 +386,7 @@ class RecordedClock(LinkClock):
                 "path",
                 f'{self.path.name} must have no column peer, because at = "nodes"',
                 None,
-                'set at = "directions", or remove the column',
+                'set at = "directions", or rename the column',
             )
         table = read_columns(self.path, ("t", *columns))
         # Nothing is sent at time 0 or before; of a longer log a scenario may choose its origin.

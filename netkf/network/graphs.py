@@ -511,7 +511,7 @@ class Edges(Graph):
                 raise ScenarioError(f"edges[{k}]", rule, list(edge), remedy)
             if edge[0] == edge[1]:
                 rule = "a link must join two nodes"
-                raise ScenarioError(f"edges[{k}]", rule, list(edge), "leave it out")
+                raise ScenarioError(f"edges[{k}]", rule, list(edge), "correct the pair")
         if not ids:
             raise ScenarioError("edges", "must name at least one node", [], "add nodes = N")
         return self._topology(ids)

@@ -142,7 +142,11 @@ GOOD = "".join(f"{k * PERIOD:.1f},2,0.5,-0.25\n" for k in range(SLOTS + 1))
         ("r.csv", "t,node,y0\n" + GOOD, "add the column y1"),
         ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,9"), "r.csv names a node that"),
         ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,2.5"), "node must hold integers"),
-        ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,two"), "node must be a finite"),
+        (
+            "r.csv",
+            "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.7,two"),
+            "node must name a node of the graph",
+        ),
         ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "0.75,2"), "multiple of the period 0.1"),
         ("r.csv", "t,node,y0,y1\n-0.1,2,0.5,1.0\n" + GOOD, "line 2: t must be at least 0"),
         ("r.csv", "t,node,y0,y1\n" + GOOD.replace("0.7,2", "nan,2"), "t must be a finite number"),
