@@ -534,7 +534,8 @@ def node_id(low: int | None = None, high: int | None = None) -> Rule:
         """Return the id as an int, or the name; raise TypeError or ValueError for others."""
         if not isinstance(value, str):
             node: int = ids.convert(value)
-            return node
+            # Ids of nodes with names are integers of a class of their own.
+            return value if isinstance(value, int) else node
         if not value.strip() or len(value) > MAX_NAME or not value.isprintable():
             raise ValueError
         return value.strip()
