@@ -187,7 +187,8 @@ class Contacts(LinkClock):
 
     def notes(self, topology: Topology) -> tuple[str, ...]:
         """Return lines on rows that overlap, and on links that have no contact."""
-        notes, name = [], self.path.name
+        notes: list[str] = []
+        name = self.path.name
         if self.overlapping:
             notes.append(
                 f"network.activation: {self.overlapping} of {len(self.row_keys)} rows overlap "
