@@ -209,3 +209,58 @@ def test_types_that_pandas_notes_in_a_file_do_not_matter(copy, capsys, kind, col
         netkf.open(copy).replica(0)
     assert main(["why", str(copy)]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+WRONG = {  # in a document of which every digest is right
+    "manifest.json": {"versions": [0, [1], "x"], "error": [1, []]},
+    "verdict.json": {"versions": [0, None], "rows": [0, [1], {}], "confidence": [None, "x"]},
+    "sweep.json": {"vary": [{"network.activation.rate": None}, []]},
+}
+
+
+@pytest.fixture(scope="module")
+def kinds(made, tmp_path_factory):
+    """A directory of each kind that has a document in WRONG."""
+    folder = tmp_path_factory.mktemp("kinds")
+    ring = [str(SCENARIOS / "poisson_ring.toml"), "--set", "horizon=1.0", "--no-plot"]
+    few = ["--workers", "1", "--out"]
+    vary = ["--vary", "network.activation.rate=1,2", "--runs", "2"]
+    assert main(["sweep", *ring, *vary, *few, str(folder / "sweep.json")]) == 0
+    assert main(["check", *ring, "--runs", "10", *few, str(folder / "verdict.json")]) in (0, 1)
+    shutil.copytree(made, folder / "manifest.json")
+    return folder
+
+
+def assert_one_line(capsys, *arguments):
+    capsys.readouterr()
+    assert main([*map(str, arguments)]) == 2, arguments
+    assert len(capsys.readouterr().err.splitlines()) == 1, arguments
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_wrong_types_in_documents_with_right_digests_are_one_line(kinds, tmp_path, capsys, kind):
+    folder = shutil.copytree(kinds / kind, tmp_path / "copy")
+    path = folder / ("verdict.json" if kind == "verdict.json" else "manifest.json")
+    before = path.read_text()
+    for key, values in WRONG[kind].items():
+        for value in values:
+            found = {**json.loads(before), key: value}
+            del found["sha256"]
+            write_sealed(path, found)
+            assert_one_line(capsys, "report", folder, "--out", tmp_path / "page.html")
+            assert_one_line(capsys, "plot", folder, "--out", tmp_path / "figures")
+            with pytest.raises(netkf.ScenarioError):
+                netkf.open(folder)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["copy"]
+
+
+def test_a_negative_standard_error_is_one_line(kinds, tmp_path, capsys):
+    folder = shutil.copytree(kinds / "sweep.json", tmp_path / "copy")
+    table = pd.read_parquet(folder / "sweep.parquet")
+    table.assign(mean_rms_se=-1.0).to_parquet(folder / "sweep.parquet", index=False)
+    assert_one_line(capsys, "plot", folder, "--out", tmp_path / "figures")
+
+
+def test_a_refusal_of_why_is_one_line(copy, capsys):
+    """It named the sample that it had chosen first."""
+    assert_one_line(capsys, "why", copy, "--replica", "0", "--below", "-1")
