@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from pathlib import Path
 from typing import Any
 
 from docutils.nodes import SkipNode
 from latex2mathml.converter import convert
-from sphinx.util.inspect import TypeAliasForwardRef
+from sphinx.util.inspect import TypeAliasForwardRef, stringify_signature
 
 from netkf import __version__, parts
+from netkf.core.fields import Component
 from netkf.scenario.schema_page import schema_page
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -61,6 +63,15 @@ BLOCK = "overflow-x: auto; overflow-y: hidden; padding: 0.4em 0"
 def readable_text(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Show docstrings, and for the class of a kind how a scenario file names it."""
     lines[:] = [*KIND_LINES.get(name, []), *restructured(lines)]
+
+
+def named_settings(
+    app: Any, what: str, name: str, obj: Any, options: Any, signature: Any, returned: Any
+) -> tuple[str, Any] | None:
+    """Show which settings a class takes, not that ``Component.__new__`` looks at any."""
+    if what == "class" and issubclass(obj, Component):
+        return stringify_signature(inspect.signature(obj), show_return_annotation=False), returned
+    return None
 
 
 TABLES = {
@@ -122,3 +133,4 @@ def setup(app: Any) -> None:
     app.add_html_math_renderer("mathml", (inline_mathml, None), (block_mathml, None))
     app.connect("builder-inited", write_keys)
     app.connect("autodoc-process-docstring", readable_text)
+    app.connect("autodoc-process-signature", named_settings)

@@ -4,9 +4,11 @@ import importlib
 import importlib.util
 import inspect
 import re
+from types import SimpleNamespace
 
 import pytest
 
+import netkf
 from tests.documents import DOCS
 
 API = DOCS / "api"
@@ -126,3 +128,23 @@ def test_lists_of_fields_are_lists():
 
 def test_code_stays_code():
     assert code_in("Use it so::\n\n    netkf.load(name)\n\nand no more.") == ["netkf.load(name)"]
+
+
+def test_pages_show_the_settings_of_a_class(monkeypatch):
+    pytest.importorskip("sphinx")
+    for name in ("myst_parser", "latex2mathml"):
+        pytest.importorskip(name)
+    spec = importlib.util.spec_from_file_location("conf", DOCS / "conf.py")
+    monkeypatch.syspath_prepend(DOCS)  # undone with what the file itself puts there
+    conf = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(conf)
+    connected = {}
+    app = SimpleNamespace(add_html_math_renderer=lambda *_: None, connect=connected.__setitem__)
+    conf.setup(app)
+
+    def shown(cls):
+        return connected["autodoc-process-signature"](app, "class", "", cls, {}, "(*values)", None)
+
+    assert shown(netkf.parts.Hybrid) == ("(epsilon: float)", None)
+    assert shown(netkf.parts.Bernoulli)[0].startswith("(delivery: ")
+    assert shown(netkf.Run) is None

@@ -14,6 +14,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.cli.options import parse_changes
+from netkf.scenario.values import parse_values
 from tests.conftest import ROOT, SCENARIOS
 
 RING = str(SCENARIOS / "poisson_ring.toml")
@@ -68,6 +69,19 @@ def test_theory_as_json_is_one_document(capsys):
 def test_settings_are_toml_or_bare_words():
     changes = parse_changes(["a.b=1.5", "c=[1, 2]", 'd="x y"', "e=word", "f=true", "g={ k = 1 }"])
     assert changes == {"a.b": 1.5, "c": [1, 2], "d": "x y", "e": "word", "f": True, "g": {"k": 1}}
+
+
+@pytest.mark.parametrize(
+    ("text", "number"), [(".5", 0.5), ("-.25", -0.25), ("2.", 2.0), ("+1.e3", 1e3)]
+)
+def test_numbers_need_no_digit_on_one_side_of_the_point(text, number):
+    assert parse_changes([f"probe={text}"]) == {"probe": number}
+    assert parse_values("--vary", "probe", f"{text},3") == [number, 3]
+
+
+@pytest.mark.parametrize("text", [".", "1.2.3", ".5s", "0.5.", "v1."])
+def test_words_with_points_are_words(text):
+    assert parse_changes([f"name={text}"]) == {"name": text}
 
 
 def test_seed_makes_another_run(tmp_path, capsys):

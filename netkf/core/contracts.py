@@ -126,7 +126,10 @@ def _watched(cls: type, own: FunctionType, contract: FunctionType) -> Any:
 
     @functools.wraps(own)
     def watched(self: Any, *arguments: Any, **options: Any) -> Any:
-        result = own(self, *arguments, **options)
+        try:
+            result = own(self, *arguments, **options)
+        except SystemExit as error:  # it would end the command without a word
+            raise ContractError(f"{describe_method(cls, own)} called exit") from error
         _Last.call = Call(cls, own, result)
         if result is None and not is_optional:
             rule = "returned nothing; it must return a value"

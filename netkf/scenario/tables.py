@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from netkf.core.contracts import is_netkf_class
+from netkf.core.contracts import is_netkf_class, place_of_error
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file
 from netkf.network.channels import Channel
@@ -245,7 +245,9 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
         raise
     except Exception as error:
         # The user's class is this one, or one of the values, whose methods a check called.
-        rule = f"{cls.__name__} could not be made ({describe_error(error)})"
+        place = place_of_error(error)
+        where = f"; {place}" if place else ""
+        rule = f"{cls.__name__} could not be made ({describe_error(error)}{where})"
         if is_netkf_class(cls):
             rule = explain_user_error(tuple(values.values()), error) or ""
         if not rule:

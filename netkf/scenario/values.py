@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from netkf.core.errors import ScenarioError
@@ -10,6 +11,9 @@ from netkf.scenario.reading import parse_toml
 MAX_WORD = 1000  # characters of a value that is not TOML and is taken as a text
 MAX_SETTING = 100_000
 """Characters of a setting; Linux passes no argument of more than 131,071."""
+
+SHORT_NUMBER = re.compile(r"[+-]?(?:\.\d+|\d+\.)(?:[eE][+-]?\d+)?", re.ASCII)
+"""Numbers without a digit on one side of the point, which people type and TOML has not."""
 
 
 def split_setting(option: str, setting: str) -> tuple[str, str]:
@@ -28,7 +32,8 @@ def split_setting(option: str, setting: str) -> tuple[str, str]:
 
 
 def parse_value(option: str, key: str, text: str) -> Any:
-    """Return the value of a TOML expression, or the text itself if it is words without quotes.
+    """Return the value of a TOML expression or of a number such as ``.5``, or the text itself if it
+    is words without quotes.
 
     Raises ScenarioError at ``option`` for a text that is neither; ``key`` is named in the message.
     """
@@ -39,7 +44,7 @@ def parse_value(option: str, key: str, text: str) -> Any:
             rule = f"value of {key} is not valid TOML"
             remedy = "correct it; quote the argument for your shell"
             raise ScenarioError(option, rule, text, remedy) from None
-        return text
+        return float(text) if SHORT_NUMBER.fullmatch(text) else text
 
 
 def parse_values(option: str, key: str, text: str) -> list[Any]:

@@ -108,6 +108,11 @@ def settled(log, kind):
     return changed
 
 
+def before_it_was_sent(log, kind):
+    """With all rows of a kind first among those of their instants."""
+    return log[np.lexsort((log["kind"] != CODES[kind], log["t"]))]
+
+
 def moved(log, kind):
     changed = log.copy()
     changed["t"][rows_of(log, kind)[-1] :] += 1e-4
@@ -136,6 +141,8 @@ LOGS = [
     *((name, counted_from_one, "") for name in TABLES),
     *((name, settled, "lost") for name in ("ring", "diffusion", "coincident")),
     ("ring", settled, "late"),
+    *((name, before_it_was_sent, "deliver") for name in TABLES),
+    ("ring", before_it_was_sent, "lost"),
     ("ring", moved, "tick"),
     ("ring", moved, "sense"),
 ]

@@ -88,6 +88,10 @@ MISTAKES = {
                      r"F failed in weight: ZeroDivisionError.*; FILE, line 6"),
     "weight is a text": ("FILTER", f"def weight(self, degree, peer_degree): return 'x'\n{SAME}",
                          r"F failed after weight \(FILE, line 6\) returned 'x': TypeError"),
+    "absorb exits": ("FILTER", "def absorb(self, state, messages, exchange): raise SystemExit(3)",
+                     r"F\.absorb \(FILE, line 6\) called exit"),
+    "it cannot be made": ("FILTER", f"def __post_init__(self): raise RuntimeError('no')\n{SAME}",
+                          r"F could not be made \(RuntimeError: no; FILE, line 6\)"),
     "nothing is defined": ("FILTER", "pass", "must define absorb"),
     "h returns nothing": ("SENSOR", "def h(self, x, node): pass\n"
                           "def jacobian(self, x, node): return np.eye(1)",

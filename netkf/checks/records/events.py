@@ -152,10 +152,11 @@ def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each message is lost at once, or arrives once, as long after it was sent
-    as its age says; none may be under way longer than its delay can be.
+    """Yield a fault unless each message is lost at once, or arrives once, in a row after that of its
+    sending, as long after it as its age says; none may be under way longer than its delay can be.
     """
-    sends = log[log["kind"] == SEND]
+    send_rows = np.flatnonzero(log["kind"] == SEND)
+    sends = log[send_rows]
     ends = np.flatnonzero(np.isin(log["kind"], (DELIVER, LOST, LATE)))
     last = log[ends]
     is_lost = last["kind"] == LOST
@@ -177,6 +178,8 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     repeats[np.unique(keys, return_index=True)[1]] = False
     if (k := _first(repeats)) is not None:
         yield f"{_describe(log, int(ends[k]))} is a second end of message {last['message'][k]}"
+    if (k := _first(ends < send_rows[order[place]])) is not None:
+        yield f"{_describe(log, int(ends[k]))} comes before message {last['message'][k]} is sent"
     age = np.where(is_lost, 0.0, last["age"])
     if (
         k := _first(~(last["t"] - sent["t"] == age) | (last["phase"] != sent["phase"]))
