@@ -152,8 +152,8 @@ def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each message is lost at once, or arrives once, in a row after that of its
-    sending, as long after it as its age says; none may be under way longer than its delay can be.
+    """Yield a fault unless each message is lost at once, or arrives once, in a row after it is sent
+    and as long after it as its age says; none may be under way longer than its delay can be.
     """
     send_rows = np.flatnonzero(log["kind"] == SEND)
     sends = log[send_rows]
