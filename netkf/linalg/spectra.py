@@ -202,5 +202,6 @@ def _balance(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``D^-1 A D`` (n, n), with rows and columns of like size, and the diagonal D (n,) of
     powers of 2.
     """
-    balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+    with np.errstate(invalid="ignore"):  # scipy takes large powers for indices that it then drops
+        balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     return np.asarray(balanced, dtype=np.float64), np.asarray(scale, dtype=np.float64)

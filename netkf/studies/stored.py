@@ -40,7 +40,7 @@ FILTERS = "filters.parquet"
 TRAFFIC = ("transmissions", "bytes")
 PARTS = ("se", "difference", "low", "high", "real")
 """Parts of a quantity beside its value, each in a column of its own."""
-FLAGS = (*(f"{key}_real" for key in QUANTITIES), "predicts")
+FLAGS = (*(f"{key}_real" for key in QUANTITIES), "predicts", "same_losses")
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,6 +102,7 @@ def _read_filter(row: dict[str, Any]) -> ComparedFilter:
         bytes=size,
         status=row["status"],
         predicts=row["predicts"],
+        same_losses=row["same_losses"],
     )
 
 

@@ -90,7 +90,7 @@ def test_every_entity_has_a_clock():
     assert Periodic(period=1.0, at="directions").entities(directed) == ((0, 1), (2, 1))
     assert OnReadings().entities(path) == ()
     assert OnReadings().at == "readings"
-    with pytest.raises(TypeError):
+    with pytest.raises(ScenarioError, match=r"at: is no setting; .*write OnReadings\(\)"):
         OnReadings(at="nodes")
     assert directed.receivers(0) == directed.receivers(2) == (1,)
     assert directed.senders(1) == (0, 2)

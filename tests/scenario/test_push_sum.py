@@ -65,7 +65,7 @@ def test_mistakes_are_refused_in_one_line(changes, words):
         ("1,1,3,0,3", "got 'slot 1, phase 1, step 3'"),
         ("1,0,1,0,3", "got 'slot 1, phase 0, step 1'"),
         ("1,0,0,0,1", "up.csv"),  # not a link
-        ("1,0,0,0,x", "peer must be a finite number"),
+        ("1,0,0,0,x", "peer must name a node of the graph"),
         ("1,0,0.5,0,3", "step must hold integers"),
         ("-1,0,0,0,3", "slot must hold integers"),
         ("1,0,0,0", "line 2 must have 5 entries"),

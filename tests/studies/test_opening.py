@@ -78,7 +78,7 @@ def test_a_run_comes_back_as_it_was(name, changes, tmp_path):
 
 def test_errors_keep_the_digits_that_were_written(tmp_path):
     """A state of 1e12 leaves no digits of x - xhat, and the tables have them."""
-    changes = {"plant.mean": [1e13, 0.0], **SHORT}
+    changes = {"plant.mean": [1e13, 0.0], "plant.A": [[0.0, 1.0], [-1.0, 4.0]], **SHORT}
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
     run = netkf.simulate(scenario)
     assert run.exact_errors

@@ -292,7 +292,7 @@ class Maybe(Gossip):
     pairwise = "yes"
 
 
-@says("Picky.accepts: must be True or False", epsilon=0.3)
+@says("Picky.accepts (tests/testing/broken_filters.py, line 297) returned nothing", epsilon=0.3)
 class Picky(Hybrid):
     def accepts(self, payload, age):
         return None
@@ -350,7 +350,7 @@ class Unmade(Hybrid):
     pass
 
 
-@says("Inverts.init: failed with LinAlgError: Singular matrix; set inverts = True", epsilon=0.3)
+@says("Singular matrix (tests/testing/broken_filters.py, line 356); set inverts", epsilon=0.3)
 class Inverts(Hybrid):
     def init(self, model, mean, cov, node):
         _ = np.linalg.inv(cov)

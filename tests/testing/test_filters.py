@@ -141,7 +141,7 @@ def test_methods_of_a_former_contract_are_refused_where_the_class_is_made():
         ("absorb", lambda self, state, messages: None, "state, messages, exchange"),
         ("absorb", lambda self, state, phase, messages: None, "state, messages, exchange"),
     ):
-        with pytest.raises(TypeError, match=rf"Former.{name} must take \({arguments}\)"):
+        with pytest.raises(TypeError, match=rf"Former\..* must take \({arguments}\)"):
             type("Former", (parts.Gossip,), {name: former})
     type("Any", (parts.Gossip,), {"absorb": lambda self, state, *rest: state})
 
