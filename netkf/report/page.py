@@ -112,7 +112,8 @@ def write_report(
     WriteError if the page cannot be written.
     """
     path = Path(directories[0]) / "report.html" if out is None else out
-    _require_page(path)
+    if out is not None or path.parent.is_dir():
+        _require_page(path)
     write_text(path, make_page(directories, replica, trust, path))
     return path
 
@@ -125,6 +126,8 @@ def _require_page(path: Path) -> None:
     if path.is_dir():
         raise WriteError(OSError(errno.EISDIR, ""), path)
     if not path.is_file():
+        if not path.parent.is_dir():  # before what takes time
+            raise WriteError(OSError(errno.ENOENT, ""), path)
         return
     try:
         with path.open("rb") as file:

@@ -92,10 +92,11 @@ def run_to_directory(
     KeyboardInterrupt) when interrupted, and EngineError if a user's class fails.
     """
     replica = integer(low=0)("replica", replica)
-    chosen_engine = choose_engine(engine, scenario)
+    chosen_engine = choose_engine(engine, scenario, announce=False)
     output = _create_output(
         scenario, out, scenario.seed, replica, chosen_engine.name, trace != "none"
     )
+    choose_engine(engine, scenario)  # says that it compiles, if nothing was refused
     recorder = Recorder(output.sinks)
     is_complete = False
     try:

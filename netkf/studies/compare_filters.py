@@ -312,7 +312,7 @@ def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEn
         )
     try:
         candidate = make()
-        choose_engine(engine, candidate)
+        choose_engine(engine, candidate, announce=False)
     except (ScenarioError, EngineError) as error:
         return FilterEntry(label, scenario=None, reason=f"cannot run here: {error}")
     return FilterEntry(label, candidate)

@@ -114,7 +114,7 @@ def plan_sweep(
     base = scenario if seed is None else scenario.replace({"seed": seed})
     points = expand_grid(base, vary)
     for point in points:
-        choose_engine(engine, point.scenario)
+        choose_engine(engine, point.scenario, announce=False)
     return SweepPlan(base=base, vary=vary, points=points, runs=runs, engine=engine)
 
 
