@@ -8,6 +8,7 @@ nonlinear sensor measures from. Several rows of one node at one time are used to
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -20,6 +21,8 @@ from netkf.core.fields import MAX_MAGNITUDE, SourceFile
 from netkf.linalg.arrays import FloatArray, block_diagonal, readonly_array
 from netkf.linalg.portable import cholesky, solve_lower
 
+_NOISE_COLUMN = re.compile(r"R\d*")
+"""Names that only columns of noises may have."""
 Matrix = Callable[[int, np.ndarray], Any]
 """Returns the H (p', n) of row k of a node for the p' values that are there, flags (p,), or a
 function that linearises them.
@@ -82,6 +85,12 @@ class ReadingTable:
         own = triangle if "R00" in header else diagonal if "R0" in header else {}
         self._noise: dict[str, tuple[int, int]] = own
         self.has_noise = bool(own)
+        foreign = [name for name in header if _NOISE_COLUMN.fullmatch(name) and name not in own]
+        if foreign:
+            forms = f"{', '.join(diagonal)} or {', '.join(triangle)}"
+            rule = f"{path.name} must give the noise of its rows as {forms}, not both"
+            remedy = "write columns of one of the two forms, and rename others"
+            raise ScenarioError("path", rule, foreign[0], remedy)
         self._surplus = [name for name in header if number_of(name) >= p]
 
     @cached_property
@@ -146,7 +155,7 @@ class ReadingTable:
                 name for name, pair in self._noise.items() if pair == (min(i, j), max(i, j))
             )
             rule = f"{self.columns.where(k)}: {name} is missing, and y{i} has a value"
-            remedy = "write it, 0 where two values do not correlate"
+            remedy = "write it" if i == j else "write it, 0 where two values do not correlate"
             raise ScenarioError("path", rule, None, remedy)
         R[without] = np.nan
         self._require_definite(R, ~without & self.present.any(axis=1))

@@ -263,6 +263,13 @@ def test_mistakes_in_tables_of_ranges(tmp_path, columns, line, sensor, said):
         ("t,node,y0,y1,R00,R11", "0.5,0,1,2,1,1", "add the column R01"),
         ("t,node,y0,y1,R0", "0.5,0,1,2,1", "add the column R1"),
         ("t,node,y0,y1,R0,R1", "0.5,0,1,2,x,1", "line 2: R0 must be a finite number"),
+        # A column of noises that no form has would be ignored.
+        ("t,node,y0,y1,R1", "0.5,0,1,2,1", "R0, R1 or R00, R01, R11, not both; got 'R1'"),
+        ("t,node,y0,y1,R01,R11", "0.5,0,1,2,0,1", "not both; got 'R01'"),
+        ("t,node,y0,y1,R", "0.5,0,1,2,1", "not both; got 'R'"),
+        ("t,node,y0,y1,R0,R1,R2", "0.5,0,1,2,1,1,1", "not both; got 'R2'"),
+        ("t,node,y0,y1,R0,R1,R00,R01,R11", "0.5,0,1,2,1,1,1,0,1", "not both; got 'R0'"),
+        ("t,node,y0,y1,R00,R01,R10,R11", "0.5,0,1,2,1,0,0,1", "not both; got 'R10'"),
     ],
 )
 def test_mistakes_in_noises_of_rows(tmp_path, columns, line, said):
@@ -270,6 +277,12 @@ def test_mistakes_in_noises_of_rows(tmp_path, columns, line, said):
         make(tmp_path, "triangle", True, "central", {"kind": "broadcast"}, f"{columns}\n{line}\n")
     assert said in str(refused.value)
     assert "leave out" not in str(refused.value)
+
+
+def test_a_variance_that_is_missing_is_not_said_to_be_0(tmp_path):
+    table = "t,node,y0,y1,R0,R1\n0.5,0,1,2,0.1,\n"
+    with pytest.raises(netkf.ScenarioError, match=r"R1 is missing, and y1 has a value; write it$"):
+        make(tmp_path, "triangle", True, "central", {"kind": "broadcast"}, table)
 
 
 def test_a_row_without_noise_has_that_of_its_sensor_and_filters_believe_rows(tmp_path):

@@ -1,6 +1,7 @@
 """The random Riccati equation against independent values in 60-digit arithmetic."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -29,6 +30,14 @@ def test_steady_covariance(name):
     case = CASES["steady"][name]
     P = theory.steady_covariance(*(case[k] for k in "AQCR"))
     np.testing.assert_allclose(P, case["Pstar"], rtol=0, atol=1e-11 * np.abs(case["Pstar"]).max())
+
+
+def test_a_rotation_without_noise_has_no_stabilising_fixed_point():
+    turn = np.array([[np.cos(0.7), np.sin(0.7)], [-np.sin(0.7), np.cos(0.7)]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(netkf.TheoryError, match="does not stabilise the filter"):
+            theory.steady_covariance(turn, np.zeros((2, 2)), [[1.0, 0.0]], [[0.1]])
 
 
 @pytest.mark.parametrize("name", CASES["critical"])

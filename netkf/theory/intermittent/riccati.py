@@ -130,6 +130,9 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
         # One step of Newton's method (Hewer) removes the rounding error of the solver:
         # P+ = (F - K H) P+ (F - K H)' + Q + K R K'.
         K = _optimal_gain(P, F, H, R)
+        if not growth_factor(F - K @ H) < 1.0:
+            # The equation of that step is singular then.
+            raise TheoryError("the fixed point found does not stabilise the filter")
         P = symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(F - K @ H, Q + K @ R @ K.T)))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise TheoryError(f"no stabilising fixed point of f_1: {error}") from None
