@@ -31,7 +31,7 @@ from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, simulate
 from netkf.runs.summary import NO_COVARIANCE, nees_bounds
 from netkf.scenario.scenario import Scenario
-from netkf.theory import error_covariance
+from netkf.theory.common.errors import error_squares
 from netkf.trace.nees import errors
 from netkf.trace.run import Run, blurred_samples
 
@@ -80,7 +80,7 @@ def run_consistency(
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
     after_start = np.flatnonzero(run.times > 0.0)
-    sigma = _exact_covariance(scenario, run)
+    sigma = _exact_squares(scenario, run)
     # Samples in which the error is mostly rounding, by its standard deviation of P and of Sigma.
     blurred = blurred_samples(run, run.P)
     blurred |= False if sigma is None else blurred_samples(run, sigma)
@@ -113,21 +113,22 @@ def _count_errors(scenario: Scenario) -> int:
     return len(scenario.nodes) * scenario.plant.n
 
 
-def _exact_covariance(scenario: Scenario, run: Run) -> FloatArray | None:
-    """Return Sigma (T, N, n, n), the exact covariance of each node's errors given the events of the
-    run; None if theory has none for this filter, or the network is too large.
+def _exact_squares(scenario: Scenario, run: Run) -> FloatArray | None:
+    """Return Sigma (T, N, n, n), the exact mean e e' of each node's errors e given the events of
+    the run; None if theory has none for this filter, or the network is too large.
     """
     if _count_errors(scenario) > MAX_ERRORS:
         return None
     try:
-        return error_covariance(scenario, run)
+        return error_squares(scenario, run)
     except TheoryError:
         return None
 
 
 def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
-    """Return the expected NEES tr(P^-1 Sigma) (T, N), from ``P`` and the exact covariance ``sigma``
-    of the errors, (T, N, n, n) each at T times and N nodes; nan if Sigma is unknown or P singular.
+    """Return the expected NEES tr(P^-1 Sigma) (T, N), from ``P`` and the exact mean ``sigma`` of e
+    e' of the errors e, (T, N, n, n) each at T times and N nodes; nan if Sigma is unknown or P
+    singular.
     """
     expected = np.full(P.shape[:2], np.nan)
     if sigma is None:
@@ -145,7 +146,7 @@ def _mean_nis(
     """Return the mean NIS (N,) of each node's own readings and its expected value (N,), over the
     samples that rounding has not ``blurred`` (T, N).
 
-    ``sigma`` (T, N, n, n) are the exact covariances of the errors, if known. Both are nan in
+    ``sigma`` (T, N, n, n) are the exact means of e e' of the errors e, if known. Both are nan in
     continuous time, where predictions at readings are not sampled.
     """
     unknown = np.full(len(run.nodes), np.nan)
@@ -162,15 +163,15 @@ class _Innovations:
 
     The innovation is computed as H e + v from the error e of the prediction, by letting the sensor
     read e instead of the state, so that a large state costs no digits. ``sigma`` (T, N, n, n) are
-    the exact covariances of the errors, if known; samples in the mask ``blurred`` (T, N) are left
+    the exact means of e e', if known; samples in the mask ``blurred`` (T, N) are left
     out.
     """
 
     def __init__(
         self, scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
     ) -> None:
-        """Take a run with its T samples: the exact covariances ``sigma`` (T, N, n, n) of the
-        errors, None if unknown, and the mask ``blurred`` (T, N) of errors to leave out.
+        """Take a run with its T samples: the exact means ``sigma`` (T, N, n, n) of e e',
+        None if unknown, and the mask ``blurred`` (T, N) of errors to leave out.
         """
         self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
         self._streams = Streams(run.seed, run.replica)
@@ -220,8 +221,8 @@ class _Innovations:
     def _prediction(
         self, k: int, i: int, noise: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """Return the error (n,) of the prediction of the i-th node, its P (n, n), and its exact
-        covariance (n, n), None if unknown.
+        """Return the error (n,) of the prediction of the i-th node, its P (n, n), and the exact
+        mean (n, n) of e e', None if unknown.
 
         They are those of sample k or, with the plant's ``noise`` (n,) of the step, one slot later.
         """
@@ -483,4 +484,9 @@ def _explain_bias(scenario: Scenario, conservative: bool) -> str:
     if conservative:
         by_design = bias == "larger"
         return "P is conservative by design" if by_design else "P is larger than the errors need"
-    return "the design of the filter makes P too small" if bias == "smaller" else "P is too small"
+    if bias == "smaller":
+        return "the design of the filter makes P too small"
+    starts = (scenario.initial_estimate(node)[0] for node in scenario.nodes)
+    if all(np.array_equal(start, scenario.plant.start_mean) for start in starts):
+        return "P is too small"
+    return "P does not know that filters start elsewhere than the state"

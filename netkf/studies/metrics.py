@@ -18,7 +18,8 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
 from netkf.scenario.model import Filtering
 from netkf.scenario.scenario import Scenario
-from netkf.theory import covariance_bound, error_covariance, riccati_step
+from netkf.theory import covariance_bound, riccati_step
+from netkf.theory.common.errors import error_squares
 from netkf.theory.hybrid.path_moments import expected_squares
 from netkf.trace.run import Run
 from netkf.trace.schema import KINDS
@@ -103,7 +104,7 @@ def _expected_squares(scenario: Scenario, run: Run) -> FloatArray:
     """
     if not scenario.slotted:
         return expected_squares(scenario, run)
-    return np.asarray(np.trace(error_covariance(scenario, run), axis1=2, axis2=3))
+    return np.asarray(np.trace(error_squares(scenario, run), axis1=2, axis2=3))
 
 
 def expected_errors_known(scenario: Scenario) -> bool:

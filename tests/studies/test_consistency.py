@@ -1,6 +1,7 @@
 """NEES and NIS: correct filters are as they should be, the cautious too; wrong ones not."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,12 +11,14 @@ import scipy.stats
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
+from netkf.scenario.reading import from_table
 from netkf.studies.consistency import (
     RunConsistency,
     consistency,
     judge_consistency,
     run_consistency,
 )
+from netkf.studies.metrics import expected_metrics
 from netkf.studies.tables import format_consistency
 from tests.checks.broken import Overconfident
 from tests.conftest import SCENARIOS
@@ -53,6 +56,50 @@ def test_a_mismatched_model_is_as_bad_as_theory_says(gossip):
     found = consistency(wrong, runs=12, confidence=0.999, workers=1)
     assert found
     assert all("the filters' model makes P too small" in row.verdict for row in found.rows)
+
+
+@pytest.mark.parametrize("time", ["slots", "clocks"])
+def test_filters_that_start_elsewhere_have_the_errors_of_that(time, gossip, ring):
+    if time == "slots":
+        scenario = gossip.replace({"filter.mean": [3.0, 0.0, -2.0, 1.0]})
+    else:
+        scenario = ring.replace({"horizon": 2.0, "filter.mean": [[4.0, -4.0]] * 6})
+    found = consistency(scenario, runs=20, confidence=0.999, workers=1)
+    assert found
+    for row in found.rows:
+        assert row.nees == pytest.approx(row.expected, rel=0.25)
+    assert max(row.expected for row in found.rows) > 1.2 * scenario.plant.n
+    assert any("start elsewhere than the state" in row.verdict for row in found.rows)
+
+
+def test_the_square_of_the_first_offset_is_in_what_nees_and_mean_squares_should_be():
+    """Of one Kalman filter: P + m m', m the offset as the filter forgets it, written plainly."""
+    F, Q, R, H, offset = 0.9, 0.5, 2.0, 1.0, 5.0
+    table = {
+        "format": 1,
+        "name": "one",
+        "horizon": 5.0,
+        "probe": 1.0,
+        "plant": {"kind": "linear", "F": [[F]], "Q": [[Q]], "period": 1.0, "cov": [[1.0]]},
+        "sensors": [{"nodes": [0], "H": [[H]], "R": [[R]]}],
+        "network": {
+            "graph": {"kind": "path", "nodes": 2},
+            "activation": {"kind": "broadcast"},
+        },
+        "filter": {"kind": "local", "mean": [-offset]},
+    }
+    scenario = from_table(table, Path())
+    P, m, squares, expected = 1.0, offset, [1.0 + offset**2], []
+    for _ in range(5):
+        P, m = F * P * F + Q, F * m
+        gain = P * H / (H * P * H + R)
+        P, m = (1.0 - gain * H) * P, (1.0 - gain * H) * m
+        squares.append(P + m**2)
+        expected.append(1.0 + m**2 / P)
+    found = run_consistency(scenario, 1, 0)
+    assert found.expected[0] == pytest.approx(np.mean(expected), rel=1e-9)
+    exact = expected_metrics(scenario, 1, 0, "simpy")
+    assert exact.mean_square[0, 0] == pytest.approx(np.mean(squares[1:]), rel=1e-9)
 
 
 def test_what_is_not_known_is_not_judged(gossip):

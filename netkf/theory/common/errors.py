@@ -31,6 +31,14 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     return joint if stacked else diagonal_blocks(joint, len(scenario.nodes))
 
 
+def error_squares(scenario: Scenario, run: Run) -> FloatArray:
+    """Return E[(x - xhat_i)(x - xhat_i)'] (T, N, n, n) at ``run.times``, given the run's events:
+    :func:`error_covariance` and the square of the mean error, which is not 0 where filters start
+    elsewhere than the plant. Raises the errors of that function.
+    """
+    return diagonal_blocks(_replay_nodes(scenario, run, about_mean=False), len(scenario.nodes))
+
+
 def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
     """Return the diagonal blocks (T, N, n, n) of T stacked covariances (T, N n, N n).
 
@@ -65,13 +73,14 @@ def _require_same_run(scenario: Scenario, run: Run) -> None:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
 
 
-def _replay_nodes(scenario: Scenario, run: Run) -> FloatArray:
-    """Return the joint error covariance (T, N n, N n) of all N nodes at the T ``run.times``.
+def _replay_nodes(scenario: Scenario, run: Run, about_mean: bool = True) -> FloatArray:
+    """Return the joint error covariance (T, N n, N n) of all N nodes at the T ``run.times``, or the
+    second moments unless ``about_mean``.
 
     Raises TheoryError if the run is of another scenario.
     """
     _require_same_run(scenario, run)
-    joint, nodes = replay_covariances(scenario, run), len(scenario.nodes)
+    joint, nodes = replay_covariances(scenario, run, about_mean), len(scenario.nodes)
     # A pooled filter is replayed once; all nodes share its estimate, and so its error.
     shared = joint.shape[-1] < nodes * scenario.plant.n
     return np.tile(joint, (1, nodes, nodes)) if shared else joint

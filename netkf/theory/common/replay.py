@@ -30,16 +30,18 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 
-def replay_covariances(scenario: Scenario, run: Run) -> FloatArray:
+def replay_covariances(scenario: Scenario, run: Run, about_mean: bool = True) -> FloatArray:
     """Return the exact joint error covariance (T, M n, M n) of M estimators at ``run.times``, given
-    the events of the run (ticks, losses, delays): the run is replayed on the errors alone.
+    the events of the run (ticks, losses, delays): the run is replayed on the errors alone. Unless
+    ``about_mean``, they are second moments: filters may start elsewhere than the plant.
 
     An estimator is a node's filter, or (M = 1) the pooled one that all nodes share. Raises
     TheoryError for a filter whose equations are not known here.
     """
     errors = _stacked_errors(scenario)
     # The generator stops at each sample, when the errors have their values of that time.
-    covariances = [errors.covariance() for _ in _replay(scenario, run, errors)]
+    joint = errors.covariance if about_mean else errors.second_moments
+    covariances = [joint() for _ in _replay(scenario, run, errors)]
     size = errors.estimators * errors.n
     return np.array(covariances).reshape(-1, size, size)
 

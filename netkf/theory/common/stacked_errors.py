@@ -140,6 +140,13 @@ class StackedErrors:
         forms = self.stack.forms(range(self.estimators))
         return self._mean_and_covariance(forms.reshape(self.estimators * self.n, -1))[1]
 
+    def second_moments(self) -> FloatArray:
+        """Return the joint second moments (M n, M n) of the errors of the estimators: covariances
+        and products of means, which the forms hold too.
+        """
+        forms = self.stack.forms(range(self.estimators)).reshape(self.estimators * self.n, -1)
+        return np.asarray(forms @ forms.T)
+
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the estimators."""
         # P = S S'
