@@ -98,7 +98,7 @@ def _make_row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[
     rms = float(np.sqrt(mean[0]))
     return {
         "rms_error": rms,
-        "rms_error_se": float(error[0]) / (2.0 * rms) if rms > 0.0 else 0.0,
+        "rms_error_se": 0.0 if rms == 0.0 else float(error[0]) / (2.0 * rms),
         "mean_trace": float(mean[1]),
         "mean_trace_se": float(error[1]),
         "bound": bound,

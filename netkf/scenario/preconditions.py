@@ -144,12 +144,13 @@ def _check_invertible(scenario: DerivedScenario) -> None:
         nonsingular = singular is None or hidden_mode(A.T, outputs_of(Q)) is None
     if not nonsingular:
         value = "a singular F" if singular is None else _describe_cov(initial[singular], singular)
+        noise = "a positive definite Q" if scenario.slotted else "a B that drives every state"
         raise ScenarioError(
             "filter.cov",
             f"must be positive definite for the {filter_name(scenario)}, which inverts "
             "covariances, where the noise does not drive every state",
             value,
-            "give filter.cov, or a positive definite Q",
+            f"give filter.cov, or {noise}",
         )
 
 

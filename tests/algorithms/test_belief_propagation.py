@@ -226,6 +226,7 @@ MODES = {
     "one grows slowly": [[1.01, 0.2], [0.0, 0.5]],
     "one grows fast": [[1.2, 0.2], [0.1, 0.03]],
     "constant and fast": [[1.0, 0.2], [0.0, 0.03]],
+    "all fast": [[0.5, 0.2], [0.15, 0.28]],
     "defective": [[1.0, 1.0], [0.0, 1.0]],
     "rotation": [[0.98, 0.19], [-0.2, 0.97]],
 }
@@ -261,6 +262,7 @@ def test_evidence_is_kept_for_thousands_of_slots(name, tmp_path):
         # Where numbers are below the smallest ones both are zero.
         size = np.trace(P, axis1=-2, axis2=-1)[..., None, None] + 1e-290
         assert (np.abs(run.P - P) / size).max() < 1e-12
+        assert (np.abs(central.P - P) / size).max() < 1e-12
         error = np.abs(run.xhat - central.xhat) / (1e-290 + np.abs(central.x)[:, None])
         assert error.max() < 1e-9
     close(error_law(scenario, run).P / size, run.P / size, 1e-9)

@@ -42,7 +42,7 @@ from netkf.linalg.lanes import (
 from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
 from netkf.linalg.structs import Size, sized
 
-TINY = 1e-200  # far below any length of a row that counts, yet above underflow
+TINY = 1e-290  # below any squared length of a row that counts, yet above underflow
 
 
 class SlotNodes(NamedTuple):
