@@ -181,6 +181,8 @@ class _Entries:
         name, source = self._row[column].strip(), self._source
         if source.node_ids and name in source.node_ids:
             return source.node_ids[name]
+        if not name and not may_miss:
+            raise self._refusal(column, "must be the id or the name of a node", "correct the entry")
         if not name or _is_number(name):
             number = self.number(column, may_miss)
             if number < 0.0:
@@ -353,6 +355,8 @@ def _open_table(source: SourceFile) -> Iterator[_Sheet]:
                 lines = _Lines(file)
                 texts = (line for line in lines if line.strip())
                 names = next(texts, "")
+                if names.lower().lstrip('"').startswith("sep="):  # a line that spreadsheets write
+                    names = next(texts, "")
                 separator = next((s for s in ";\t" if s in names), ",")
                 reader = csv.reader(itertools.chain([names], texts), delimiter=separator)
                 header = [name.strip() for name in next(reader, [])]

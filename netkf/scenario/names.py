@@ -54,7 +54,8 @@ def _bind_at(key: str, value: Any, names: Names | None) -> Any:
     try:
         return bind_names(value, names)
     except ScenarioError as error:
-        raise error.under(key) from None
+        # The keys of the kind of a filter stand beside those that all filters have.
+        raise (error if key == "algorithm" else error.under(key)) from None
 
 
 def _bind_field(key: str, value: Any, names: Names | None) -> Any:
@@ -68,7 +69,7 @@ def _bind_field(key: str, value: Any, names: Names | None) -> Any:
         raise ScenarioError(key, "must be an integer", value, "give the id of a node")
     if value in names:
         return names[value]
-    if value.isascii() and value.isdecimal() and str(int(value)) == value:
+    if value.isascii() and value.isdecimal():  # 07 is 7, as in tables
         return int(value)
     remedy = f"{suggest_nearest(value, names)}correct it, or name the nodes in the graph"
     raise ScenarioError(key, "must name a node of the graph", value, remedy)

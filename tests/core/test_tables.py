@@ -18,6 +18,7 @@ SECONDS = TimeBase()
 DIALECTS = {
     "plain": PLAIN,
     "semicolons": PLAIN.replace(",", ";"),
+    "of a spreadsheet": "sep=;\n" + PLAIN.replace(",", ";"),
     "decimal commas": "t;node;y0\n1,0;0;0,3\n2,5;1;-0,7\n",
     "tabs": PLAIN.replace(",", "\t"),
     "tabs and commas": "t\tnode\ty0\n1,0\t0\t0,3\n2,5\t1\t-0,7\n",

@@ -162,6 +162,19 @@ def test_names_that_are_numbers_keep_them_and_others_take_what_is_free(folder):
     assert topology.links == ((0, 1), (0, 2), (2, 3))
 
 
+def test_ids_with_zeros_before_them_are_those_of_tables(folder):
+    (folder / "links.csv").write_text("sender,receiver\n01,02\n02,03\n")
+    network = {
+        "graph": {"kind": "csv", "path": "links.csv"},
+        "activation": {"kind": "poisson", "rate": 1.0},
+    }
+    sensors = [DRAWN["sensors"][0] | {"nodes": ["02"]}]
+    more = {"plant": DRAWN["plant"], "sensors": sensors, "network": network}
+    scenario = from_table(SCENARIO | more, folder)
+    assert tuple(scenario.nodes) == (1, 2, 3)
+    assert tuple(scenario.sensors[0].nodes) == (2,)
+
+
 def test_a_scenario_of_parts_takes_a_graph_and_names(folder):
     graph = network()
     graph.add_node("shed")
@@ -229,6 +242,16 @@ WRONG = {
         {},
         {"ticks.csv": "t,node,peer\n1,lab,rooof\n"},
         "line 2: peer must name",
+    ),
+    "no name in a table": (
+        {},
+        {"ticks.csv": "t,node,peer\n1,lab,\n"},
+        "line 2: peer must be the id or the name of a node; got ''",
+    ),
+    "unknown in a key of the filter": (
+        {"filter": {"kind": "push-sum", "leader": "rof"}},
+        {},
+        "^filter.leader: must name",
     ),
     "one link, two values": (
         {},
