@@ -28,8 +28,8 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--confidence",
         type=float,
-        default=0.95,
-        help="probability that no consistent filter is called broken (default: 0.95)",
+        default=0.99,
+        help="probability that no consistent filter is called broken (default: 0.99)",
     )
     add_seed(parser)
     add_engine(parser)

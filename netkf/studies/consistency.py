@@ -316,7 +316,7 @@ def consistency(
     scenario: Scenario,
     runs: int = 50,
     seed: int | None = None,
-    confidence: float = 0.95,
+    confidence: float = 0.99,
     workers: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
