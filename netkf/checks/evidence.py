@@ -262,29 +262,8 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     (``early``) or about errors that rounding hides (``blurred``) is undecided, and so is one whose
     test gives no number.
     """
-    (margin, low, high), tolerance, message = finding.margin, finding.tolerance, finding.message
-    needed = None
-    if finding.blurred:
-        verdict = UNDECIDED
-    elif finding.early:
-        verdict, message = UNDECIDED, f"{message}; {_describe_horizon(finding.horizon)}"
-    elif math.isnan(low) or math.isnan(high):
-        verdict, message = UNDECIDED, f"not judged, its test gives no number (nan): {message}"
-    elif not high >= 0.0:
-        verdict = BROKEN
-    elif low >= -tolerance:
-        verdict = HOLDS
-    else:
-        verdict = UNDECIDED
-        runs_used = min(runs, finding.most_runs)
-        forecast_runs = FORECAST_MARGIN * runs_used * _factor_needed(finding, MAX_RUNS / runs_used)
-        if forecast_runs < min(MAX_RUNS, finding.most_runs):
-            needed = math.ceil(forecast_runs)
-        if forecast_runs > finding.most_runs:
-            message = (
-                f"{message}; exact covariances are those of {finding.most_runs:,} runs at most, "
-                "too few to decide it"
-            )
+    margin, low, high = finding.margin
+    verdict, needed, message = _decide(finding, runs)
     off = finding.off
     if math.isnan(off) and (low < high or verdict == BROKEN):
         off = max(0.0, -margin)
@@ -298,7 +277,7 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         margin=margin,
         low=low,
         high=high,
-        tolerance=tolerance,
+        tolerance=finding.tolerance,
         verdict=verdict,
         needed=needed,
         evidence=message,
@@ -310,6 +289,30 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
         replica=finding.replica if verdict == BROKEN else None,
         group=promise.kind,
     )
+
+
+def _decide(finding: Finding, runs: int) -> tuple[str, int | None, str]:
+    """Return the verdict on a finding about ``runs`` runs, the number of runs that would decide it
+    (None unless it is undecided and that number is known), and the message.
+    """
+    (_, low, high), message = finding.margin, finding.message
+    if finding.blurred:
+        return UNDECIDED, None, message
+    if finding.early:
+        return UNDECIDED, None, f"{message}; {_describe_horizon(finding.horizon)}"
+    if math.isnan(low) or math.isnan(high):
+        return UNDECIDED, None, f"not judged, its test gives no number (nan): {message}"
+    if high < 0.0:
+        return BROKEN, None, message
+    if low >= -finding.tolerance:
+        return HOLDS, None, message
+    most, runs_used = finding.most_runs, min(runs, finding.most_runs)
+    forecast_runs = FORECAST_MARGIN * runs_used * _factor_needed(finding, MAX_RUNS / runs_used)
+    if forecast_runs > most:
+        few = f"exact covariances are those of {most:,} runs at most, too few to decide it"
+        message = f"{message}; {few}"
+    needed = math.ceil(forecast_runs) if forecast_runs < min(MAX_RUNS, most) else None
+    return UNDECIDED, needed, message
 
 
 def _factor_needed(finding: Finding, max_factor: float) -> float:

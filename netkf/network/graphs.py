@@ -604,33 +604,18 @@ class LinkTable:
         Raises ScenarioError if no link is left, or if the table does not fit.
         """
         if minimum is not None and not self.has_probabilities:
-            raise ScenarioError(
-                "minimum",
-                "needs a column delivery_probability in the table",
-                minimum,
-                "add the column or leave minimum out",
-            )
+            rule = "needs a column delivery_probability in the table"
+            raise ScenarioError("minimum", rule, minimum, "add the column or leave minimum out")
         named = {node for link in self.probability for node in link}
         delivery = self._with_reverse_links()
         links = self._links(delivery, minimum or 0.0)
         if not links and not self.alone:
-            raise ScenarioError(
-                "path" if minimum is None else "minimum",
-                "no link of the table is left",
-                minimum,
-                "lower minimum or add rows",
-            )
+            key, rule = "path" if minimum is None else "minimum", "no link of the table is left"
+            raise ScenarioError(key, rule, minimum, "lower minimum or add rows")
         # Pairs listed from i to j only, in a table that lists others both ways.
         one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
         if self.has_probabilities and links.intersection(one_way):
-            raise ScenarioError(
-                "path",
-                f"{self.rows.path}: some links are listed in both directions and others in one, so "
-                "the probability of the other direction is not known",
-                _list_directions(one_way, self._label),
-                "list every link twice, or every link once (then the row counts both ways), or set "
-                "directed = true",
-            )
+            raise self._unknown_direction(one_way)
         nodes = {node for link in links for node in link} | self.alone
         isolated = named - nodes
         _check_size(len(nodes), len(links))
@@ -648,6 +633,17 @@ class LinkTable:
             left_out=frozenset(isolated),
             tables={"": self.rows} | ({} if place_rows is None else {".positions": place_rows}),
             names=self.names,
+        )
+
+    def _unknown_direction(self, one_way: Sequence[Link]) -> ScenarioError:
+        """Return the error of pairs that are listed ``one_way`` where others are listed twice."""
+        return ScenarioError(
+            "path",
+            f"{self.rows.path}: some links are listed in both directions and others in one, so "
+            "the probability of the other direction is not known",
+            _list_directions(one_way, self._label),
+            "list every link twice, or every link once (then the row counts both ways), or set "
+            "directed = true",
         )
 
     def _label(self, node: int) -> str:
