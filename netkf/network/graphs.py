@@ -635,7 +635,7 @@ class LinkTable:
             names=self.names,
         )
 
-    def _unknown_direction(self, one_way: Sequence[Link]) -> ScenarioError:
+    def _unknown_direction(self, one_way: list[Link]) -> ScenarioError:
         """Return the error of pairs that are listed ``one_way`` where others are listed twice."""
         return ScenarioError(
             "path",
