@@ -58,6 +58,16 @@ class Columns(dict[str, FloatArray]):
         listed = " and ".join(str(self.lines[row]) for row in sorted(rows))
         return f"{self.source.name} line{'s' if len(rows) > 1 else ''} {listed}"
 
+    def refuse_early(self, early: np.ndarray, rule: str) -> None:
+        """Raise ScenarioError with the text ``rule`` and the line of the first of the rows that are
+        too ``early`` (indices), if no origin is given: of a longer log a scenario may choose where
+        it begins.
+        """
+        if early.size and not self.source.stamps.origin:
+            row = int(early[0])
+            remedy = "set [time] origin to where the run begins in the log"
+            raise ScenarioError("path", f"{self.where(row)}: {rule}", float(self["t"][row]), remedy)
+
     def integers(self, name: str) -> list[int]:
         """Return the column ``name`` as K integers, ids or counts; raises ScenarioError, with the
         line, for a value that is not an integer from 0 to MAX_ID. Names of nodes are below 0 until

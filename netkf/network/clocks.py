@@ -389,15 +389,8 @@ class RecordedClock(LinkClock):
                 'set at = "directions", or rename the column',
             )
         table = read_columns(self.path, ("t", *columns))
-        # Nothing is sent at time 0 or before; of a longer log a scenario may choose its origin.
         early = np.flatnonzero(table["t"] <= 0.0)
-        if early.size and not self.path.stamps.origin:
-            raise ScenarioError(
-                "path",
-                f"{table.where(int(early[0]))}: t must be above 0, nothing is sent at time 0",
-                float(table["t"][early[0]]),
-                "set [time] origin to where the run begins in the log",
-            )
+        table.refuse_early(early, "t must be above 0, nothing is sent at time 0")
         entities: list[Entity] = list(zip(*map(table.integers, columns), strict=True))
         first_line: dict[Entity, int] = {}
         for entity, line in zip(entities, table.lines.tolist(), strict=True):

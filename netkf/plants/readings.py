@@ -213,7 +213,7 @@ class ReadingTable:
                 rule = f"{columns.where(wrong[0])}: {name} has no row in H"
                 value = str(entries[wrong[0]])
                 raise ScenarioError("path", rule, value, "give H and R a row for it")
-        require_start(columns, np.flatnonzero(own))
+        columns.refuse_early(np.flatnonzero(own & (columns["t"] < 0.0)), "t must be at least 0")
         # A stamp may lie before the origin by its rounding.
         begun = columns["t"] >= -columns.half_digits
         rows = np.flatnonzero(own & begun & self.present.any(axis=1))
@@ -270,20 +270,6 @@ def number_of(name: str, letter: str = "y") -> int:
     """
     number = name.removeprefix(letter)
     return int(number) if name.startswith(letter) and number.isdecimal() else -1
-
-
-def require_start(columns: Columns, rows: np.ndarray) -> None:
-    """Raise ScenarioError, with the line, for a time below 0 in one of the ``rows`` (indices) if no
-    origin is given: of a longer log a scenario may choose where it begins.
-    """
-    early = rows[columns["t"][rows] < 0.0]
-    if early.size and not columns.source.stamps.origin:
-        raise ScenarioError(
-            "path",
-            f"{columns.where(early[0])}: t must be at least 0",
-            float(columns["t"][early[0]]),
-            "set [time] origin to where the run begins in the log",
-        )
 
 
 def slot_number(columns: Columns, row: int, period: float) -> int:

@@ -36,7 +36,6 @@ from netkf.plants.readings import (
     ReadingTable,
     RecordedReadings,
     RecordedSamples,
-    require_start,
     slot_number,
     take_from_record,
 )
@@ -104,7 +103,7 @@ class RecordedPlant(LinearPlant):
     def _slots(self) -> list[int]:
         """The slot number of each row, in the order of the table; rows of one slot are equal."""
         columns = self._states[0]
-        require_start(columns, np.arange(len(columns.lines)))
+        columns.refuse_early(np.flatnonzero(columns["t"] < 0.0), "t must be at least 0")
         return [slot_number(columns, row, self.period) for row in range(len(columns.lines))]
 
     @property

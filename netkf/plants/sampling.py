@@ -11,7 +11,6 @@ import numpy as np
 
 from netkf.core.clock import Clock, Entity
 from netkf.core.csv_files import read_columns
-from netkf.core.errors import ScenarioError
 from netkf.core.fields import Rule, SourceFile, field, source_file
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import SlotReadings
@@ -76,11 +75,7 @@ class RecordedSampling(Clock):
         table = read_columns(self.path, ("t", "node"))
         nodes = table.integers("node")
         early = np.flatnonzero(table["t"] <= 0.0)
-        if early.size and not self.path.stamps.origin:
-            where = table.where(int(early[0]))
-            rule = f"{where}: t must be above 0, the first sample comes after the start"
-            remedy = "set [time] origin to where the run begins in the log"
-            raise ScenarioError("path", rule, float(table["t"][early[0]]), remedy)
+        table.refuse_early(early, "t must be above 0, the first sample comes after the start")
         return list(zip(nodes, table["t"].tolist(), strict=True))
 
     @cached_property

@@ -179,9 +179,19 @@ def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray
     """Return how often each of E clocks of the network ticks in one ``replica`` of the runs of
     ``seed``, (E,), drawn from the clocks' streams without simulating anything else.
     """
+    ticks = draw_ticks(scenario, network_clocks(scenario).entities, seed, replica)
+    return np.array([len(times) for times in ticks])
+
+
+def draw_ticks(
+    scenario: Scenario, entities: Sequence[Entity], seed: int, replica: int
+) -> list[FloatArray]:
+    """Return the times in seconds of the ticks of each of the ``entities`` of the network's clock,
+    drawn again from the streams of one ``replica`` of the runs of ``seed``.
+    """
     clock: Any = scenario.network.activation
     streams = Streams(seed, replica)
-    ticks = [
+    return [
         generate_ticks(
             clock,
             entity,
@@ -189,9 +199,8 @@ def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray
             streams.generator("clock", *entity),
             scenario.horizon,
         )
-        for entity in network_clocks(scenario).entities
+        for entity in entities
     ]
-    return np.array([len(times) for times in ticks])
 
 
 def draw_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:

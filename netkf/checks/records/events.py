@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from netkf.core.clock import generate_ticks
+from netkf.checks.parts.ticks import draw_ticks
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import Matching, RecordedSlots
@@ -271,18 +270,8 @@ def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     silent = not scenario.node_filter.talks or run.status != "complete"
     if silent or not isinstance(clock, LinkClock) or isinstance(clock, OnReadings):
         return
-    streams = Streams(run.seed, run.replica)
     entities = list(clock.entities(scenario.topology))
-    times = [
-        generate_ticks(
-            clock,
-            entity,
-            partial(streams.generator, "phase", *entity),
-            streams.generator("clock", *entity),
-            scenario.horizon,
-        )
-        for entity in entities
-    ]
+    times = draw_ticks(scenario, entities, run.seed, run.replica)
     owner = np.repeat(np.arange(len(entities)), [len(part) for part in times])
     drawn = np.concatenate([np.empty(0), *times])
     order = np.lexsort((owner, drawn))
