@@ -41,7 +41,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(numpy|pd|pandas|networkx|collections|concurrent|pathlib|tuple\[).*"),
     (
         r"py:class",
-        r"ndarray|ArrayLike|FloatArray|IntArray|Edge|Entry|Link|AnyFilter|SourceFile|Executor|Path"
+        r"ndarray|ArrayLike|FloatArray|IntArray|Edge|Entry|Link|SourceFile|Executor|Path"
         r"|Progress|dict\[.*",
     ),
     # parts of the inside: states of filters, paths of sensors, base classes without public members

@@ -27,7 +27,6 @@ from netkf.algorithms.filter import (
     Reading,
     State,
 )
-from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.information_consensus import Hcmci, Icf
@@ -35,7 +34,6 @@ from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kalman_consensus import Kcf
 from netkf.algorithms.one_bit import OneBit
 from netkf.algorithms.push_sum import PushSum
-from netkf.algorithms.slot import SlotFilter
 from netkf.algorithms.stochastic_trigger import StochasticTrigger
 from netkf.algorithms.track_fusion import BarShalomCampo, InverseIntersection, OptimisedIntersection
 from netkf.core.clock import Clock
@@ -110,9 +108,6 @@ from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.stamps import Time
 
-SlotLocal, SlotCentral = Local, Central
-"""Former names of Local and Central in slots."""
-
 
 def kinds() -> dict[str, dict[str, type]]:
     """Return the classes by family ("plant", "filter", ...) and kind, as scenario files name them.
@@ -157,7 +152,6 @@ __all__ = [
     "ExponentialDelay",
     "Filter",
     "Filtering",
-    "FlowFilter",
     "Geometric",
     "GilbertElliott",
     "GmlGraph",
@@ -214,9 +208,6 @@ __all__ = [
     "Scenario",
     "Sensor",
     "SlotActivation",
-    "SlotCentral",
-    "SlotFilter",
-    "SlotLocal",
     "Star",
     "State",
     "StochasticTrigger",

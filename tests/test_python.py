@@ -21,7 +21,7 @@ def test_directories_to_compare_are_a_list():
 def test_all_parts_can_be_taken_at_once():
     names = {}
     exec("from netkf.parts import *", names)
-    assert {"Scenario", "Hybrid", "Poisson", "FlowFilter", "setting", "kinds"} <= names.keys()
+    assert {"Scenario", "Hybrid", "Poisson", "setting", "kinds"} <= names.keys()
 
 
 def test_a_scenario_can_be_built_from_public_parts(ring):

@@ -141,12 +141,3 @@ def test_a_filter_without_covariance_runs_from_the_command_line(folder, capsys):
     assert run.status == "complete"
     assert np.isnan(run.P).all()
     assert np.isfinite(run.xhat).all()
-
-
-def test_every_former_method_is_on_the_page():
-    from netkf.algorithms.filter import FORMER
-
-    section = PAGE[PAGE.index("## From FlowFilter and SlotFilter") :]
-    for name, present in FORMER.items():
-        assert re.search(rf"\| `{name}\b", section)
-        assert present.partition("(")[0] in section

@@ -10,7 +10,6 @@ carried as roots, ``P = root root'``, so that wide and narrow directions keep th
 
 from __future__ import annotations
 
-import inspect
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -184,17 +183,6 @@ class Estimate(NamedTuple):
 STEPS = ("init", "predict", "update", "emit", "absorb", "estimate")
 """The methods that define a filter."""
 
-FORMER = {
-    "flow": "predict(state, gap)",
-    "measure": "update(state, reading)",
-    "sense": "update(state, reading), and predict(state, gap) as a phase of the schedule",
-    "place": "init(model, mean, cov, node)",
-    "stretch": "max_measurement_interval(state)",
-    "programme": "schedule",
-    "redraws": "redraws_links(phase, step)",
-}
-"""Methods of the deprecated FlowFilter and SlotFilter, and their replacements in Filter."""
-
 
 class FirstSlot:
     """The first slot with an exchange, where a class does not say it: that of built-in filters."""
@@ -277,20 +265,6 @@ class Filter(Component):
     P_by_design: ClassVar[tuple[str, str]] = ("", "")
     slot_kernel: ClassVar[Any] = None
     unrolled: ClassVar[bool] = False
-
-    def __init_subclass__(cls) -> None:
-        """Raise TypeError if a derived class has a method of the deprecated contracts, by name or
-        by its arguments.
-        """
-        # A method by a former name would never be called: fail when the class is defined.
-        for name, present in FORMER.items():
-            if name in cls.__dict__:
-                raise TypeError(f"{cls.__name__}.{name} is now {present}, see netkf.parts.Filter")
-        for name in ("init", "emit", "absorb"):
-            if "phase" in inspect.signature(getattr(cls, name)).parameters:
-                listed = ", ".join(list(inspect.signature(getattr(Filter, name)).parameters)[1:])
-                raise TypeError(f"{cls.__name__}.{name} must take ({listed}), without phase")
-        super().__init_subclass__()
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n), with the ``model`` of

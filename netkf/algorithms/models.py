@@ -17,7 +17,6 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.kernels.gains import GainTable, gain_table
-from netkf.algorithms.kernels.riccati import RiccatiTable, riccati_table
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
 from netkf.algorithms.kernels.slots import predict_root_alone
@@ -87,16 +86,6 @@ class FlowModel:
     def information(self) -> FloatArray:
         """The information rate ``G = H' R^-1 H`` (n, n) of the node's sensors, per second."""
         return np.asarray(self.H.T @ np.linalg.solve(self.R, self.H))
-
-    @cached_property
-    def riccati(self) -> RiccatiTable:
-        """Table of the Riccati flow of the covariance P (n, n) with this node's increments."""
-        return riccati_table(self.A, self.Q, self.information, self.horizon)
-
-    @cached_property
-    def prediction(self) -> RiccatiTable:
-        """Table of the Riccati flow of the covariance P (n, n) without readings."""
-        return riccati_table(self.A, self.Q, np.zeros_like(self.A), self.horizon)
 
     @cached_property
     def gains(self) -> GainTable:
@@ -239,6 +228,19 @@ def usable(rate: float) -> float:
     ``Filter.max_measurement_interval``.
     """
     return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
+
+
+@kernel
+def interval_end(now: float, time: float, length: float) -> float:
+    """Return the end, in seconds, of a measurement interval that begins at ``now`` and lasts
+    ``length`` seconds, but ends at ``time`` at the latest.
+
+    Engines cut the time to the next event, ``time``, into such intervals, see
+    ``Filter.max_measurement_interval``. One too short to change the clock would repeat for ever; it
+    ends at ``time`` instead.
+    """
+    end = now + length
+    return end if now < end < time else time
 
 
 def first_root(cov: FloatArray) -> FloatArray:

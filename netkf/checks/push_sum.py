@@ -457,8 +457,8 @@ def _every_slot(scenario: Scenario) -> Assumption:
     computes its gain from them in every slot (steps 2 and 3 of the push-sum paper), on which the
     exact covariances rely: a row of the table of assumptions.
     """
-    algorithm = with_promised_filter(scenario).filter.algorithm
-    holds = algorithm.stop == "never" and not algorithm.asymptotic  # type: ignore[union-attr]
+    algorithm: Any = with_promised_filter(scenario).filter.algorithm
+    holds = algorithm.stop == "never" and not algorithm.asymptotic
     evidence = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
     if not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F):
         holds, evidence = False, "exchanged, but the filters' F is not the plant's"

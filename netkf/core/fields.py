@@ -10,11 +10,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -82,24 +81,12 @@ setting = field
 """The public name of ``field``: users' classes import it from netkf.parts."""
 
 
-def required(method: Method) -> Method:
-    """Mark a method that subclasses must define, under its present or its former name.
-
-    It is ``abstractmethod``, hidden from type checkers: they would report a class that defines the
-    method under its former name.
-    """
-    return abstractmethod(method)
-
-
 @dataclass(frozen=True, eq=False)
 class Component:
     """Base class of the parts of a scenario: an immutable dataclass with checked fields.
 
     Components are equal if they have the same class and equal fields.
     """
-
-    former_names: ClassVar[Mapping[str, str]] = {}
-    """Deprecated names of methods that users' classes may still define, by their present names."""
 
     def __new__(cls, *values: Any, **named: Any) -> Self:
         """Return a new object; raises ScenarioError for settings without a name that must have one,
@@ -113,19 +100,10 @@ class Component:
         return super().__new__(cls)
 
     def __init_subclass__(cls) -> None:
-        """Hold the methods of a user's class to the contract (``core.contracts``), and give a
-        method that has a former name both names, whichever the class defines.
-        """
+        """Hold the methods of a user's class to the contract (``core.contracts``)."""
         super().__init_subclass__()
         if not is_netkf_class(cls):
             hold_to_contract(cls)
-        own_attributes = vars(cls)
-        for name, former in cls.former_names.items():
-            # Both names refer to one function, so super() reaches the base class under either.
-            if former in own_attributes and name not in own_attributes:
-                setattr(cls, name, own_attributes[former])
-            elif name in own_attributes:
-                setattr(cls, former, own_attributes[name])
 
     def __post_init__(self) -> None:
         """Check and convert each field by its rule; raises ScenarioError for a value that breaks

@@ -77,11 +77,6 @@ class Ensemble(NotebookTable):
             f"seed {self.seed}>"
         )
 
-    @property
-    def shown(self) -> bool:
-        """Former name of ``truth_known``."""
-        return self.truth_known
-
     def plot(self, figure: str = "error") -> Any:
         """Return a figure of the ensemble as a matplotlib Figure, as ``netkf plot`` draws it:
         overview, error, quantiles, ratios, network, nees, stability or law; those of single runs

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from netkf.core.fields import (
     number,
     positive,
     probability,
-    required,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
@@ -34,14 +33,7 @@ class Loss(Component):
     symmetric.
     """
 
-    former_names: ClassVar[Mapping[str, str]] = {
-        "delivery_probability": "chance",
-        "next_state": "weather",
-        "deterministic": "certain",
-        "stateful": "changing",
-    }
-
-    @required
+    @abstractmethod
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
@@ -68,8 +60,6 @@ class Loss(Component):
     def stateful(self) -> bool:
         """True if ``next_state`` draws."""
         return False
-
-    chance, weather, certain, changing = delivery_probability, next_state, deterministic, stateful
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
         """Return the fraction of messages from link[0] to link[1] that arrive in the long run, for
@@ -245,8 +235,6 @@ class GilbertElliott(Loss):
 class Delay(Component):
     """The contract of a delay model."""
 
-    former_names: ClassVar[Mapping[str, str]] = {"is_random": "drawn"}
-
     @abstractmethod
     def draw(self, random: np.random.Generator) -> float:
         """Draw a delay in seconds, not negative; called once per activation if ``is_random``."""
@@ -265,8 +253,6 @@ class Delay(Component):
     def is_random(self) -> bool:
         """True if ``draw`` is called."""
         return self.fixed is None
-
-    drawn = is_random
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
         """Return the seconds that message number ``message`` takes from link[0] to link[1].

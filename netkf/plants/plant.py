@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -22,9 +21,6 @@ class Plant(Component):
 
     Both are zero by default.
     """
-
-    former_names: ClassVar[Mapping[str, str]] = {"is_random": "drawn", "truth_known": "shown"}
-    """Attributes and their former names, which users' subclasses may still set (core.fields)."""
 
     is_random: ClassVar[bool] = True
     """True if runs draw the state from the model; else the model is what the filters assume of a

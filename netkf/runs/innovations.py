@@ -61,13 +61,11 @@ class Innovations(NamedTuple):
 def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     """Return the innovations of the samples and increments of a run, which is replayed for them.
 
-    Raises NetkfError with the reason if there are none: the filter implements a deprecated
-    contract or gives no covariance, there are no readings, the run has more than ``max_events``
+    Raises NetkfError with the reason if there are none: the filter gives no covariance, there are
+    no readings, the run has more than ``max_events``
     events, or the events of the replay differ, as they may if another version made the run.
     """
     scenario: Scenario = run.scenario
-    if not isinstance(scenario.filter.algorithm, Filter):
-        raise NetkfError("filters of the deprecated contracts do not say how they use readings")
     if len(run.log) > max_events:
         raise NetkfError(f"a run of more than {max_events:,} events is not replayed")
     algorithm: Filter = scenario.filter.algorithm

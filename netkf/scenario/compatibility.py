@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import SlotActivation
@@ -26,16 +24,14 @@ def filter_name(scenario: DerivedScenario) -> str:
 
 def check_time(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if filter or activation need slots over a diffusion, or the reverse."""
-    algorithm, node_filter = scenario.filter.algorithm, scenario.node_filter
-    slotted, remedy = scenario.slotted, "change the plant or choose another kind"
-    # A Filter runs in slots if it has a ``schedule`` of their phases, and in continuous time if it
-    # names ``clocks`` that may make it send, or never sends. FlowFilter and SlotFilter, deprecated
-    # contracts, are for one model of time each.
+    algorithm, slotted = scenario.node_filter, scenario.slotted
+    remedy = "change the plant or choose another kind"
+    # A filter runs in slots if it has a ``schedule`` of their phases, and in continuous time if it
+    # names ``clocks`` that may make it send, or never sends.
     if slotted:
-        fits = not isinstance(algorithm, FlowFilter) and node_filter.schedule is not None
+        fits = algorithm.schedule is not None
     else:
-        only_slots = node_filter.talks and not node_filter.clocks
-        fits = not isinstance(algorithm, SlotFilter) and not only_slots
+        fits = bool(algorithm.clocks) or not algorithm.talks
     if not fits:
         rule = explain_time_mismatch(slotted)
         raise ScenarioError("filter.kind", rule, kind_name(algorithm), remedy)

@@ -8,10 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.adapters import AnyFilter, adapt
 from netkf.algorithms.filter import Filter
-from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import (
     Component,
@@ -94,7 +91,7 @@ class Filtering(Component):
     model  what the filters believe where it differs from the truth
     """
 
-    algorithm: AnyFilter = field(instance_of(Filter, FlowFilter, SlotFilter))
+    algorithm: Filter = field(instance_of(Filter))
     mean: FloatArray | tuple[FloatArray, ...] | None = field(
         either(vector, list_of(vector, "vectors, one per node"), has_depth(2)), default=None
     )
@@ -219,10 +216,10 @@ class ScenarioModel(Component):
         period = self.slot_plant.period
         return tuple(round(t / period) for t in self.times.tolist())
 
-    @cached_property
+    @property
     def node_filter(self) -> Filter:
-        """The filter of every node as a Filter; a FlowFilter or SlotFilter of a user is wrapped."""
-        return adapt(self.filter.algorithm)
+        """The filter of every node."""
+        return self.filter.algorithm
 
     @property
     def end_time(self) -> float:

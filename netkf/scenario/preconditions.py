@@ -11,11 +11,9 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import breadth_first_order
 
-from netkf.algorithms.flow import FlowFilter
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.linalg.spectra import hidden_mode, outputs_of
-from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.compatibility import SAMPLING, filter_name
 from netkf.scenario.derived import DerivedScenario
@@ -48,18 +46,9 @@ def check_preconditions(scenario: DerivedScenario) -> None:
 
 
 def _check_increments(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a filter over a diffusion cannot use samples, or only samples."""
+    """Raise ScenarioError if a filter over a diffusion can use samples only, and has others."""
     name = filter_name(scenario)
     for k, sensor in enumerate(scenario.sensors):
-        if isinstance(scenario.filter.algorithm, FlowFilter) and takes_samples(sensor):
-            raise ScenarioError(
-                f"sensors[{k}].sampling"
-                if isinstance(sensor, LinearSensor)
-                else f"sensors[{k}].kind",
-                f"must be continuous for the {name}, a FlowFilter, which takes no samples",
-                None,
-                "remove it, or derive the class from netkf.parts.Filter",
-            )
         if scenario.node_filter.needs_samples and not takes_samples(sensor):
             raise ScenarioError(
                 f"sensors[{k}].sampling",

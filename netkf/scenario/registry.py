@@ -7,9 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from netkf.algorithms.filter import Filter
-from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.registry import built_in_filters, split_choice
-from netkf.algorithms.slot import SlotFilter
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
@@ -44,9 +42,6 @@ FAMILIES: dict[str, type[Component]] = {
     "slot filter": Filter,
 }
 """The base class of the classes of each family."""
-
-FORMER: dict[str, tuple[type[Component], ...]] = {"filter": (FlowFilter, SlotFilter)}
-"""Deprecated base classes that users' classes may still have (algorithms.adapters)."""
 
 KINDS: dict[str, dict[str, type[Component]]] = {
     "plant": {
@@ -222,8 +217,7 @@ def _find_user_class(family: str, kind: str, origin: Origin) -> type[Component] 
     if cls is None:
         return None
     base = FAMILIES[family]
-    bases = (base, *FORMER.get(family, ()))
-    if not (isinstance(cls, type) and issubclass(cls, bases)):
+    if not (isinstance(cls, type) and issubclass(cls, base)):
         raise ScenarioError(
             "kind",
             f"must be a subclass of netkf's {base.__name__}",

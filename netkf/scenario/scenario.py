@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from netkf.scenario.checks import check_scenario
 from netkf.scenario.derived import DerivedScenario
@@ -16,19 +15,6 @@ from netkf.scenario.sampling import sampling_notes
 from netkf.scenario.stamps import stamp_notes
 from netkf.scenario.tables import change_keys
 from netkf.scenario.usage import repeat_notes
-
-FORMER_ATTRIBUTES = {
-    "ends": "end_time",
-    "hosted": "node_filter",
-    "noise": "noise_covariance",
-    "observation": "observation_matrices",
-    "placed": "placed_sensors",
-    "sensing": "sensing_nodes",
-    "slots": "sampled_slots",
-    "start": "initial_estimate",
-    "truth": "diffusion",
-}
-"""Former names of attributes of Scenario, which scripts may still use, and the present names."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,17 +39,6 @@ class Scenario(DerivedScenario):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_scenario(self)
-
-    if not TYPE_CHECKING:  # a type checker would take any name for an attribute
-
-        def __getattr__(self, name: str) -> Any:
-            """Return an attribute by its former name, with a warning; else raise AttributeError."""
-            present = FORMER_ATTRIBUTES.get(name)
-            if present is None:
-                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            message = f"Scenario.{name} is now Scenario.{present}"
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
-            return getattr(self, present)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields and the topology for pickle.

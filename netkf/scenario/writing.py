@@ -25,7 +25,7 @@ from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.model import Filtering, Network
 from netkf.scenario.names import map_nodes
-from netkf.scenario.registry import FAMILIES, FORMER, name_of
+from netkf.scenario.registry import FAMILIES, name_of
 
 
 class _Style(NamedTuple):
@@ -113,7 +113,7 @@ def part_as_table(part: Component) -> dict[str, Any]:
     if isinstance(part, Sensor):
         return _sensor_table(part, _Style())
     families = (family for family, base in FAMILIES.items() if isinstance(part, base))
-    family = next(families, "filter" if isinstance(part, FORMER["filter"]) else None)
+    family = next(families, None)
     if family == "sampling" and isinstance(part, FAMILIES["activation"]):
         family = "activation"  # every clock of links is of both families
     if family is None:

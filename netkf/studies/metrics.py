@@ -216,7 +216,7 @@ def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> Flo
     """Return the traces (T,) of P at the T samples of a Kalman filter in slots with ``model``, from
     P(0) = ``start`` (n, n): of predictions if the scenario's filter predicts, else after updates.
     """
-    predicts = scenario.filter.algorithm.predicts  # type: ignore[union-attr]
+    predicts = scenario.filter.algorithm.predicts
     # At most n rows with the same information: a central filter may read hundreds.
     F, Q, H = model.F, model.Q, whiten_observation(model.H, model.R)
     R = np.eye(len(H))

@@ -129,7 +129,7 @@ def _check_pure(watched: WatchedPart, links: dict[Link, float]) -> None:
         link, message = call[:2]
         demand(
             forwards[call] == backwards[call],
-            f"{watched.name}.{watched.defined_name('delivery_probability')}",
+            f"{watched.name}.delivery_probability",
             "must not depend on which links and messages were asked for before",
             f"{forwards[call]:.4g} and {backwards[call]:.4g} for message {message} of link "
             f"{list(link)}",
@@ -158,7 +158,7 @@ def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> Non
             for link, probability in zip(links, probabilities, strict=True):
                 demand(
                     abs(probability - median) <= PROBABILITY_TOLERANCE,
-                    f"{watched.name}.{watched.defined_name('delivery_probability')}",
+                    f"{watched.name}.delivery_probability",
                     "must be the same for links with equal entries in the graph's table",
                     f"{probability:.4g} for link {list(link)} and {median:.4g} for others",
                     "define mean_delivery beside it if links differ by design",
@@ -173,7 +173,7 @@ def _check_delivery_probabilities(
 
     ``table_probability`` is the entry of the graph's table for the link.
     """
-    part, where = watched.part, f"{watched.name}.{watched.defined_name('delivery_probability')}"
+    part, where = watched.part, f"{watched.name}.delivery_probability"
     for bad in (False, True):
         for message in (0, 1, 2, 1000):
             probability = watched.call(
@@ -200,7 +200,7 @@ def _check_channel_state(watched: WatchedPart) -> None:
     """Check ``next_state``: the state is True or False, each call makes the same draws (none if the
     loss is not ``stateful``), and equal generators give equal states.
     """
-    part, where = watched.part, f"{watched.name}.{watched.defined_name('next_state')}"
+    part, where = watched.part, f"{watched.name}.next_state"
     histories: list[list[Any]] = []
     for _ in range(2):
         random, bad, history = RecordingGenerator(5), None, []

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.adapters import FlowAdapter
 from netkf.algorithms.filter import Exchange, Increments, Message
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel
@@ -79,8 +78,7 @@ class ClockTrial(Trial):
         (n,) moves the truth on the way, None does not.
         """
         part = watched.part
-        if not isinstance(part, FlowAdapter):
-            yield cls(watched, system, shift, clock, increments=False)
+        yield cls(watched, system, shift, clock, increments=False)
         if not part.needs_samples and clock != "readings":
             yield cls(watched, system, shift, clock, increments=True)
 
@@ -121,9 +119,8 @@ class ClockTrial(Trial):
                 if one is not None and other is not None:
                     self._compare_predictions(name, one, other, first, second)
         if self._increments and len(self.models[node].H):
-            method = "max_measurement_interval"
-            seconds = watched.call(method, state)
-            where = f"{watched.name}.{watched.defined_name(method)}"
+            seconds = watched.call("max_measurement_interval", state)
+            where = f"{watched.name}.max_measurement_interval"
             demand(seconds > 0.0, where, "must be above 0 seconds", seconds)
 
     def _compare_predictions(
@@ -134,11 +131,10 @@ class ClockTrial(Trial):
         """
         difference = float(np.abs(one_step - two_steps).max())
         size = max(float(np.abs(one_step).max()), float(np.abs(two_steps).max()), 1e-300)
-        method = self.watched.defined_name("predict")
         demand(
             difference <= COMPOSITION_TOLERANCE * size,
-            f"{self.watched.name}.{method}",
-            f"must compose over gaps, {method}(a + b) = {method}(b) after {method}(a)",
+            f"{self.watched.name}.predict",
+            "must compose over gaps, predict(a + b) = predict(b) after predict(a)",
             f"{name} that differs by {difference / size:.2g} of its size at a = {first:g} and "
             f"b = {second:g} s",
             "solve over the gap exactly, as state.model.predict does, and keep no count of calls",

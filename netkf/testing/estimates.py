@@ -22,7 +22,7 @@ def check_estimate(
     Raises AssertionError unless both have these shapes and are finite, and P is symmetric and
     positive semidefinite. ``after`` is the method that returned the state, for messages.
     """
-    where = f"{watched.name}.estimate after {watched.defined_name(after)}"
+    where = f"{watched.name}.estimate after {after}"
     pair = watched.call("estimate", state)
     demand(isinstance(pair, tuple) and len(pair) == 2, where, "must be (xhat, P)", pair)
     xhat = np.asarray(pair[0])

@@ -6,10 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.adapters import FlowAdapter, SlotAdapter, adapt
 from netkf.algorithms.filter import CLOCKS, Filter, commutes
-from netkf.algorithms.flow import FlowFilter
-from netkf.algorithms.slot import SlotFilter
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.parents import check_parent
 from netkf.testing.shifts import check_shift, make_trials
@@ -36,8 +33,7 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
     Weights are not negative and sum to at most 1. Filter and states survive pickle. In continuous
     time ``predict`` composes over gaps. In slots the schedule is valid and an empty inbox is
     absorbed. An exchange without losses conserves the sums that ``conserved`` names. A class that
-    defines ``shift`` must give shifted estimates from shifted data. FlowFilter and SlotFilter
-    classes are checked through their adapters.
+    defines ``shift`` must give shifted estimates from shifted data.
 
     A class that derives from a built-in filter and overrides anything (methods, class variables,
     weights, the first slot, private helpers) is also compared with that filter, with the same
@@ -50,34 +46,21 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    part = make_part(filter, (Filter, FlowFilter, SlotFilter), settings)
-    node_filter = adapt(part)
-    watched = WatchedPart(node_filter, part, former_names(node_filter))
+    part = make_part(filter, (Filter,), settings)
+    watched = WatchedPart(part)
     watched.pickle_copy()
     _check_class_variables(watched)
-    if node_filter.talks:
+    if part.talks:
         _check_weights(watched)
-    if node_filter.schedule is not None:
+    if part.schedule is not None:
         _check_schedule(watched)
     trials = list(make_trials(watched))
     for trial in trials:
         trial.run()
-    if commutes(node_filter):
+    if commutes(part):
         check_shift(watched, trials)
     watched.finish()
-    if isinstance(part, Filter):
-        check_parent(watched, same_as_parent)
-
-
-def former_names(node_filter: Filter) -> dict[str, str]:
-    """Return the names of methods in the deprecated contract of an adapted filter, by their present
-    names; empty for a filter of the present contract.
-    """
-    if isinstance(node_filter, FlowAdapter):
-        return {"predict": "flow", "update": "measure", "max_measurement_interval": "stretch"}
-    if isinstance(node_filter, SlotAdapter):
-        return {"update": "sense", "schedule": "programme", "redraws_links": "redraws"}
-    return {}
+    check_parent(watched, same_as_parent)
 
 
 def _check_class_variables(watched: WatchedPart) -> None:
@@ -105,23 +88,13 @@ def _check_schedule(watched: WatchedPart) -> None:
     ("predict", "sense", "exchange"), the number of steps of each exchange, and that in its first
     step it is drawn anew which links are up.
     """
-    part, where = watched.part, f"{watched.name}.{watched.defined_name('schedule')}"
-    schedule = part.schedule
-    if isinstance(part, SlotAdapter):
-        is_schedule = set(schedule) <= {"exchange", "sense"} and schedule.count("sense") == 1
-        demand(
-            is_schedule,
-            where,
-            'must be a tuple of "exchange" and "sense" with one "sense"',
-            schedule,
-        )
-    else:
-        are_phases = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
-        text = ", ".join(f'"{phase}"' for phase in PHASES)
-        demand(are_phases, where, f"must be None or a tuple of {text}", schedule)
-        no_repeats = max(schedule.count("predict"), schedule.count("sense")) <= 1
-        demand(no_repeats, where, 'must have one "predict" and one "sense" at most', schedule)
-        _check_predicts(watched, schedule)
+    schedule, where = watched.part.schedule, f"{watched.name}.schedule"
+    are_phases = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
+    text = ", ".join(f'"{phase}"' for phase in PHASES)
+    demand(are_phases, where, f"must be None or a tuple of {text}", schedule)
+    no_repeats = max(schedule.count("predict"), schedule.count("sense")) <= 1
+    demand(no_repeats, where, 'must have one "predict" and one "sense" at most', schedule)
+    _check_predicts(watched, schedule)
     for phase in range(schedule.count("exchange")):
         steps = watched.call("exchange_steps", phase)
         is_count = isinstance(steps, int) and steps >= 1
@@ -129,7 +102,7 @@ def _check_schedule(watched: WatchedPart) -> None:
         redraws = watched.call("redraws_links", phase, 0)
         demand(
             redraws is True,
-            f"{watched.name}.{watched.defined_name('redraws_links')}",
+            f"{watched.name}.redraws_links",
             "must be True in step 0",
             redraws,
             "links have no outcome yet",

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from netkf.algorithms.adapters import SlotAdapter
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.clocked import ClockTrial
 from netkf.testing.slotted import SlotTrial
@@ -29,8 +28,6 @@ def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterat
     part = watched.part
     systems = make_systems(part.inverts)
     clocks: list[str | None] = list(part.clocks) if part.talks else [None]
-    if isinstance(part, SlotAdapter):
-        clocks = []
     for system in systems:
         system_shift = None if shift is None else shift[: len(system.M)]
         if part.schedule is not None:

@@ -217,35 +217,14 @@ class WatchedPart:
 
     A call must change neither its arguments nor the component, nor results of earlier calls; a
     second call must return the same; the global generators of numpy and Python must not be used.
-
-    If ``part`` is an adapter, ``owner`` is the object of the user's class, and ``former_names`` has
-    the names of methods in that class by their present names. ``name`` is that of the user's class.
+    ``name`` is that of the user's class.
     """
 
-    def __init__(
-        self, part: Any, owner: Any = None, former_names: Mapping[str, str] | None = None
-    ) -> None:
-        """Take the component ``part``, the user's object ``owner`` that it adapts (by default
-        itself), and the former names of its methods by their present ones.
-        """
-        self.part, self._owner = part, part if owner is None else owner
-        self.name = type(self._owner).__name__
-        self._former_names = former_names or {}
+    def __init__(self, part: Any) -> None:
+        """Take the component ``part``."""
+        self.part, self.name = part, type(part).__name__
         # Of each call: the method, the result, and its leaves at that time.
         self._results: list[tuple[str, Any, Leaves]] = []
-
-    def defined_name(self, method: str) -> str:
-        """Return the name by which the user's class defines a method or property, for messages: it
-        may still use a deprecated name of the contract.
-        """
-        if method in self._former_names:
-            return self._former_names[method]
-        cls: Any = type(self._owner)
-        attribute = _static_attribute(cls, method)
-        defined_as = getattr(getattr(attribute, "fget", attribute), "__name__", method)
-        # A class may define the method by its former name, see Component.former_names.
-        former_name = getattr(self._owner, "former_names", {}).get(method)
-        return former_name if defined_as == former_name else method
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """Call a method, check for side effects and return the result.
@@ -253,7 +232,7 @@ class WatchedPart:
         A ``repeatable`` method, one that draws no random numbers, is called twice and must return
         equal results. Raises AssertionError if a check or the method fails.
         """
-        where = f"{self.name}.{self.defined_name(method)}"
+        where = f"{self.name}.{method}"
         before = [collect_leaves(argument) for argument in arguments]
         attributes = self.attributes()
         results = [self._call_method(where, method, arguments) for _ in range(1 + repeatable)]
@@ -288,16 +267,16 @@ class WatchedPart:
 
     def unchecked(self) -> WatchedPart:
         """Return the same component with calls that are made once and not checked."""
-        return _UncheckedPart(self.part, self._owner, self._former_names)
+        return _UncheckedPart(self.part)
 
     def attributes(self) -> Leaves:
         """Return copies of the numbers, texts and arrays in the attributes of the user's object, by
         their paths, except for cached properties, which a call may compute and store.
         """
-        cls: Any = type(self._owner)
+        cls: Any = type(self.part)
         attributes = {
             name: value
-            for name, value in vars(self._owner).items()
+            for name, value in vars(self.part).items()
             if not isinstance(_static_attribute(cls, name), cached_property)
         }
         return {path.strip("[]'"): leaf for path, leaf in collect_leaves(attributes).items()}
@@ -359,7 +338,7 @@ class WatchedPart:
         is equal.
         """
         try:
-            copy = pickle.loads(pickle.dumps(self._owner))
+            copy = pickle.loads(pickle.dumps(self.part))
         except Exception as error:
             fail(
                 self.name,
@@ -367,7 +346,7 @@ class WatchedPart:
                 describe_error(error),
                 "define the class at the top level of a module and keep no open files or lambdas",
             )
-        path = differing_path(collect_leaves(self._owner), collect_leaves(copy))
+        path = differing_path(collect_leaves(self.part), collect_leaves(copy))
         demand(path is None, self.name, f"must be equal after pickling, but lost {path}")
         return copy
 
@@ -377,7 +356,7 @@ class _UncheckedPart(WatchedPart):
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
         """Call a method once and return the result."""
-        return self._call_method(f"{self.name}.{self.defined_name(method)}", method, arguments)
+        return self._call_method(f"{self.name}.{method}", method, arguments)
 
 
 @contextmanager

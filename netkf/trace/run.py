@@ -69,11 +69,6 @@ class Run(NotebookTable):
             f"replica {self.replica}>"
         )
 
-    @property
-    def shown(self) -> bool:
-        """Former name of ``truth_known``."""
-        return self.truth_known
-
     @cached_property
     def events(self) -> pd.DataFrame:
         """The table of events, with columns trace.schema.EVENT_COLUMNS."""

@@ -5,13 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from netkf.algorithms.kernels.gains import gain_table, gain_update
 from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from netkf.algorithms.kernels.root_flow import (
     flow_root,
     flow_scratch,
     flow_table,
-    gain_update_root,
     information_rate,
     propagate_root,
     stack_tables,
@@ -211,19 +209,6 @@ def test_models_side_by_side_are_what_they_are_alone():
             G = table.whitened_H[0].T @ table.whitened_H[0]
             rate = information_rate(ONE, scratch.size, stack.whitened_H[m], roots[m])
             assert rate == pytest.approx((P * G).sum(), rel=1e-12)
-
-
-def test_readings_are_used_as_before():
-    random = np.random.default_rng(9)
-    for n, p in ((1, 1), (3, 1), (4, 2), (2, 3)):
-        A, Q = system("random", "full", n, random)
-        H, R = random.normal(size=(p, n)), np.eye(p) + 0.2
-        table = gain_table(A, Q, H, R, 0.1)
-        root, x, moments = wide_root(random, n, 2.0, 9.0), random.normal(size=n), np.ones(2 * p)
-        expected = gain_update(table, root @ root.T, x, moments, 0.08)
-        made = gain_update_root(table, root, x, moments, 0.08)
-        assert made == pytest.approx(expected, rel=1e-12, abs=1e-13)
-        assert np.array_equal(moments, np.ones(2 * p))
 
 
 def test_what_is_known_exactly_stays_so_without_noise():

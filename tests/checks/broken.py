@@ -6,13 +6,42 @@ import numpy as np
 
 from netkf.algorithms.baselines import Central
 from netkf.algorithms.diffusion import DiffusionFilter
-from netkf.algorithms.filter import Estimate
+from netkf.algorithms.filter import Estimate, Filter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import AVERAGE, PushSum, average_estimates
+from netkf.core.fields import positive, setting
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
+
+
+@dataclass(frozen=True, eq=False)
+class OwnReset(Filter):
+    """A reset filter from scratch that forgets its own share."""
+
+    epsilon: float = setting(positive)
+
+    def absorb(self, state, messages, exchange):
+        P = state.P + sum(message.weight * message.payload.P for message in messages)
+        return state._replace(root=np.linalg.cholesky(P))
+
+    def weight(self, degree, peer_degree):
+        return self.epsilon
+
+
+@dataclass(frozen=True, eq=False)
+class OwnSwap(Filter):
+    """A gossip filter from scratch that takes twice the partner's covariance."""
+
+    schedule = ("exchange", "sense", "predict")
+    predicts = True
+    pairwise = True
+
+    def absorb(self, state, messages, exchange):
+        for message in messages:
+            state = state._replace(xhat=message.payload.xhat, root=1.4 * message.payload.root)
+        return state
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +85,7 @@ class Reluctant(Matching):
 class Lossier(Bernoulli):
     """Claims ``delivery``, delivers a tenth less."""
 
-    def chance(self, link, message, bad, measured):
+    def delivery_probability(self, link, message, bad, table_probability):
         return self.delivery - 0.1
 
     def mean_delivery(self, link, measured):

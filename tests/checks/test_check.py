@@ -225,7 +225,7 @@ def test_broken_diffusion_is_caught(kind, caught, not_seen, tmp_path):
 def test_nothing_is_promised_of_filters_written_from_scratch(tmp_path):
     """They are asked to say which filter they should be; then they are held to it."""
     for table, kind, settings in ((RING, "OwnReset", {"epsilon": 0.3}), (GOSSIP, "OwnSwap", {})):
-        filtering = {"kind": f"tests.engines.former_filters:{kind}", **settings}
+        filtering = {"kind": f"tests.checks.broken:{kind}", **settings}
         with pytest.raises(TheoryError, match=f"nothing is promised of {kind}: derive it from"):
             check(scenario_of(table, tmp_path, filter=filtering), runs=10, workers=1)
     filtering = {"kind": "tests.checks.broken:AddsUp", "epsilon": 0.3}

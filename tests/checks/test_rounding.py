@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.algorithms.flow import FlowFilter
+from netkf.algorithms.filter import Filter
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.pools import PoolOptions
 from netkf.runs.run import run_to_directory
@@ -69,15 +69,12 @@ def test_samples_after_digits_are_lost_are_found(growing):
     assert not blurred_samples(exact, exact.P).any()
 
 
-class NoFrames(FlowFilter):
+class NoFrames(Filter):
     """A local filter that does not say how it commutes with a shift."""
 
     talks = False
 
-    def emit(self, state):
-        return None
-
-    def absorb(self, state, messages):
+    def absorb(self, state, messages, exchange):
         return state
 
 

@@ -444,10 +444,10 @@ class Cautious(Hybrid):
 
 
 class Halved(Bernoulli):
-    """A user's loss, with the method under its former name: half of what it says."""
+    """A user's loss: half of what it says."""
 
-    def chance(self, link, message, bad, measured):
-        return 0.5 * super().chance(link, message, bad, measured)
+    def delivery_probability(self, link, message, bad, table_probability):
+        return 0.5 * super().delivery_probability(link, message, bad, table_probability)
 
 
 def test_a_filter_of_ones_own_is_refused_by_name_and_auto_takes_the_other(ring):

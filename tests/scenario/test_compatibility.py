@@ -3,7 +3,6 @@
 import pytest
 
 import netkf
-from netkf import parts
 from netkf.scenario.usage import record_usage, usage_notes
 from netkf.scenario.writing import resolve_defaults
 
@@ -283,19 +282,3 @@ def test_what_a_run_used_of_its_records(build, tmp_path):
         "sensors[0].sampling: 2 of 3 rows were not used (samples.csv)",
     )
     assert record_usage(build(), {(0, 1): 3}) == {}
-
-
-def test_a_former_flow_filter_takes_increments_only(build):
-    class Old(parts.FlowFilter):
-        def absorb(self, state, messages):
-            return state
-
-    base = build(sensors=SAMPLED)
-    settings = {name: getattr(base, name) for name in ("name", "horizon", "plant", "sensors")}
-    settings |= {"network": base.network, "probe": 0.5}
-    with pytest.raises(netkf.ScenarioError, match=r"sensors\[0\]\.sampling: must be continuous"):
-        netkf.Scenario(filter=netkf.Filtering(algorithm=Old()), **settings)
-    slots = build(plant=SLOTS, filter=FILTERS["diffusion"], network=network({"kind": "broadcast"}))
-    settings |= {"plant": slots.plant, "network": slots.network, "sensors": slots.sensors}
-    with pytest.raises(netkf.ScenarioError, match=r"filter\.kind: belongs to plants in continuous"):
-        netkf.Scenario(filter=netkf.Filtering(algorithm=Old()), **settings)

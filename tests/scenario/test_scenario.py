@@ -141,20 +141,3 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
         netkf.theory.error_covariance(ring.replace({"network.graph.nodes": 5}), run)
     with pytest.raises(netkf.ScenarioError, match=r"filter\.share: must be a finite number"):
         scenario.replace({"filter.share": 2.0})
-
-
-def test_attributes_are_found_by_their_former_names(build):
-    from netkf.scenario.scenario import FORMER_ATTRIBUTES
-
-    scenario = netkf.load(next(file for file in scenario_files() if file.stem == "gossip_ring"))
-    for former, present in FORMER_ATTRIBUTES.items():
-        if present == "diffusion":  # a plant in continuous time only
-            continue
-        with pytest.warns(DeprecationWarning, match=f"{former} is now Scenario.{present}$"):
-            value = getattr(scenario, former)
-        # Methods are bound anew each time: equal, not the same.
-        assert value is getattr(scenario, present) or value == getattr(scenario, present)
-    with pytest.warns(DeprecationWarning, match="truth is now Scenario.diffusion"):
-        assert build().truth.A.tolist() == build().diffusion.A.tolist()
-    with pytest.raises(AttributeError, match="no attribute 'plants'"):
-        scenario.plants  # noqa: B018

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import netkf
 from netkf.parts import (
-    Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, FlowFilter, Increments,
+    Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, Increments,
     LinearSensor, LinkClock, Loss, Message, NodeInfo, Poisson, Reading, State,
     positive, probability, setting,
 )
@@ -137,12 +137,12 @@ class Everything(Filter):
 
 
 @dataclass(frozen=True, eq=False)
-class Replace(FlowFilter):
+class Replace(Filter):
     """Takes the last estimate that arrives."""
 
-    def absorb(self, state: Any, messages: Sequence[tuple[float, Any, float]]) -> Any:
-        for _, payload, _ in messages:
-            state = state._replace(xhat=payload.xhat, P=payload.P)
+    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
+        for message in messages:
+            state = state._replace(xhat=message.payload.xhat, root=message.payload.root)
         return state
 
 
@@ -161,7 +161,9 @@ class Regular(LinkClock):
 class Fading(Loss):
     delivery: float = setting(probability)
 
-    def chance(self, link: tuple[int, int], message: int, bad: bool, measured: float) -> float:
+    def delivery_probability(
+        self, link: tuple[int, int], message: int, bad: bool, table_probability: float
+    ) -> float:
         return self.delivery ** (1 + message)
 
 

@@ -36,7 +36,7 @@ class TooSure(Loss):
 
 @says(CHANNELS, "Lossier.mean_delivery: must be the delivered fraction", delivery=0.5)
 class Lossier(Bernoulli):
-    def chance(self, link, message, bad, measured):
+    def delivery_probability(self, link, message, bad, table_probability):
         return self.delivery - 0.02
 
     def mean_delivery(self, link, measured):
@@ -61,9 +61,9 @@ class HalfSure(Bernoulli):
         return True
 
 
-@says(CHANNELS, "Fickle.weather: must draw nothing where stateful is False", delivery=0.5)
+@says(CHANNELS, "Fickle.next_state: must draw nothing where stateful is False", delivery=0.5)
 class Fickle(Bernoulli):
-    def weather(self, bad, random):
+    def next_state(self, bad, random):
         return random.random() < 0.5
 
 
@@ -80,9 +80,9 @@ class Lazy(GilbertElliott):
         return super().next_state(random.random() < 2, random)
 
 
-@says(CHANNELS, "OwnLuck.chance: must return the same for the same arguments")
+@says(CHANNELS, "OwnLuck.delivery_probability: must return the same for the same arguments")
 class OwnLuck(Loss):
-    def chance(self, link, message, bad, measured):
+    def delivery_probability(self, link, message, bad, table_probability):
         return float(np.random.default_rng().random())
 
 

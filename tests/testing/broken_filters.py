@@ -7,12 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Estimate, Filter
-from netkf.algorithms.flow import FlowFilter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
-from netkf.algorithms.slot import SlotFilter, update_and_predict
 
 BROKEN = {}
 
@@ -292,7 +290,7 @@ class Maybe(Gossip):
     pairwise = "yes"
 
 
-@says("Picky.accepts (tests/testing/broken_filters.py, line 297) returned nothing", epsilon=0.3)
+@says("Picky.accepts (tests/testing/broken_filters.py, line 295) returned nothing", epsilon=0.3)
 class Picky(Hybrid):
     def accepts(self, payload, age):
         return None
@@ -405,72 +403,3 @@ class Gates(Gossip):
 
     def shift(self, state, offset):
         return state._replace(xhat=state.xhat + offset)
-
-
-# Classes of the former contracts, checked through their adapters.
-
-
-@says("FormerEuler.flow: must compose over gaps, flow(a + b) = flow(b) after flow(a)")
-class FormerEuler(FlowFilter):
-    def flow(self, state, gap):
-        A, P = state.model.A, state.P
-        return state._replace(
-            xhat=state.xhat + gap * A @ state.xhat,
-            P=P + gap * (A @ P + P @ A.T + state.model.Q),
-        )
-
-    def absorb(self, state, messages):
-        return state
-
-
-@says("FormerInPlace.measure: must not change its arguments, but changed state.xhat")
-class FormerInPlace(FlowFilter):
-    def measure(self, state, reading):
-        state.xhat[:] += reading.moments[0]
-        return state
-
-    def absorb(self, state, messages):
-        return state
-
-
-@says("FormerImpatient.stretch: must be above 0 seconds")
-class FormerImpatient(FlowFilter):
-    def stretch(self, state):
-        return 0.0
-
-    def absorb(self, state, messages):
-        return state
-
-
-@says("FormerProgramme.programme: must be a tuple of")
-class FormerProgramme(SlotFilter):
-    programme = ("exchange", "listen")
-
-    def sense(self, state, reading):
-        return state
-
-
-@says("FormerSense.sense: must not change its arguments, but changed reading.y")
-class FormerSense(SlotFilter):
-    def sense(self, state, reading):
-        reading.y[:] = 0.0
-        xhat, root = update_and_predict(state.xhat, state.root, state.model, reading)
-        return state._replace(xhat=xhat, root=root)
-
-
-@says("FormerRedraws.redraws: must be True in step 0")
-class FormerRedraws(SlotFilter):
-    def redraws(self, phase, step):
-        return False
-
-    def sense(self, state, reading):
-        return state
-
-
-@says("FormerPlace.init: failed with AttributeError: 'Role' object has no attribute 'degree'")
-class FormerPlace(SlotFilter):
-    def place(self, state, role):
-        return state._replace(kept=role.degree)
-
-    def sense(self, state, reading):
-        return state

@@ -121,7 +121,7 @@ def test_a_broken_promise_fails_with_its_row():
 
 
 def test_where_nothing_is_promised_theory_says_so(build):
-    filtering = {"kind": "tests.engines.former_filters:OwnReset", "epsilon": 0.3}
+    filtering = {"kind": "tests.checks.broken:OwnReset", "epsilon": 0.3}
     with pytest.raises(TheoryError, match="nothing is promised of OwnReset"):
         testing.assert_promises(build(filter=filtering))
 

@@ -23,10 +23,8 @@ import numpy as np
 
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.compiling import kernel
 from netkf.linalg.legendre import MOMENTS, backward_coefficients
-from netkf.linalg.series import exponential_terms, polynomial, with_reach
-from netkf.linalg.small import add_matmul, matvec
+from netkf.linalg.series import exponential_terms, with_reach
 
 MAX_INTERVAL = 8.0  # |M| g beyond which two moments do not describe a reading well enough
 
@@ -100,21 +98,3 @@ def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     norm = float(np.abs(M).sum(axis=0).max())
     # No dynamics and no information: every interval is short enough.
     return MAX_INTERVAL / norm if norm > 0.0 else math.inf
-
-
-@kernel(allocates=True)
-def gain_update(
-    table: GainTable, P: FloatArray, x: FloatArray, moments: FloatArray, gap: float
-) -> FloatArray:
-    """Return ``xhat(b)`` (n,) at the end b of an interval of ``gap`` seconds, from the open-loop
-    prediction ``x`` (n,) there, ``P = P(b)`` (n, n), the ``moments`` (2p,) of the reading and the
-    ``table`` of the node's gains.
-    """
-    n, q = table.n, table.moments
-    # One evaluation of the concatenated series [U, W, C].
-    values = polynomial(table.series, gap)
-    U = values[: n * q].reshape(n, q)
-    W = values[n * q : 2 * n * q].reshape(n, q)
-    C = values[2 * n * q :].reshape(q, n)
-    # xhat(b) = x + (U + P W) (moments - C x), with the innovation of both moments.
-    return x + matvec(add_matmul(U, P, W), moments - matvec(C, x))

@@ -2,8 +2,8 @@
 
 P is the covariance of a Kalman-Bucy filter between messages, for a plant ``dx = A x dt + noise`` of
 covariance Q per second and sensors that give the information ``G = H' R^-1 H`` per second. The
-theory of paper H (Tanwani 2021) and filters of the deprecated contract (``algorithms.flow``) use
-these covariances; other filters carry roots of P, which ``root_flow`` moves.
+theory of paper H (Tanwani 2021) uses these covariances; filters carry roots of P, which
+``root_flow`` moves.
 
 The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian ``M = [[-A', G], [Q,
 A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``. One exponential over a long gap
@@ -217,7 +217,7 @@ def propagate_riccati(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (n, n) after the Riccati flow of a ``table`` over ``gap`` >= 0 seconds
     from P (n, n), and ``exp(A gap) x`` (n,): the covariance counts the readings of the gap, the
-    estimate does not (``gains.gain_update`` corrects it by them).
+    estimate does not (``root_flow.gain_update_root`` corrects it by them).
     """
     P, x = P.copy(), x.copy()  # C-contiguous, so that one version of this code is compiled
     # One step for each binary digit 1 of the number of whole units, with its tabulated triple.
