@@ -348,7 +348,7 @@ class Unmade(Hybrid):
     pass
 
 
-@says("Singular matrix (tests/testing/broken_filters.py, line 356); set inverts", epsilon=0.3)
+@says("Singular matrix (tests/testing/broken_filters.py, line 354); set inverts", epsilon=0.3)
 class Inverts(Hybrid):
     def init(self, model, mean, cov, node):
         _ = np.linalg.inv(cov)
