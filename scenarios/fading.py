@@ -1,4 +1,4 @@
-"""A network in Python, with a class of one's own: messages fade with the distance of two nodes.
+"""A network in Python, with a user-defined class: messages fade with the distance of two nodes.
 
 python scenarios/fading.py
 """

@@ -29,7 +29,7 @@ def test_run_ends_with_a_table_and_a_picture(tmp_path, capsys):
         "node  RMS error  mean trace P  bound   ratio",
         "messages: ",
         "events: ",
-        "limit S of H(13)",
+        "limit S of Tanwani's H(13)",
         str(out),
     ):
         assert words in printed.out

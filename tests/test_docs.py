@@ -128,3 +128,9 @@ def test_the_snippets_run(tmp_path, monkeypatch):
         exec(compile(snippet, "docs/scenario_files.md", "exec"), {})
     assert len((tmp_path / "replay" / "lost.csv").read_text().splitlines()) > 100
     assert (tmp_path / "slower" / "summary.json").exists()
+
+
+@pytest.mark.parametrize(("family", "kind", "cls"), list(described()))
+def test_the_class_of_a_kind_is_named_like_it_or_stands_beside_it(family, kind, cls):
+    guessed = "".join(word.capitalize() for word in kind.partition(" ")[0].split("-"))
+    assert cls.__name__ == guessed or f"`{cls.__name__}`" in rows(family)[kind].partition(")")[0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import textwrap
 from collections import Counter
 from typing import Any
@@ -12,23 +11,10 @@ from typing import Any
 from netkf.checks.check import Verdict
 from netkf.checks.evidence import BROKEN, COMPUTED, NOT_PROMISED, VERDICTS, Evidence
 from netkf.runs.files import to_json_value
+from netkf.theory.common.papers import paper_legend
 
 INDENT = " " * 13
 WIDTH = 87  # with the indent 100 columns
-
-PAPERS = {
-    "H": "Tanwani: Error bounds for locally optimal distributed filters with random communication "
-    "graphs",
-    "R": "Kar, Sinopoli and Moura: Kalman filtering with intermittent observations: weak "
-    "convergence to a stationary distribution",
-    "G": "Kar and Moura: Gossip and distributed Kalman filtering: weak consensus under weak "
-    "detectability",
-    "D": "Xie, Gan and Liu: Stability analysis of distributed Kalman filtering algorithm for "
-    "stochastic regression model",
-    "P": "Battilotti, Cacace and d'Angelo: Consensus analysis of random sub-graphs for distributed "
-    "filtering with link failures",
-}
-"""The papers behind the letters in the sources of promises."""
 
 
 def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: bool = True) -> str:
@@ -51,9 +37,14 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: boo
             lines += textwrap.wrap(message, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
         else:
             lines.append(INDENT + textwrap.shorten(_summarise_row(row), WIDTH, placeholder=" ..."))
-    lines += [*_computed_lines(folded), "", *_legend_lines(verdict), *_summary_lines(verdict)]
+    lines += [
+        *_computed_lines(folded),
+        "",
+        *paper_legend(row.source for row in verdict.rows),
+        *_summary_lines(verdict),
+    ]
     if not full:
-        lines.append("detectable: an error that would have been seen; --all shows all evidence")
+        lines.append("detectable: an error found with probability 0.9; --all shows all evidence")
     return "\n".join([*lines, *_broken_again(broken, command)])
 
 
@@ -66,19 +57,6 @@ def _computed_lines(rows: list[Evidence]) -> list[str]:
     listed = "; ".join(f"{row.promise} [{row.source}]: {row.verdict}" for row in rows)
     text = f"{'computed':<{len(INDENT)}}no run can break these: {listed}"
     return textwrap.wrap(text, len(INDENT) + WIDTH, subsequent_indent=INDENT)
-
-
-def _legend_lines(verdict: Verdict) -> list[str]:
-    """Return a line with the title of each paper whose letter (PAPERS) occurs in the source of a
-    row, such as "G Theorem 8".
-    """
-    # A letter stands for a paper only at the beginning of a source or of one of its parts.
-    sources = "; ".join(row.source for row in verdict.rows)
-    return [
-        textwrap.fill(f"[{letter} ...]: {title}", WIDTH + len(INDENT), subsequent_indent=INDENT)
-        for letter, title in PAPERS.items()
-        if re.search(rf"(^|[;,] |from ){letter}[ (]", sources)
-    ]
 
 
 def _summary_lines(verdict: Verdict) -> list[str]:
@@ -131,7 +109,7 @@ def _describe_row(row: Evidence) -> str:
 
 def _summarise_row(row: Evidence) -> str:
     """Return what a row says in short: the runs that would decide it, its measured deviation and
-    the smallest one that it would have seen; its evidence or reason if it has no interval.
+    the smallest one that is detectable; its evidence or reason if it has no interval.
     """
     if row.verdict == NOT_PROMISED or not row.low < row.high:
         return _describe_row(row)
@@ -144,7 +122,7 @@ def _describe_limits(row: Evidence) -> str:
     """Return the tolerance and the detectable error of a row in brackets, or an empty text."""
     limits = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
     if row.detectable > 0.0:
-        limits.append(f"an error of {row.detectable:.2g} would have been seen")
+        limits.append(f"an error of {row.detectable:.2g} is detectable")
     return f" ({'; '.join(limits)})" if limits else ""
 
 

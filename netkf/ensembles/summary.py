@@ -40,7 +40,7 @@ def summarise_ensemble(
         "overall": rows[-1],
         "limit": promised.limit,
         "central": promised.central,
-        "bound": promised.reason or "H(12), promised by H Theorem 2",
+        "bound": promised.reason or "Tanwani's H(12), promised by H Theorem 2",
         "rounding_from": rounding_from,
         "notes": summary_notes(scenario, rounding_from, bool(np.isfinite(mean[:, 1]).any())),
         "messages": dict(zip(MESSAGES, messages, strict=True)),

@@ -224,7 +224,7 @@ def ratios_figure(data: FigureData) -> Picture:
     Raises UnavailableError if neither is known.
     """
     rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
-    key, label, reference_label = "ratio", "mean trace P / mean bound H(12)", "the bound"
+    key, label, reference_label = "ratio", "mean trace P / Tanwani's bound H(12)", "the bound"
     scale = 1.0
     if not rows:
         data.require_truth()

@@ -155,7 +155,7 @@ def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
     equation 12), over ``times`` (T,) in seconds, only the largest and smallest if nodes differ.
     """
     same = np.allclose(roots.max(axis=1), roots.min(axis=1))
-    label = "bound H(12)" if same else "bound H(12): largest"
+    label = "Tanwani's bound H(12)" if same else "Tanwani's bound H(12): largest"
     axes.plot(times, roots.max(axis=1), color=INK, lw=1.3, ls="--", label=label, zorder=3)
     if not same:
         axes.plot(

@@ -65,7 +65,7 @@ def stability_figure(data: FigureData) -> Picture:
     loss = scenario.network.channel.loss
     if reason or rate is None or not isinstance(loss, Bernoulli):
         reason = reason or "it is drawn over the rate of Poisson clocks and a Bernoulli delivery"
-        raise UnavailableError(f"There is no map of the bound H(12): {reason}.")
+        raise UnavailableError(f"There is no map of Tanwani's bound H(12): {reason}.")
     rates = [rate * factor for factor in FACTORS]
     # Before the map: it raises TheoryError for plants of which no point can be decided.
     verb = "has a" if has_steady_state(scenario) else "has no"
@@ -89,7 +89,7 @@ def stability_figure(data: FigureData) -> Picture:
     headline = f"The bound of this scenario {verb} steady state; it has one "
     headline += f"at {int(stable.sum())} of {stable.size} points of rate and delivery"
     caption = data.caption(
-        "From theory alone: no simulation. Existence of the steady state of H(12)."
+        "From theory alone: no simulation. Existence of the steady state of Tanwani's H(12)."
     )
     finish_figure(figure, headline, caption)
     return figure
@@ -221,7 +221,7 @@ def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
     image = axes.imshow(errors, aspect="auto", origin="lower", cmap=SEQUENTIAL, norm=norm)
     for group, marker, label in (
         (diverged, "x", "runs diverged"),
-        (unbounded, "o", "no bound H(12)"),
+        (unbounded, "o", "no bound"),
     ):
         rows, columns = np.nonzero(group)
         if len(rows):

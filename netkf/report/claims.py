@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from netkf.checks.report import PAPERS
 from netkf.engines.soundness import describe_divergence
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
@@ -25,6 +24,7 @@ from netkf.studies.compare import Comparison
 from netkf.studies.compare_filters import ComparedFilter
 from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
+from netkf.theory.common.papers import PAPERS
 from netkf.trace.run import first_difference
 
 UNUSUAL_SHARE = 0.9
@@ -395,14 +395,14 @@ def _describe_bound(source: ReportSource) -> list[str]:
     )
     if exceeding:
         return [
-            f"The bound {bound} is exceeded by more than {margin:.2g} standard errors at "
+            f"The bound of {bound} is exceeded by more than {margin:.2g} standard errors at "
             f"{len(exceeding)} of {len(rows)} nodes; most: {numbers}{PAPER}"
         ]
     if source.runs > 1:
-        return [f"The bound {bound} holds; closest: {numbers}{PAPER}"]
+        return [f"The bound of {bound} holds; closest: {numbers}{PAPER}"]
     side = "below" if ratio <= 1.0 else "above"
     return [
-        f"The bound {bound} is about the mean over runs. In this one run "
+        f"The bound of {bound} is about the mean over runs. In this one run "
         f"P was {side} it: largest {numbers}. netkf check decides if it holds{PAPER}"
     ]
 

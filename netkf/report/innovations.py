@@ -95,9 +95,9 @@ def describe_innovations(readings: Innovations) -> str:
         return f"{sentence}: at all {len(nodes)} nodes with readings as exact covariances allow"
     judgements = []
     if above:
-        judgements.append(f"too sure at {above} of {len(nodes)} nodes with readings")
+        judgements.append(f"overconfident at {above} of {len(nodes)} nodes with readings")
     if below:
-        judgements.append(f"more careful than needed at {below} of {len(nodes)}")
+        judgements.append(f"conservative at {below} of {len(nodes)}")
     return f"{sentence}: P is {' and '.join(judgements)}"
 
 
@@ -107,7 +107,7 @@ def _judge_mean(mean: float, low: float, high: float) -> str:
     """
     interval = f"{format_number(low)} .. {format_number(high)}"
     if mean > high:
-        return f"P is too sure: {CONFIDENCE:.0%} of such means would lie in {interval}"
+        return f"P is overconfident: {CONFIDENCE:.0%} of such means would lie in {interval}"
     if mean < low:
         return (
             f"P is more careful than needed: {CONFIDENCE:.0%} of such means would lie in {interval}"

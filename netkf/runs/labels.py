@@ -17,7 +17,7 @@ def limit_label(scenario: Scenario) -> str:
     if not concerns_hybrid_paper(scenario):
         return ""
     balanced = has_balanced_rates(scenario)
-    name = "limit S of H(13)" if balanced else "weighted limit (not S of H(13))"
+    name = "limit S of Tanwani's H(13)" if balanced else "weighted limit (not S of Tanwani's H(13))"
     return name + delay_suffix(scenario)
 
 

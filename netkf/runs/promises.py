@@ -32,7 +32,7 @@ from netkf.theory import (
 )
 from netkf.theory.assumptions import assumption_rows
 from netkf.theory.common.mean_square import has_linear_errors, is_quickly_solved
-from netkf.theory.common.papers import paper_function
+from netkf.theory.common.papers import paper_function, paper_legend
 from netkf.theory.hybrid.coupled import concerns_hybrid_paper
 from netkf.theory.hybrid.steady import steady_by_node
 
@@ -192,6 +192,7 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
     """
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
+    lines += paper_legend(row["source"] for row in promises["assumptions"])
     paper = scenario.node_filter.paper
     if paper and paper in promises:
         slot_lines = paper_function(scenario, "promises", "slot_lines")

@@ -174,7 +174,7 @@ class PromisedTraces:
     limit: float
     central: float
     reason: str
-    limit_label: str = "limit S of H(13)"
+    limit_label: str = "limit S of Tanwani's H(13)"
     notes: tuple[str, ...] = ()
 
 
@@ -213,8 +213,8 @@ def _require_small_bound(scenario: Scenario, samples: int) -> None:
     entries = (samples * (1.5 * n * n + n) + SERIES_TERMS * n * (n + 1)) * len(scenario.nodes)
     if 8.0 * entries > MAX_BOUND_BYTES:
         raise TheoryError(
-            f"not computed: H(12) of {len(scenario.nodes):,} nodes at {samples:,} samples takes "
-            f"{8.0 * entries / 2**30:.1f} GiB; sample less often (probe), or call "
+            f"not computed: Tanwani's H(12) of {len(scenario.nodes):,} nodes, {samples:,} samples, "
+            f"takes {8.0 * entries / 2**30:.1f} GiB; sample less often (probe), or call "
             "netkf.theory.covariance_bound"
         )
 
@@ -269,7 +269,7 @@ def summarise(
         "overall": overall,
         "limit": promised.limit,
         "central": promised.central,
-        "bound": promised.reason or "H(12), promised by H Theorem 2",
+        "bound": promised.reason or "Tanwani's H(12), promised by H Theorem 2",
         "rounding_from": sink.rounding_from,
         "notes": summary_notes(scenario, sink.rounding_from, sink.has_covariance),
         "messages": {

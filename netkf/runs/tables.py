@@ -66,7 +66,7 @@ def shorten_rows(rows: list[list[str]], max_rows: int) -> list[list[str]]:
 
 
 def summary_table(
-    summary: dict[str, Any], limit: str = "limit S of H(13)", notes: Sequence[str] = ()
+    summary: dict[str, Any], limit: str = "limit S of Tanwani's H(13)", notes: Sequence[str] = ()
 ) -> str:
     """Return the table that `netkf run` prints, from the contents of summary.json.
 

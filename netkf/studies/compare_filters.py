@@ -66,7 +66,7 @@ class ComparedFilter:
 
     quantities    : rms_error, worst_instant (mean over runs of the largest error of any node at any
                     sample) and nees_ratio (NEES / n), empty if it cannot run
-    consistency   : "consistent", "too sure" or "too careful", by NEES / n, "-" where unknown
+    consistency   : "consistent", "overconfident" or "conservative", by NEES / n, "-" where unknown
     transmissions, bytes : of replica 0, a broadcast counts once; nan if it cannot run
     status        : "complete", how many runs diverged, or why it cannot run there
     predicts      : True if its samples in slots are predictions, not filtered

@@ -187,14 +187,14 @@ def _width(values: FloatArray, level: float) -> float:
 
 
 def credibility(values: FilterValues, n: int, level: float) -> str:
-    """Return whether P fits the errors of a filter: "too sure", "too careful" or "consistent", as
-    the interval of NEES / n, which misses with probability ``level``, lies above, below or around
-    1; "-" where NEES is unknown or one run shows nothing.
+    """Return whether P fits the errors of a filter: "overconfident", "conservative" or
+    "consistent", as the interval of NEES / n, which misses with probability ``level``, lies
+    above, below or around 1; "-" where NEES is unknown or one run shows nothing.
     """
     ratios = values.nees / n
     mean, width = float(ratios.mean()), _width(ratios, level)
     if not math.isfinite(width) or not math.isfinite(mean):
         return "-"
-    return (
-        "too sure" if mean - width > 1.0 else "too careful" if mean + width < 1.0 else "consistent"
-    )
+    if mean - width > 1.0:
+        return "overconfident"
+    return "conservative" if mean + width < 1.0 else "consistent"

@@ -179,7 +179,7 @@ def bound_traces(scenario: Scenario) -> FloatArray:
         bound = covariance_bound(scenario, scenario.times)
         return time_average(scenario, np.trace(bound, axis1=2, axis2=3))
     if scenario.filter.algorithm.talks:
-        raise TheoryError("H(12) is about filters in continuous time")
+        raise TheoryError("Tanwani's H(12) is about filters in continuous time")
     _require_fixed_H(scenario)
     # A pooled filter has the readings of all nodes.
     pooled = scenario.filter.algorithm.pooled
@@ -207,7 +207,7 @@ def central_trace(scenario: Scenario) -> float:
 def _require_fixed_H(scenario: Scenario) -> None:
     """Raise TheoryError if readings are recorded or H is random."""
     if not scenario.is_random:
-        raise TheoryError("the readings are recorded: nobody knows their law")
+        raise TheoryError("the readings are recorded: their law is unknown")
     for node in scenario.sensing_nodes:
         scenario.observation_matrices(node)  # raises where H is random
 

@@ -80,7 +80,7 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
     # Without exchange the bound of bound_traces() is the covariance itself.
     message = "exact: the covariance of filters that do not talk"
     if algorithm.talks:
-        message = "an upper bound: the trace of H(12), which E[P_i] stays below"
+        message = "an upper bound: the trace of Tanwani's H(12), which E[P_i] stays below"
     if target.of_errors:
         message += _explain_errors(scenario)
     value = float(traces.max() if target.of_worst else traces.mean())
@@ -118,7 +118,7 @@ def _explain_errors(scenario: Scenario) -> str:
     if not start["holds"].all():
         raise TheoryError("P_i(0) is below the covariance of the first error: P need not bound it")
     exact = _starts_with_the_truth(scenario) and not scenario.filter.algorithm.talks
-    return "" if exact else "; P_i in turn bounds the covariance of the error, H (10)"
+    return "" if exact else "; P_i in turn bounds the covariance of the error, Tanwani's H (10)"
 
 
 def quantity_by_simulation(

@@ -32,7 +32,7 @@ late     the same, but it was not used and counts as lost: in slots its exchange
 absorb   node used all messages of t in one reset; ``age`` is that of the oldest message
 swap     node replaced its estimate and covariance by those of peer
 round    a step of exchange number ``phase`` of the slot begins, in which every node sends
-stop     node has stopped learning from the others in exchange number ``phase``
+stop     node has permanently frozen its network estimate in exchange number ``phase``
 crash, restart  recorded by no engine; they keep the codes of the kinds after them as they were
 diverged the estimate of node or its squared error was no longer finite, or its covariance no longer
          finite and positive semidefinite

@@ -85,7 +85,7 @@ SAYS = {
     "diverged": ("error", "Diverged: "),
     "ring": ("nis", "NIS per row of a reading is"),
     "ensemble": ("age", "Only single runs have events"),
-    "slots": ("stability", "There is no map of the bound H(12)"),
+    "slots": ("stability", "There is no map of Tanwani's bound H(12)"),
 }
 
 

@@ -48,8 +48,8 @@ def test_unknown_consistency_is_no_inconsistency():
             filter=name, ran=True, status="complete", consistency=consistency, values={"rms": rms}
         )
 
-    rows = [row("a", "consistent"), row("b", "-"), row("c", "too sure")]
+    rows = [row("a", "consistent"), row("b", "-"), row("c", "overconfident")]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(claims, "_rms_error", lambda row: row.values["rms"])
         sentences = claims._describe_filters(SimpleNamespace(rows=rows, runs=1, first="a"))
-    assert "P does not describe the errors of c (too sure)" in sentences
+    assert "P does not describe the errors of c (overconfident)" in sentences

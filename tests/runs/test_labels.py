@@ -34,14 +34,14 @@ def weighted(build, folder):
 
 def test_a_weighted_limit_is_not_called_S(build, tmp_path):
     for words in said(weighted(build, tmp_path), tmp_path):
-        assert "weighted limit (not S of H(13))" in words
+        assert "weighted limit (not S of Tanwani's H(13))" in words
         assert "limit S" not in words
 
 
 def test_a_limit_without_the_delay_says_so(build, tmp_path):
     delay = {"network.channel.delay": {"kind": "constant", "seconds": 0.1}}
     for words in said(build().replace(delay), tmp_path):
-        assert "limit S of H(13), if messages took no time" in words
+        assert "limit S of Tanwani's H(13), if messages took no time" in words
 
 
 def test_the_picture_uses_the_words_of_the_table(build, tmp_path):
@@ -54,7 +54,7 @@ def test_the_picture_uses_the_words_of_the_table(build, tmp_path):
     axes = Figure().add_subplot()
     completed = run_to_directory(scenario, tmp_path / "out")
     draw_covariances(axes, reduce_completed_run(scenario, completed))
-    assert "weighted limit (not S of H(13))" in axes.get_legend_handles_labels()[1]
+    assert "weighted limit (not S of Tanwani's H(13))" in axes.get_legend_handles_labels()[1]
 
 
 def test_a_mismatched_model_is_named_beside_the_bound(build, tmp_path):

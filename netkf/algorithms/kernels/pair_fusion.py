@@ -72,8 +72,8 @@ def common_basis(
 def regular_diagonal(root: FloatArray, i: int) -> float:
     """Return entry ``i`` of the diagonal of a lower triangular ``root`` (n, n), in size at least
     SINGULAR (2^-25) times the length of its row: what is smaller is rounding, and two such roots
-    would be thin in directions that rounding tells apart, and their fusion far too sure. P gets no
-    smaller.
+    would be thin in directions that rounding tells apart, and their fusion overconfident. P gets
+    no smaller.
     """
     # As in ``intersection.invert_lanes``, the floor grows with the whole root.
     square = TINY

@@ -344,7 +344,7 @@ def _check_gaps(group: Group, samples: PartSamples, level: float) -> Finding:
         return find_largest([(distance, label)], finding.tolerance, "largest correlation")
     text = f"; correlation of neighbouring gaps {correlation.value:.2g}"
     return finding._replace(
-        message=f"{finding.message}{text}, {distance.detectable:.2g} would be seen"
+        message=f"{finding.message}{text}, {distance.detectable:.2g} is detectable"
     )
 
 

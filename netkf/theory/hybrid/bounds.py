@@ -66,7 +66,7 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
         packed = PackedRiccati(equations)
         P = packed.unpack(_solve_coupled(packed, instants))
     if not np.abs(P).max() < OVERFLOW:
-        raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {instants[-1]:g} s")
+        raise TheoryError(f"Tanwani's H(12) grows beyond {OVERFLOW:g} before {instants[-1]:g} s")
     return P
 
 
@@ -170,7 +170,7 @@ class _PiecewiseSolution:
             if delay == 0.0 or end - begin <= delay * (1.0 + 1e-12):
                 output, end = self._integrate(begin, end, slope, math.inf if delay else GROWTH)
                 if not end > begin:
-                    raise TheoryError(f"H(12) could not be integrated beyond {begin:g} s")
+                    raise TheoryError(f"Tanwani's H(12) could not be integrated beyond {begin:g} s")
                 self._append(end, output)
             else:
                 self._iterate(begin, end, slope)
@@ -236,7 +236,7 @@ class _PiecewiseSolution:
             """
             Y = y.reshape(packed.start.shape)
             if not np.abs(y).max() < OVERFLOW:
-                raise TheoryError(f"H(12) grows beyond {OVERFLOW:g} before {t:g} s")
+                raise TheoryError(f"Tanwani's H(12) grows beyond {OVERFLOW:g} before {t:g} s")
             if delay == 0.0:
                 return packed.slope(Y).reshape(-1)
             if begin < delay * (1.0 - 1e-12):  # nothing has arrived yet
@@ -259,7 +259,9 @@ class _PiecewiseSolution:
             max_step = (end - begin) / step_count if step_count > 1 else np.inf
             result = self._integrate_piece(begin, end, slope, max_step, growth)
             if not result.success:
-                raise TheoryError(f"H(12) could not be integrated to {end:g} s: {result.message}")
+                raise TheoryError(
+                    f"Tanwani's H(12) could not be integrated to {end:g} s: {result.message}"
+                )
             assert result.sol is not None
             try:
                 _check_defect(slope, result.sol)
@@ -328,8 +330,8 @@ class _PiecewiseSolution:
         rounding = ROUNDING * sizes.max()
         if rounding > DEFECT_TOLERANCE * sizes.min():
             raise TheoryError(
-                f"H(12) cannot be integrated beyond {begin:.3g} s: the covariances of two nodes "
-                f"differ by a factor of {sizes.max() / sizes.min():.1g}, so that rounding hides "
+                f"Tanwani's H(12) cannot be integrated beyond {begin:.3g} s: covariances of two "
+                f"nodes differ by a factor of {sizes.max() / sizes.min():.1g}, and rounding hides "
                 "the smaller one"
             )
         tolerance = 1e-3 * TOLERANCE * sizes + rounding
@@ -466,4 +468,6 @@ def _check_defect(slope: Slope, output: Any) -> None:
         )
         defect = np.abs(change - integral).max()
         if not defect <= DEFECT_TOLERANCE * (np.abs(output(b)).max() + np.abs(change).max()):
-            raise TheoryError(f"H(12) was integrated with a defect of {defect:.1e} at {a:g} s")
+            raise TheoryError(
+                f"Tanwani's H(12) was integrated with a defect of {defect:.1e} at {a:g} s"
+            )

@@ -109,20 +109,24 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     name = type(algorithm).__name__
     if not concerns_hybrid_paper(scenario):
         return (
-            f"H(12) is about the hybrid filter in continuous time, not about {kind_name(algorithm)}"
+            f"Tanwani's H(12) is about the hybrid filter in continuous time, not "
+            f"about {kind_name(algorithm)}"
         )
     overridden_names = overridden(algorithm)  # built-in resets by intersection give no larger P
     if overridden_names:
         definition = f"{name} defines {overridden_names[0]} itself"
-        return f"not promised: H(12) is about the hybrid filter, and {definition}"
+        return f"not promised: Tanwani's H(12) is about the hybrid filter, and {definition}"
     assert isinstance(network.activation, LinkClock)
     if not transmits_at_samples(scenario) and not network.activation.memoryless:
         return (
             f"not promised: the clocks of the {network.activation.at} are not Poisson processes, "
-            "and for other clocks of the same rate the mean covariance can lie above H(12)"
+            "and for other clocks of the same rate the mean covariance can lie above Tanwani's "
+            "H(12)"
         )
     if network.channel.delay.fixed is None:
-        return "not promised: H(12) holds for no delay or a fixed one, and the delay is random"
+        return (
+            "not promised: Tanwani's H(12) holds without delays or with fixed ones, not random ones"
+        )
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
     return _reason_of_samples(scenario) if network.channel.loss.independent else dependent
 

@@ -61,12 +61,14 @@ def _require_limit(scenario: Scenario) -> None:
     if not algorithm.talks:
         return
     if scenario.node_filter.combination != "convex":
-        raise TheoryError(f"H(13) is about the hybrid filter, not about {kind_name(algorithm)}")
+        raise TheoryError(
+            f"Tanwani's H(13) is about the hybrid filter, not about {kind_name(algorithm)}"
+        )
     if overridden_names := overridden(algorithm):
         name = kind_name(algorithm)
         if ":" in name_of("filter", algorithm):
             name = f"{type(algorithm).__name__}, which defines {overridden_names[0]} itself"
-        raise TheoryError(f"H(13) is about the hybrid filter, not about {name}")
+        raise TheoryError(f"Tanwani's H(13) is about the hybrid filter, not about {name}")
     if transmits_at_samples(scenario):
         raise TheoryError("S is the limit of fast links, and nodes transmit when they sample")
 

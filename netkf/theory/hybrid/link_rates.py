@@ -49,7 +49,7 @@ def link_rate_threshold(scenario: Scenario) -> LinkRate:
         slow *= 0.1
     factor = threshold_factor(equations.scale_rates(slow))
     if factor is None:
-        raise TheoryError("H(12) has no steady state for any link rates")
+        raise TheoryError("Tanwani's H(12) has no steady state for any link rates")
     return _with_rate(scenario, slow * factor)
 
 

@@ -121,7 +121,7 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
     # Newton's method stalls if a mode is neither driven nor damped.
     if not residual <= RESIDUAL * sum(sizes):
         raise TheoryError(
-            f"the steady state of H(12) was solved to {residual:.1e} only: "
+            f"the steady state of Tanwani's H(12) was solved to {residual:.1e} only: "
             "some mode is neither driven by noise nor damped"
         )
     return P
@@ -223,16 +223,16 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
         return f"{reason}, and the covariance of node{plural} {listed} alone has no steady state"
     activation = scenario.network.activation
     if transmits_at_samples(scenario):
-        return "H(12) has no steady state: nodes that sample more often would transmit more often"
+        return "Tanwani's H(12) has no steady state: nodes that sample more also transmit more"
     factor = threshold_factor(equations)
     if factor is None:
-        return "H(12) has no steady state, and faster links do not give it one"
+        return "Tanwani's H(12) has no steady state, and faster links do not give it one"
     rate = getattr(activation, "rate", None)
     entity = {"nodes": "node", "directions": "direction"}.get(getattr(activation, "at", ""), "link")
     remedy = f"every {entity} rate must be at least {factor:.5g} times what it is"
     if rate is not None and not getattr(activation, "rates", ()):
         remedy = f"the rate {rate:g} is below the threshold {factor * rate:.5g}"
-    return f"H(12) has no steady state: {remedy}"
+    return f"Tanwani's H(12) has no steady state: {remedy}"
 
 
 def threshold_factor(equations: CoupledRiccati) -> float | None:

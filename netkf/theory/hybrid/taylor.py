@@ -71,7 +71,7 @@ def solve_by_taylor_series(
         out[count:until] = solution[:-2]
         Y, now, span, count = end, following, step * span, until
         if not np.abs(Y).max() < limit:
-            raise TheoryError(f"H(12) grows beyond {limit:g} before {now:g} s")
+            raise TheoryError(f"Tanwani's H(12) grows beyond {limit:g} before {now:g} s")
     return out
 
 

@@ -238,7 +238,7 @@ def _exact_row(
         evidence += "; single paths may still stay bounded in probability"
     elif heavy and radius > HEAVY_TAIL_RADIUS:
         evidence += f"; above {HEAVY_TAIL_RADIUS} averages over runs have heavy tails "
-        evidence += "and no honest interval"
+        evidence += "and no valid interval"
     return *name, stable, evidence
 
 
