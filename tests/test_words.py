@@ -7,11 +7,13 @@ import pytest
 
 from netkf.cli.main import make_parser
 from netkf.scenario.registry import KINDS
+from netkf.scenario.schema_page import schema_page
 from tests.conftest import ROOT, SCENARIOS
 from tests.documents import blocks
 
 README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+KEYS = ROOT / "docs" / "keys.md"  # made by Sphinx, of schema_page()
+PAGES = [README, *sorted(set((ROOT / "docs").rglob("*.md")) - {KEYS})]
 TEXTS = [
     *PAGES,
     *(ROOT / name for name in ("CHANGELOG.md", "SECURITY.md", "CITATION.cff", "pyproject.toml")),
@@ -105,7 +107,14 @@ def test_nobody_has_to_decode_a_phrase(phrase):
     ids=lambda page: page.name,
 )
 def test_a_letter_stands_for_a_paper_whose_author_is_named_first(page):
-    text = page.read_text(encoding="utf-8")
+    require_authors(page, page.read_text(encoding="utf-8"))
+
+
+def test_the_page_of_all_keys_names_authors_before_letters():
+    require_authors(KEYS, schema_page())
+
+
+def require_authors(page, text):
     for letter, author in AUTHORS.items():
         first = next((m.start() for m in LETTER.finditer(text) if m[1] == letter), None)
         if first is not None:  # the author stands before it or in the same line

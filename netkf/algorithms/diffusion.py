@@ -201,8 +201,8 @@ def combine_senders(
 @built_in("diffusion")
 @dataclass(frozen=True, eq=False)
 class DiffusionFilter(Filter):
-    """Paper D Algorithm 1, (6)-(9), with any F in place of the paper's identity; samples in slots
-    are predictions.
+    """Xie, Gan and Liu, D Algorithm 1, (6)-(9), with any F in place of the identity; samples in
+    slots are predictions.
 
     Under clocks a node combines its estimate with those that it heard at one instant; those of
     delayed messages are predicted to now first.

@@ -572,7 +572,7 @@ def correct_root_single(
 @built_in("push-sum")
 @dataclass(frozen=True, eq=False)
 class PushSum(Filter):
-    """In slots the filter of P Fig. 1, whose samples show estimates after readings; under node
+    """In slots Battilotti et al., P Fig. 1, whose samples show estimates after readings; under node
     clocks broadcast rounds by running sums (``algorithms.running_sums``), which use none of the
     settings. All methods serve both: under clocks the state is a ``RunningSums``.
 

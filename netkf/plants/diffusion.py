@@ -32,7 +32,7 @@ NO_TIMES = np.empty(0)
 
 @dataclass(frozen=True, eq=False)
 class Diffusion(Plant):
-    """``dx = A x dt + B dw``, paper H (1), with x(0) Gaussian of ``mean`` and ``cov``.
+    """``dx = A x dt + B dw``, Tanwani, H (1), with x(0) Gaussian of ``mean`` and ``cov``.
 
     ``A`` (n, n), ``B`` (n, m); ``sensing_period`` is the step h of the sensors in seconds.
     """

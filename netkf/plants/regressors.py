@@ -22,7 +22,7 @@ from netkf.plants.sensors import Sensor
 
 @dataclass(frozen=True, eq=False)
 class RegressorSensor(Sensor):
-    """``y_k = phi_k' x_k + v_k``, cov(v) = R, with ``phi_k = C s_k``, paper D (1), section VI.
+    """``y_k = phi_k' x_k + v_k``, cov(v) = R, with ``phi_k = C s_k``, Xie et al., D (1), VI.
 
     ``s_0 = start`` and ``s_k = A s_{k-1} + B xi_k``, cov(xi) = ``xi_cov``, independent of all else
     and from node to node. ``A`` (m, m), ``B`` (m, q), ``C`` (n, m), ``start`` (m,),

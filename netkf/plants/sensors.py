@@ -128,8 +128,8 @@ def sampling_ticks(
 @dataclass(frozen=True, eq=False)
 class LinearSensor(Sensor):
     """A sensor that is linear in the state. In slots it reads ``y = H x + v``, cov(v) = R, in every
-    slot. In continuous time it reads increments ``dy = H x dt + dv``, cov(dv) = R dt, paper H (3).
-    With a clock as ``sampling`` it reads ``y = H x + v`` in continuous time at every tick.
+    slot. In continuous time it reads increments ``dy = H x dt + dv``, cov(dv) = R dt, Tanwani,
+    H (3). With a clock as ``sampling`` it reads ``y = H x + v`` in continuous time at every tick.
 
     ``H`` (p, n), ``R`` (p, p).
     """

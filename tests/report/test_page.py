@@ -370,16 +370,16 @@ def test_innovations_are_those_of_the_run(name, request):
     np.testing.assert_array_equal(columns["t"], found.times)
     np.testing.assert_array_equal(columns["nis"], found.nis / found.rows)
     nodes = np.unique(found.nodes)
-    overconfident = 0
+    above = 0
     for node in nodes.tolist():
         mine = found.nis[found.nodes == node]
         rows = int(found.rows[found.nodes == node].sum())
         ends = scipy.stats.chi2(rows).ppf([0.005 / len(nodes), 1.0 - 0.005 / len(nodes)]) / rows
         place = str(run.nodes.index(node))
         np.testing.assert_allclose(shown["means"][place], [mine.sum() / rows, *ends], rtol=1e-9)
-        overconfident += mine.sum() / rows > ends[1]
+        above += mine.sum() / rows > ends[1]
     assert f"Over {len(found.nis):,} readings the squared innovation" in page.shown
-    assert (f"P is overconfident at {overconfident} of {len(nodes)} nodes" in page.shown) == (overconfident > 0)
+    assert (f"P is overconfident at {above} of {len(nodes)} nodes" in page.shown) == (above > 0)
 
 
 def test_what_stands_against_innovations_is_said(ring, slots, monkeypatch):
