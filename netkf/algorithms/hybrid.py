@@ -23,8 +23,9 @@ class Hybrid(Filter):
     """A Kalman-Bucy filter on the node's own readings whose estimate and covariance are reset to
     convex combinations, with weight ``epsilon`` for each neighbour heard.
 
-    ``epsilon`` is the off-diagonal entry of ``Pi = I - epsilon L``, L the graph's Laplacian, Tanwani,
-    H (5): 0 < epsilon <= 1/max degree. A delayed message is predicted to its arrival first.
+    ``epsilon`` is the off-diagonal entry of ``Pi = I - epsilon L``, L the graph's Laplacian,
+    Tanwani, H (5): 0 < epsilon <= 1/max degree. A delayed message is predicted to its
+    arrival first.
     """
 
     epsilon: float = field(number(above=0.0, high=1.0))

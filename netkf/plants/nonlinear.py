@@ -402,7 +402,7 @@ class BearingSensor(PositionedSensor):
 
 @dataclass(frozen=True, eq=False)
 class RangeBearingSensor(PositionedSensor):
-    """The distance and the direction of a target from a node: R (2, 2)."""
+    """The distance and the direction of a target from a node; ``R`` (2, 2)."""
 
     rows: ClassVar[int] = 2
     turns: ClassVar[bool] = True
