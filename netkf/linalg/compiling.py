@@ -25,6 +25,7 @@ from typing import Any, TypeVar, cast, overload
 from netkf.linalg.code_files import CodeFiles, make_own_folder
 from netkf.linalg.compile_once import SharedCache
 from netkf.linalg.linking import linked_once
+from netkf.linalg.plain import is_plain, plain_kernel
 from netkf.linalg.shortcuts import kernel_compiler, without_collection
 
 ROOT = Path(__file__).parents[1]
@@ -192,6 +193,8 @@ def _make_kernel(
     loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool, compact: bool
 ) -> Callable[..., Any]:
     """Return the Kernel of a function, with numba's options for the arguments of :func:`kernel`."""
+    if is_plain():
+        return plain_kernel(loops)
     # "_nrt": without numba's runtime there is no reference counting, and no allocation.
     options = {**_OPTIONS, "_nrt": allocates}
     if inlined:

@@ -7,38 +7,43 @@ other, so that each entry is stored and loaded again. For larger n the given arr
 
 from __future__ import annotations
 
+import numpy as np
+
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import Lanes
 from netkf.linalg.structs import Size
 
 
-def local_matrix(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised array (n, n), valid until the calling kernel returns.
+def local_matrix(size: Size, scratch: FloatArray) -> FloatArray:
+    """Return an uninitialised array (n, n), valid until the calling kernel returns.
 
     It is on the stack if ``size`` is a tuple, and ``scratch`` (n, n) if ``size`` is an array.
-    Called from Python it raises TypeError.
     """
-    raise TypeError("local_matrix is for kernels")
+    return _local(size, scratch, len(size), len(size))
 
 
-def local_vector(size: Size, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised array (n,), valid until the calling kernel returns: on
-    the stack if ``size`` is a tuple, else ``scratch`` (n,). Called from Python it raises TypeError.
+def local_vector(size: Size, scratch: FloatArray) -> FloatArray:
+    """Return an uninitialised array (n,), valid until the calling kernel returns: on the stack if
+    ``size`` is a tuple, else ``scratch`` (n,).
     """
-    raise TypeError("local_vector is for kernels")
+    return _local(size, scratch, len(size))
 
 
-def local_lanes_matrix(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised array (n, n, L) for L lanes, valid until the calling
-    kernel returns: on the stack if ``size`` is a tuple, else ``scratch`` (n, n, L). Called from
-    Python it raises TypeError. ``lanes`` is a tuple of length L.
+def local_lanes_matrix(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:
+    """Return an uninitialised array (n, n, L) for L lanes, valid until the calling kernel returns:
+    on the stack if ``size`` is a tuple, else ``scratch`` (n, n, L). ``lanes`` is a tuple of length
+    L.
     """
-    raise TypeError("local_lanes_matrix is for kernels")
+    return _local(size, scratch, len(size), len(size), len(lanes))
 
 
-def local_lanes_vector(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:  # noqa: ARG001
-    """Return, in kernels, an uninitialised array (n, L) for L lanes, valid until the calling kernel
-    returns: on the stack if ``size`` is a tuple, else ``scratch`` (n, L). Called from Python it
-    raises TypeError. ``lanes`` is a tuple of length L.
+def local_lanes_vector(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:
+    """Return an uninitialised array (n, L) for L lanes, valid until the calling kernel returns: on
+    the stack if ``size`` is a tuple, else ``scratch`` (n, L). ``lanes`` is a tuple of length L.
     """
-    raise TypeError("local_lanes_vector is for kernels")
+    return _local(size, scratch, len(size), len(lanes))
+
+
+def _local(size: Size, scratch: FloatArray, *shape: int) -> FloatArray:
+    """Return a new array of this ``shape`` if the size is a tuple, else ``scratch``."""
+    return np.full(shape, np.nan) if isinstance(size, tuple) else scratch

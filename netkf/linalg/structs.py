@@ -25,11 +25,13 @@ calls often take ``struct.memory``, and begin with ``struct = struct_at(memory, 
 from __future__ import annotations
 
 from typing import Any, ClassVar, TypeVar, dataclass_transform
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from netkf.linalg.arrays import address_of
+from netkf.linalg.plain import is_plain, with_fields
 
 FloatArray = NDArray[np.float64]
 NUMBERS = {"int": np.int64, "float": np.float64}
@@ -93,6 +95,7 @@ class Struct(metaclass=StructClass):
             cls._lay_out(values)
         object.__setattr__(self, "memory", np.zeros(cls.struct_size(), dtype=np.int64))
         object.__setattr__(self, "address", address_of(self.memory))
+        _structs[self.address] = self
         for name, value in values.items():
             setattr(self, name, value)
 
@@ -149,7 +152,7 @@ class Struct(metaclass=StructClass):
             self.memory[word] = address_of(value)
             self.memory[word + 1 : word + 1 + value.ndim] = value.shape
             # The dictionary keeps the array alive, since the memory holds its address only.
-            self.__dict__[name] = value
+            self.__dict__[name] = with_fields(value) if is_plain() else value
         elif kind is np.int64 or kind is np.float64:
             # Integers and floats share the words, seen as one or the other type.
             self.memory.view(kind)[word] = value
@@ -178,13 +181,16 @@ class Struct(metaclass=StructClass):
         kind = self.struct_kinds.get(name)
         if kind is not np.int64 and kind is not np.float64:
             raise AttributeError(name)
-        return self.memory.view(kind)[self.struct_offsets[name]].item()
+        number = self.memory.view(kind)[self.struct_offsets[name]]
+        return number if is_plain() else number.item()
 
 
 Derived = TypeVar("Derived", bound=Struct)
 
 
 _sized_classes: dict[tuple[type[Struct], int], Any] = {}
+_structs: WeakValueDictionary[int, Struct] = WeakValueDictionary()
+"""All structs by address, for ``struct_at`` in plain Python."""
 
 
 def _rebuilt(cls: type[Derived], n: int | None, values: dict[str, Any]) -> Derived:
@@ -199,8 +205,10 @@ def sized(n: int) -> Size:
     return (0,) * n if n <= MAX_UNROLLED else np.zeros(n)
 
 
-def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:  # noqa: ARG001
+def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:
     """Return, in kernels, the struct of class ``cls`` whose block of int64 words is ``memory``
-    (words,); Python raises TypeError.
+    (words,).
     """
-    raise TypeError("struct_at is for kernels; Python has the struct itself")
+    struct = _structs[address_of(memory)]
+    assert isinstance(struct, cls)
+    return struct

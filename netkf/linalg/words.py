@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 
-def high_word(a: Any, b: Any) -> Any:  # noqa: ARG001
-    """Return, in kernels, the upper 64 bits of the product of two unsigned 64-bit words. Python
-    raises TypeError.
-    """
-    raise TypeError("high_word is for kernels")
+
+def high_word(a: Any, b: Any) -> Any:
+    """Return the upper 64 bits of the product of two unsigned 64-bit words."""
+    return np.uint64(int(a) * int(b) >> 64)

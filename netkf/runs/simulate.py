@@ -11,6 +11,7 @@ from netkf.core.fields import integer
 from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
+from netkf.linalg.plain import is_plain
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import MemorySink, Recorder, Sink
@@ -27,8 +28,8 @@ def choose_engine(
     """Return the engine for a scenario, given by its name or as an Engine.
 
     Names are ``simpy`` (or ``processes``), ``compiled``, and ``auto``: the compiled engine if it
-    can run the scenario, and SimPy otherwise. With ``announce`` an engine that has to compile first
-    prints so.
+    can run the scenario and kernels are compiled, and SimPy otherwise. With ``announce`` an engine
+    that has to compile first, or cannot, prints so.
 
     Raises EngineError if the name is unknown or the engine cannot run the scenario.
     """
@@ -36,7 +37,7 @@ def choose_engine(
         engine: Engine = name_or_engine
     elif name_or_engine in ("auto", "compiled"):
         engine = CompiledEngine()
-        if name_or_engine == "auto" and engine.refusal(scenario) is not None:
+        if name_or_engine == "auto" and (is_plain() or engine.refusal(scenario) is not None):
             engine = SimpyEngine()
     elif name_or_engine in ("simpy", "processes"):
         engine = SimpyEngine()

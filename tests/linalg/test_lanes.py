@@ -29,6 +29,7 @@ from netkf.linalg.lanes import (
     with_sign,
     with_spare,
 )
+from netkf.linalg.plain import is_plain
 
 SIZES = pytest.mark.parametrize("lanes", [ONE, MANY], ids=["one", "many"])
 
@@ -99,9 +100,22 @@ def test_comparisons_with_nan_are_false(lanes):
     assert not exceed(lanes, np.full((1, len(lanes)), np.nan), 0.0, flags)
 
 
-def test_values_exist_in_kernels_only():
-    with pytest.raises(TypeError, match="kernels only"):
-        load(ONE, np.zeros((1, 1)), 0)
+@kernel
+def sum_and_first(lanes, a, out):
+    """Values do not change when others that were equal do."""
+    first = total = load(lanes, a, 0)
+    total += 1.0
+    total *= 2.0
+    store(lanes, out, 0, total)
+    store(lanes, out, 1, first)
+
+
+@SIZES
+def test_a_value_never_changes(lanes):
+    a, out = np.arange(1.0, 1.0 + len(lanes))[None], aligned((2, len(lanes)))
+    sum_and_first(lanes, a, out)
+    np.testing.assert_array_equal(out, [2.0 * a[0] + 2.0, a[0]])
+    np.testing.assert_array_equal(a[0], np.arange(1.0, 1.0 + len(lanes)))
 
 
 def test_runs_are_laid_out_by_blocks():
@@ -159,6 +173,11 @@ def test_asking_for_memory_changes_nothing():
     add_while_fetching(rows, out)
     np.testing.assert_allclose(out, kept.sum(axis=1), rtol=1e-12)
     np.testing.assert_equal(rows, kept)
+
+
+@pytest.mark.skipif(is_plain(), reason="looks at compiled code")
+def test_memory_is_asked_for():
+    rows, out = np.ones((2, 3)), np.empty(2)
     # The code of functions that were read from disk cannot be looked at.
     compiled = add_while_fetching._kernel_dispatcher
     compiled(rows, out)

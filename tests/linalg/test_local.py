@@ -65,12 +65,3 @@ def test_local_arrays_of_lanes_hold_what_is_written(n):
     matrix_times(sized(n), matrix, vector, scratch, line, out)
     np.testing.assert_allclose(out, np.einsum("ijq,jq->iq", matrix, vector), rtol=1e-12, atol=1e-14)
     assert np.isnan(scratch).all() == np.isnan(line).all() == (n <= 4)
-
-
-def test_local_arrays_are_for_kernels():
-    for local, scratch in ((local_matrix, np.zeros((2, 2))), (local_vector, np.zeros(2))):
-        with pytest.raises(TypeError, match="for kernels"):
-            local(sized(2), scratch)
-    for local in (local_lanes_matrix, local_lanes_vector):
-        with pytest.raises(TypeError, match="for kernels"):
-            local(sized(2), MANY, np.zeros((2, 8)))

@@ -83,8 +83,3 @@ def test_pickled_structs_are_structs_of_their_own():
     other = pickle.loads(pickle.dumps(walk))
     walk_on(other, 0, 0)
     assert (walk.steps, other.steps, other.clock.next) == (0, 1, 2)
-
-
-def test_struct_at_is_for_kernels():
-    with pytest.raises(TypeError, match="kernels"):
-        struct_at(make().memory, Walk)

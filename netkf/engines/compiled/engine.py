@@ -21,6 +21,7 @@ from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
 from netkf.engines.compiled.state import COMBINATIONS
 from netkf.linalg import compiling
+from netkf.linalg.plain import announce_plain, has_numba, is_plain
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import (
@@ -56,6 +57,8 @@ class CompiledEngine(Engine):
     def refusal(self, scenario: Scenario) -> str | None:
         """Return why this engine cannot run the scenario, with the remedy; None if it can."""
         remedy = 'use engine="simpy", or "auto", which chooses'
+        if not has_numba():
+            return f'engine "compiled" needs numba, which is not installed; {remedy}'
         parts: list[tuple[str, Component]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
         parts += [("filter", scenario.filter.algorithm)]
@@ -77,6 +80,9 @@ class CompiledEngine(Engine):
 
     def announce(self, scenario: Scenario) -> None:
         """Say on stderr that code is compiled, unless it is cached from an earlier run."""
+        if is_plain():
+            announce_plain()
+            return
         # Slots and continuous time are compiled separately.
         if scenario.slotted:
             compiling.announce(scenario.node_filter.slot_kernel)

@@ -25,6 +25,7 @@ from netkf.engines.simpy.slots import (
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import Transmitter
 from netkf.engines.soundness import stack_estimates
+from netkf.linalg.plain import announce_plain
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -51,6 +52,10 @@ class SimpyEngine(Engine):
     def refusal(self, scenario: Scenario) -> str | None:
         """Return None: this engine runs every scenario."""
         return None
+
+    def announce(self, scenario: Scenario) -> None:
+        """Say on stderr that runs are slow where kernels are not compiled."""
+        announce_plain()
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

@@ -1,0 +1,108 @@
+"""Kernels as plain Python compute what compiled ones compute."""
+
+import math
+import os
+import subprocess
+import sys
+from math import exp
+from pathlib import Path
+from types import FunctionType
+
+import numpy as np
+import pytest
+
+from netkf.linalg import structs
+from netkf.linalg.compiling import kernel
+from netkf.linalg.plain import is_plain, plain_kernel
+from netkf.linalg.words import high_word
+
+HERE = Path(__file__).parent
+COMPILED = pytest.mark.skipif(is_plain(), reason="compares plain kernels with compiled ones")
+ODD = [0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e200, -1e200, 1000.0, math.inf, -math.inf, math.nan]
+
+
+def both(function):
+    """The same function as a compiled kernel and as a plain one."""
+    copy = FunctionType(function.__code__, dict(function.__globals__), function.__name__)
+    return kernel(function), plain_kernel(copy)
+
+
+def quotients(x, y):
+    return x / y, (x - x) / y, x * x / (y * y), math.inf / y, 1.0 / (x + y)
+
+
+def functions(x, y):
+    root, power, logarithm = math.sqrt(x), exp(x), math.log(y)
+    return root, power, logarithm, math.log1p(x), math.copysign(x, y), math.tanh(x), np.sqrt(y)
+
+
+def words(x, y):
+    product = np.uint64(x) * np.uint64(y) + np.uint64(x)
+    return (
+        product,
+        product >> np.uint64(3),
+        high_word(product, np.uint64(y)),
+        product < np.uint64(x),
+    )
+
+
+@COMPILED
+@pytest.mark.parametrize("function", [quotients, functions])
+def test_plain_numbers_are_those_of_ieee_754(function):
+    compiled, plain = both(function)
+    for x in ODD:
+        for y in ODD:
+            expected = compiled(x, y)
+            got = plain(x, y)
+            np.testing.assert_allclose(got, expected, rtol=1e-15, atol=0.0)
+            assert [math.copysign(1.0, a) for a in got if a == 0.0] == [
+                math.copysign(1.0, b) for b in expected if b == 0.0
+            ]
+            assert {type(number) for number in got} == {float}
+
+
+@COMPILED
+def test_plain_words_wrap_around():
+    compiled, plain = both(words)
+    for pair in [(2**63 + 12345, 2**62 + 99), (1, 2), (2**64 - 1, 2**64 - 1)]:
+        pair_of_words = [np.uint64(word) for word in pair]
+        assert plain(*pair_of_words) == compiled(*pair_of_words)
+    assert plain(np.uint64(3), np.uint64(5)) == (18, 2, 0, False)
+
+
+def test_a_plain_kernel_leaves_the_rest_of_its_module_alone():
+    _, plain = both(functions)
+    assert plain(-1.0, 1.0)[0] != plain(-1.0, 1.0)[0]
+    with pytest.raises(ValueError, match=r"math domain|nonnegative"):
+        math.sqrt(-1.0)
+    with pytest.warns(RuntimeWarning, match="divide by zero"):
+        np.float64(1.0) / np.float64(0.0)
+    with pytest.raises(OverflowError):
+        exp(1000.0)
+
+
+def test_errors_of_plain_kernels_come_through_and_leave_nothing():
+    plain = plain_kernel(lambda x: x[3] / 0.0)
+    for _ in range(2):
+        with pytest.raises(IndexError):
+            plain(np.ones(3))
+    assert plain(np.ones(4)) == math.inf
+
+
+def test_a_struct_is_found_by_its_memory_while_it_lives():
+    class Pair(structs.Struct):
+        a: np.ndarray
+        b: float
+
+    pair = Pair(a=np.ones(2), b=2.0)
+    assert structs.struct_at(pair.memory, Pair) is pair
+
+
+@COMPILED
+def test_lanes_structs_and_small_matrices_pass_their_tests_as_plain_python():
+    files = [HERE / f"test_{name}.py" for name in ("lanes", "structs", "local", "small", "series")]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *map(str, files)]
+    told = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(command, check=False, env=told, capture_output=True, cwd=HERE.parents[1])
+    assert done.returncode == 0, done.stdout.decode()
+    assert b" passed" in done.stdout
