@@ -88,12 +88,12 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
 
 def add_trust(parser: argparse.ArgumentParser, folder: str) -> None:
     """Add ``--trust``; ``folder`` names, in its help, the folder from which modules are imported
-    besides the current one.
+    besides the current one and installed packages.
     """
     parser.add_argument(
         "--trust",
         action="store_true",
-        help=f"import classes that the scenario names from modules in {folder} or the current one",
+        help=f"import classes that the scenario names, also from {folder} or the current one",
     )
 
 

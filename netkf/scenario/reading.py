@@ -39,8 +39,8 @@ def load(
 
     A file can name classes of modules in its own folder or the current folder. With ``trust``, the
     default, these modules are imported, which executes their code. Give ``trust=False`` for files
-    whose author you do not trust: such classes are refused then, those of installed packages are
-    not. The command ``netkf`` does so unless ``--trust`` is given.
+    whose author you do not trust: such classes are refused then, those that installed packages
+    offer as kinds are not. The command ``netkf`` does so unless ``--trust`` is given.
 
     Raises ScenarioError with one line for the first mistake.
     """

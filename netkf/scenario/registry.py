@@ -26,7 +26,7 @@ from netkf.plants.recorded import (
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.scenario.imports import Origin, find_class
+from netkf.scenario.imports import Origin, find_class, find_offered_class, offered_kinds
 
 FAMILIES: dict[str, type[Component]] = {
     "plant": Plant,
@@ -167,7 +167,8 @@ def list_kinds(family: str) -> list[str]:
 def find_kind(
     family: str, kind: object, origin: Origin, table: Mapping[str, Any] = MappingProxyType({})
 ) -> type[Component] | None:
-    """Return the class that ``kind`` names: a kind of the family, or ``"package.module:Class"``.
+    """Return the class that ``kind`` names: a kind of the family, ``"package.module:Class"``, or a
+    kind that an installed package offers.
 
     ``table`` has the other keys beside ``kind``; where several classes share the kind, one of these
     chooses the class. Returns None for a user's class that is not loaded yet and must not be
@@ -178,17 +179,20 @@ def find_kind(
     if choices:
         return KINDS[family][_choose_name(choices, table)]
     if isinstance(kind, str) and ":" in kind:
-        return _find_user_class(family, kind, origin)
+        return _require_part(family, kind, find_class(kind, origin))
     reason = explain_kind_mismatch(family, kind)
     if reason is not None:
         raise ScenarioError("kind", reason, kind, "change the plant or choose another kind")
-    kinds = list_kinds(family)
+    kinds, offered = list_kinds(family), offered_kinds()
+    if isinstance(kind, str) and kind in offered:
+        return _require_part(family, kind, find_offered_class(kind, origin))
     listed = ", ".join(f'"{name}"' for name in kinds)
+    others = ", ".join(f'"{name}"' for name in offered)
     raise ScenarioError(
         "kind",
-        f"must be one of {listed}",
+        f"must be one of {listed}" + (f", or of those of packages, {others}" if others else ""),
         kind,
-        f'{suggest_nearest(kind, kinds)}choose one, or write "package.module:Class"',
+        f'{suggest_nearest(kind, [*kinds, *offered])}choose one, or write "package.module:Class"',
     )
 
 
@@ -208,12 +212,11 @@ def _choose_name(choices: Mapping[str, Mapping[str, str]], table: Mapping[str, A
     raise ScenarioError(key, f"must be one of {listed}", table[key], "choose one of them")
 
 
-def _find_user_class(family: str, kind: str, origin: Origin) -> type[Component] | None:
-    """Return the class "package.module:Class"; None if it must not be imported, see ``find_class``.
+def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
+    """Return the class ``cls`` that ``kind`` names, or None if it is None: not imported yet.
 
     Raises ScenarioError if it is not a class of the family or lacks a method that it must define.
     """
-    cls = find_class(kind, origin)
     if cls is None:
         return None
     base = FAMILIES[family]
@@ -229,7 +232,8 @@ def _find_user_class(family: str, kind: str, origin: Origin) -> type[Component] 
         raise ScenarioError(
             "kind", f"must define {', '.join(missing)}", kind, "write what the contract asks for"
         )
-    return cls
+    found: type[Component] = cls
+    return found
 
 
 def _is_abstract(attribute: object) -> bool:
@@ -238,7 +242,8 @@ def _is_abstract(attribute: object) -> bool:
 
 
 def name_of(family: str, component: Component) -> str:
-    """Return the name of a component's class in KINDS, or its ``package.module:Class``.
+    """Return the name of a component's class in KINDS, the kind as which an installed package
+    offers it, or its ``package.module:Class``.
 
     ``family`` may be that without "slot" or "continuous": these families are searched too.
     """
@@ -247,6 +252,9 @@ def name_of(family: str, component: Component) -> str:
         for name, cls in classes.items():
             if type(component) is cls:
                 return name
+    for kind in offered_kinds(type(component)):
+        if not list_names_of_kind(family, kind) and ":" not in kind:
+            return kind
     return f"{type(component).__module__}:{type(component).__qualname__}"
 
 

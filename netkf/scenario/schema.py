@@ -18,6 +18,7 @@ from netkf.algorithms.registry import split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
+from netkf.scenario.imports import offered_kinds
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
 from netkf.scenario.registry import KINDS, list_kinds
 from netkf.scenario.scenario import Scenario
@@ -173,7 +174,7 @@ def _family_schema(name: str, families: Sequence[str]) -> Schema:
         for kind, cls in KINDS[family].items()
     ]
     description = "A class, package.module:Class."
-    kind_schema = {"type": "string", "pattern": USER_CLASS, "description": description}
+    kind_schema = {"type": "string", "pattern": _user_kinds(), "description": description}
     user_class = {"type": "object", "properties": {"kind": kind_schema}, "required": ["kind"]}
     return {"anyOf": [*variants, {"title": "a class of your own", **user_class}]}
 
@@ -226,8 +227,14 @@ def _time_model_rules() -> list[Schema]:
 
 def _component_schema(kinds: Sequence[str]) -> Schema:
     """Return the schema of a table whose kind is one of these or a user's class."""
-    kind = {"anyOf": [{"enum": [*kinds]}, {"type": "string", "pattern": USER_CLASS}]}
+    kind = {"anyOf": [{"enum": [*kinds]}, {"type": "string", "pattern": _user_kinds()}]}
     return {"type": "object", "properties": {"kind": kind}}
+
+
+def _user_kinds() -> str:
+    """Return the pattern of users' classes and of the kinds that installed packages offer."""
+    offered = (f"^{re.escape(kind)}$".replace("\\-", "-") for kind in offered_kinds())
+    return "|".join([USER_CLASS, *offered])
 
 
 def plain_docstring(cls: type) -> str:

@@ -24,6 +24,7 @@ from netkf.runs.files import check_sources, create_output_directory, write_scena
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
 from netkf.runs.simulate import choose_engine
+from netkf.scenario.imports import offered_kinds
 from netkf.scenario.registry import list_kinds, name_of
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import as_table, part_as_table
@@ -370,7 +371,7 @@ def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
     own_table = as_table(scenario)["filter"]
     table = {"kind": choice} if isinstance(choice, str) else dict(choice)
     kind = table.get("kind")
-    kinds = sorted(list_kinds("filter"))
+    kinds = sorted([*list_kinds("filter"), *offered_kinds()])
     # A kind with a colon, module:Class, is a user's class.
     if not isinstance(kind, str) or (":" not in kind and kind not in kinds):
         hint = suggest_nearest(kind, kinds) if isinstance(kind, str) else ""

@@ -77,8 +77,7 @@ def test_modules_of_the_folder_need_trust(folder, monkeypatch, kind, path, curre
     if on_path is not None:
         monkeypatch.syspath_prepend(folder / on_path)
     found = kind != "stranger.evil:P" or current == ".." or on_path == ".."
-    words = "add --trust" if found else "could not be imported"
-    with pytest.raises(netkf.ScenarioError, match=rf"filter\.kind: .*{words}"):
+    with pytest.raises(netkf.ScenarioError, match=r"filter\.kind: .*add --trust"):
         netkf.load(file, trust=False)
     assert not ran(folder)
     if found:
@@ -179,6 +178,15 @@ def test_replace_and_pickle_keep_the_rule(folder):
     assert ran(folder)
 
 
+def offer(site, package, **offered):
+    """Write the metadata of an installed package that offers classes, as pip leaves it."""
+    info = site / f"{package}-1.0.dist-info"
+    info.mkdir(parents=True)
+    lines = [f"{kind.replace('_', '-')} = {value}" for kind, value in offered.items()]
+    (info / "entry_points.txt").write_text("\n".join(["[netkf.parts]", *lines, ""]))
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+
+
 @pytest.fixture
 def site(folder, monkeypatch):
     """A folder of installed packages inside the stranger's folder, as that of a .venv can be."""
@@ -190,114 +198,136 @@ def site(folder, monkeypatch):
     return place
 
 
-PACKAGES = {
-    "good:P": {"good.py": PART},
-    "good.deep:P": {"good/__init__.py": "", "good/deep.py": PART},
-    "good:Q": {
-        "good/__init__.py": "from .deep import P as Q\n",
-        "good/deep.py": "from . import base\n\n\nclass P(base.P):\n    pass\n",
-        "good/base.py": "try:\n    import netkf.parts as parts\nexcept ImportError:\n    raise\n"
-        "class P(parts.Hybrid):\n    pass\n",
-    },
-    "good:R": {"good.py": "import netkf\n\n\nclass P(netkf.parts.Hybrid):\n    pass\n\n\nR = P\n"},
-    "good:S": {"good/__init__.py": "from good.all import *\n", "good/all.py": PART + "S = P\n"},
-    "good:T": {
-        "good.py": "import sys\n\nmatch sys.platform:\n    case _:\n"
-        "        from netkf.parts import Hybrid\n\n\nclass T(Hybrid):\n    pass\n"
-    },
-}
+LOSS = """from netkf.parts import Loss, probability, setting
+from dataclasses import dataclass
 
 
-@pytest.mark.parametrize("kind", PACKAGES)
-def test_classes_of_installed_packages_are_imported(folder, site, monkeypatch, kind):
-    for path, text in PACKAGES[kind].items():
-        module(site / path, text)
+@dataclass(frozen=True, eq=False)
+class Rare(Loss):
+    delivery: float = setting(probability)
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return self.delivery
+"""
+
+
+def test_a_package_offers_classes_as_kinds(folder, site, monkeypatch, capsys):
+    """From the command line without --trust, up to the run directory and many processes."""
+    offer(site, "good", my_hybrid="good.deep:Again", rare="good.losses:Rare")
+    module(site / "good" / "__init__.py", "")
+    module(site / "good" / "deep.py", PART + "Again = P\n")
+    module(site / "good" / "losses.py", LOSS)
     monkeypatch.chdir(folder)
-    netkf.load(scenario(folder, kind), trust=False)
-    assert ran(site)
+    file = scenario(folder, "my-hybrid", horizon=1.0)
+    out = folder / "out"
+    change = 'network.channel.loss={kind="rare", delivery=0.5}'
+    options = ["--set", change, "--runs", "2", "--workers", "2", "--no-plot", "--out", str(out)]
+    assert main(["run", str(file), *options]) == 0, capsys.readouterr().err
+    assert sorted(set(ran(site))) == ["__init__.ran", "deep.ran", "losses.ran"]
+    resolved = (out / "scenario.toml").read_text()
+    assert 'kind = "my-hybrid"' in resolved
+    assert 'kind = "rare"' in resolved
+    again = netkf.open(out).scenario  # without trust
+    assert type(again.filter.algorithm).__module__ == "good.deep"
+    assert again.network.channel.loss.delivery == 0.5
+    assert main(["compare-filters", str(file), "--filters", "hybrid,my-hybrid"]) == 0
+
+
+def test_nothing_is_imported_to_find_out_what_packages_offer(folder, site, capsys, monkeypatch):
+    offer(site, "good", my_hybrid="good:P", other="good:Q")
+    module(site / "good.py")
+    with pytest.raises(netkf.ScenarioError, match=r"of those of packages, .my-hybrid., .other.; "):
+        netkf.load(scenario(folder, "my-hibrid"))
+    with pytest.raises(netkf.ScenarioError, match="horizon"):
+        netkf.load(scenario(folder, "my-hybrid", horizon=-1.0))
+    assert main(["schema"]) == 0
+    assert "|^my-hybrid$|^other$" in capsys.readouterr().out
+    assert not ran(site)
+    for kind in ("good:P", "json:JSONDecoder", "no_such_module:P"):
+        with pytest.raises(netkf.ScenarioError, match=r"whose code would run.*add --trust"):
+            netkf.load(scenario(folder, kind), trust=False)
+    assert not ran(site)
+    for kind, words in (
+        ("netkf.cli.main:make_parser", "must be a subclass of netkf's Filter"),
+        ("netkf.nonsense:P", "could not be imported"),
+        ("netkf.__main__:main", "could not be imported"),
+    ):
+        with pytest.raises(netkf.ScenarioError, match=words):
+            netkf.load(scenario(folder, kind), trust=False)
 
 
 @pytest.mark.parametrize(
-    ("kind", "text"),
+    ("value", "text", "words"),
     [
-        ("side:P", "class P:\n    pass\n"),
-        ("side:Q", PART),
-        ("side:P", "from json import *\n\n\nclass P(JSONDecoder):\n    pass\n"),
-        ("side:P", "class P(P):\n    pass\n"),
-        ("side:P", "class P(Q):\n    pass\n\n\nclass Q(P):\n    pass\n"),
-        ("side:P", "def P(:\n"),
-        ("side.P:P", PART),
-        ("side:P()", PART),
-        ("antigravity:X", ""),
-        ("json:JSONDecoder", ""),
-        ("__main__:X", ""),
-        ("netkf.__main__:main", ""),
-        ("netkf.cli.main:make_parser", ""),
-        ("netkf.nonsense:P", ""),
+        ("side:P", "class P:\n    pass\n", "must be a subclass of netkf's Filter"),
+        ("side:Rare", LOSS, "must be a subclass of netkf's Filter"),
+        ("side:Q", PART, "could not be imported"),
+        ("side:P", "def P(:\n", "could not be imported"),
+        ("side", PART, "must be a subclass of netkf's Filter"),
+        ("side side", PART, "could not be imported"),
+        ("sid:P", PART, "could not be imported"),
+        ("side:P", "from netkf.parts import Filter as P\n", "must define absorb"),
     ],
 )
-def test_installed_modules_without_such_a_part_are_not_imported(folder, site, kind, text):
+def test_what_a_package_offers_must_be_such_a_part(folder, site, value, text, words):
+    offer(site, "side", bad=value)
     module(site / "side.py", text)
-    with pytest.raises(netkf.ScenarioError, match=r"filter\.kind: "):
-        netkf.load(scenario(folder, kind), trust=False)
+    with pytest.raises(netkf.ScenarioError, match=rf"filter\.kind: {words}"):
+        netkf.load(scenario(folder, "bad"), trust=False)
+
+
+def test_built_in_kinds_stay_and_a_kind_of_two_packages_is_nobodys(folder, site):
+    for package in ("one", "two"):
+        module(site / f"{package}.py")
+        offer(site, package, hybrid=f"{package}:P", mine=f"{package}:P")
+    assert type(netkf.load(scenario(folder, "hybrid")).filter.algorithm) is netkf.parts.Hybrid
+    with pytest.raises(netkf.ScenarioError, match="by several packages, as one:P, two:P"):
+        netkf.load(scenario(folder, "mine"))
     assert not ran(site)
-    assert "antigravity" not in sys.modules
 
 
 def test_installed_packages_win_over_the_folder_and_do_not_import_from_it(
     folder, site, monkeypatch
 ):
+    offer(site, "good", good="good:P")
     module(site / "good.py", "import helper\n" + PART)
     module(site / "helper.py", "")
     for name in ("good.py", "helper.py"):
         module(folder / name)
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
-    loaded = netkf.load(scenario(folder, "good:P"), trust=False)
+    loaded = netkf.load(scenario(folder, "good"), trust=False)
     assert ran(site) == ["good.ran", "helper.ran"]
     assert not list(folder.glob("*.ran"))
     assert find_module_files(loaded) == {"good": None}  # the one beside the scenario is not copied
 
 
-@pytest.mark.parametrize(
-    ("line", "current", "file", "allowed"),
-    [
-        ("../../project", "project", "elsewhere", True),
-        ("../../project/src", "project", "project", True),
-        ("../../project", "elsewhere", "project", False),
-        ("../../project", "elsewhere", "project/scenarios", True),
-    ],
-)
-def test_editable_installs_are_installed(folder, site, monkeypatch, line, current, file, allowed):
-    """``.pth`` files name their folders, relative to the packages; see docs/security.md."""
-    (site / "mine.pth").write_text(f"# a comment\nimport os\n{line}\n")
-    root = (site / line).resolve()
-    module(root / "mine.py")
-    for name in (current, file):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+@pytest.mark.parametrize("current", [".", ".."])
+def test_what_lies_in_the_folder_is_not_installed(folder, monkeypatch, current):
+    """A stranger's folder may pretend to be one of installed packages."""
+    offer(folder, "evil", evil="evil:P")
+    module(folder / "evil.py")
+    monkeypatch.syspath_prepend(folder)
     monkeypatch.chdir(folder / current)
-    monkeypatch.syspath_prepend(root)
-    chosen = scenario(folder / file, "mine:P")
-    if allowed:
-        netkf.load(chosen, trust=False)
-    else:
-        with pytest.raises(netkf.ScenarioError, match="add --trust"):
-            netkf.load(chosen, trust=False)
-    assert bool(ran(root)) is allowed
+    with pytest.raises(netkf.ScenarioError, match="add --trust"):
+        netkf.load(scenario(folder, "evil"), trust=False)
+    assert not ran(folder)
+    netkf.load(scenario(folder, "evil"))
+    assert ran(folder)
 
 
-@pytest.mark.parametrize(("given", "allowed"), [("{}/lib", True), ("lib", False), ("{}", False)])
+@pytest.mark.parametrize(("given", "allowed"), [("{}/lib", True), ("lib", False), ("{}", True)])
 def test_the_python_path_counts_where_it_does_not_depend_on_the_folder(
     folder, monkeypatch, given, allowed
 ):
-    """An absolute entry below the current folder is a choice of the user's."""
-    module(folder / "lib" / "mine.py")
-    module(folder / "mine.py")
-    monkeypatch.chdir(folder)
     entry = given.format(folder)
+    root = Path(os.path.join(folder, entry))
+    offer(root, "mine", mine="mine:P")
+    module(root / "mine.py")
+    monkeypatch.chdir(folder)
     monkeypatch.setenv("PYTHONPATH", entry)
-    monkeypatch.syspath_prepend(os.path.abspath(entry))
-    chosen = scenario(folder, "mine:P")
+    monkeypatch.syspath_prepend(root)
+    chosen = scenario(folder, "mine")
     if allowed:
         netkf.load(chosen, trust=False)
     else:
@@ -306,16 +336,25 @@ def test_the_python_path_counts_where_it_does_not_depend_on_the_folder(
     assert bool(ran(folder)) is allowed
 
 
+def test_editable_installs_are_installed(folder, site, monkeypatch):
+    """Their metadata lie with the packages, and a ``.pth`` file there names the folder."""
+    offer(site, "mine", mine="mine:P")
+    (site / "mine.pth").write_text("# a comment\nimport os\n../..\n")
+    module(folder / "mine.py")
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    netkf.load(scenario(folder, "mine"), trust=False)
+    assert ran(folder)
+
+
 def test_a_loaded_module_of_that_name_is_not_taken_for_an_installed_one(folder, site):
+    offer(site, "good", good="good:P")
     module(site / "good.py")
     module(folder / "good.py")
-    assert "stranger/good" in str(sys.modules[_loaded(scenario(folder, "good:P"))].__file__)
+    loaded = type(netkf.load(scenario(folder, "good:P")).filter.algorithm).__module__
+    assert "stranger/good" in str(sys.modules[loaded].__file__)
     with pytest.raises(netkf.ScenarioError, match="another module of that name is loaded"):
-        netkf.load(scenario(folder, "good:P"), trust=False)
-
-
-def _loaded(file):
-    return type(netkf.load(file).filter.algorithm).__module__
+        netkf.load(scenario(folder, "good"), trust=False)
 
 
 def test_workers_import_nothing_from_the_current_folder(folder):
