@@ -25,7 +25,7 @@ PHRASES = {
     r"too sure|so sure|as sure": "overconfident",
     r"too careful|very careful": "conservative",
     r"honest": "consistent",
-    r"(of|about) one's own": "user-defined",
+    r"(of|about) (one's|your) own": "user-defined, custom",
     r"is what the errors are": "P is consistent with the errors",
     r"would have seen|would be seen": "detectable: the smallest error that the test detects",
     r"a row a promise": "one row per theorem",

@@ -52,12 +52,12 @@ def nees_note(scenario: Scenario) -> str:
         return (
             "until others hear of its samples a node counts them as if all nodes had taken them: "
             f"P is too small there, NEES above n = {n} is right, and netkf consistency says what "
-            "it should be"
+            "to expect"
         )
     if design == "larger":
         return (
             "this filter keeps P above the covariance of its error by design: NEES below "
-            f"n = {n} is right, and netkf consistency says what it should be"
+            f"n = {n} is right, and netkf consistency says what to expect"
         )
     return ""
 

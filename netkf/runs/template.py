@@ -13,8 +13,8 @@ NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,60}")
 
 SCENARIO = """\
 # netkf run {name}.toml                  simulates it
-# netkf theory {name}.toml               says what is promised
-# netkf check {name}.toml --runs 200     holds the two against each other
+# netkf theory {name}.toml               computes what theory promises
+# netkf check {name}.toml --runs 200     compares the two
 # Every key is in the reference (docs/scenario_files.md) and in `netkf schema --markdown`. For an
 # editor: netkf schema > netkf.schema.json, and as first line #:schema ./netkf.schema.json
 format  = 1

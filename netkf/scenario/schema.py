@@ -176,7 +176,7 @@ def _family_schema(name: str, families: Sequence[str]) -> Schema:
     description = "A class, package.module:Class."
     kind_schema = {"type": "string", "pattern": _user_kinds(), "description": description}
     user_class = {"type": "object", "properties": {"kind": kind_schema}, "required": ["kind"]}
-    return {"anyOf": [*variants, {"title": "a class of your own", **user_class}]}
+    return {"anyOf": [*variants, {"title": "a custom class", **user_class}]}
 
 
 def _kind_schema(

@@ -381,7 +381,7 @@ def judge_consistency(
     notes = () if has_covariance else (NO_COVARIANCE,)
     if _count_errors(scenario) > MAX_ERRORS:
         reason = (
-            f"what NEES should be is left out: the exact covariance of {_count_errors(scenario):,} "
+            f"the expected NEES is left out: the exact covariance of {_count_errors(scenario):,} "
             f"errors, more than {MAX_ERRORS}, takes long; netkf.theory.error_covariance computes it"
         )
         notes = (*notes, reason)
@@ -464,12 +464,12 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
         return "no NEES: P is singular, or P or the errors are not finite"
     if expected is None:
         side = "near n" if abs(excess) <= width else "above n" if excess > 0.0 else "below n"
-        return f"{side}; what it should be is not known"
+        return f"{side}; the expected NEES is unknown"
     if abs(excess) > width:
-        return f"BROKEN: errors are {'larger' if excess > 0.0 else 'smaller'} than they should be"
+        return f"BROKEN: errors are {'larger' if excess > 0.0 else 'smaller'} than expected"
     if abs(expected / n - 1.0) <= BIAS_TOLERANCE:
-        return "as it should be"
-    return f"as it should be: {_explain_bias(scenario, expected < n)}"
+        return "consistent"
+    return f"as expected: {_explain_bias(scenario, expected < n)}"
 
 
 def _explain_bias(scenario: Scenario, conservative: bool) -> str:
@@ -479,14 +479,14 @@ def _explain_bias(scenario: Scenario, conservative: bool) -> str:
     another start explains it otherwise.
     """
     if not scenario.filters_know_the_truth:
-        return f"the filters' model makes P too {'large' if conservative else 'small'}"
+        return f"the filters' model makes P {'conservative' if conservative else 'overconfident'}"
     bias = covariance_bias(scenario)
     if conservative:
         by_design = bias == "larger"
-        return "P is conservative by design" if by_design else "P is larger than the errors need"
+        return "P is conservative by design" if by_design else "P is conservative"
     if bias == "smaller":
-        return "the design of the filter makes P too small"
+        return "P is overconfident by design"
     starts = (scenario.initial_estimate(node)[0] for node in scenario.nodes)
     if all(np.array_equal(start, scenario.plant.start_mean) for start in starts):
-        return "P is too small"
-    return "P does not know that filters start elsewhere than the state"
+        return "P is overconfident"
+    return "P is overconfident: filters start elsewhere than the state"

@@ -112,7 +112,7 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
     Unless ``full``, a large network has rows for the nodes whose P is inconsistent, and for the
     first and last of the others.
     """
-    header = ["node", "NEES", "should be", "inside", "NIS", "should be", "verdict"]
+    header = ["node", "NEES", "expected", "inside", "NIS", "expected", "verdict"]
     rows = [
         [
             str(row.node),
@@ -133,7 +133,7 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
             format_table(header, rows if full else shorten_rows(rows, MAX_ROWS)),
             "",
             f"{consistency.runs:,} runs, n = {consistency.n}; +-: half width of the interval on "
-            f"the difference from what NEES should be, all nodes together at confidence {level}",
+            f"the difference from the expected NEES, all nodes together at confidence {level}",
             f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
             f"chi-square bounds at {level} where P is exact",
             *(f"note: {note}" for note in consistency.notes),

@@ -1,4 +1,4 @@
-"""Checkers for classes of your own and assertions for pytest.
+"""Checkers for custom classes and assertions for pytest.
 
 Each raises AssertionError with one line (method, rule, the value got, what to do), and returns None
 if all is well.

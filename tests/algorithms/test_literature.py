@@ -256,7 +256,7 @@ def test_the_optimism_of_the_kcf_shows_and_breaks_no_promise(tmp_path):
     assert found
     assert max(row.expected for row in found.rows) > 1.3 * 2
     verdicts = [row.verdict for row in found.rows]
-    assert "as it should be: P is too small" in verdicts
+    assert "as expected: P is overconfident" in verdicts
     assert not any(verdict.endswith("is not known") for verdict in verdicts)
     verdict = netkf.check(scenario.replace({"horizon": 12.0}), 10, confidence=0.999, workers=1)
     assert verdict

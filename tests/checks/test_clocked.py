@@ -81,5 +81,5 @@ def test_push_sum_says_where_its_covariance_is_too_small(clocked):
     found = netkf.consistency(scenario, runs=20, workers=1)
     assert found
     said = [row.verdict for row in found.rows]
-    assert "as it should be: the design of the filter makes P too small" in said
+    assert "as expected: P is overconfident by design" in said
     assert nees_note(clocked("gossip")) == ""

@@ -34,7 +34,7 @@ def gossip():
 def test_exact_filters_should_have_n_and_do(gossip):
     found = consistency(gossip, runs=20, confidence=0.999, workers=1)
     assert found
-    assert all(row.verdict == "as it should be" for row in found.rows)
+    assert all(row.verdict == "consistent" for row in found.rows)
     np.testing.assert_allclose([row.expected for row in found.rows], 4.0, rtol=1e-9)
     np.testing.assert_allclose([row.expected_nis for row in found.rows if row.node != 1], 1.0)
     assert np.isnan(found.rows[1].nis)
@@ -48,14 +48,14 @@ def test_cautious_filters_are_not_called_wrong(ring):
     assert found
     for row in found.rows:
         assert row.expected < 1.9
-        assert row.verdict == "as it should be: P is conservative by design"
+        assert row.verdict == "as expected: P is conservative by design"
 
 
 def test_a_mismatched_model_is_as_bad_as_theory_says(gossip):
     wrong = gossip.replace({"filter.model": {"R": [[0.2]]}})
     found = consistency(wrong, runs=12, confidence=0.999, workers=1)
     assert found
-    assert all("the filters' model makes P too small" in row.verdict for row in found.rows)
+    assert all("the filters' model makes P overconfident" in row.verdict for row in found.rows)
 
 
 @pytest.mark.parametrize("time", ["slots", "clocks"])
@@ -114,7 +114,7 @@ def test_what_is_not_known_is_not_judged(gossip):
     found = consistency(other, runs=12, workers=1)
     assert found
     for row in found.rows:
-        assert row.verdict == "above n; what it should be is not known"
+        assert row.verdict == "above n; the expected NEES is unknown"
         assert row.nees == pytest.approx(16.0, rel=0.3)
 
 
@@ -122,9 +122,9 @@ def test_exact_covariances_of_large_networks_are_left_out_and_a_line_says_so(rin
     changes = {"network.graph": {"kind": "cycle", "nodes": 129}, "horizon": 1.0}
     changes["filter"] = {"kind": "local"}  # exact, so that NEES is near n
     found = consistency(ring.replace(changes), runs=10, workers=1, confidence=0.999)
-    assert "what NEES should be is left out: the exact covariance of 258 errors" in found.notes[0]
+    assert "the expected NEES is left out: the exact covariance of 258 errors" in found.notes[0]
     assert all(np.isnan(row.expected) for row in found.rows)
-    assert {row.verdict for row in found.rows} == {"near n; what it should be is not known"}
+    assert {row.verdict for row in found.rows} == {"near n; the expected NEES is unknown"}
 
 
 def test_nis_is_the_textbook_one(gossip):
@@ -144,7 +144,7 @@ def test_nis_is_the_textbook_one(gossip):
     assert np.isnan(seen.nis[1])
 
 
-@pytest.mark.parametrize(("factor", "words"), [(1.6, "larger"), (0.5, "smaller"), (1.0, "as it")])
+@pytest.mark.parametrize(("factor", "words"), [(1.6, "larger"), (0.5, "smaller"), (1.0, "consistent")])
 def test_errors_that_are_not_what_they_should_be_are_found(gossip, factor, words):
     random, n, nodes = np.random.default_rng(8), 4, len(gossip.nodes)
     runs = []
@@ -166,7 +166,7 @@ def test_the_command_and_the_table_of_a_run_say_so(capsys, tmp_path):
     assert main([*arguments, "--confidence", "0.999"]) == 0
     printed = capsys.readouterr().out
     assert "chi-square bounds" in printed
-    assert "as it should be" in printed
+    assert "consistent" in printed
     assert main([*arguments, "--json", "--confidence", "0.999"]) == 0
     found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert found["n"] == 4
