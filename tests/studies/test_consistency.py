@@ -144,7 +144,9 @@ def test_nis_is_the_textbook_one(gossip):
     assert np.isnan(seen.nis[1])
 
 
-@pytest.mark.parametrize(("factor", "words"), [(1.6, "larger"), (0.5, "smaller"), (1.0, "consistent")])
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1.6, "larger"), (0.5, "smaller"), (1.0, "consistent")]
+)
 def test_errors_that_are_not_what_they_should_be_are_found(gossip, factor, words):
     random, n, nodes = np.random.default_rng(8), 4, len(gossip.nodes)
     runs = []
