@@ -11,13 +11,15 @@ carried as roots, ``P = root root'``, so that wide and narrow directions keep th
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from netkf.algorithms import single
+from netkf.algorithms.models import first_root, sample_update
+from netkf.algorithms.records import Kernels, Record
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 
@@ -85,6 +87,7 @@ class NodeInfo(NamedTuple):
     information : (n, n), sum of H' R^-1 H over all sensors, with the R that filters believe
     max_delay : longest time that a message may take, seconds (inf if unbounded)
     place : its index in the order of ids, from 0
+    senders : ids of the nodes that it can hear, sorted
     network : the whole network, if the filter ``needs_network``
     """
 
@@ -96,6 +99,7 @@ class NodeInfo(NamedTuple):
     information: FloatArray
     max_delay: float = 0.0
     place: int = 0
+    senders: tuple[int, ...] = ()
     network: NetworkInfo | None = None
 
 
@@ -264,20 +268,40 @@ class Filter(Component):
     combination: ClassVar[str] = ""
     P_by_design: ClassVar[tuple[str, str]] = ("", "")
     slot_kernel: ClassVar[Any] = None
+    kernels: ClassVar[Kernels | None] = None
     unrolled: ClassVar[bool] = False
+
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return the arrays of nodes, links and messages that ``kernels`` need, for nodes with
+        these ``infos`` and ``models``.
+        """
+        n = len(models[0].information)
+        return Record(payload={"xhat": (n,), "root": (n, n)})
+
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Set the entries of one node in the arrays of its ``record`` at time 0: ``node`` has
+        views by name, with xhat (n,) and root (n, n) set.
+        """
+
+    def prepare(self, record: Any, first: int, count: int) -> None:
+        """Set the fields of a ``record`` that are known before the run for ``count`` slots from
+        number ``first`` on, such as gains.
+        """
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n), with the ``model`` of
         plant and sensors; ``node`` is what the node knows about itself and the network.
         """
-        from netkf.algorithms.models import first_root
-
+        if self.kernels is not None:
+            return single.begin(self, model, mean, cov, node)
         return State(mean, first_root(cov), model)
 
     def predict(self, state: Any, gap: float) -> Any:
         """Return the state ``gap`` > 0 seconds later (in slots a period). If the node has increment
         sensors, its covariance counts their readings already, its estimate does not yet.
         """
+        if self.kernels is not None:
+            return single.predict(state, gap)
         xhat, root = state.model.predict(state.xhat, state.root, gap)
         return state._replace(xhat=xhat, root=root)
 
@@ -286,8 +310,8 @@ class Filter(Component):
         node gets one a slot, without rows if it has no sensor), or the increments of the interval
         that just passed (``Increments``).
         """
-        from netkf.algorithms.models import sample_update
-
+        if self.kernels is not None:
+            return single.update(state, reading)
         if isinstance(reading, Increments):
             return state._replace(
                 xhat=state.model.gain_update(state.xhat, state.root, reading.moments, reading.gap)
@@ -303,14 +327,18 @@ class Filter(Component):
         of this step); a payload of None sends nothing. By default the payload is ``xhat`` (n,) and
         ``root`` (n, n).
         """
+        if self.kernels is not None:
+            return single.emit(state, exchange)
         return state, Estimate(state.xhat, state.root)
 
-    @abstractmethod
     def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
         """Return the state after all messages of this instant, sorted by sender, are used together.
         In slots it is called for every node when the inbox of a step closes, even without
         messages. Payloads must not be changed.
         """
+        if self.kernels is None:
+            raise NotImplementedError(f"{type(self).__name__} has no absorb")
+        return single.absorb(state, messages, exchange)
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:
         """Return the estimate ``xhat`` (n,) and its covariance ``P`` (n, n) now; P is None if the
@@ -326,6 +354,8 @@ class Filter(Component):
         shift (``commutes``), as those that are affine in readings and payloads do. A class that
         defines one of STEPS itself says so by defining ``shift`` too.
         """
+        if self.kernels is not None:
+            return single.shift(state, offset)
         return state._replace(xhat=state.xhat + offset)
 
     def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
@@ -333,6 +363,8 @@ class Filter(Component):
         call it when they move the origin, with ``shift`` for all states; ``offset`` is the move at
         the time of sending.
         """
+        if self.kernels is not None:
+            return single.shift_payload(self, payload, offset)
         return payload._replace(xhat=payload.xhat + offset)
 
     def accepts(self, payload: Any, age: float) -> bool:

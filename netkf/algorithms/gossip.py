@@ -11,91 +11,22 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from netkf.algorithms.filter import Exchange, Filter, Message, State
-from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    predict_all,
-    read_all,
-    rebase,
-    store_sample_of_slot,
-)
+from netkf.algorithms.kernels.run import copy_estimate
+from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import any_lane, load, load_flags, select, store
+from netkf.linalg.lanes import load_flags
 
 
 @kernel
-def gossip_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-) -> None:
-    """Simulate H gossip filters over the S slots of a plan in B blocks of L runs, paper G (10): in
-    each slot they swap estimates in pairs, then read and predict.
-
-    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
-    ``samples``, of the predictions with which slots begin.
-    """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            # Samples show predictions: before the reading of the slot.
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            # Keep the estimates relative to an origin near the true state.
-            rebase(nodes, readings, scratch, b, s)
-            if plan.exchanged[s]:
-                swap_pairs(nodes, plan, links, scratch, b, s)
-            if plan.sensed[s]:
-                read_all(nodes, readings, scratch, b, s)
-                predict_all(nodes, scratch, b)
-
-
-@kernel
-def swap_pairs(
-    nodes: SlotNodes, plan: SlotPlan, links: SlotLinks, scratch: SlotScratch, b: int, s: int
-) -> None:
-    """Replace the estimate ``nodes.xhat[b, h]`` (n, L) and root ``nodes.root[b, h]`` (n, n, L) of
-    each filter h of block ``b`` by those that arrive in slot ``s``; if several arrive, by those of
-    the last sender. The estimates that are sent are copied to ``scratch`` first.
-
-    Axes: L runs side by side.
-    """
-    lanes, n = scratch.lanes, len(scratch.size)
-    # All payloads are from before the exchange.
-    for h in range(len(nodes.rows)):
-        for i in range(n):
-            store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
-            for j in range(i + 1):
-                store(lanes, scratch.root, h, i, j, load(lanes, nodes.root, b, h, i, j))
-    for h in range(len(nodes.rows)):
-        for m in range(links.first[h], links.first[h + 1]):
-            arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-            # Skip idle links: in a single run a matching uses few.
-            if any_lane(arrived):
-                copy_pair(nodes, scratch, b, h, links.sender[m], arrived)
-
-
-@kernel(inlined=True)
-def copy_pair(
-    nodes: SlotNodes, scratch: SlotScratch, b: int, h: int, sender: int, arrived: Any
-) -> None:
-    """Copy the estimate and root of filter ``sender`` from ``scratch`` to ``nodes.xhat[b, h]``
-    (n, L) and ``nodes.root[b, h]`` (n, n, L) of filter ``h`` of block ``b``, in the lanes (runs) in
-    which the message has ``arrived`` (L,).
-    """
-    lanes = scratch.lanes
-    for i in range(len(scratch.size)):
-        own, sent = load(lanes, nodes.xhat, b, h, i), load(lanes, scratch.xhat, sender, i)
-        store(lanes, nodes.xhat, b, h, i, select(arrived, sent, own))
-        for j in range(i + 1):
-            own, sent = load(lanes, nodes.root, b, h, i, j), load(lanes, scratch.root, sender, i, j)
-            store(lanes, nodes.root, b, h, i, j, select(arrived, sent, own))
+def swap(record: Any, h: int, run: Any) -> None:
+    """Replace the estimate of node ``h`` by the one that arrives; of several, the last sender's."""
+    payload = record.payload
+    for k in range(run.count):
+        arrived = load_flags(run.lanes, run.arrived, k)
+        copy_estimate(
+            run, record.xhat, record.root, h, payload.xhat, payload.root, run.message[k], arrived
+        )
 
 
 @built_in("gossip")
@@ -115,18 +46,6 @@ class Gossip(Filter):
     clocks: ClassVar[tuple[str, ...]] = ("links",)
     predicts: ClassVar[bool] = True
     pairwise: ClassVar[bool] = True
-    slot_kernel = staticmethod(gossip_slots)
-    unrolled: ClassVar[bool] = True
-
-    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Return the state with the estimate and root of the last of the messages, predicted to
-        now, in place of the node's own.
-        """
-        if not messages:
-            return state
-        message = messages[-1]
-        pair = message.payload
-        xhat, root = state.model.extrapolate(pair.xhat, pair.root, message.age)
-        return state._replace(xhat=xhat, root=root)
+    kernels = Kernels(absorb=swap)
 
     shift = Filter.shift  # affine in readings and messages

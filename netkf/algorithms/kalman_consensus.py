@@ -4,145 +4,102 @@ performance", CDC 2009, Algorithm 1 (first proposed in CDC 2007, Algorithm 3).
 With predictions xbar_j, the readings heard and a consensus term give ``xhat = xbar + M (y - S xbar)
 + gamma P sum_j (xbar_j - xbar)``: y and S are sums of H' R^-1 y and H' R^-1 H over these readings,
 P is the covariance of xbar, M = (P^-1 + S)^-1, and gamma = epsilon / (1 + |P|).
-
-Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
-``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
-noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
-``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
-(``rebase``, ``shift``), so that large states cost no digits. A kernel ``*_single`` runs one node
-in one run, for the SimPy engine: both engines round alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.neighbours import (
-    add_to_estimate,
-    fuse_readings,
-    scale_by_covariance,
-    sum_differences,
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.run import (
+    carry,
+    copy_estimate,
+    predict_estimate,
+    shift_vector,
+    use_reading,
 )
-from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    predict_all,
-    rebase,
-    star_of,
-    store_sample_of_slot,
-)
-from netkf.algorithms.models import first_root, sample_update
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import boolean, field, number
-from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import ONE
-
-
-class KcfState(NamedTuple):
-    """The state of a node.
-
-    xhat, root : estimate (n,) and root (n, n) of P
-    model : of the plant and the node's sensors
-    prior, prior_root : prediction (n,) of this instant and its root (n, n), before any reading
-    reading : the node's own reading of this instant, or None
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    prior: FloatArray
-    prior_root: FloatArray
-    reading: Reading | None = None
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-
-class Shared(NamedTuple):
-    """A payload: the sender's prediction ``xhat`` (n,) and its reading of this instant."""
-
-    xhat: FloatArray
-    reading: Reading | None
-
-
-class KcfArrays(NamedTuple):
-    """The settings of all filters: ``epsilon``, the strength of the consensus term, and whether
-    nodes ``share`` their readings.
-    """
-
-    epsilon: float
-    share: bool
+from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
 
 
 @kernel
-def kcf_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: KcfArrays,
-) -> None:
-    """Simulate H Kalman-consensus filters over the S slots of a plan, in B blocks of L runs:
-    changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place, and writes
-    ``samples`` in the slots that have one; ``arrays`` holds the settings.
-
-    With prediction x and its covariance P, a slot's readings first update x, and then the consensus
-    term epsilon / (1 + |P|) P sum_j (x_j - x), computed from predictions alone, is added.
-    """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            if plan.sensed[s]:
-                predict_all(nodes, scratch, b)
-                # Consensus is on predictions and their covariances: before any reading is used. The
-                # sum has no weights (False).
-                for h in range(len(nodes.rows)):
-                    sum_differences(
-                        scratch.lanes, nodes.xhat, b, h, links, plan.up, s, 0, False, scratch.xhat
-                    )
-                    scale_by_covariance(
-                        scratch.lanes, nodes.root, b, h, arrays.epsilon, scratch.xhat, scratch.row
-                    )
-                # The terms are in scratch.xhat, so that estimates may change one after the other.
-                for h in range(len(nodes.rows)):
-                    fuse_readings(nodes, readings, plan, links, scratch, arrays.share, b, s, h)
-                    add_to_estimate(scratch.lanes, nodes.xhat, b, h, scratch.xhat)
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            rebase(nodes, readings, scratch, b, s)
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict node ``h``, and keep the prediction, which is sent."""
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    copy_estimate(run, record.prior, record.prior_root, h, record.xhat, record.root, h, True)
 
 
 @kernel
-def consensus_term_single(
-    x: FloatArray,
-    links: SlotLinks,
-    up: Any,
-    root: FloatArray,
-    epsilon: float,
-    term: FloatArray,
-    work: FloatArray,
-) -> None:
-    """Write the consensus term ``epsilon / (1 + |P|) P sum_j (x_j - x_0)`` of one node in one run
-    into ``term`` (1, n, 1).
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the prediction; the reading of this instant goes with it."""
+    payload = record.payload
+    copy_estimate(run, payload.xhat, payload.root, m, record.prior, record.prior_root, h, True)
 
-    x (1, H, n, 1) holds its own prediction x_0 and those of its senders, ``up`` (1, 1, 1, W, 1)
-    flags their messages, and P has the root ``root`` (1, 1, n, n, 1); ``work`` (n, 1) is scratch.
-    Axes: W directed links, H nodes.
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Use the readings heard, and add the consensus term, in which the predictions heard count."""
+    lanes, payload = run.lanes, record.payload
+    # (u, U) of Algorithm 1: readings themselves, row by row.
+    for k in range(run.count):
+        # A late reading belongs to another instant.
+        if record.share == 1 and run.heard[k] >= 0 and run.age[k] <= 0.0:
+            arrived = load_flags(lanes, run.arrived, k)
+            use_reading(run, record.xhat, record.root, h, run.heard[k], arrived)
+    # sum_j (xbar_j - xbar)
+    for k in range(run.count):
+        carry(run.model, run, payload.xhat, payload.root, run.message[k], run.age[k])
+    for i in range(len(run.size)):
+        total = spread(lanes, 0.0)
+        for k in range(run.count):
+            arrived = load_flags(lanes, run.arrived, k)
+            difference = load(lanes, payload.xhat, run.message[k], i) - load(
+                lanes, record.prior, h, i
+            )
+            total += select(arrived, difference, 0.0)
+        store(lanes, run.row, i, total)
+    add_consensus_term(record, h, run)
+
+
+@kernel
+def add_consensus_term(record: Any, h: int, run: Any) -> None:
+    """Add ``epsilon / (1 + |P|) P d`` to the estimate of node ``h``, with d in ``run.row`` and P of
+    its prediction; |P| is the Frobenius norm.
     """
-    sum_differences(ONE, x, 0, 0, links, up, 0, 0, False, term)
-    scale_by_covariance(ONE, root, 0, 0, epsilon, term, work)
+    lanes, n, S, square = run.lanes, len(run.size), record.prior_root, spread(run.lanes, 0.0)
+    for i in range(n):
+        for j in range(i + 1):
+            entry = spread(lanes, 0.0)
+            for m in range(j + 1):
+                entry += load(lanes, S, h, i, m) * load(lanes, S, h, j, m)
+            # An entry off the diagonal counts twice.
+            square += entry * entry if i == j else 2.0 * entry * entry
+    gain = record.epsilon / (1.0 + root_of(square))
+    # P d = S (S' d)
+    for j in range(n):
+        total = spread(lanes, 0.0)
+        for i in range(j, n):
+            total += load(lanes, S, h, i, j) * load(lanes, run.row, i)
+        store(lanes, run.gains, j, total)
+    for i in range(n):
+        total = spread(lanes, 0.0)
+        for j in range(i + 1):
+            total += load(lanes, S, h, i, j) * load(lanes, run.gains, j)
+        store(lanes, record.xhat, h, i, load(lanes, record.xhat, h, i) + gain * total)
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move estimate and prediction: the consensus term is made of differences."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.prior, h)
 
 
 @built_in("kcf")
@@ -168,16 +125,20 @@ class Kcf(Filter):
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
-    slot_kernel = staticmethod(kcf_slots)
-    unrolled: ClassVar[bool] = True
+    kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift)
 
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[KcfArrays]:
-        """Return the settings that the compiled ``slot_kernel`` needs: epsilon, and whether
-        readings are shared, the same for all nodes and runs.
-        """
-        return (KcfArrays(self.epsilon, self.share_readings),)
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return predictions of nodes, (xbar, root) in messages, and the settings."""
+        estimate = {"xhat": (n := len(models[0].information),), "root": (n, n)}
+        return Record(
+            node={"prior": (n,), "prior_root": (n, n)},
+            payload=estimate,
+            settings={"epsilon": self.epsilon, "share": self.share_readings},
+        )
+
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Take the first estimate for a prediction."""
+        node["prior"][:], node["prior_root"][:] = node["xhat"], node["root"]
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message about n states in numbers of 64 bits: (u, U, xbar) with
@@ -186,69 +147,4 @@ class Kcf(Filter):
         """
         return 2 * n + n * (n + 1) // 2 if rows and self.share_readings else n
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> KcfState:
-        """Return the state at time 0, a prediction with ``mean`` (n,) and ``cov`` (n, n)."""
-        root = first_root(cov)
-        return KcfState(mean, root, model, mean, root)
-
-    def predict(self, state: KcfState, gap: float) -> KcfState:
-        """Return the state ``gap`` seconds later, a prediction without a reading: one of an earlier
-        instant is not sent any more.
-        """
-        xhat, root = state.model.predict(state.xhat, state.root, gap)
-        return KcfState(xhat, root, state.model, xhat, root)
-
-    def update(self, state: KcfState, reading: Reading) -> KcfState:
-        """Return the state after the node's own reading, which is kept to be sent."""
-        if not len(reading.y):
-            return state
-        xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
-        return state._replace(xhat=xhat, root=root, reading=reading)
-
-    def emit(self, state: KcfState, exchange: Exchange) -> tuple[KcfState, Shared]:
-        """Return the state, unchanged, and the payload: the prediction, and unless readings are not
-        shared the reading, which stands for u and U in the message (u, U, xbar) of Algorithm 1.
-        """
-        return state, Shared(state.prior, state.reading if self.share_readings else None)
-
-    def absorb(self, state: KcfState, messages: Sequence[Message], exchange: Exchange) -> KcfState:
-        """Return the state after an update with all readings heard, with the consensus term on
-        predictions added.
-        """
-        if not messages:
-            return state
-        xhat, root = state.xhat, state.root
-        for message in messages:
-            reading = message.payload.reading
-            # A late reading belongs to another instant.
-            if reading is not None and (exchange.slot >= 0 or message.age <= 0.0):
-                xhat, root = sample_update(xhat, root, reading.y, reading.H, reading.R)
-        # Only the means are needed, since the gain of the consensus term is the node's own P: any
-        # root serves as second argument.
-        predictions = [
-            state.model.extrapolate(message.payload.xhat, state.root, message.age)[0]
-            for message in messages
-        ]
-        term = consensus_term(state.prior, state.prior_root, predictions, self.epsilon)
-        return state._replace(xhat=xhat + term, root=root)
-
-    def shift(self, state: KcfState, offset: FloatArray) -> KcfState:
-        """Return the state with ``offset`` (n,) added to estimate and prediction, for a move of the
-        origin: the consensus term is made of differences.
-        """
-        return state._replace(xhat=state.xhat + offset, prior=state.prior + offset)
-
-
-def consensus_term(
-    prior: FloatArray, root: FloatArray, predictions: Sequence[FloatArray], epsilon: float
-) -> FloatArray:
-    """Return ``gamma P sum_j (xbar_j - xbar)`` (n,) with ``gamma = epsilon / (1 + |P|)``, for the
-    ``predictions`` xbar_j (n,) that a node received; its own is ``prior`` (n,) with the lower
-    triangular ``root`` (n, n) of P.
-    """
-    # The kernel of slots on a star: the node itself, and one link from each sender.
-    n, x = len(prior), np.stack([prior, *predictions])[None, :, :, None]
-    links, up = star_of([1.0] * len(predictions))
-    term, S = np.empty((1, n, 1)), np.ascontiguousarray(root).reshape(1, 1, n, n, 1)
-    consensus_term_single(x, links, up, S, epsilon, term, np.empty((n, 1)))
-    return term.reshape(n)
+    shift = Filter.shift  # the class commutes with a shift, by its kernel

@@ -109,8 +109,7 @@ class CodeFiles:
         from numba.core import serialize
 
         dumps: Any = serialize.dumps
-        cells = self._function.__closure__ or ()
-        constants = dumps(tuple(cell.cell_contents for cell in cells))
+        constants = dumps(_constants(self._function))
         parts = [str(sig), *map(str, codegen.magic_tuple())]
         texts = [part.encode() for part in parts]
         return _digest(*texts, self._function.__code__.co_code, constants).hex()
@@ -143,6 +142,26 @@ def _describe(function: Callable[..., Any], path: str, state: str) -> bytes:
     names = [path, function.__qualname__, function.__code__.co_firstlineno]
     versions = [numba.__version__, llvmlite.__version__, sys.version]
     return json.dumps([state, source, *names, *versions]).encode()
+
+
+def _constants(function: Callable[..., Any]) -> list[Any]:
+    """Return the values that a function takes from the functions around it; of kernels their
+    names, contents, and what they take in turn, so that code made of other kernels is other code.
+    """
+    values: list[Any] = [cell.cell_contents for cell in function.__closure__ or ()]
+    # Kernels that users' kernels name: their files are no part of the state of netkf's sources.
+    if not function.__module__.startswith("netkf."):
+        names = (function.__globals__.get(name) for name in function.__code__.co_names)
+        values += [value for value in names if hasattr(value, "loops")]
+    return [_describe_kernel(v.loops) if hasattr(v, "loops") else v for v in values]
+
+
+def _describe_kernel(loops: Callable[..., Any]) -> list[Any]:
+    """Return what the code of a kernel depends on."""
+    described: list[Any] = [loops.__module__, loops.__qualname__, loops.__code__.co_firstlineno]
+    if not loops.__module__.startswith("netkf."):
+        described.append(_digest(Path(inspect.getfile(loops)).read_bytes()))
+    return [*described, *_constants(loops)]
 
 
 def _digest(*parts: bytes) -> bytes:

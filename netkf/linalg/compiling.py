@@ -106,6 +106,7 @@ def _numba() -> Any:
     import numba
 
     from netkf.linalg import (  # noqa: F401 - register types
+        generic_types,
         lane_types,
         local_types,
         struct_types,
@@ -147,6 +148,11 @@ class Kernel:
         """
         self._loops, self._options, self._compact = loops, options, compact
         update_wrapper(self, loops)
+
+    @property
+    def loops(self) -> Callable[..., Any]:
+        """The Python function."""
+        return self._loops
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the compiled function; the first call compiles it or loads it from disk."""

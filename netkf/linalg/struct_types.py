@@ -55,6 +55,7 @@ class StructType(types.Type):
 register_model(StructType)(models.OpaqueModel)
 # One numba type per class: another instance would make numba compile every kernel again.
 _struct_types: dict[type[Struct], StructType] = {}
+_classes: dict[str, type[Struct]] = {}
 
 
 @typeof_impl.register(Struct)
@@ -70,8 +71,14 @@ def struct_type(cls: type[Struct]) -> StructType:
             (name, WORD * cls.struct_offsets[name], _field_type(cls.struct_kinds[name]))
             for name in cls.struct_fields
         )
-        _struct_types[cls] = StructType(cls.__name__, fields)
+        made = _struct_types[cls] = StructType(cls.__name__, fields)
+        _classes[made.name] = cls
     return _struct_types[cls]
+
+
+def class_of(kind: StructType) -> type[Struct]:
+    """Return the class of a numba type of a struct."""
+    return _classes[kind.name]
 
 
 def _field_type(kind: Any) -> Any:

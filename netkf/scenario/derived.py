@@ -90,14 +90,16 @@ class DerivedScenario(ScenarioModel):
         for information in self._informations:
             total_information = total_information + information
         receiver_counts = dict.fromkeys(self.nodes, 0)
-        for sender, _ in self.topology.directions:
+        senders: dict[int, list[int]] = {node: [] for node in self.nodes}
+        for sender, receiver in self.topology.directions:
             receiver_counts[sender] += 1
+            senders[receiver].append(sender)
         max_delay = 0.0 if self.slotted else self.network.channel.delay.longest
         degrees, own_weights, network = self.topology.degrees, self.own_weights, self._network_info
         return tuple(
             NodeInfo(
                 node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
-                total_information, max_delay, k, network,
+                total_information, max_delay, k, tuple(sorted(senders[node])), network,
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip

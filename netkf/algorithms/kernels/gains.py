@@ -17,14 +17,16 @@ the innovation only, so the error never depends on the state itself.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.legendre import MOMENTS, backward_coefficients
 from netkf.linalg.series import exponential_terms, with_reach
+from netkf.linalg.structs import Struct
 
 MAX_INTERVAL = 8.0  # |M| g beyond which two moments do not describe a reading well enough
 
@@ -41,6 +43,37 @@ class GainTable(NamedTuple):
     n: int
     moments: int
     series: FloatArray
+
+
+class Gains(Struct):
+    """The gain tables of M models, padded to one size; p rows of readings.
+
+    series : (M, terms, width), coefficients of the power series in the interval of the gains U
+             (n, 2 p), W (n, 2 p) and C (2 p, n)
+    reach : (M, terms, 1), up to which interval in seconds the terms so far are enough
+    moments : (M,), 2 p, the numbers of moments that are read
+    """
+
+    series: FloatArray
+    reach: FloatArray
+    moments: IntArray
+
+
+def no_gains(n: int) -> GainTable:
+    """Return the table of a model without sensors, n states."""
+    return GainTable(n, 0, np.zeros((0, 1)))
+
+
+def stack_gains(gains: Sequence[GainTable]) -> Gains:
+    """Return the tables of M models as one struct."""
+    terms, width = np.max([gain.series.shape for gain in gains], axis=0)
+    # The padding is never read: the last reach of a table is infinite.
+    series, reach = np.zeros((len(gains), terms, width - 1)), np.zeros((len(gains), terms, 1))
+    for k, gain in enumerate(gains):
+        count, entries = len(gain.series), gain.series.shape[1] - 1
+        series[k, :count, :entries], reach[k, :count] = gain.series[:, :-1], gain.series[:, -1:]
+    moments = np.array([gain.moments for gain in gains], dtype=np.int64)
+    return Gains(series=series, reach=reach, moments=moments)
 
 
 def gain_table(

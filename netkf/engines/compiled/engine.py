@@ -17,6 +17,7 @@ from netkf.engines.compiled.agenda import is_immediate, simulate_agenda
 from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.engines.compiled.batches import flow_batches, quick_runs
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
+from netkf.engines.compiled.slot_loop import slot_loop
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
 from netkf.engines.compiled.state import COMBINATIONS
@@ -71,7 +72,9 @@ class CompiledEngine(Engine):
                 )
         node_filter = scenario.node_filter
         if not (
-            node_filter.slot_kernel if scenario.slotted else node_filter.combination in COMBINATIONS
+            (node_filter.kernels or node_filter.slot_kernel)
+            if scenario.slotted
+            else node_filter.combination in COMBINATIONS
         ):
             time = "in slots" if scenario.slotted else "under clocks"
             name = name_of("filter", scenario.filter.algorithm)
@@ -85,7 +88,8 @@ class CompiledEngine(Engine):
             return
         # Slots and continuous time are compiled separately.
         if scenario.slotted:
-            compiling.announce(scenario.node_filter.slot_kernel)
+            kernels = scenario.node_filter.kernels
+            compiling.announce(slot_loop(kernels) if kernels else scenario.node_filter.slot_kernel)
         else:
             compiling.announce(simulate_agenda if is_immediate(scenario) else simulate_runs)
 

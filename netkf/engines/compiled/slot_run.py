@@ -27,6 +27,7 @@ from netkf.algorithms.kernels.slots import (
 )
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
+from netkf.engines.compiled import slot_loop as loop
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_messages import (
@@ -44,6 +45,7 @@ from netkf.engines.compiled.slot_messages import (
     mark_all_senders,
     mark_paired_senders,
 )
+from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
@@ -117,8 +119,11 @@ class SlotRuns:
             root_Q=setup.root_Q,
             rows=setup.rows,
         )
-        self._scratch = slot_scratch(setup.estimators, setup.n, setup.algorithm.unrolled)
-        self._filter_arrays = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
+        kernels = setup.algorithm.kernels
+        self._filters = SlotFilters(setup, kernels, blocks) if kernels is not None else None
+        if self._filters is None:
+            self._scratch = slot_scratch(setup.estimators, setup.n, setup.algorithm.unrolled)
+            self._filter_arrays = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
         # NEVER: a slot that no run reaches, for a node that never stops.
         self._stopped = np.full((blocks, setup.estimators, LANES), NEVER)
         self._conserved = aligned((blocks, setup.estimators, 2, LANES))
@@ -233,7 +238,7 @@ class SlotRuns:
         limit), and return their results: draw messages, true states and readings, then run the
         filters' kernel on them. ``timed``: compute the times of slots, which event rows need.
         """
-        setup = self.setup
+        setup, self._max_events = self.setup, max_events
         times, messages = self._next_messages(max_events, timed)
         local, absolute, rebased = self._next_states(len(times.start))
         readings = self._draw_readings(times, local, rebased)
@@ -244,6 +249,9 @@ class SlotRuns:
         x, xhat, P, error = (
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
+        if self._filters is not None:
+            self._simulate(times, messages, readings, (x, xhat, P, error), local, absolute)
+            return SlotBlock(sampled, samples, times, messages)
         kernel_samples = SlotSamples(
             x=x,
             xhat=xhat,
@@ -286,6 +294,54 @@ class SlotRuns:
             messages.sent[:, unread] = 0
         self._slot += count
         return SlotBlock(sampled, samples, times, messages)
+
+    def _simulate(
+        self,
+        times: SlotTimes,
+        messages: SlotMessages,
+        readings: ReadingBlock,
+        flat: tuple[FloatArray, ...],
+        local: FloatArray,
+        absolute: FloatArray,
+    ) -> None:
+        """Simulate the filters in the slots of ``times`` and write their samples into ``flat``, and
+        which nodes send into ``messages``.
+        """
+        filters, count = self._filters, len(times.start)
+        assert filters is not None
+        samples = loop.SlotSamples(
+            *flat,
+            absolute,
+            local,
+            self.setup.frame > 0,
+            self._total,
+            *filters.sample_scratch,
+            np.zeros(LANES, dtype=np.int64),
+        )
+        drawn: dict[str, Any] = {
+            "first": self._slot,
+            "sensed": times.sensed,
+            "exchanged": times.exchanged,
+            "sample": times.sample,
+            "rebased": readings.rebased,
+            "up": messages.up,
+            "sent": messages.sent,
+            "uniform": self._draw_uniforms(messages.sent),
+        }
+        unread = self._missed_readings(messages, count)
+        part = loop.WHOLE
+        # Filters decide who sends, and Python makes the messages: the loop runs in two parts, up to
+        # the sending, and from the arrivals on.
+        if self._events is not None and self.setup.decides:
+            filters.simulate(readings, samples, **drawn, part=loop.SENDING)
+            messages.sent[:, unread] = 0
+            _, up = self._events.following(self._max_events, messages.sent[0, 0, :, :, 0])
+            messages.up[..., 0], part = up, loop.ARRIVING
+        filters.simulate(readings, samples, **drawn, part=part)
+        if len(messages.sent):
+            # Only now, since the kernel decides for all nodes that are asked, readings or not.
+            messages.sent[:, unread] = 0
+        self._slot += count
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
         """Return the times and messages of the next slots, with about ``max_events`` events at most

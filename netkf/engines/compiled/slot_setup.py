@@ -256,7 +256,8 @@ class SlotSetup:
         models = [
             _widened(model, rows) for model, rows in zip(models, self.rows.tolist(), strict=True)
         ]
-        self.infos = infos
+        self.infos, self.models = infos, models
+        self.period = scenario.slot_plant.period
         self.states = [
             self.algorithm.init(model, *scenario.initial_estimate(info.node), info)
             for info, model in zip(infos, models, strict=True)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.gains import GainTable
+from netkf.algorithms.kernels.gains import Gains, no_gains, stack_gains
 from netkf.algorithms.kernels.root_flow import (
     FlowScratch,
     FlowTable,
@@ -84,20 +84,6 @@ CLOCKS = ("links", "directions", "nodes", "readings")
 """The values of ``Senders.at`` in the order of these constants. From NODES on nodes broadcast: one
 transmission to all receivers.
 """
-
-
-class Gains(Struct):
-    """The gain tables of M models, padded to one size; p rows of readings.
-
-    series : (M, terms, width), coefficients of the power series in the interval of the gains U
-             (n, 2 p), W (n, 2 p) and C (2 p, n), see kernels.gains
-    reach : (M, terms, 1), up to which interval in seconds the terms so far are enough
-    moments : (M,), 2 p, the numbers of moments that are read
-    """
-
-    series: FloatArray
-    reach: FloatArray
-    moments: IntArray
 
 
 class Scratch(Struct):
@@ -407,19 +393,10 @@ def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     """
     n = len(models[0].A)
     # A model without sensors has no gains; its entry keeps the numbering.
-    no_gains = GainTable(n, 0, np.zeros((0, 1)))
-    gains = [model.gains if len(model.H) else no_gains for model in models]
-    terms, width = np.max([gain.series.shape for gain in gains], axis=0)
-    # The padding is never read: the last reach of a table is infinite.
-    series, reach = np.zeros((len(gains), terms, width - 1)), np.zeros((len(gains), terms, 1))
-    for k, gain in enumerate(gains):
-        count, entries = len(gain.series), gain.series.shape[1] - 1
-        series[k, :count, :entries], reach[k, :count] = gain.series[:, :-1], gain.series[:, -1:]
-    moments = np.array([gain.moments for gain in gains], dtype=np.int64)
+    gains = [model.gains if len(model.H) else no_gains(n) for model in models]
     # The last model of the stack has no sensors: it predicts messages under way.
-    return stack_tables([*(model.flow for model in models), models[0].unobserved_flow]), Gains(
-        series=series, reach=reach, moments=moments
-    )
+    table = stack_tables([*(model.flow for model in models), models[0].unobserved_flow])
+    return table, stack_gains(gains)
 
 
 @once_per_scenario

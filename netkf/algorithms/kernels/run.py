@@ -1,0 +1,328 @@
+"""What a filter's kernels are given: the surroundings of a node, and the standard verbs.
+
+The verbs of a filter are kernels ``predict``, ``update``, ``emit``, ``absorb`` and ``shift`` on a
+*record*, a struct with one entry for each of H nodes (``algorithms.records``), for node ``h``.
+Everything else is in ``run``, a :class:`SlotRun` or :class:`ClockRun`, whose fields have the same
+names: the model, the links, the reading, the inbox, scratch. Engines set its numbers before each
+call, so that one text of a filter serves slots and clocks, one run or L of them side by side.
+
+=================================  ============================================================
+``predict_estimate``               predict an estimate by ``run.gap`` seconds (slots: one slot)
+``update_estimate``                update an estimate with the node's own reading
+``use_reading``                    update an estimate with any reading
+``predict_copy``, ``carry``        predict an estimate of another node, a message to now
+``load_flags(lanes, arrived, k)``  the runs in which message k of the inbox has arrived
+=================================  ============================================================
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.kernels.estimates import (
+    copy_root,
+    copy_vector,
+    transform_mean,
+    transform_root,
+    update_by_row,
+)
+from netkf.algorithms.kernels.gains import Gains
+from netkf.algorithms.kernels.root_flow import (
+    FlowScratch,
+    FlowTable,
+    gain_root,
+    propagate_root,
+)
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.generic import drop_lane, generic
+from netkf.linalg.lanes import Lanes, aligned, load, store
+from netkf.linalg.structs import Size, Struct, sized
+
+
+class SlotTables(Struct):
+    """The model of a slot that all nodes believe: F (n, n) and the lower triangular root of Q."""
+
+    F: FloatArray
+    root_Q: FloatArray
+
+
+class SlotRun(Struct):
+    """The surroundings of H nodes in slots, L runs side by side, with W directed links.
+
+    size, lanes : n and L as lengths (``linalg.structs``, ``linalg.lanes``)
+    model : SlotTables
+    first, sender, weight : links to node h are ``first[h]`` to ``first[h + 1]`` - 1: the index of
+                            the sender, and the weight that the receiver gives it
+    y, H, rows, matrix : whitened readings: reading r has ``rows[r]`` rows ``y[first_y + r]``
+                         (p, L) with ``H[first_H + matrix[r]]`` (p, n, L)
+    reading : number r of the reading of ``update``
+    count, message, link, message_weight, age, heard, arrived : the inbox: ``count`` messages, for
+        each its number in the payloads, its link, weight and age in seconds, the number of the
+        reading that the sender had at the time of sending (-1: none), and flags (L,) of the runs in
+        which it has arrived
+    sends : (L,), 1 on entry of ``emit``; it writes 0 where the node sends nothing
+    uniform : (L,), uniform numbers for ``emit`` of a randomised filter
+    offset : (n, L), by which ``shift`` moves estimates
+    gap, slot, phase, step : seconds of a prediction, numbers of slot, exchange and repetition
+    row, gains, moved_mean, moved, noise, whitened, total : scratch, (n, L) three times, (n, n, L)
+        twice, (n, n + 1, L) twice
+    """
+
+    size: Size
+    lanes: Lanes
+    model: SlotTables
+    first: IntArray
+    sender: IntArray
+    weight: FloatArray
+    y: FloatArray
+    H: FloatArray
+    rows: IntArray
+    matrix: IntArray
+    message: IntArray
+    link: IntArray
+    message_weight: FloatArray
+    age: FloatArray
+    heard: IntArray
+    arrived: np.ndarray
+    sends: np.ndarray
+    uniform: FloatArray
+    offset: FloatArray
+    row: FloatArray
+    gains: FloatArray
+    moved_mean: FloatArray
+    moved: FloatArray
+    noise: FloatArray
+    whitened: FloatArray
+    total: FloatArray
+    reading: int
+    first_y: int
+    first_H: int
+    count: int
+    slot: int
+    phase: int
+    step: int
+    gap: float
+
+
+class SingleSlotRun(Struct):
+    """The surroundings of one node in one run, for the SimPy engine: a SlotRun with L = 1."""
+
+    __annotations__ = SlotRun.__annotations__
+
+
+class ClockTables(Struct):
+    """The models of H nodes under clocks.
+
+    table : tables of all models, the last without sensors, for messages and copies
+    models : (H,), index of each node's model
+    gains, moments, increments : for nodes that read increments: the tables of their gains, the
+        moments (2 p,) of the reading of ``update``, and 1 where that is one of increments
+    scratch, values : scratch of predictions, and of gains
+    """
+
+    table: FlowTable
+    models: IntArray
+    gains: Gains
+    moments: FloatArray
+    increments: int
+    scratch: FlowScratch
+    values: FloatArray
+
+
+class ClockRun(Struct):
+    """The surroundings of H nodes of one run under clocks: a SlotRun with ClockTables, in which
+    ``slot``, ``phase`` and ``step`` are -1.
+    """
+
+    __annotations__ = SlotRun.__annotations__
+
+
+def scratch_of(n: int, L: int) -> dict[str, FloatArray]:
+    """Return the scratch arrays of a run by name, for n states and L lanes."""
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(("row", "gains", "moved_mean", "offset"), (n, L)),
+        **dict.fromkeys(("moved", "noise"), (n, n, L)),
+        **dict.fromkeys(("whitened", "total"), (n, n + 1, L)),
+    }
+    return {name: aligned(shape) for name, shape in shapes.items()}
+
+
+def size_of(n: int, unrolled: bool) -> Size:
+    """Return the ``size`` of a run: kernels are compiled for this n where it is small and
+    ``unrolled``.
+    """
+    # Loops over one state need no unrolling.
+    return sized(n) if unrolled and n > 1 else np.zeros(n)
+
+
+@generic
+def predict_estimate(model: Any, run: Any, x: FloatArray, root: FloatArray, k: int, h: int) -> None:
+    """Predict estimate ``k`` of the stacks ``x`` (K, n, L) and ``root`` (K, n, n, L) by
+    ``run.gap`` seconds (in slots by one slot), as node ``h`` predicts its own: the root counts the
+    increments of the gap. ``model`` is ``run.model``.
+    """
+
+
+@generic
+def predict_copy(model: Any, run: Any, x: FloatArray, root: FloatArray, k: int) -> None:
+    """Predict estimate ``k`` by ``run.gap`` seconds without readings."""
+
+
+@generic
+def carry(model: Any, run: Any, x: FloatArray, root: FloatArray, m: int, age: float) -> None:
+    """Predict estimate ``m``, of a message ``age`` seconds old, to now without readings; in slots
+    messages are used in the slot in which they are sent.
+    """
+
+
+@generic
+def update_estimate(model: Any, run: Any, x: FloatArray, root: FloatArray, k: int, h: int) -> None:
+    """Update estimate ``k`` with the reading of node ``h``, ``run.reading``, or its increments."""
+
+
+@predict_copy.register(SlotTables)
+@kernel(inlined=True)
+def predict_slot(model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int) -> None:
+    """Predict by one slot: ``x <- F x``, ``P <- F P F' + Q``."""
+    F = model.F
+    transform_mean(run.lanes, run.size, x, k, F, run.moved_mean)
+    transform_root(run.lanes, run.size, root, k, F, model.root_Q, (run.moved, run.noise))
+
+
+@predict_estimate.register(SlotTables)
+@kernel(inlined=True)
+def _predict_in_slot(
+    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, h: int
+) -> None:
+    predict_slot(model, run, x, root, k)
+
+
+@carry.register(SlotTables)
+@kernel(inlined=True)
+def _carry_in_slot(
+    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
+) -> None:
+    pass
+
+
+@update_estimate.register(SlotTables)
+@kernel(inlined=True)
+def _update_in_slot(
+    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, h: int
+) -> None:
+    use_reading(run, x, root, k, run.reading, True)
+
+
+@predict_estimate.register(ClockTables)
+@kernel
+def _predict_over_gap(
+    model: ClockTables, run: Any, x: FloatArray, root: FloatArray, k: int, h: int
+) -> None:
+    m = model.models[h]
+    propagate_root(model.table, m, drop_lane(root), drop_lane(x), k, run.gap, model.scratch)
+
+
+@predict_copy.register(ClockTables)
+@kernel
+def _predict_copy_over_gap(
+    model: ClockTables, run: Any, x: FloatArray, root: FloatArray, k: int
+) -> None:
+    carry(model, run, x, root, k, run.gap)
+
+
+@carry.register(ClockTables)
+@kernel
+def _carry_over_age(
+    model: ClockTables, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
+) -> None:
+    if age > 0.0:
+        last = len(model.table.unit) - 1
+        propagate_root(model.table, last, drop_lane(root), drop_lane(x), m, age, model.scratch)
+
+
+@update_estimate.register(ClockTables)
+@kernel
+def _update_under_clocks(
+    model: ClockTables, run: Any, x: FloatArray, root: FloatArray, k: int, h: int
+) -> None:
+    if model.increments == 0:
+        use_reading(run, x, root, k, run.reading, True)
+        return
+    m, gains = model.models[h], model.gains
+    gain_root(
+        run.size, model.moments, gains.series[m], gains.reach[m], 0, drop_lane(root), drop_lane(x),
+        k, run.gap, model.values,
+    )  # fmt: skip
+
+
+@kernel(inlined=True)
+def use_reading(run: Any, x: FloatArray, root: FloatArray, k: int, r: int, arrived: Any) -> None:
+    """Update estimate ``k`` of the stacks ``x`` (K, n, L) and ``root`` (K, n, n, L) with reading
+    number ``r``, row by row, in the runs with ``arrived`` (flags (L,); True: all).
+    """
+    y, H = run.y, run.H
+    first, matrix = run.first_y + r, run.first_H + run.matrix[r]
+    for i in range(run.rows[r]):
+        place = first, matrix, i
+        update_by_row(run.lanes, run.size, x, root, k, y, H, place, arrived, (run.row, run.gains))
+
+
+@kernel(inlined=True)
+def copy_estimate(
+    run: Any,
+    x: FloatArray,
+    root: FloatArray,
+    k: int,
+    from_x: FloatArray,
+    from_root: FloatArray,
+    m: int,
+    flags: Any,
+) -> None:
+    """Copy estimate ``m`` of ``from_x`` and ``from_root`` to number ``k`` of ``x`` and ``root``, in
+    the lanes with ``flags`` (True: all).
+    """
+    copy_vector(run.lanes, run.size, x, k, from_x, m, flags)
+    copy_root(run.lanes, run.size, root, k, from_root, m, flags)
+
+
+@kernel(inlined=True)
+def shift_vector(run: Any, x: FloatArray, k: int) -> None:
+    """Add ``run.offset`` (n, L) to ``x[k]``: the origin of coordinates has moved."""
+    for i in range(len(run.size)):
+        store(run.lanes, x, k, i, load(run.lanes, x, k, i) + load(run.lanes, run.offset, i))
+
+
+# The standard verbs: those of a Kalman filter on the node's own readings, which sends estimates.
+
+
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict the estimate of node ``h`` by ``run.gap`` seconds."""
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Update the estimate of node ``h`` with its reading."""
+    update_estimate(run.model, run, record.xhat, record.root, h, h)
+
+
+@kernel
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Write the estimate of node ``h`` into payload ``m``."""
+    payload = record.payload
+    copy_estimate(run, payload.xhat, payload.root, m, record.xhat, record.root, h, True)
+
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Do nothing: nothing arrives."""
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move the estimate of node ``h`` with the origin."""
+    shift_vector(run, record.xhat, h)

@@ -1,0 +1,179 @@
+"""Filters as kernels: the verbs, and the record of a node that they change.
+
+A filter whose verbs are kernels (``Filter.kernels``) says what a node knows, in arrays with names:
+``Filter.record`` returns their shapes. Engines make one *record* of H nodes, a struct with an axis
+of nodes before each shape and an axis of L runs side by side after it, and call the verbs for one
+node at a time, see ``algorithms.kernels.run``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.kernels import run as standard
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.lanes import aligned
+from netkf.linalg.structs import Struct, StructClass
+
+Shapes = Mapping[str, Any]
+"""Shape of each array by name; a pair (shape, dtype) where entries are no float64."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """The arrays of a filter besides ``xhat`` (n,) and ``root`` (n, n) of each node.
+
+    node : shapes of what each node knows, by name
+    link : shapes of what a node knows for each of its incoming links
+    payload : shapes of what a message carries
+    scratch : shapes of arrays for intermediate results, shared by all nodes
+    settings : numbers, arrays and structs that are the same in all runs
+    """
+
+    node: Shapes = field(default_factory=dict)
+    link: Shapes = field(default_factory=dict)
+    payload: Shapes = field(default_factory=dict)
+    scratch: Shapes = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """The verbs of a filter as kernels, by default those of a Kalman filter on own readings.
+
+    predict, update, absorb, shift : ``verb(record, h, run)`` for node h
+    emit : ``emit(record, h, m, run)`` writes payload number m of node h
+    positions : fields of the payload that move with the origin
+    decides : ``emit`` may write 0 into ``run.sends``
+    unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
+               runs a tenth faster
+    under_clocks : the verbs under clocks, where they are others than in slots
+    """
+
+    predict: Any = standard.predict
+    update: Any = standard.update
+    emit: Any = standard.emit
+    absorb: Any = standard.absorb
+    shift: Any = standard.shift
+    positions: tuple[str, ...] = ("xhat",)
+    decides: bool = False
+    unrolled: bool = True
+    under_clocks: Kernels | None = None
+
+    def of(self, clocked: bool) -> Kernels:
+        """Return the verbs under clocks, or in slots."""
+        return self.under_clocks or self if clocked else self
+
+
+ESTIMATE = ("xhat", "root")
+_classes: dict[tuple[str, ...], Any] = {}
+
+
+def make_arrays(shapes: Shapes, leading: tuple[int, ...], lanes: int) -> dict[str, np.ndarray]:
+    """Return arrays of zeros (*leading, *shape, L) by name."""
+    made: dict[str, np.ndarray] = {}
+    for name, shape in shapes.items():
+        kind: Any = np.float64
+        if len(shape) == 2 and isinstance(shape[0], tuple):
+            shape, kind = shape
+        made[name] = aligned((*leading, *shape, lanes), kind)
+    return made
+
+
+def estimate_shapes(n: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of an estimate and the root of its covariance."""
+    return {"xhat": (n,), "root": (n, n)}
+
+
+def record_class(name: str, values: Mapping[str, Any]) -> Any:
+    """Return the class of records with these fields: one for each name and set of fields, so that
+    filters of equal layout share compiled code.
+    """
+    kinds = tuple(f"{key}:{_kind(value)}" for key, value in values.items())
+    key = (name, *kinds)
+    if key not in _classes:
+        annotations = {key: _kind(value) for key, value in values.items()}
+        _classes[key] = StructClass(name, (Struct,), {"__annotations__": annotations})
+    return _classes[key]
+
+
+def _kind(value: Any) -> str:
+    """Return "int", "float" or "array" with its type: what the layout of a field depends on."""
+    if isinstance(value, bool | int | np.integer):
+        return "int"
+    if isinstance(value, float | np.floating):
+        return "float"
+    if isinstance(value, Struct):
+        return type(value).__name__
+    return f"{value.dtype}{value.ndim}"
+
+
+@dataclass
+class Records:
+    """The records of H nodes in B blocks of L runs: the struct of the first block, and the arrays
+    (B, ..., L) of all by name.
+
+    struct : its fields are the arrays of the first block, ``payload`` and the settings
+    arrays : of nodes (B, H, ..., L) and links (B, W, ..., L)
+    links : names of those of links
+    """
+
+    struct: Any
+    arrays: dict[str, np.ndarray]
+    links: tuple[str, ...] = ()
+
+    @property
+    def memories(self) -> np.ndarray:
+        """(B, words) int64: the struct of each block, for ``struct_like``."""
+        first = self.struct
+        blocks = len(self.arrays["xhat"])
+        memories = np.tile(first.memory, (blocks, 1))
+        for name, array in self.arrays.items():
+            steps = np.arange(blocks, dtype=np.int64) * array.strides[0]
+            memories[:, first.struct_offsets[name]] += steps
+        return memories
+
+
+def make_records(
+    filtering: Any,
+    starts: Sequence[tuple[FloatArray, FloatArray]],
+    infos: Sequence[Any],
+    models: Sequence[Any],
+    links: int,
+    messages: int,
+    blocks: int = 1,
+    lanes: int = 1,
+) -> Records:
+    """Return the records of H nodes at time 0 in B ``blocks`` of L ``lanes``, with W ``links`` and
+    room for so many ``messages``; ``starts`` are estimates (n,) and roots (n, n) of the nodes.
+    """
+    n, count = len(starts[0][0]), len(starts)
+    record: Record = filtering.record(infos, models)
+    nodes = make_arrays({**estimate_shapes(n), **record.node}, (blocks, count), lanes)
+    per_link = make_arrays(record.link, (blocks, links), lanes)
+    for h, ((mean, root), info, model) in enumerate(zip(starts, infos, models, strict=True)):
+        views = {name: array[0, h, ..., 0] for name, array in nodes.items()}
+        views["xhat"][...], views["root"][...] = mean, root
+        filtering.begin(views, info, model)
+    for array in nodes.values():
+        # All runs start alike.
+        array[:] = array[:1, ..., :1].copy()
+    payload = make_arrays({**record.payload}, (messages,), lanes)
+    arrays = {**nodes, **per_link}
+    values: dict[str, Any] = {name: array[0] for name, array in arrays.items()}
+    name = record_owner(type(filtering)).__name__
+    # A struct has at least one field.
+    payload = payload or {"empty": np.zeros((1, 1))}
+    values["payload"] = record_class(f"{name}Payload", payload)(**payload)
+    values |= make_arrays(record.scratch, (), lanes)
+    values |= record.settings
+    return Records(record_class(f"{name}Record", values)(**values), arrays, tuple(per_link))
+
+
+def record_owner(cls: type) -> type:
+    """Return the class, ``cls`` or one it derives from, that defines the record."""
+    return next(base for base in cls.__mro__ if "record" in vars(base))

@@ -1,0 +1,337 @@
+"""One node of a filter whose verbs are kernels, for Python: what the SimPy engine calls.
+
+A state is a :class:`NodeState`, whose record holds one node of one run. Each verb copies the arrays
+that it may change, so that states are values as those of filters in plain Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.kernels.gains import Gains, stack_gains
+from netkf.algorithms.kernels.root_flow import flow_scratch, stack_tables
+from netkf.algorithms.kernels.run import (
+    ClockRun,
+    ClockTables,
+    SingleSlotRun,
+    SlotTables,
+    scratch_of,
+    size_of,
+)
+from netkf.algorithms.kernels.slots import whiten_reading
+from netkf.algorithms.models import FlowModel, first_root
+from netkf.algorithms.records import Kernels, Records, make_records
+from netkf.linalg.arrays import FloatArray, address_of
+from netkf.linalg.lanes import ONE
+
+OWN = 0
+"""The reading of ``update`` in the tables of a run; those of messages follow."""
+
+
+class Payload:
+    """A message of a kernel filter: its ``fields`` by name, and the ``reading``, whitened (y, H),
+    that the sender had taken at that instant, or None.
+    """
+
+    def __init__(self, fields: dict[str, np.ndarray], reading: Any) -> None:
+        self.fields, self.reading = fields, reading
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a field without its axes of messages and lanes."""
+        try:
+            return self.__dict__["fields"][name][0, ..., 0]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    @property
+    def P(self) -> FloatArray:
+        """The covariance ``root root'`` (n, n) of the estimate."""
+        root: FloatArray = self.root
+        return root @ root.T
+
+    def _replace(self, **fields: Any) -> Payload:
+        """Return a payload with other values of some fields, as of a NamedTuple."""
+        arrays = {name: np.asarray(value)[None, ..., None] for name, value in fields.items()}
+        return Payload({**self.fields, **arrays}, self.reading)
+
+
+class NodeState:
+    """The state of a node: a record of one node, and what surrounds it in its run.
+
+    ``xhat`` (n,), ``root`` (n, n) and the fields of the filter's record are attributes.
+    """
+
+    def __init__(self, kernels: Kernels, record: Any, changing: tuple[str, ...], run: Any) -> None:
+        self.kernels, self.record, self.changing, self.run = kernels, record, changing, run
+        self.reading: Any = None
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a field of the record for this node, without its axis of lanes."""
+        if name in self.__dict__.get("changing", ()):
+            value = getattr(self.record, name)
+            # Fields of links have an axis of links in place of that of nodes.
+            return value[0, ..., 0] if name in self.__dict__["run"].node_fields else value[..., 0]
+        raise AttributeError(name)
+
+    @property
+    def P(self) -> FloatArray:
+        """The covariance ``root root'`` (n, n) of the estimate."""
+        root: FloatArray = self.root
+        return root @ root.T
+
+    @property
+    def model(self) -> Any:
+        """The model of the plant and the node's sensors."""
+        return self.run.model
+
+    def _replace(self, **fields: Any) -> NodeState:
+        """Return a state with other values of some fields, as of a NamedTuple."""
+        new = self.copied()
+        for name, value in fields.items():
+            getattr(new, name)[...] = value
+        return new
+
+    def copied(self) -> NodeState:
+        """Return a state with arrays of its own."""
+        record, cls = self.record, type(self.record)
+        new = cls.__new__(cls)
+        memory = record.memory.copy()
+        object.__setattr__(new, "memory", memory)
+        object.__setattr__(new, "address", address_of(memory))
+        for name, value in record.__dict__.items():
+            if name in self.changing:
+                array = value.copy()
+                new.__dict__[name] = array
+                memory[cls.struct_offsets[name]] = address_of(array)
+            elif name not in ("memory", "address"):
+                new.__dict__[name] = value
+        state = NodeState(self.kernels, new, self.changing, self.run)
+        state.reading = self.reading
+        return state
+
+
+class Surroundings:
+    """The run of one node: the struct that kernels take, and how Python fills it."""
+
+    def __init__(
+        self, filtering: Any, model: Any, info: Any, unrolled: bool, node_fields: tuple[str, ...]
+    ) -> None:
+        self.filtering = filtering
+        n, self.info, self.node_fields = len(model.information), info, node_fields
+        self.model, self.period = model, getattr(model, "period", 0.0)
+        self.clocked = isinstance(model, FlowModel)
+        size = size_of(n, unrolled)
+        base = ClockRun if self.clocked else SingleSlotRun
+        cls = base.of_size(n) if isinstance(size, tuple) else base
+        degree = max(1, info.degree, len(info.senders))
+        self.links = {sender: k for k, sender in enumerate(info.senders)}
+        self.struct = cls(
+            size=size,
+            lanes=ONE,
+            model=clock_tables(model, unrolled) if self.clocked else slot_tables(model),
+            first=np.array([0, info.degree]),
+            sender=np.arange(degree),
+            weight=np.zeros(degree),
+            y=np.zeros((1, 1, 1)),
+            H=np.zeros((1, 1, n, 1)),
+            rows=np.zeros(1, dtype=np.int64),
+            matrix=np.arange(1),
+            message=np.arange(degree),
+            link=np.zeros(degree, dtype=np.int64),
+            message_weight=np.zeros(degree),
+            age=np.zeros(degree),
+            heard=np.full(degree, -1),
+            arrived=np.ones((degree, 1), dtype=np.uint8),
+            sends=np.ones(1, dtype=np.uint8),
+            uniform=np.zeros(1),
+            reading=OWN,
+            first_y=0,
+            first_H=0,
+            count=0,
+            slot=-1,
+            phase=-1,
+            step=-1,
+            gap=0.0,
+            **scratch_of(n, 1),
+        )
+
+    def set_readings(self, readings: Sequence[tuple[FloatArray, FloatArray]]) -> None:
+        """Make these whitened readings (y (p,), H (p, n)) the numbers 0, 1, ... of the run."""
+        n, p = len(self.struct.size), max(1, *(len(y) for y, _ in readings))
+        ys, Hs = np.zeros((len(readings), p, 1)), np.zeros((len(readings), p, n, 1))
+        for k, (y, H) in enumerate(readings):
+            ys[k, : len(y), 0], Hs[k, : len(y), :, 0] = y, H
+        self.struct.y, self.struct.H = ys, Hs
+        self.struct.rows = np.array([len(y) for y, _ in readings], dtype=np.int64)
+        self.struct.matrix = np.arange(len(readings))
+
+    def set_inbox(self, messages: Sequence[Any], slotted: bool) -> None:
+        """Make these messages the inbox of the run; their readings are numbered after the own."""
+        run, count = self.struct, len(messages)
+        run.message, run.age = np.arange(max(1, count)), np.zeros(max(1, count))
+        run.link, run.heard = (np.full(max(1, count), value) for value in (0, -1))
+        run.message_weight = np.ones(max(1, count))
+        run.arrived = np.ones((max(1, count), 1), dtype=np.uint8)
+        run.count = count
+        readings: list[Any] = []
+        for k, message in enumerate(messages):
+            # A sender that was not announced gets the next link.
+            run.link[k] = self.links.setdefault(message.sender, len(self.links))
+            run.message_weight[k] = message.weight
+            run.age[k] = 0.0 if slotted else message.age
+            reading = getattr(message.payload, "reading", None)
+            if reading is not None:
+                readings.append(reading)
+                run.heard[k] = len(readings)
+        nothing = np.zeros(0), np.zeros((0, len(run.size)))
+        self.set_readings([nothing, *readings])
+
+    def prepare(self, record: Any, slot: int) -> None:
+        """Let the filter set what it knows of a slot before the run."""
+        if slot >= 0:
+            self.filtering.prepare(record, slot, 1)
+
+    def set_exchange(self, exchange: Any) -> None:
+        """Set the circumstances of ``emit`` or ``absorb``."""
+        run = self.struct
+        run.slot, run.phase, run.step = exchange.slot, exchange.phase, exchange.step
+        run.uniform[0], run.sends[0] = exchange.uniform, 1
+
+
+def slot_tables(model: Any) -> SlotTables:
+    """Return the model of slots as kernels take it."""
+    return SlotTables(F=np.ascontiguousarray(model.F), root_Q=np.ascontiguousarray(model.root_Q))
+
+
+def clock_tables(model: FlowModel, unrolled: bool) -> ClockTables:
+    """Return the model of one node under clocks as kernels take it."""
+    table = stack_tables([model.flow, model.unobserved_flow])
+    gains = _gains_of(model)
+    return ClockTables(
+        table=table,
+        models=np.zeros(1, dtype=np.int64),
+        gains=gains,
+        moments=np.zeros(2 * len(model.H)),
+        increments=0,
+        scratch=flow_scratch(table, unrolled),
+        values=np.zeros(max(1, gains.series.shape[2])),
+    )
+
+
+def _gains_of(model: FlowModel) -> Gains:
+    """Return the gains of a model, without any if its node reads no increments."""
+    from netkf.algorithms.kernels.gains import no_gains
+
+    return stack_gains([model.gains if len(model.H) else no_gains(len(model.A))])
+
+
+def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: Any) -> NodeState:
+    """Return the state of a node at time 0, with estimate ``mean`` (n,) and ``cov`` (n, n)."""
+    degree = max(1, info.degree, len(info.senders))
+    start = np.asarray(mean, dtype=np.float64), first_root(cov)
+    records: Records = make_records(filtering, [start], [info], [model], degree, 1)
+    fields = tuple(records.arrays)
+    nodes = tuple(name for name in fields if name not in records.links)
+    kernels = filtering.kernels.of(isinstance(model, FlowModel))
+    run = Surroundings(filtering, model, info, kernels.unrolled, nodes)
+    return NodeState(kernels, records.struct, fields, run)
+
+
+def predict(state: NodeState, gap: float) -> NodeState:
+    """Return the state ``gap`` seconds later."""
+    new = state.copied()
+    new.reading = None
+    run = state.run.struct
+    run.gap = gap
+    for _ in range(1 if state.run.clocked else round(gap / state.run.period)):
+        state.kernels.predict(new.record, 0, run)
+    return new
+
+
+def update(state: NodeState, reading: Any) -> NodeState:
+    """Return the state after a reading or increments."""
+    new, surroundings = state.copied(), state.run
+    run = surroundings.struct
+    if hasattr(reading, "moments"):
+        run.model.moments = np.array(reading.moments)
+        run.model.increments, run.gap = 1, reading.gap
+        state.kernels.update(new.record, 0, run)
+        run.model.increments = 0
+        return new
+    whitened = whiten_reading(reading.y, reading.H, reading.R) if len(reading.y) else None
+    # In slots a node without a sensor gets readings without rows.
+    surroundings.set_readings([whitened or (np.zeros(0), reading.H[:0])])
+    run.reading = OWN
+    state.kernels.update(new.record, 0, run)
+    new.reading = whitened
+    return new
+
+
+def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
+    """Return the state after sending, and the payload, None if the node sends nothing."""
+    new, surroundings = state.copied(), state.run
+    record, run = new.record, surroundings.struct
+    surroundings.set_exchange(exchange)
+    surroundings.prepare(record, exchange.slot)
+    payload = _payload_struct(record, 1)
+    record.payload = payload
+    state.kernels.emit(record, 0, 0, run)
+    if not run.sends[0]:
+        return new, None
+    fields = {name: getattr(payload, name) for name in type(payload).struct_fields}
+    return new, Payload(fields, new.reading)
+
+
+def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeState:
+    """Return the state after all messages of this instant."""
+    new, surroundings = state.copied(), state.run
+    record, run = new.record, surroundings.struct
+    surroundings.set_exchange(exchange)
+    surroundings.prepare(record, exchange.slot)
+    surroundings.set_inbox(messages, exchange.slot >= 0)
+    if messages:
+        names = type(record.payload).struct_fields
+        fields = {
+            name: np.concatenate([_field(message.payload, name) for message in messages])
+            for name in names
+        }
+        record.payload = type(record.payload)(**fields)
+    state.kernels.absorb(record, 0, run)
+    return new
+
+
+def shift(state: NodeState, offset: FloatArray) -> NodeState:
+    """Return the state after the origin of coordinates moved by ``-offset`` (n,)."""
+    new, run = state.copied(), state.run.struct
+    run.offset[:, 0] = offset
+    state.kernels.shift(new.record, 0, run)
+    return new
+
+
+def shift_payload(filtering: Any, payload: Payload, offset: FloatArray) -> Payload:
+    """Return a payload under way after the origin moved by ``-offset`` (n,) at its sending."""
+    moved = {name: payload.fields[name].copy() for name in filtering.kernels.positions}
+    for array in moved.values():
+        array[0, ..., 0] += offset
+    return Payload({**payload.fields, **moved}, payload.reading)
+
+
+def _field(payload: Any, name: str) -> np.ndarray:
+    """Return a field of a payload with axes of messages and lanes; a user's own payload may be any
+    object that has it.
+    """
+    if isinstance(payload, Payload):
+        return payload.fields[name]
+    return np.asarray(getattr(payload, name), dtype=np.float64)[None, ..., None]
+
+
+def _payload_struct(record: Any, count: int) -> Any:
+    """Return room for so many messages of the kind of a record's payload."""
+    cls = type(record.payload)
+    shapes = {name: getattr(record.payload, name) for name in cls.struct_fields}
+    return cls(
+        **{name: np.zeros((count, *a.shape[1:]), dtype=a.dtype) for name, a in shapes.items()}
+    )

@@ -1,0 +1,112 @@
+"""Filters in slots as records: what the composed loop needs, made once for R runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.kernels.run import SlotRun, SlotTables, scratch_of, size_of
+from netkf.algorithms.records import Kernels, make_records
+from netkf.engines.compiled.slot_loop import (
+    EXCHANGE,
+    PREDICT,
+    SENSE,
+    SlotPlan,
+    SlotSamples,
+    slot_loop,
+)
+from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.lanes import LANES, MANY, aligned
+
+_KINDS = {"predict": PREDICT, "sense": SENSE, "exchange": EXCHANGE}
+
+
+class SlotFilters:
+    """H filters in B blocks of L runs, whose verbs are kernels."""
+
+    def __init__(self, setup: SlotSetup, kernels: Kernels, blocks: int) -> None:
+        self._setup, self._kernels = setup, kernels
+        H, W, n = setup.estimators, len(setup.links.sender), setup.n
+        self.records = make_records(
+            setup.algorithm,
+            list(zip(setup.xhat, setup.root, strict=True)),
+            setup.infos,
+            setup.models,
+            links=W,
+            messages=H,
+            blocks=blocks,
+            lanes=LANES,
+        )
+        self._memories = self.records.memories
+        size = size_of(n, kernels.unrolled)
+        cls = SlotRun.of_size(n) if isinstance(size, tuple) else SlotRun
+        # Inbox: a node hears at most all of its links.
+        most = max(1, int(np.diff(setup.links.first).max(initial=0)))
+        self._run = cls(
+            size=size,
+            lanes=MANY,
+            model=SlotTables(F=setup.F, root_Q=setup.root_Q),
+            first=setup.links.first,
+            sender=setup.links.sender,
+            weight=setup.links.weight,
+            y=np.zeros((1, 1, LANES)),
+            H=np.zeros((1, 1, 1, LANES)),
+            rows=setup.rows,
+            matrix=np.arange(H),
+            message=np.zeros(most, dtype=np.int64),
+            link=np.zeros(most, dtype=np.int64),
+            message_weight=np.zeros(most),
+            age=np.zeros(most),
+            heard=np.zeros(most, dtype=np.int64),
+            arrived=aligned((most, LANES), np.uint8),
+            sends=aligned((LANES,), np.uint8),
+            uniform=aligned((LANES,)),
+            reading=0,
+            first_y=0,
+            first_H=0,
+            count=0,
+            slot=0,
+            phase=0,
+            step=0,
+            gap=setup.period,
+            **scratch_of(n, LANES),
+        )
+        # L entries are copied at a time, so that the last copy may go beyond the last entry.
+        sizes = H * n + LANES, H * n + LANES, H * n * n + LANES
+        self.sample_scratch = [aligned((size, LANES)) for size in sizes]
+        algorithm = setup.algorithm
+        stages = [
+            kind for kind in algorithm.schedule or () if algorithm.talks or kind != "exchange"
+        ]
+        self._stages = np.array([_KINDS[kind] for kind in stages], dtype=np.int64)
+        exchange = np.cumsum(self._stages == EXCHANGE) - 1
+        self._phases = np.where(self._stages == EXCHANGE, exchange, -1)
+        self._steps = np.array(
+            [
+                algorithm.exchange_steps(phase) if phase >= 0 else 0
+                for phase in self._phases.tolist()
+            ],
+            dtype=np.int64,
+        )
+
+    def simulate(self, readings: Any, samples: SlotSamples, **drawn: Any) -> None:
+        """Simulate the slots of a plan, whose drawn parts are given by name, with whitened
+        ``readings``.
+        """
+        y, H = readings.y, readings.H
+        self._run.y = y.reshape(-1, *y.shape[3:])
+        self._run.H = H.reshape(-1, *H.shape[3:])
+        plan = SlotPlan(
+            stages=self._stages,
+            phases=self._phases,
+            steps=self._steps,
+            predicts=self._setup.algorithm.predicts,
+            direction=self._setup.links.direction,
+            varies=H.shape[0] * H.shape[1] > 1,
+            **drawn,
+        )
+        self._setup.algorithm.prepare(self.records.struct, plan.first, len(plan.sensed))
+        loop = slot_loop(self._kernels)
+        loop(self.records.struct, self._memories, self._run, plan, samples)

@@ -1,0 +1,265 @@
+"""The one loop of all filters in slots: stages of a slot, composed of the verbs of a filter.
+
+``slot_loop`` makes it for a filter's kernels. It simulates S slots of B blocks of L runs in one
+call; what is drawn for them is in a :class:`SlotPlan`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.kernels.run import SlotRun
+from netkf.algorithms.kernels.slots import scatter_sample
+from netkf.algorithms.records import Kernels
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.generic import struct_like
+from netkf.linalg.lanes import any_lane, load, load_flags, spread, store, store_flags
+
+PREDICT, SENSE, EXCHANGE = range(3)
+WHOLE, SENDING, ARRIVING = range(3)
+"""The part of a slot that a call simulates: SENDING ends when the first exchange has been sent,
+ARRIVING begins there.
+"""
+
+
+class SlotPlan(NamedTuple):
+    """What happens in S slots of B blocks of L runs, with E steps of the exchanges in each slot, W
+    directed links and H filters.
+
+    first : number of the first slot
+    stages, phases, steps : (G,) kinds of the stages of a slot, in order (PREDICT, SENSE or
+        EXCHANGE), and for exchanges the number of their phase and the repetitions
+    predicts : samples show the predictions with which slots begin
+    sensed, exchanged : (S,), whether nodes read and predict, and whether they exchange
+    sample : (S,), index of the slot's sample, -1: none
+    rebased : (S,), whether the origin moves to the state of the slot
+    up : (B, S, E, W, L), 1 if a message arrives on a directed link in a step of the exchanges
+    direction : (W,), index in the axis W of ``up`` of each link by receiver
+    sent : (B, S, E, H, L), 1 if a node is asked for a message, and where kernels decide 0 where it
+        sends nothing; empty if all nodes send that are asked
+    uniform : (B, S, E, H, L), uniform numbers for these decisions; empty unless randomised
+    varies : whether H differs from block to block and slot to slot
+    part : WHOLE, SENDING or ARRIVING
+    """
+
+    first: int
+    stages: np.ndarray
+    phases: np.ndarray
+    steps: np.ndarray
+    predicts: bool
+    sensed: np.ndarray
+    exchanged: np.ndarray
+    sample: np.ndarray
+    rebased: np.ndarray
+    up: np.ndarray
+    direction: np.ndarray
+    sent: np.ndarray
+    uniform: FloatArray
+    varies: bool
+    part: int
+
+
+class SlotSamples(NamedTuple):
+    """T samples of R runs that the loop writes, and the true states of S slots that they need.
+
+    x, xhat, P : (R, T, n), (R, T, H n) and (R, T, H n n) in the coordinates of the plant, with all
+                 filters side by side
+    error : (R, T, H n), x - xhat
+    absolute, local : (B, S, n, L), true states in all slots, in the coordinates of the plant and
+                      relative to the moving origin that estimates refer to
+    framed : whether the origin moves; otherwise both are the same
+    total : (B, L), sum of all samples of xhat and P so far: finite if all of them are
+    sampled_xhat, sampled_error, sampled_P : (>= H n, L), (>= H n, L) and (>= H n n, L), a sample
+    runs : (L,), the run of each lane, -1 if it is idle
+    """
+
+    x: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+    error: FloatArray
+    absolute: FloatArray
+    local: FloatArray
+    framed: bool
+    total: FloatArray
+    sampled_xhat: FloatArray
+    sampled_error: FloatArray
+    sampled_P: FloatArray
+    runs: np.ndarray
+
+
+@cache
+def slot_loop(kernels: Kernels) -> Any:
+    """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan,
+    samples)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first.
+    """
+    predict, update, emit, absorb, shift = (
+        kernels.predict,
+        kernels.update,
+        kernels.emit,
+        kernels.absorb,
+        kernels.shift,
+    )
+    decides = kernels.decides
+
+    @kernel
+    def exchange(
+        record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int, e: int, part: int
+    ) -> None:
+        """Let all nodes send and absorb in step ``e`` of the exchanges of slot ``s``."""
+        nodes, lanes = len(record.xhat), run.lanes
+        if part != ARRIVING:
+            # All messages are made before any arrives.
+            for h in range(nodes):
+                if decides:
+                    store_flags(lanes, run.sends, load_flags(lanes, plan.sent, b, s, e, h))
+                    if plan.uniform.shape[0] > 0:
+                        store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
+                emit(record, h, h, run)
+                if decides:
+                    store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
+            if decides:
+                drop_silent(run, plan, b, s, e)
+        if part != SENDING:
+            for h in range(nodes):
+                fill_inbox(run, plan, b, s, e, h)
+                absorb(record, h, run)
+
+    @kernel
+    def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int) -> None:
+        """Go through the stages of slot ``s``, or those of its part."""
+        nodes, e, arrived = len(record.xhat), 0, plan.part != ARRIVING
+        for g in range(len(plan.stages)):
+            stage = plan.stages[g]
+            if stage == EXCHANGE:
+                run.phase = plan.phases[g]
+                for step in range(plan.steps[g]):
+                    if plan.exchanged[s]:
+                        run.step = step
+                        # The first exchange divides a slot of which Python makes the messages.
+                        part = WHOLE if e > 0 else plan.part
+                        exchange(record, run, plan, b, s, e, part)
+                        if plan.part == SENDING:
+                            return
+                        arrived = True
+                    e += 1
+            elif plan.sensed[s] and arrived:
+                for h in range(nodes):
+                    if stage == PREDICT:
+                        predict(record, h, run)
+                    else:
+                        run.reading = h
+                        update(record, h, run)
+
+    @kernel
+    def loop(
+        record: Any, memories: np.ndarray, run: SlotRun, plan: SlotPlan, samples: SlotSamples
+    ) -> None:
+        """Simulate all slots of the plan in all blocks."""
+        nodes, slots = len(record.xhat), plan.up.shape[1]
+        for b in range(len(memories)):
+            block = struct_like(record, memories[b])
+            for s in range(slots):
+                run.slot = plan.first + s
+                run.first_y = (b * slots + s) * nodes
+                run.first_H = run.first_y if plan.varies else 0
+                begins, ends = plan.part != ARRIVING, plan.part != SENDING
+                if plan.predicts and begins:
+                    store_sample(block.xhat, block.root, run, plan, samples, b, s)
+                    if plan.rebased[s]:
+                        set_offset(run, samples, b, s)
+                        for h in range(nodes):
+                            shift(block, h, run)
+                simulate_slot(block, run, plan, b, s)
+                if not plan.predicts and ends:
+                    store_sample(block.xhat, block.root, run, plan, samples, b, s)
+                    if plan.rebased[s]:
+                        set_offset(run, samples, b, s)
+                        for h in range(nodes):
+                            shift(block, h, run)
+
+    return loop
+
+
+@kernel
+def fill_inbox(run: SlotRun, plan: SlotPlan, b: int, s: int, e: int, h: int) -> None:
+    """Write the messages that node ``h`` hears in step ``e`` of slot ``s`` into the inbox."""
+    count, lanes = 0, run.lanes
+    up, direction, sender, weight = plan.up, plan.direction, run.sender, run.weight
+    for m in range(run.first[h], run.first[h + 1]):
+        arrived = load_flags(lanes, up, b, s, e, direction[m])
+        # Skip idle links: in a single run a matching uses few.
+        if any_lane(arrived):
+            store_flags(lanes, run.arrived, count, arrived)
+            # Messages and readings have the number of their sender.
+            run.message[count], run.link[count], run.heard[count] = sender[m], m, sender[m]
+            run.message_weight[count] = weight[m]
+            count += 1
+    run.count = count
+
+
+@kernel
+def drop_silent(run: SlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
+    """Set ``plan.up`` to 0 for the messages of nodes that send nothing in step ``e``."""
+    for m in range(len(run.sender)):
+        for q in range(plan.up.shape[4]):
+            if plan.sent[b, s, e, run.sender[m], q] == 0:
+                plan.up[b, s, e, plan.direction[m], q] = 0
+
+
+@kernel
+def set_offset(run: SlotRun, samples: SlotSamples, b: int, s: int) -> None:
+    """Make the true state of slot ``s`` the origin: write its negative into ``run.offset``."""
+    for i in range(len(run.size)):
+        store(run.lanes, run.offset, i, -load(run.lanes, samples.local, b, s, i))
+
+
+@kernel
+def store_sample(
+    xhat: FloatArray,
+    root: FloatArray,
+    run: SlotRun,
+    plan: SlotPlan,
+    samples: SlotSamples,
+    b: int,
+    s: int,
+) -> None:
+    """Write the sample of slot ``s``, if it has one, of the L runs of block ``b`` with estimates
+    ``xhat`` (H, n, L) and roots ``root`` (H, n, n, L).
+    """
+    k, lanes = plan.sample[s], run.lanes
+    if k < 0:
+        return
+    n, first = len(run.size), b * len(lanes)
+    sum_of_all = load(lanes, samples.total, b)
+    for h in range(len(xhat)):
+        for i in range(n):
+            x = load(lanes, xhat, h, i)
+            # Relative to the moving origin: a difference of large absolute states loses digits.
+            local = load(lanes, samples.local, b, s, i)
+            store(lanes, samples.sampled_error, h * n + i, local - x)
+            if samples.framed:
+                x += load(lanes, samples.absolute, b, s, i) - local
+            store(lanes, samples.sampled_xhat, h * n + i, x)
+            sum_of_all += x
+            # P = S S' and its mirror image, because samples hold covariances.
+            for j in range(i + 1):
+                total = spread(lanes, 0.0)
+                for m in range(j + 1):
+                    total += load(lanes, root, h, i, m) * load(lanes, root, h, j, m)
+                store(lanes, samples.sampled_P, (h * n + i) * n + j, total)
+                store(lanes, samples.sampled_P, (h * n + j) * n + i, total)
+                sum_of_all += total
+    store(lanes, samples.total, b, sum_of_all)
+    for q in range(len(lanes)):
+        # The last block may have more lanes than there are runs left.
+        used = first + q < len(samples.x)
+        samples.runs[q] = first + q if used else -1
+        for i in range(n if used else 0):
+            samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
+    scatter_sample(lanes, samples.sampled_xhat, samples.xhat[:, k], samples.runs)
+    scatter_sample(lanes, samples.sampled_error, samples.error[:, k], samples.runs)
+    scatter_sample(lanes, samples.sampled_P, samples.P[:, k], samples.runs)
