@@ -6,11 +6,10 @@ the types of its arguments are described in ``kernels.slots``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from netkf.algorithms.filter import Exchange, Filter, Message, State
+from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.run import copy_estimate
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in

@@ -76,10 +76,9 @@ _classes: dict[tuple[str, ...], Any] = {}
 def make_arrays(shapes: Shapes, leading: tuple[int, ...], lanes: int) -> dict[str, np.ndarray]:
     """Return arrays of zeros (*leading, *shape, L) by name."""
     made: dict[str, np.ndarray] = {}
-    for name, shape in shapes.items():
-        kind: Any = np.float64
-        if len(shape) == 2 and isinstance(shape[0], tuple):
-            shape, kind = shape
+    for name, given in shapes.items():
+        has_type = len(given) == 2 and isinstance(given[0], tuple)
+        shape, kind = given if has_type else (given, np.float64)
         made[name] = aligned((*leading, *shape, lanes), kind)
     return made
 

@@ -8,7 +8,14 @@ from typing import Any
 
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import (
+    intrinsic,
+    lower_builtin,
+    models,
+    overload,
+    register_model,
+    type_callable,
+)
 from numba.np.arrayobj import populate_array
 
 from netkf.linalg.generic import drop_lane, struct_like
@@ -42,25 +49,25 @@ class GenericType(types.Callable, types.Opaque):  # type: ignore[misc]
 register_model(GenericType)(models.OpaqueModel)
 
 
-@intrinsic
-def _drop_lane(_: Any, array: Any) -> Any:
-    """Type and emit an array without its last axis, which has one entry."""
-    fewer = types.Array(array.dtype, array.ndim - 1, "C")
+@type_callable(drop_lane)
+def _type_drop_lane(_: Any) -> Any:
+    """Return the function that types a call: the array has one dimension less."""
 
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        given = context.make_array(sig.args[0])(context, builder, args[0])
-        made = context.make_array(fewer)(context, builder)
-        shape = cgutils.unpack_tuple(builder, given.shape)[:-1]
-        strides = cgutils.unpack_tuple(builder, given.strides)[:-1]
-        populate_array(made, given.data, shape, strides, given.itemsize, None)
-        return made._getvalue()
+    def typed(array: Any) -> Any:
+        return types.Array(array.dtype, array.ndim - 1, "C")
 
-    return fewer(array), emit
+    return typed
 
 
-@overload(drop_lane, inline="always")
-def _overload_drop_lane(array):  # noqa: ANN001, ANN202, ARG001
-    return lambda array: _drop_lane(array)  # noqa: PLW0108 - of the same parameter names
+@lower_builtin(drop_lane, types.Array)
+def _lower_drop_lane(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Emit the same array without its last axis, which has one entry."""
+    given = context.make_array(sig.args[0])(context, builder, args[0])
+    made = context.make_array(sig.return_type)(context, builder)
+    shape = cgutils.unpack_tuple(builder, given.shape)[:-1]
+    strides = cgutils.unpack_tuple(builder, given.strides)[:-1]
+    populate_array(made, given.data, shape, strides, given.itemsize, None)
+    return made._getvalue()
 
 
 @intrinsic

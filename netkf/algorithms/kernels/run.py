@@ -195,7 +195,12 @@ def predict_slot(model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k
 @predict_estimate.register(SlotTables)
 @kernel(inlined=True)
 def _predict_in_slot(
-    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, h: int
+    model: SlotTables,
+    run: Any,
+    x: FloatArray,
+    root: FloatArray,
+    k: int,
+    h: int,  # noqa: ARG001
 ) -> None:
     predict_slot(model, run, x, root, k)
 
@@ -211,7 +216,12 @@ def _carry_in_slot(
 @update_estimate.register(SlotTables)
 @kernel(inlined=True)
 def _update_in_slot(
-    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, h: int
+    model: SlotTables,
+    run: Any,
+    x: FloatArray,
+    root: FloatArray,
+    k: int,
+    h: int,  # noqa: ARG001
 ) -> None:
     use_reading(run, x, root, k, run.reading, True)
 
@@ -236,7 +246,12 @@ def _predict_copy_over_gap(
 @carry.register(ClockTables)
 @kernel
 def _carry_over_age(
-    model: ClockTables, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
+    model: ClockTables,
+    run: Any,
+    x: FloatArray,
+    root: FloatArray,
+    m: int,
+    age: float,  # noqa: ARG001
 ) -> None:
     if age > 0.0:
         last = len(model.table.unit) - 1

@@ -17,7 +17,6 @@ from netkf.engines.compiled.slot_loop import (
     slot_loop,
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
-from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned
 
 _KINDS = {"predict": PREDICT, "sense": SENSE, "exchange": EXCHANGE}

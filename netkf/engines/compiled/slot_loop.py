@@ -91,19 +91,9 @@ class SlotSamples(NamedTuple):
     runs: np.ndarray
 
 
-@cache
-def slot_loop(kernels: Kernels) -> Any:
-    """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan,
-    samples)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first.
-    """
-    predict, update, emit, absorb, shift = (
-        kernels.predict,
-        kernels.update,
-        kernels.emit,
-        kernels.absorb,
-        kernels.shift,
-    )
-    decides = kernels.decides
+def exchange_of(kernels: Kernels) -> Any:
+    """Return the kernel of one step of an exchange, composed of ``emit`` and ``absorb``."""
+    emit, absorb, decides = kernels.emit, kernels.absorb, kernels.decides
 
     @kernel
     def exchange(
@@ -127,6 +117,17 @@ def slot_loop(kernels: Kernels) -> Any:
             for h in range(nodes):
                 fill_inbox(run, plan, b, s, e, h)
                 absorb(record, h, run)
+
+    return exchange
+
+
+@cache
+def slot_loop(kernels: Kernels) -> Any:
+    """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan,
+    samples)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first.
+    """
+    predict, update, shift = kernels.predict, kernels.update, kernels.shift
+    exchange = exchange_of(kernels)
 
     @kernel
     def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int) -> None:

@@ -30,6 +30,7 @@ from netkf.engines.base import Progress
 from netkf.engines.compiled import slot_loop as loop
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
+from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_messages import (
     Channels,
     Matchings,
@@ -45,7 +46,6 @@ from netkf.engines.compiled.slot_messages import (
     mark_all_senders,
     mark_paired_senders,
 )
-from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
