@@ -200,7 +200,7 @@ def _predict_in_slot(
     x: FloatArray,
     root: FloatArray,
     k: int,
-    h: int,  # noqa: ARG001
+    _h: int,
 ) -> None:
     predict_slot(model, run, x, root, k)
 
@@ -216,12 +216,12 @@ def _carry_in_slot(
 @update_estimate.register(SlotTables)
 @kernel(inlined=True)
 def _update_in_slot(
-    model: SlotTables,
+    _model: SlotTables,
     run: Any,
     x: FloatArray,
     root: FloatArray,
     k: int,
-    h: int,  # noqa: ARG001
+    _h: int,
 ) -> None:
     use_reading(run, x, root, k, run.reading, True)
 
@@ -247,11 +247,11 @@ def _predict_copy_over_gap(
 @kernel
 def _carry_over_age(
     model: ClockTables,
-    run: Any,
+    _run: Any,
     x: FloatArray,
     root: FloatArray,
     m: int,
-    age: float,  # noqa: ARG001
+    age: float,
 ) -> None:
     if age > 0.0:
         last = len(model.table.unit) - 1
