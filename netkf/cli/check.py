@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf check``, which tests the promises of the filter's paper on
-    simulated runs and prints a row with a verdict for each.
-    """
     parser.add_argument(
         "--runs", type=parse_count, default=500, help="number of runs (default: 500)"
     )
@@ -64,9 +61,6 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Test on simulated runs what theory promises for a scenario, such as bounds on P; return the
-    exit status, 1 if a promise is broken.
-    """
     from netkf.runs.directory_lock import lock_directory
 
     # Promises are checked at other times than those of ``probe``, which therefore need not fit the
@@ -77,11 +71,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Test what theory promises for a scenario, write the verdict (a row for each promise: holds,
-    broken, undecided or not promised) with ``--out``, and print it; return the exit status.
-
-    The verdict is printed even if its files cannot be written.
-    """
+    """Compute, write and print the verdict; return the exit status, 1 if a promise is broken."""
     from netkf.checks.points import sampling_note
     from netkf.checks.report import verdict_json, verdict_text
     from netkf.scenario.usage import unused_notes
@@ -116,9 +106,7 @@ def _check(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict | None) -> Verdict:
-    """Return the verdict (a row for each promise of theory) on ``--runs`` runs, which include those
-    of an ``earlier`` verdict that is resumed; only the others are simulated.
-    """
+    """Return the verdict on ``--runs`` runs, which include those of an ``earlier`` one."""
     from netkf.checks.check import check
     from netkf.checks.looks import MAX_LOOKED_RUNS
 
@@ -138,10 +126,7 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
 
 @contextlib.contextmanager
 def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> Iterator[None]:
-    """Add to a KeyboardInterrupt of the ``with`` block, if there is ``--out``, a message on what is
-    in the directory: the ``earlier`` verdict or nothing, because runs are written only together
-    with the verdict on all of them.
-    """
+    """Add to a KeyboardInterrupt what is in the directory of ``--out``."""
     try:
         yield
     except KeyboardInterrupt:
@@ -155,11 +140,7 @@ def _explain_interrupt(options: argparse.Namespace, earlier: Verdict | None) -> 
 
 
 def _open_verdict_directory(scenario: Scenario, options: argparse.Namespace) -> Verdict | None:
-    """Make the directory of ``--out``, or, with ``--resume``, return the verdict of an earlier
-    ``netkf check`` in it, to which runs are added, if its files are complete.
-
-    Raises ScenarioError for ``--resume`` without ``--out``, and if the directory does not fit.
-    """
+    """Make the directory of ``--out``, or return the earlier verdict in it with ``--resume``."""
     if options.out is None:
         if options.resume:
             remedy = "add --out DIR with the directory of the verdict"
@@ -177,11 +158,7 @@ def _open_verdict_directory(scenario: Scenario, options: argparse.Namespace) -> 
 def _write_verdict(
     scenario: Scenario, verdict: Verdict, text: str, options: argparse.Namespace
 ) -> None:
-    """Write the files of a verdict into ``--out``, with ``text`` as the terminal shows it, unless
-    that is empty, which means that they are there; and its picture if it is missing.
-
-    Raises WriteError if a file cannot be written.
-    """
+    """Write ``text`` (unless empty) and the other files of a verdict, and its missing picture."""
     from netkf.checks.storage import PICTURE, save_verdict
 
     if text:
@@ -192,9 +169,7 @@ def _write_verdict(
 
 
 def _replay_command(options: argparse.Namespace) -> str:
-    """Return the command line that simulates one run of this check, up to its number, which the
-    caller appends: a broken promise names a run that shows it.
-    """
+    """Return the command line that replays one run, whose number the caller appends."""
     command = ["netkf", "run", str(options.scenario)]
     for change in options.set:
         command += ["--set", change]

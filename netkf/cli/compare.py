@@ -9,9 +9,6 @@ from netkf.cli.options import Command, add_json, print_json
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf compare``, which prints finished runs side by side, on its
-    ``parser``; called when the command line is built.
-    """
     parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
     parser.add_argument(
         "--confidence",

@@ -23,9 +23,6 @@ from netkf.cli.progress import ProgressLine
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf compare-filters``, which runs several filters on the same
-    draws, on its ``parser``; called when the command line is built.
-    """
     parser.add_argument(
         "--filters",
         required=True,
@@ -51,9 +48,6 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Compare filters while no other command can write into the directory of ``--out``, if there
-    is one; return the exit status.
-    """
     from netkf.runs.directory_lock import lock_directory
 
     with lock_directory(options.out, must_be_empty=True):
@@ -61,11 +55,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    """Simulate the scenario with each of ``--filters`` on the same draws, write the files of
-    ``--out``, and print the table of the comparison; return the exit status.
-
-    The table is printed even if its files cannot be written.
-    """
     from netkf.scenario.values import parse_values
     from netkf.studies.compare_filters import compare_filters, write_comparison
     from netkf.studies.tables import format_filters

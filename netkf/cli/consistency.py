@@ -21,9 +21,6 @@ from netkf.cli.options import (
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf consistency``, which tests if P describes the errors, on its
-    ``parser``; called when the command line is built.
-    """
     parser.add_argument("--runs", type=parse_count, default=50, help="number of runs (default: 50)")
     parser.add_argument(
         "--confidence",
@@ -39,9 +36,6 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Test the consistency of a filter and print the table; return the exit status, 1 if the errors
-    of a node are inconsistent with its P.
-    """
     from netkf.studies.consistency import consistency
     from netkf.studies.tables import format_consistency
 

@@ -64,11 +64,7 @@ class _Outcome:
 
 
 def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
-    """Run a command line, print the message about its error on standard error, if any, and return
-    the exit status.
-
-    Signals raise KeyboardInterrupt only while ``interruption`` is armed.
-    """
+    """Run a command line and print its error; signals raise KeyboardInterrupt while armed."""
     with safe_streams():
         try:
             interruption.arm()
@@ -82,11 +78,7 @@ def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
 
 
 def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
-    """Run a command line and return its exit status and the message about its error, if any.
-
-    ``interruption`` knows whether a signal was received. Raises KeyboardInterrupt if the command is
-    interrupted, and SystemExit for bad usage.
-    """
+    """Run a command line and return its exit status and the message about its error, if any."""
     try:
         options = make_parser().parse_args(arguments)
         status: int = options.run(options)
@@ -113,9 +105,7 @@ def _report_interrupt(detail: str) -> _Outcome:
 
 
 def _describe_error(error: Exception) -> str | None:
-    """Return the one-line message about an expected error, such as a bad file or a full disk; None
-    for an unexpected one, which gets a traceback.
-    """
+    """Return the line about an expected error; None for one that gets a traceback."""
     if isinstance(error, NetkfError):
         return str(error)
     if isinstance(error, OSError):

@@ -10,9 +10,6 @@ from netkf.cli.options import Command
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf new``, which writes a first scenario and tests of it, on its
-    ``parser``; called when the command line is built.
-    """
     parser.add_argument("name", metavar="NAME", help="NAME.toml and test_NAME.py are written")
     parser.add_argument(
         "--folder", type=Path, default=Path(), help="folder of the files (default: the current one)"

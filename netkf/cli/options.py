@@ -36,10 +36,7 @@ class Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Raise ArgumentError if a value is not one of the choices, suggesting the nearest one.
-
-        Overrides argparse's method, which it calls for each value.
-        """
+        """Raise ArgumentError if a value is not one of the choices, suggesting the nearest one."""
         if action.choices is not None and value not in action.choices:
             choices = [str(choice) for choice in action.choices]
             remedy = f"{suggest_nearest(value, choices)}choose from {', '.join(choices)}"

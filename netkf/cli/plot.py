@@ -12,9 +12,6 @@ from netkf.figures.names import FIGURE_NAMES, FORMATS
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf plot``, which draws figures of finished runs, on its
-    ``parser``; called when the command line is built.
-    """
     parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
     parser.add_argument(
         "--figure",
@@ -31,11 +28,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Draw figures of directories into files and print their paths; return the exit status.
-
-    Raises ScenarioError without matplotlib, for unknown figures, and for one file of several
-    figures.
-    """
+    """Draw figures of directories into files and print their paths; return the exit status."""
     from netkf.studies.opening import open as open_directory
 
     if find_spec("matplotlib") is None:
@@ -61,9 +54,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check_output(out: Path, directories: int) -> None:
-    """Raise ScenarioError or WriteError if ``out`` cannot be the file or folder of the figures
-    of this number of ``directories``.
-    """
+    """Raise ScenarioError or WriteError if ``out`` cannot hold the figures."""
     from netkf.runs.files import require_own
 
     if out.is_dir():
@@ -79,9 +70,7 @@ def _check_output(out: Path, directories: int) -> None:
 
 
 def _figure_names(text: str) -> list[str]:
-    """Return the names of a list separated by commas; raises ScenarioError if it is empty or one is
-    not known.
-    """
+    """Return the names of a list separated by commas; raises ScenarioError."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise ScenarioError("--figure", "must name figures", text, "leave it out to draw all")

@@ -71,9 +71,7 @@ class Interruption:
         self._disarmed, self._armed = True, False
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        """Handle Ctrl-C or SIGTERM, the first of them only: remember that it was received, and
-        raise KeyboardInterrupt if the command is running (armed).
-        """
+        """Remember the first signal, and raise KeyboardInterrupt if the command is armed."""
         if self.received or self._disarmed:
             return
         self.received = True
@@ -85,11 +83,7 @@ class Interruption:
             raise KeyboardInterrupt
 
     def _handle_unraisable(self, unraisable: Any) -> None:
-        """Send a signal again if Python has dropped its KeyboardInterrupt, as it does in finalizers
-        and callbacks of C code; other exceptions go to the previous hook.
-
-        Called by Python as sys.unraisablehook.
-        """
+        """Send again a KeyboardInterrupt that Python dropped in a finalizer or C callback."""
         if unraisable.exc_type is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
             self._previous_hook(unraisable)
         elif self._armed and self._previous_handlers:
@@ -97,9 +91,7 @@ class Interruption:
             _thread.start_new_thread(self._send_again, (number,))
 
     def _send_again(self, number: signal.Signals) -> None:
-        """Send a signal to the main thread again after RESEND_SECONDS, as if it were the first;
-        runs in a thread of its own.
-        """
+        """Send a signal again after RESEND_SECONDS; runs in a thread of its own."""
         time.sleep(RESEND_SECONDS)
         self.received = False
         # A signal to that very thread also ends its blocking system calls.
@@ -202,9 +194,7 @@ class SafeStream:
 
     @contextlib.contextmanager
     def _handle_failures(self) -> Iterator[None]:
-        """Within a ``with`` block that writes, raise OutputError for failures, or ignore them if
-        the stream is lossy; after a broken pipe discard all further output.
-        """
+        """Raise OutputError for failures, unless lossy; discard the output of broken pipes."""
         try:
             yield
         except BrokenPipeError:

@@ -9,9 +9,6 @@ from netkf.cli.options import Command, add_trust, parse_replica
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf report``, which writes an HTML page of finished runs, on its
-    ``parser``; called when the command line is built.
-    """
     parser.add_argument(
         "directories",
         type=Path,

@@ -35,9 +35,6 @@ MIN_RATED_EVENTS = 10_000  # of fewer events a run takes as long as its preparat
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf run``, which simulates a scenario into a directory, on its
-    ``parser``; called when the command line is built.
-    """
     parser.add_argument("--runs", type=parse_count, help="number of independent runs (default: 1)")
     parser.add_argument(
         "--replica", type=parse_replica, help="run this replica of an ensemble (default: 0)"
@@ -58,10 +55,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate one run or several into a directory; return the exit status.
-
-    Raises ScenarioError for options that exclude each other.
-    """
+    """Simulate one run or several into a directory; return the exit status."""
     is_ensemble = (options.runs or 1) > 1
     if is_ensemble and options.replica is not None:
         remedy = "leave out --runs or --replica"
@@ -82,10 +76,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Simulate one run into the directory ``--out`` and print its summary; return the exit status.
-
-    With ``--resume`` a run that was stopped there is done again, and a finished one stays.
-    """
+    """Simulate one run into ``--out``; ``--resume`` keeps a finished one."""
     from netkf.ensembles.resume import clear_unfinished_runs
     from netkf.runs.run import run_to_directory
 
@@ -120,9 +111,7 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
-    """Simulate several runs into the directory ``--out`` and print averages over them; return the
-    exit status. With ``--resume`` only runs that are missing there are simulated.
-    """
+    """Simulate several runs into ``--out``; ``--resume`` simulates those that are missing."""
     from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
     from netkf.ensembles.pools import PoolOptions
 
@@ -160,9 +149,6 @@ def _print_note(note: str) -> None:
 
 
 def _print_summary(scenario: Scenario, completed: Any) -> None:
-    """Print the notes on a scenario, its title, and the table of averages of a CompletedRun or a
-    FinishedEnsemble.
-    """
     from netkf.runs.files import missing_modules
     from netkf.runs.tables import summary_table
 
@@ -174,9 +160,6 @@ def _print_summary(scenario: Scenario, completed: Any) -> None:
 
 
 def _print_ensemble(completed: Any, runs: int) -> None:
-    """Print the duration of an ensemble of ``runs`` runs (a FinishedEnsemble), the number of
-    diverged runs, and its directory.
-    """
     ensemble = completed.ensemble
     # No rate: the time may count compiling, in this process or in workers.
     print(
@@ -192,9 +175,7 @@ def _print_ensemble(completed: Any, runs: int) -> None:
 
 
 def _describe_divergence(completed: CompletedRun, nodes: Sequence[int]) -> str:
-    """Return a text on what diverged, at which nodes and when, and on the time up to which errors
-    are averaged, if rounding dominates them from then on.
-    """
+    """Return what diverged, where and when, and from when on rounding dominates errors."""
     samples = completed.samples
     problem = describe_divergence(nodes, *samples.last)
     averaging = ""

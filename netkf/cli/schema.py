@@ -9,9 +9,6 @@ from netkf.cli.options import Command
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf schema``, which prints the JSON Schema of scenario files, on
-    its ``parser``; called when the command line is built.
-    """
     parser.add_argument(
         "--markdown", action="store_true", help="print a reference of all keys instead"
     )

@@ -23,9 +23,6 @@ from netkf.core.errors import ScenarioError
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf size``, which searches a key of the scenario for the value
-    that just meets a target, on its ``parser``; called when the command line is built.
-    """
     add_vary(parser, "KEY.PATH=LOW:HIGH", "the key to search and its range")
     parser.add_argument(
         "--target",
@@ -58,9 +55,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Search a value that meets the target and print it; return the exit status, 1 if there is
-    none.
-    """
+    """Search the value and print it; return the exit status, 1 if there is none."""
     from netkf.studies.parameter_grid import parse_interval
     from netkf.studies.size import size
     from netkf.studies.tables import format_answer, format_sizing

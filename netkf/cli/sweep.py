@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf sweep``, which simulates every point of a grid of values of
-    keys, on its ``parser``; called when the command line is built.
-    """
     add_vary(
         parser,
         "KEY.PATH=V1,V2,...",
@@ -50,10 +47,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate a grid of scenarios into a directory and print the table; return the exit status.
-
-    The table is printed even if its files cannot be written.
-    """
+    """Simulate a grid of scenarios into a directory and print the table; return the exit status."""
     from netkf.ensembles.pools import PoolOptions
     from netkf.runs.directory_lock import lock_directory
     from netkf.studies.parameter_grid import parse_grid

@@ -8,16 +8,10 @@ from netkf.cli.options import Command, add_json, load_scenario, print_json, prin
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf theory``, which prints what theory says without simulation, on
-    its ``parser``; called when the command line is built.
-    """
     add_json(parser)
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print what theory says about a scenario without simulation: assumptions, bounds on P and
-    limits; return the exit status.
-    """
     scenario = load_scenario(options)
     # These imports take half a second, which an invalid scenario need not wait for.
     from netkf.runs.failures import explain_failures

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``netkf why``, which explains the estimate of a node of a finished
-    run, on its ``parser``; called when the command line is built.
-    """
     parser.add_argument("directory", type=Path, metavar="DIR", help="run directory")
     parser.add_argument(
         "--node",
@@ -73,12 +70,6 @@ def _parse_node(text: str) -> str:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print and write into a directory why the error of one node at one time of a run is as large
-    as it is: which readings had reached it, and which lost messages mattered. Return the exit
-    status.
-
-    Raises ScenarioError for ``--node`` without ``--at``, or the reverse.
-    """
     from netkf.runs.directory_lock import lock_directory
 
     if (options.node is None) != (options.at is None):
@@ -89,11 +80,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _explain(options: argparse.Namespace) -> int:
-    """Explain the estimate of ``--node`` at ``--at`` seconds (default: the worst sample), write the
-    files of ``--out``, and print the text; return the exit status.
-
-    The text is printed even if its files cannot be written.
-    """
     from netkf.studies.why import why
 
     run: Run | Path = options.directory
@@ -125,11 +111,7 @@ def _explain(options: argparse.Namespace) -> int:
 
 
 def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float, str]:
-    """Return a run that is read back, the node and the time (s) of its worst sample, that with the
-    largest error of the worst node after the start-up of its filter, and a note on it.
-
-    Raises ScenarioError if the directory has no samples of a single run.
-    """
+    """Return run, node and time (s) of the worst sample after the start-up, and a note on it."""
     from netkf.report.directories import read_source
 
     source = read_source(options.directory, options.replica, options.trust)

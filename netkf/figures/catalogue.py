@@ -93,9 +93,7 @@ class FigureSet:
                 return message_figure(*self._explain(name, str(unavailable)))
 
     def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
-        """Return title, message and caption of the picture that stands for figure ``name``, which
-        cannot be drawn for this ``reason``.
-        """
+        """Return title, message and caption in place of figure ``name``, which cannot be drawn."""
         headline = f"No {name.upper() if name in ACRONYMS else name} to show"
         if self._data is None:
             return headline, reason, [f"{self._sweep.scenario.name}, a sweep."]

@@ -63,9 +63,6 @@ def nees_figure(data: FigureData) -> Picture:
 
 
 def _nees_headline(inside: float, mean: float, n: int) -> str:
-    """Return the headline of the figure: a sentence on the share of samples whose NEES is
-    ``inside`` the interval that holds if P is exact, and on their ``mean``, for n states.
-    """
     headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
     return f"{headline}; their mean is {mean:.3g} where exact covariances give {n}"
 
@@ -180,9 +177,7 @@ def whiteness_figure(data: FigureData) -> Picture:
 def _draw_correlations(
     axes: Any, curves: dict[int, FloatArray], worst: int, band: float, lags: int
 ) -> None:
-    """Draw the autocorrelations (lags,) of each node, ``curves`` by node id, over the lag, that of
-    the ``worst`` node as a line of its own, and the 95% band of white noise, 0 +- ``band``.
-    """
+    """Draw the autocorrelations (lags,) of each node, with the 95% ``band`` of white noise."""
     positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
     axes.axhline(0.0, color=EXACT, lw=0.8)

@@ -63,9 +63,7 @@ def _interval_notes(data: FigureData) -> list[str]:
 
 
 def _draw_innovations(axes: Any, data: FigureData) -> list[str]:
-    """Draw the NIS (squared innovations in units of their covariances), for scenarios without
-    ground truth, or the reason why there is none; return the sentences of the caption.
-    """
+    """Draw NIS, without ground truth, or the reason why there is none; return the caption."""
     try:
         innovations = require_innovations(data)
     except UnavailableError as error:
@@ -88,10 +86,7 @@ def bound_headline(data: FigureData) -> str:
 
 
 def _one_run_headline(rows: list[dict[str, Any]]) -> str:
-    """Return the headline of one run: how many nodes have a trace P below the bound, from their
-    averages over time (``ratio`` is that of trace P to the bound). It does not say whether the
-    bound holds, because that is on the mean over runs.
-    """
+    """Return how many nodes of one run have trace P below the bound, which is on the mean."""
     below, count = sum(row["ratio"] <= 1.0 for row in rows), len(rows)
     if count == 1:
         return f"In this run the node claims {'no more' if below else 'more'} than the bound"
@@ -99,9 +94,7 @@ def _one_run_headline(rows: list[dict[str, Any]]) -> str:
 
 
 def _mean_headline(rows: list[dict[str, Any]]) -> str:
-    """Return the headline of an ensemble: how many nodes have a mean trace P below or above the
-    bound, by the 95% intervals of the ``ratio`` of the two in ``rows``, the averages of each node.
-    """
+    """Return how many mean traces of P are below or above the bound, by 95% intervals."""
     margins = [NORMAL_QUANTILE * _known_or_zero(row.get("ratio_se")) for row in rows]
     above = sum(row["ratio"] - m > 1.0 for row, m in zip(rows, margins, strict=True))
     below = sum(row["ratio"] + m <= 1.0 for row, m in zip(rows, margins, strict=True))
@@ -176,11 +169,7 @@ def quantiles_figure(data: FigureData) -> Picture:
 def _mark_worst(
     axes: Any, data: FigureData, times: FloatArray, values: FloatArray, name: str
 ) -> str:
-    """Mark the largest value of each of the three nodes with the largest ones, and return the
-    headline of the figure, a sentence on the largest of all; ``name`` is what the values are.
-
-    ``values`` (T, N) are those at ``times`` (T,); samples that are not averaged are not marked.
-    """
+    """Mark the largest ``values`` (T, N) of the three worst nodes; return the headline."""
     rows = np.flatnonzero(np.isin(times, data.times[data.averaged]))
     rows = rows if len(rows) else np.arange(len(times))
     averaged = np.where(np.isfinite(values[rows]), values[rows], -np.inf)
@@ -210,9 +199,7 @@ def _mark_worst(
 
 
 def _compare_with_median(values: FloatArray, median: float) -> str:
-    """Return text with the ratio of the largest of ``values`` (any shape, nan ignored) to their
-    ``median``, or with the median if it is 0.
-    """
+    """Return the ratio of the largest value to the ``median`` as text; the median if it is 0."""
     largest = float(np.nanmax(values))
     return f"{largest / median:.3g} times the median" if median > 0.0 else f"median {median:.3g}"
 
@@ -260,9 +247,6 @@ def ratios_figure(data: FigureData) -> Picture:
 
 
 def _nees_headline(rows: list[dict[str, Any]], key: str, scale: float) -> str:
-    """Return the headline of a figure of NEES / n: the range of the nodes' ratios of squared errors
-    to what P says, ``row[key] * scale`` of each row.
-    """
     ratios = [row[key] * scale for row in rows]
     span = f"{min(ratios):.3g} to {max(ratios):.3g}" if len(ratios) > 1 else f"{ratios[0]:.3g}"
     return f"Squared errors are {span} times what P says; no bound applies"
@@ -271,9 +255,7 @@ def _nees_headline(rows: list[dict[str, Any]], key: str, scale: float) -> str:
 def _draw_ratios(
     axes: Any, data: FigureData, rows: list[dict[str, Any]], key: str, scale: float
 ) -> None:
-    """Draw the ratio of each node, ``scale`` times the entry ``key`` of its row: a dot, a bar of
-    1.96 standard errors on each side, and a line to the reference value 1.
-    """
+    """Draw ``scale`` times the entry ``key`` of each node's row, with 95% bars and a line at 1."""
     positions = np.arange(len(rows))
     values = scale * np.array([row[key] for row in rows])
     widths = (

@@ -169,9 +169,7 @@ class FigureData:
         return ""
 
     def _paper_notes(self, topic: str) -> list[str]:
-        """Return the notes on departures from the paper's assumptions about a topic: "bound",
-        "nees" or "both".
-        """
+        """Return the notes on departures from the paper about "bound", "nees" or "both"."""
         notes = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
         return [f"Note: {note}." for note, kind in notes if topic in (kind, "both")]
 
@@ -201,9 +199,6 @@ def reduce_result(result: Any) -> FigureData:
 
 
 def _reduce_run(run: Run) -> FigureData:
-    """Return the data to draw of a run, simulated or read from a directory; its averages are those
-    of its summary.json, or computed as that would be.
-    """
     # The sink collects the samples as it does while a run is simulated.
     sink = SummarySink()
     sink.exact_errors = run.exact_errors
@@ -306,9 +301,7 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
 def _average_rows(
     scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces
 ) -> list[dict[str, Any]]:
-    """Return a row of averages over time for each node, with standard errors, by the names in
-    summary.json; ``promised`` has the bound on the trace of P, if theory gives one.
-    """
+    """Return a row of averages over time for each node, by the names in summary.json."""
     after_start = ensemble.times > 0.0
     bound = None if promised.bound is None else promised.bound[after_start].mean(axis=0)
     rows = []

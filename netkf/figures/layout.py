@@ -27,9 +27,7 @@ def get_positions(topology: Topology) -> Positions:
 
 
 def _compute_layout(topology: Topology) -> Positions:
-    """Return positions computed from the links: rings as a circle, other small networks by Kamada
-    and Kawai, large ones by distances to pivots.
-    """
+    """Return positions: rings as a circle, small networks by Kamada and Kawai, large by pivots."""
     if len(topology.nodes) > MAX_KAMADA_KAWAI:
         return _pivot_layout(topology)
     graph: networkx.Graph[int] = networkx.Graph()
@@ -45,12 +43,7 @@ def _compute_layout(topology: Topology) -> Positions:
 
 
 def _pivot_layout(topology: Topology) -> Positions:
-    """Return positions for a large network: along the two principal axes of the distances, in
-    links, from each node to PIVOTS of them.
-
-    Each pivot takes one search of the network. Source: Brandes and Pich, Eigensolver methods for
-    progressive multidimensional scaling (Pivot MDS), Graph Drawing 2006.
-    """
+    """Return positions by Pivot MDS (Brandes and Pich, Graph Drawing 2006), for large networks."""
     pairs = [(topology.index[i], topology.index[j]) for i, j in topology.links]
     # scipy 1.13 searches only graphs with 32-bit indices.
     ends = np.array(pairs, dtype=np.int32)

@@ -62,9 +62,6 @@ def node_values(data: FigureData, key: str) -> dict[int, float]:
 
 
 def _colour_quantities(data: FigureData) -> dict[str, dict[int, float]]:
-    """Return the quantities that colours of nodes show, as far as they are known: for each label
-    of a colour bar the values by node id.
-    """
     key, label = error_label(data)
     quantities = {label: node_values(data, key)}
     if data.runs == 1 and any("sent" in row for row in data.node_averages):
@@ -84,9 +81,6 @@ def _message_bytes(data: FigureData) -> int:
 
 
 def _explain_widths(data: FigureData) -> str:
-    """Return the sentences of the figure's caption on widths of links and, for one run, bytes of
-    transmissions.
-    """
     size = _message_bytes(data)
     links = "Links are as wide as the messages that they delivered. " if data.delivered else ""
     if len(data.scenario.topology.links) > MAX_LINKS:
@@ -98,9 +92,7 @@ def _explain_widths(data: FigureData) -> str:
 
 
 def _make_headline(data: FigureData) -> str:
-    """Return the headline of the figure: a sentence that names the nodes with the largest and the
-    smallest error, or trace of P without ground truth.
-    """
+    """Return a sentence on the nodes with the largest and smallest error, or trace P."""
     key, _ = error_label(data)
     values = {n: v for n, v in node_values(data, key).items() if math.isfinite(v)}
     quantity = "RMS error" if data.shows_errors else "mean trace of P"
@@ -160,9 +152,7 @@ def draw_network(
 
 
 def _dot_area(data: FigureData) -> float:
-    """Return the area of a node's marker in square points: smaller in large networks, so that
-    markers do not cover each other, but never too small to see its colour.
-    """
+    """Return a node's marker area in square points, smaller in large networks."""
     return max(10.0, min(80.0, 3000.0 / len(data.nodes)))
 
 
@@ -188,9 +178,7 @@ def _draw_links(axes: Any, data: FigureData, positions: Positions) -> None:
 def _draw_nodes(
     axes: Any, data: FigureData, positions: Positions, values: Mapping[int, float]
 ) -> Any:
-    """Draw the nodes, coloured by their ``values``, white if that is nan; return what matplotlib
-    makes the colour bar from, None if all values are nan.
-    """
+    """Draw the nodes by ``values``, white where nan; return what the colour bar shows, or None."""
     finite = [value for value in values.values() if math.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.0, 1.0)
     dots = None

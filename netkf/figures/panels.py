@@ -151,9 +151,7 @@ def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> Non
 
 
 def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
-    """Draw ``roots`` (T, N), the square roots of the bounds on trace P of N nodes (hybrid paper, H
-    equation 12), over ``times`` (T,) in seconds, only the largest and smallest if nodes differ.
-    """
+    """Draw ``roots`` (T, N) of the bounds on trace P; only largest and smallest if nodes differ."""
     same = np.allclose(roots.max(axis=1), roots.min(axis=1))
     label = "Tanwani's bound H(12)" if same else "Tanwani's bound H(12): largest"
     axes.plot(times, roots.max(axis=1), color=INK, lw=1.3, ls="--", label=label, zorder=3)

@@ -114,10 +114,7 @@ def reason_to_omit_stability(data: FigureData) -> str | None:
 
 
 def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
-    """Return a mask (D, K), True where the bound on the mean of P (hybrid paper, H equation 12) has
-    a steady state, for the D delivery probabilities DELIVERIES and K increasing ``rates`` (1/s) of
-    the links.
-    """
+    """Return a mask (D, K): P has a bounded mean at DELIVERIES and link ``rates``."""
     stable = np.zeros((len(DELIVERIES), len(rates)), dtype=bool)
     first = 0
     # From a threshold on all rates have a steady state, and with fewer deliveries it is not lower:
@@ -130,9 +127,6 @@ def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
 
 
 def _is_stable(scenario: Scenario, rate: float, delivery: float) -> bool:
-    """Return True if the bound on the mean of P (hybrid paper, H equation 12) has a steady state
-    with this link rate (1/s) and delivery probability.
-    """
     return has_stabilising_gains(scenario.replace({RATE: rate, DELIVERY: delivery}))
 
 
@@ -167,11 +161,6 @@ def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Pic
 
 
 def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
-    """Draw the largest and the mean RMS error of a sweep over one key with 95% intervals, and the
-    root of the bound on the trace of P.
-
-    ``table`` is that of the sweep, a row for each point; ``keys`` is a list of the one key.
-    """
     positions, labels = _axis_positions(axes.set_xscale, table[keys[0]])
     order = np.argsort(positions, kind="stable")
     columns = (("worst_rms", "node with the largest error"), ("mean_rms", "all nodes"))
@@ -201,12 +190,7 @@ def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
 
 
 def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
-    """Draw a cell for each point of a sweep over two ``keys``, those of the horizontal and the
-    vertical axis, coloured by the largest RMS error, with crosses where runs diverged and circles
-    where there is no bound.
-
-    ``table`` is that of the sweep, a row for each point.
-    """
+    """Draw a cell per point, crosses where runs diverged, circles where there is no bound."""
     x_values, y_values = (list(dict.fromkeys(table[key].tolist())) for key in keys)
     errors = np.full((len(y_values), len(x_values)), np.nan)
     diverged, unbounded = (np.zeros(errors.shape, dtype=bool) for _ in range(2))
@@ -235,11 +219,6 @@ def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
 
 
 def _describe_best(table: Any, keys: Sequence[str]) -> str:
-    """Return a sentence on the point of a sweep whose largest RMS error is smallest, with its
-    values of ``keys``, and on the number of points at which runs diverged.
-
-    ``table`` is that of the sweep, a row for each point.
-    """
     finite = table[np.isfinite(table["worst_rms"])]
     diverged = int(table["status"].astype(str).str.contains("diverged").sum())
     if not len(finite):
@@ -251,11 +230,7 @@ def _describe_best(table: Any, keys: Sequence[str]) -> str:
 
 
 def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[FloatArray, list[str]]:
-    """Return the positions (K,) of a column of K ``values`` (a pandas Series) on an axis, and the
-    labels of the positions 0, 1, ..; numbers are their own positions and have no labels.
-
-    ``set_scale`` is called with "log" if the numbers need a logarithmic axis.
-    """
+    """Return the positions (K,) of ``values`` on an axis, and the labels of texts."""
     if values.dtype.kind in "iuf":
         positions = values.to_numpy(dtype=np.float64)
         if positions.min() > 0.0 and positions.max() > LOG_RATIO * positions.min():
@@ -333,26 +308,19 @@ def law_figure(data: FigureData) -> Picture:
 
 
 def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: str) -> None:
-    """Draw the share of an increasing ``sample`` (K,) that is at least as large as each of its
-    values, as a step function in this colour, dash pattern (of matplotlib) and legend ``label``.
-    """
+    """Draw the share of an increasing ``sample`` (K,) at least as large as each value."""
     share = 1.0 - np.arange(len(sample)) / len(sample)
     axes.plot(sample, share, color=colour, ls=dashes, label=label, drawstyle="steps-post")
 
 
 def _tail_headline(values: FloatArray) -> str:
-    """Return a sentence on the median and the 99% quantile of the finite traces of P among
-    ``values`` (T, N), of N nodes at T times; there must be one.
-    """
     finite = values[np.isfinite(values)]
     median, high = np.quantile(finite, (0.5, 0.99))
     return f"The median trace of P is {median:.3g}; 1% of samples exceed {high:.3g}"
 
 
 def _hears_one_sensor(scenario: Scenario) -> np.ndarray:
-    """Return (N,) bool: True for nodes without a sensor whose neighbours have one sensor in all, so
-    that their P follows the random Riccati equation with one reading that arrives or not.
-    """
+    """Return a mask (N,) of nodes without a sensor whose neighbours have one sensor in all."""
     neighbours = {
         node: [i for i, j in scenario.topology.directions if j == node] for node in scenario.nodes
     }
@@ -366,10 +334,7 @@ def _hears_one_sensor(scenario: Scenario) -> np.ndarray:
 
 
 def _sample_invariant_law(data: FigureData) -> FloatArray | None:
-    """Return traces (LAW_SAMPLES,) of P drawn from its law in the steady state; None unless the
-    scenario is the model of the paper on the random Riccati equation (R): one sensor, linear
-    readings, and independent losses.
-    """
+    """Return steady traces (LAW_SAMPLES,) of P by the random Riccati equation, or None."""
     scenario = data.scenario
     loss = scenario.network.channel.loss
     # A class derived from the built-in filter may have another law.

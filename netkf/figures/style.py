@@ -140,9 +140,7 @@ def break_lines(text: str, width: float, size: float, weight: str = "normal") ->
 
 
 def _split_word(line: str, width: float, size: float, weight: str) -> list[str]:
-    """Return a line in pieces of at most ``width`` points: several if it is one long word, which
-    ``break_lines`` cannot break between words.
-    """
+    """Return a line in pieces of at most ``width`` points, several if it is one long word."""
     pieces = []
     while len(line) > 1 and text_width(line, size, weight) > width:
         count = max(1, int(len(line) * width / text_width(line, size, weight)) - 1)
@@ -192,18 +190,14 @@ def draw_legend(axes: Any, columns: int | None = None) -> None:
 
 
 def _axes_width(axes: Any) -> float:
-    """Return the width of the cell of the figure's grid that the axes are in, in points:
-    constrained layout decides on that of the axes themselves only when it draws.
-    """
+    """Return the width in points of the grid cell of the axes, known before they are drawn."""
     cell = axes.get_subplotspec()
     share = cell.get_position(axes.figure).width if cell else 1.0
     return share * float(axes.figure.get_size_inches()[0]) * POINTS_PER_INCH
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
-    """Return the largest number of columns in which a legend with these ``labels`` fits ``width``
-    points.
-    """
+    """Return the largest number of legend columns that fit ``width`` points."""
     # Handle, gaps and column spacing take about six font sizes.
     widths = [text_width(label, LEGEND_SIZE) + 6.0 * LEGEND_SIZE for label in labels]
     for count in range(len(labels), 1, -1):

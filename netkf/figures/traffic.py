@@ -94,9 +94,7 @@ class AgeSawtooth(NamedTuple):
 
 
 def _sum_excess(values: FloatArray, levels: FloatArray) -> FloatArray:
-    """Return the sum of ``max(0, value - level)`` over K ``values`` (K,), for each of L ``levels``
-    (L,), from which ``time_above`` finds for how long an age is above each level.
-    """
+    """Return sums of max(0, value - level) over ``values`` (K,), for each of ``levels`` (L,)."""
     # Values above a level: their sum, less the level for each of them.
     descending = np.sort(values)[::-1]
     sums = np.concatenate([[0.0], np.cumsum(descending)])
@@ -148,9 +146,7 @@ def age_figure(data: FigureData) -> Picture:
 
 
 def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
-    """Draw the median of the nodes' mean ages of information, the range of 90% of the nodes, and
-    the largest age, in B bins of time between ``edges`` (B + 1,), in seconds.
-    """
+    """Draw median, 90% range and largest age of information in bins between ``edges`` (B + 1,)."""
     # Samples of a sawtooth at the times of a grid would alias with the clocks; means do not.
     centres = 0.5 * (edges[:-1] + edges[1:])
     means = np.array([age.mean(edges) for age in ages])
@@ -172,10 +168,7 @@ def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
 def _draw_age_distribution(
     axes: Any, ages: list[AgeSawtooth], means: FloatArray, end: float
 ) -> None:
-    """Draw the share of the time until ``end`` (seconds) for which the age of information exceeds a
-    value: of all nodes, and of those with the largest and the smallest of the mean ages ``means``
-    (N,).
-    """
+    """Draw the share of time in which the age exceeds a value: all nodes, best and worst."""
     largest = max(float((age.low + age.stop - age.start).max()) for age in ages)
     levels = np.linspace(0.0, largest, AGE_LEVELS)
     shares = np.array([age.time_above(levels) for age in ages]) / end
@@ -236,9 +229,7 @@ def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
 def _times_by_direction(
     senders: np.ndarray, receivers: np.ndarray, times: FloatArray
 ) -> dict[tuple[int, int], FloatArray]:
-    """Return for each pair (sender, receiver) the sorted times (M,) in seconds of its events, of K
-    events with ``senders``, ``receivers`` (ids) and ``times``, (K,) each.
-    """
+    """Return the sorted times (s) of the events of each (sender, receiver)."""
     if not len(times):
         return {}
     order = np.lexsort((times, receivers, senders))
@@ -344,12 +335,7 @@ def delivery_figure(data: FigureData) -> Picture:
 def _draw_shares(
     axes: Any, data: FigureData, directions: list[DirectedMessages], shares: FloatArray
 ) -> int | None:
-    """Draw the ``shares`` (L,) of messages delivered in L directions (from one node to another) in
-    increasing order, with intervals.
-
-    Return the number of intervals that exclude the delivery probability of the scenario, None if it
-    has none.
-    """
+    """Draw ``shares`` (L,) with intervals; return how many exclude the stated probability."""
     order = np.argsort(shares, kind="stable")
     directions = [directions[k] for k in order.tolist()]
     low, high = np.transpose(
@@ -379,9 +365,7 @@ def _draw_shares(
 
 
 def _delivery_probability(data: FigureData, direction: DirectedMessages) -> float:
-    """Return the mean probability that a message of this direction (from one node to another) is
-    delivered, by the scenario's model of losses; nan if the model does not know it.
-    """
+    """Return the mean delivery probability of a direction; nan if the loss model has none."""
     link = direction.sender, direction.receiver
     loss = data.scenario.network.channel.loss
     try:
@@ -391,9 +375,7 @@ def _delivery_probability(data: FigureData, direction: DirectedMessages) -> floa
 
 
 def _draw_losses(axes: Any, directions: list[DirectedMessages], end: float) -> None:
-    """Draw the share of messages lost in each of TIME_BINS equal intervals until ``end`` seconds,
-    with intervals of confidence.
-    """
+    """Draw the share of messages lost in TIME_BINS intervals until ``end`` s."""
     edges = np.linspace(0.0, end, TIME_BINS + 1)
     lost = np.histogram(np.concatenate([d.lost for d in directions]), edges)[0]
     totals = lost + np.histogram(np.concatenate([d.delivered for d in directions]), edges)[0]

@@ -108,10 +108,7 @@ def describe_differences(
 
 
 def _describe_first_difference(first: ReportSource, second: ReportSource) -> list[str]:
-    """Return a sentence on the first event in which two recorded runs differ.
-
-    The list is empty if a run was not recorded or is long, or if nodes or seeds differ.
-    """
+    """Return a sentence on the first event in which two recorded runs differ."""
     if first.run is None or second.run is None:
         return []
     if max(len(first.run.log), len(second.run.log)) > MAX_COMPARED:
@@ -126,9 +123,7 @@ def _describe_first_difference(first: ReportSource, second: ReportSource) -> lis
 
 
 def _describe_status(source: ReportSource) -> list[str]:
-    """Return sentences on what limits the results of a source: interruption, failure, divergence
-    of the run that is shown, or a network of one node.
-    """
+    """Return sentences on what limits the results: interruption, failure, divergence, one node."""
     sentences, run = [], source.run
     if source.status == "interrupted":
         sentences.append(_describe_interruption(source))
@@ -145,9 +140,6 @@ def _describe_status(source: ReportSource) -> list[str]:
 
 
 def _describe_interruption(source: ReportSource) -> str:
-    """Return a sentence on how many runs, or how much of the only run, an interrupted command had
-    done.
-    """
     runs = source.manifest["runs"]
     if runs["wanted"] > 1:
         progress = f"{runs['done']:,} of {runs['wanted']:,} runs are done"
@@ -160,11 +152,7 @@ def _describe_interruption(source: ReportSource) -> str:
 
 
 def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndarray) -> list[str]:
-    """Return sentences on the node of a recorded run with the largest RMS error (of P without
-    ground truth), its worst sample and the reasons; empty if no sample is finite.
-
-    ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent.
-    """
+    """Return sentences on the worst node of a run, its worst sample and the reasons."""
     if source.worst is None:
         return []
     worst = source.worst.overall
@@ -194,11 +182,7 @@ def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndar
 def _explain_worst(
     source: ReportSource, run: StoredRun, messages: np.ndarray, samples: WorstSamples
 ) -> list[str]:
-    """Return sentences on the worst node's worst sample after the start-up of its filter: the
-    messages that it had received by then, and whether P allows the error.
-
-    ``messages`` are the MESSAGE rows (M,) of the run, one for each message sent.
-    """
+    """Return sentences on the messages received by the worst sample, and on its error and P."""
     worst, topology = samples.explained, source.scenario.topology
     received = messages[messages["receiver"] == worst.node]
     sentences = []
@@ -218,11 +202,7 @@ def _explain_worst(
 
 
 def _describe_start_up(worst: WorstSample, later: WorstSample, start: StartUp) -> str:
-    """Return sentences saying that the worst sample was in the start-up, the time in which trace P
-    falls from its initial value, and which ``later`` sample is explained instead.
-
-    ``start`` has trace P at the first sample, at the worst one and on average over the last ones.
-    """
+    """Return sentences saying that ``later`` is explained, as the worst is in the start-up."""
     sentence = (
         f"The filters had just started at {_format_time(worst.time)}: trace P was "
         f"{format_number(start.now)}, {format_number(start.first)} at the first sample and "
@@ -238,11 +218,7 @@ def _describe_start_up(worst: WorstSample, later: WorstSample, start: StartUp) -
 
 
 def _judge_error(source: ReportSource, run: StoredRun, worst: WorstSample) -> list[str]:
-    """Return a sentence on whether P allows the error of the worst sample; empty without NEES.
-
-    The sample was chosen for its large error, so its NEES is compared with a quantile of the
-    maximum over all samples.
-    """
+    """Return a sentence on whether P allows the error of the worst sample; empty without NEES."""
     column, row = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
     nees, n = float(run.nees[row, column]), run.x.shape[1]
     if not math.isfinite(nees):
@@ -266,12 +242,7 @@ def _judge_error(source: ReportSource, run: StoredRun, worst: WorstSample) -> li
 def _describe_last_messages(
     received: np.ndarray, worst: WorstSample, cutoff: float, label: Callable[[int], str]
 ) -> str:
-    """Return a sentence on the last message that the node of the worst sample had received from
-    each neighbour by then, and on how many messages were lost or late since.
-
-    ``received`` are the MESSAGE rows (M,) of all messages sent to that node, lost ones included;
-    only arrivals until ``cutoff`` (seconds) count. ``label`` returns the name of a node.
-    """
+    """Return a sentence on the last message of each neighbour by ``cutoff`` s, and losses."""
     # For each sender the seconds since its last message that arrived was sent, inf without one.
     ages, missing = [], 0
     for sender in np.unique(received["sender"]).tolist():
@@ -298,12 +269,7 @@ def _describe_last_messages(
 
 
 def _compare_delivery(messages: np.ndarray, received: np.ndarray) -> str:
-    """Return a sentence that compares the delivery ratio of the messages to a node with that of all
-    messages of the run; empty if they differ by chance.
-
-    Both are MESSAGE rows, one for each message sent: ``messages`` of the run and ``received`` those
-    to the node, lost ones included.
-    """
+    """Return how delivery to a node differs from that of the run; empty if by chance."""
     node_count, total = max(1, len(received)), max(1, len(messages))
     node_ratio = int((received["outcome"] == DELIVERED).sum()) / node_count
     overall_ratio = int((messages["outcome"] == DELIVERED).sum()) / total
@@ -320,12 +286,7 @@ def _compare_delivery(messages: np.ndarray, received: np.ndarray) -> str:
 def _judge_age(
     source: ReportSource, run: StoredRun, received: np.ndarray, worst: WorstSample
 ) -> str:
-    """Return a sentence on whether the node's information (seconds since the newest message that it
-    had received on a link was sent, averaged over its links) was unusually old at its worst sample;
-    empty if there are too few samples to compare with.
-
-    ``received`` are the MESSAGE rows (M,) of the messages sent to that node, lost ones included.
-    """
+    """Return whether the node's information was unusually old at its worst sample, or ""."""
     # The latest arrivals (T,) that the estimates sampled at ``run.times`` (T,) include, in seconds.
     cutoffs = source.cutoffs(run.times)
     ages: FloatArray = information_age(received, (worst.node,), run.times, cutoffs)[:, 0]
@@ -348,9 +309,6 @@ def _judge_age(
 
 
 def _describe_ensemble(source: ReportSource) -> list[str]:
-    """Return a sentence on the node of an ensemble with the largest RMS error over all finished
-    runs.
-    """
     ensemble = source.ensemble
     assert ensemble is not None
     errors = np.sqrt(ensemble.average[:, 0])  # RMS errors of the nodes, then of all together
@@ -370,12 +328,7 @@ def _describe_ensemble(source: ReportSource) -> list[str]:
 
 
 def _describe_bound(source: ReportSource) -> list[str]:
-    """Return a sentence that compares the mean trace of P over time with the bound that theory
-    promises on its mean over runs, at the node that exceeds it most clearly, or else at the node
-    that comes closest to it.
-
-    A single run cannot break the bound, and the sentence on one says so.
-    """
+    """Return a sentence on mean trace P and its bound, at the node that exceeds it most."""
     summary = source.summary
     if not summary:
         return []
@@ -408,16 +361,12 @@ def _describe_bound(source: ReportSource) -> list[str]:
 
 
 def _standard_errors_allowed(nodes: int, runs: int) -> float:
-    """Return how many standard errors of ``runs`` runs a mean may lie above its bound, such that
-    all of ``nodes`` means together stay below that with probability CONFIDENCE where bounds hold.
-    """
+    """Return the standard errors above the bound that all ``nodes`` keep with CONFIDENCE."""
     return -float(scipy.special.stdtrit(max(1, runs - 1), (1.0 - CONFIDENCE) / nodes))
 
 
 def _excess(row: dict[str, Any], margin: float) -> float:
-    """Return by how much the mean trace of P in a ``row`` (of one node) exceeds its bound, beyond
-    ``margin`` standard errors; negative if it does not.
-    """
+    """Return by how much a mean trace exceeds its bound beyond ``margin`` standard errors."""
     error = float(row.get("mean_trace_se") or 0.0)
     # Where P does not depend on chance it may equal its bound, up to rounding.
     return float(row["mean_trace"]) - margin * error - (1.0 + ROUNDING) * float(row["bound"])
@@ -430,9 +379,6 @@ def _format_trace_error(row: dict[str, Any]) -> str:
 
 
 def _describe_verdict(source: ReportSource) -> list[str]:
-    """Return a sentence that counts the results of ``netkf check``, which tests on many runs what
-    theory promises for the scenario, and one sentence for each promise that the runs broke.
-    """
     verdict = source.verdict or {}
     rows = verdict.get("rows", [])
     # Each row is one promise; its verdict is holds, broken, undecided or not promised.
@@ -454,9 +400,6 @@ def _describe_verdict(source: ReportSource) -> list[str]:
 
 
 def _describe_sweep(source: ReportSource) -> list[str]:
-    """Return a sentence on the best point of a sweep, a grid of values of keys: that at which the
-    largest RMS error of any node is smallest.
-    """
     assert source.sweep is not None
     table, keys = source.sweep.table, source.sweep.keys
     if not len(table):
@@ -474,10 +417,7 @@ def _describe_sweep(source: ReportSource) -> list[str]:
 
 
 def _describe_filters(comparison: StoredComparison) -> list[str]:
-    """Return sentences on filters that were run on the same draws: the best one, certain
-    differences from the first one, P that does not describe the errors, and filters that could not
-    run.
-    """
+    """Return sentences on the best filter, certain differences, consistency, and failures."""
     rows = [row for row in comparison.rows if row.ran and math.isfinite(_rms_error(row).value)]
     if not rows:
         return ["No filter has a finite RMS error"]
@@ -505,9 +445,6 @@ def _describe_filters(comparison: StoredComparison) -> list[str]:
 
 
 def _describe_difference(row: ComparedFilter, first: str) -> str:
-    """Return the sentence on a certain difference between the RMS errors of a filter and of the
-    ``first`` one.
-    """
     error = _rms_error(row)
     side = "less" if error.difference < 0.0 else "more"
     return (

@@ -191,9 +191,7 @@ def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
 
 
 def _make_layout(source: ReportSource, run: StoredRun) -> dict[int, Any]:
-    """Return coordinates (2,) at which a page draws each node of a network without positions,
-    computed from its links.
-    """
+    """Return coordinates of nodes without positions, computed from their links."""
     graph: networkx.Graph[int] = networkx.Graph()
     graph.add_nodes_from(run.nodes)
     graph.add_edges_from(source.scenario.topology.links)
@@ -204,13 +202,7 @@ def _make_layout(source: ReportSource, run: StoredRun) -> dict[int, Any]:
 
 
 def _flow_kind(source: ReportSource) -> str:
-    """Return how messages change the information of their receivers, as the page's scripts need to
-    know to show it.
-
-    ``combine``: receivers combine the estimates with their own; ``swap``: two nodes exchange their
-    estimates; ``readings``: messages carry readings, which receivers do not forward; ``pooled``:
-    one filter uses the readings of all nodes.
-    """
+    """Return how messages change their receivers: "combine", "swap", "readings" or "pooled"."""
     node_filter = source.scenario.node_filter
     if node_filter.pooled:
         return "pooled"
@@ -218,11 +210,7 @@ def _flow_kind(source: ReportSource) -> str:
 
 
 def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None) -> list[int]:
-    """Return the indices of the two components of the state that the page shows first.
-
-    They are the first two that sensors measure, unless another component had the largest error at
-    the worst sample: then the two components with the largest errors.
-    """
+    """Return the indices of the two components of the state that the page shows first."""
     n = run.x.shape[1]
     observed_states: set[int] = set()
     for sensor in source.scenario.sensors:
@@ -250,9 +238,7 @@ def _worst_data(worst: WorstSample | None) -> dict[str, Any] | None:
 
 
 def _interval_scales() -> dict[str, float]:
-    """Return the half axes of ellipses and intervals of probability ELLIPSE_LEVEL, in standard
-    deviations of a normal distribution.
-    """
+    """Return half axes of ellipses of probability ELLIPSE_LEVEL, in standard deviations."""
     return {
         "ellipse": math.sqrt(float(scipy.special.chdtri(2, 1.0 - ELLIPSE_LEVEL))),
         "interval": float(scipy.special.ndtri(0.5 + 0.5 * ELLIPSE_LEVEL)),
@@ -260,9 +246,7 @@ def _interval_scales() -> dict[str, float]:
 
 
 def _drawing_limits(source: ReportSource) -> dict[str, Any]:
-    """Return the traces of P that theory gives as limits, those that are finite, by the labels of
-    the horizontal lines that show them.
-    """
+    """Return the finite limits of trace P by theory, by their labels."""
     promised = source.promised
     if promised is None:
         return {}
@@ -273,13 +257,7 @@ def _drawing_limits(source: ReportSource) -> dict[str, Any]:
 def _sample_columns(
     source: ReportSource, run: StoredRun, rows: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
-    """Return the samples with the indices ``rows`` (K,) for the live views: their columns as added
-    to ``packer``, their number K, the step between them (1: none left out), and the interval of
-    the NEES of a sample if P is exact.
-
-    ``messages`` are the MESSAGE rows of the run, one for each message sent, from which the ages of
-    the nodes' information follow.
-    """
+    """Return the samples ``rows`` (K,) for the live views; columns are added to ``packer``."""
     n = run.x.shape[1]
     i, j = np.triu_indices(n)  # P is symmetric: its upper triangle is enough
     total = len(run.times)
@@ -308,13 +286,7 @@ def _sample_columns(
 
 
 def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -> dict[str, Any]:
-    """Return the messages of a run for the live views: columns as added to ``packer``, their
-    number, and the rule by which they were thinned.
-
-    ``travel`` is 0 for a message that took no time, else the time (s) at which it ended, inf if it
-    is under way; ``age`` is 0 if it is unknown; ``number`` is the difference from the previous row
-    modulo 2^32.
-    """
+    """Return the messages for the live views; ``number`` is the difference from the row before."""
     messages = thinned.messages
     nodes = np.array(run.nodes)
     ended = np.where(np.isnan(messages["ended"]), np.inf, messages["ended"])
@@ -342,12 +314,7 @@ def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -
 def _event_columns(
     run: StoredRun, kinds: tuple[str, ...], max_events: int, packer: Packer
 ) -> dict[str, Any]:
-    """Return the events of these ``kinds`` for the live views of a page, every k-th if there are
-    more than ``max_events``: columns, k, the number of all, and the names of the codes of kinds.
-
-    Columns are added to ``packer``, which compresses the numbers of the page; the result refers to
-    them.
-    """
+    """Return the events of ``kinds`` for the live views, every k-th if more than ``max_events``."""
     codes = [CODES[kind] for kind in kinds]
     rows = run.log[np.isin(run.log["kind"], codes)]
     step = max(1, -(-len(rows) // max(1, max_events)))

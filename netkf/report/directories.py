@@ -176,12 +176,7 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
 def _choose_run(
     stored: StoredRun | StoredEnsemble, replica: int | None
 ) -> tuple[StoredRun | None, StoredEnsemble | None]:
-    """Return the run that the page animates, None if none was recorded, and the ensemble that it is
-    from, None for a run of its own.
-
-    ``replica`` is the number of the run that the user asks for, None for the first. Raises
-    ScenarioError if ``replica`` is not in the directory.
-    """
+    """Return the run that the page animates, if any, and the ensemble that it is from, if any."""
     if isinstance(stored, StoredRun):
         if replica is not None and replica != stored.replica:
             where = shorten(stored.directory)
@@ -194,9 +189,7 @@ def _choose_run(
 
 
 def _verdict_manifest(stored: StoredVerdict) -> dict[str, Any]:
-    """Return the entries of a manifest for a verdict of ``netkf check``, whose directory has no
-    manifest.json, so that pages treat it like other directories.
-    """
+    """Return the entries of a manifest for a verdict, whose directory has none."""
     runs = {"done": stored.runs, "wanted": stored.runs}
     versions = stored.document.get("versions", {})
     return {"seed": stored.seed, "status": "complete", "runs": runs, "versions": versions}

@@ -59,9 +59,7 @@ def _bar_end(row: ComparedFilter) -> float:
 
 
 def _draw_row(row: ComparedFilter, k: int, scale: float) -> str:
-    """Return label, bar, dot and number of a filter as SVG elements of row ``k`` from the top;
-    ``scale`` is in pixels per unit of error.
-    """
+    """Return label, bar, dot and number of row ``k`` as SVG; ``scale`` is pixels per unit."""
     error, y = row.quantities["rms_error"].value, ROW_HEIGHT * k + ROW_HEIGHT // 2 + 4
     axis_end, high = WIDTH - NUMBER_WIDTH, _bar_end(row)
     low = max(0.0, 2.0 * error - high)  # the bar is symmetric about the error

@@ -102,9 +102,7 @@ def describe_innovations(readings: Innovations) -> str:
 
 
 def _judge_mean(mean: float, low: float, high: float) -> str:
-    """Return as text whether P is consistent with a node's ``mean`` NIS over its degrees of
-    freedom, which lies in ``low`` .. ``high`` if P is exact.
-    """
+    """Return whether a node's ``mean`` NIS is consistent: in ``low`` .. ``high`` if P is exact."""
     interval = f"{format_number(low)} .. {format_number(high)}"
     if mean > high:
         return f"P is overconfident: {CONFIDENCE:.0%} of such means would lie in {interval}"

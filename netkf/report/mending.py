@@ -137,17 +137,12 @@ def describe_central(source: ReportSource, explanation: Explanation, central: Ce
 
 
 def _describe_change(name: str, before: float, after: float) -> str:
-    """Return text such as ``error 1.5 in place of 2 (-25.0 %)`` for a value called ``name`` that
-    was 2 ``before`` and is 1.5 ``after``; the change only if it is defined.
-    """
+    """Return text such as ``error 1.5 in place of 2 (-25.0 %)``."""
     change = f"{name} {format_number(after)} in place of {format_number(before)}"
     return f"{change} ({relative_change(after, before)})" if before > 0.0 else change
 
 
 def _describe_smallest_set(explanation: Explanation) -> str:
-    """Return text on the smallest set of missing messages that would have sufficed, or on the best
-    set that was tried; empty if no search was made or no message was needed.
-    """
     smallest = explanation.smallest
     if smallest is None or smallest.messages == ():
         return ""

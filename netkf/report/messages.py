@@ -67,13 +67,7 @@ def join_messages(log: np.ndarray) -> np.ndarray:
 def _message_keys(
     rows: np.ndarray, node_columns: tuple[str, str], number_column: str = "number"
 ) -> np.ndarray:
-    """Return one integer for each of M ``rows``, (M,), which identifies its message and orders by
-    sender, receiver and number, so that events find their message by a sorted search.
-
-    ``node_columns`` are the names of the columns of sender and receiver, ``number_column`` that of
-    the number. Raises ValueError for ids of 2^20 and more, or numbers of 2^24 and more, which runs
-    that fit in memory do not reach.
-    """
+    """Return integers (M,) that order messages by sender, receiver, number; raises ValueError."""
     sender, receiver = (rows[name].astype(np.uint64) for name in node_columns)
     number = rows[number_column].astype(np.uint64)
     if len(rows) and (max(sender.max(), receiver.max()) >> 20 or number.max() >> 24):
@@ -84,12 +78,7 @@ def _message_keys(
 def _set_outcomes(
     messages: np.ndarray, rows: np.ndarray, outcome: int, node_columns: tuple[str, str]
 ) -> None:
-    """Set the ``outcome`` (delivered, lost or late), ``ended`` and ``age`` of those ``messages``
-    (M,), in place, that EVENT ``rows`` (K,) are about.
-
-    ``node_columns`` are the names of the events' columns of sender and receiver. Raises ValueError
-    if a row is about none of the messages.
-    """
+    """Set ``outcome``, ``ended`` and ``age`` of the ``messages`` that EVENT ``rows`` are about."""
     if not len(rows):
         return
     keys = _message_keys(messages, ("sender", "receiver"))

@@ -37,8 +37,6 @@ class Packer:
 
 
 def _transpose_bytes(column: np.ndarray) -> bytes:
-    """Return the bytes of an array of any shape: the first byte of all numbers, then the second,
-    and so on.
-    """
+    """Return the first byte of all numbers, then the second, and so on."""
     octets = np.frombuffer(column.tobytes(), dtype=np.uint8)
     return octets.reshape(column.size, column.itemsize).T.tobytes()

@@ -75,13 +75,7 @@ HEAD = 4096
 
 
 class _AnalysedSource(NamedTuple):
-    """A source (the contents of one directory) and the results of the computations that take long.
-
-    messages : the MESSAGE rows of its run, one for each message sent; none without a run
-    worst    : the explanation of its worst sample, or the reason why there is none
-    readings : the innovations of its run, or the reason why there are none
-    layout   : [x, y] of its nodes in the live views, see ``positions``
-    """
+    """The contents of a directory with its MESSAGE rows, worst sample, innovations and layout."""
 
     source: ReportSource
     messages: np.ndarray
@@ -119,9 +113,7 @@ def write_report(
 
 
 def _require_page(path: Path) -> None:
-    """Raise ScenarioError if ``path`` is a file other than a page, which would be overwritten, and
-    WriteError if it is no file of its own.
-    """
+    """Raise ScenarioError if ``path`` is a file that is no page; WriteError if it is no file."""
     require_own(path)
     if path.is_dir():
         raise WriteError(OSError(errno.EISDIR, ""), path)
@@ -169,11 +161,7 @@ def make_page(
 
 
 def _analyse_directory(directory: Path, replica: int | None, trust: bool) -> _AnalysedSource:
-    """Read a directory of the page and do what takes long once: join its messages, explain its
-    worst sample by replays, compute its innovations, and place its nodes.
-
-    Raises ScenarioError if netkf did not write the directory, or if its files are damaged.
-    """
+    """Read a directory and compute what takes long once; raises ScenarioError."""
     source = read_source(directory, replica, trust)
     if source.run is None:
         return _AnalysedSource(source, np.empty(0, dtype=MESSAGE))
@@ -187,11 +175,7 @@ def _analyse_directory(directory: Path, replica: int | None, trust: bool) -> _An
 
 
 def _merge_verdict(entries: list[_AnalysedSource]) -> list[_AnalysedSource]:
-    """Return the read directories of a page; if they are a run or an ensemble and the verdict of
-    ``netkf check`` on it, one entry that has both.
-
-    Raises ScenarioError if two directories of other kinds are not runs and ensembles.
-    """
+    """Return the entries; a run and its verdict become one; raises ScenarioError for others."""
     kinds = [entry.source.kind for entry in entries]
     if len(entries) == 2 and kinds[1] == "verdict" and kinds[0] in ("run", "ensemble"):
         first, verdict = entries
@@ -217,10 +201,7 @@ def _report_command(
 def _compare(
     entries: list[_AnalysedSource], directories: Sequence[str | Path]
 ) -> Comparison | str | None:
-    """Return the differences of the two ``directories`` of a page, which ``entries`` are the
-    contents of; the reason why there are none, if a run did not finish; or None for a single
-    directory.
-    """
+    """Return the differences of two directories, the reason why there are none, or None for one."""
     if len(entries) < 2:
         return None
     have_ended = all(
@@ -235,12 +216,7 @@ def _assemble_page(
     command: str,
     data_limits: Budget,
 ) -> str:
-    """Return the page of one or two ``entries`` (read directories) as HTML, with at most about as
-    many messages and sample values of each run as ``data_limits`` allow.
-
-    ``comparison`` is that of the two: a text if it is only the reason why there is none, None for
-    one entry. ``command`` is the command line that makes the page.
-    """
+    """Return the page of one or two ``entries`` as HTML, within the ``data_limits``."""
     packer = Packer()  # collects columns of numbers as one compressed text
     runs = [
         run_data(
@@ -286,9 +262,6 @@ def _assemble_page(
 
 
 def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | None) -> str:
-    """Return the head of the page as HTML: the names of the scenarios, the sentences on what the
-    data of the ``entries`` (read directories) say, and those on their differences, if any.
-    """
     parts = []
     for letter, entry in zip("AB", entries, strict=False):
         source = entry.source
@@ -309,9 +282,7 @@ def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | 
 
 
 def _source_sentences(entry: _AnalysedSource) -> list[str]:
-    """Return the sentences at the top of the page about a read directory: what its data say and,
-    after the sentence that begins with Why, what replays with the missing messages say.
-    """
+    """Return the sentences about a directory: its data, and after "Why" the replays."""
     sentences = describe_source(entry.source, entry.messages, entry.readings)
     if isinstance(entry.worst, Explanation):
         after_why = (k for k, line in enumerate(sentences, 1) if line.startswith("Why: "))
@@ -330,12 +301,6 @@ def _main_sections(
     rules: list[str],
     live: bool,
 ) -> str:
-    """Return the sections of the page below its head as HTML, for the ``entries`` (read
-    directories) and their ``comparison``, as ``_assemble_page`` describes them.
-
-    ``rules`` are the sentences on data that were left out; ``live`` is True if the page animates a
-    run.
-    """
     sources = [entry.source for entry in entries]
     parts = [_asset("live.html") if live else _explain_no_live_views(sources)]
     # What would have reduced the worst error of each run.
@@ -360,9 +325,7 @@ def _main_sections(
 
 
 def _curve_area(entries: list[_AnalysedSource]) -> str:
-    """Return the element in which the page's script draws the curves, and notes on innovations that
-    could not be computed, as HTML.
-    """
+    """Return the element in which the script draws the curves, and notes on innovations."""
     reasons = dict.fromkeys(entry.readings for entry in entries if isinstance(entry.readings, str))
     notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
     return '<div id="curves" class="curves"></div>' + "".join(notes)
@@ -376,9 +339,6 @@ def _difference_tables(comparison: Comparison | str) -> str:
 
 
 def _explain_no_live_views(sources: list[ReportSource]) -> str:
-    """Return a section with the reason why the page has no live views, which animate a recorded
-    run, as HTML.
-    """
     untraced_kinds = {"sweep": "sweep", "verdict": "verdict", "filters": "comparison of filters"}
     if sources[0].kind in untraced_kinds:
         reason = (
@@ -395,9 +355,7 @@ def _explain_no_live_views(sources: list[ReportSource]) -> str:
 
 
 def _result_tables(source: ReportSource) -> str:
-    """Return the tables of a source (the contents of one directory) as HTML: of the verdict of
-    ``netkf check`` and of its sweep, its compared filters or its averages.
-    """
+    """Return the tables of a source as HTML: verdict, and sweep, filters or averages."""
     parts = []
     if source.verdict is not None:
         parts.append(tables.verdict_table(source))
@@ -436,9 +394,7 @@ def _event_counts(run: StoredRun) -> str:
 
 
 def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]) -> str:
-    """Return the commands that make the page and the results in its ``sources`` (directories), the
-    versions, the counts of events, and sentences (``rules``) on data that were left out, as HTML.
-    """
+    """Return the commands that make the page, versions, counts and ``rules`` as HTML."""
     parts = [paragraph("This page was made by:"), _command_box(command)]
     for source in sources:
         parts.append(paragraph("The results can be computed again by:"))
@@ -460,9 +416,7 @@ def _command_box(command: str) -> str:
 
 
 def _source_command(source: ReportSource) -> str:
-    """Return the command line that computes the results of a source, the contents of one
-    directory, again.
-    """
+    """Return the command line that computes the results of a source again."""
     subcommands = {"sweep": "sweep", "verdict": "check", "filters": "compare-filters"}
     subcommand = subcommands.get(source.kind, "run")
     command = f"netkf {subcommand} {shlex.quote(source.label + '/scenario.toml')}"
@@ -485,9 +439,6 @@ def _source_command(source: ReportSource) -> str:
 
 
 def _filter_option(comparison: StoredComparison) -> str:
-    """Return the value of ``--filters`` for a comparison: kinds, or inline TOML tables of a kind
-    and its settings.
-    """
     options = []
     for row in comparison.rows:
         # The label of a filter is its kind, then its settings as key=value.
@@ -505,9 +456,7 @@ def _asset(name: str) -> str:
 
 @cache
 def _script() -> str:
-    """Return the script of the page: uPlot, a library that draws curves, and the page's own files,
-    which share the scope of one function.
-    """
+    """Return uPlot and the page's own files in the scope of one function."""
     # The licence of uPlot requires its text in every copy.
     licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
     scripts = "\n".join(_asset(name) for name in SCRIPTS)

@@ -62,9 +62,7 @@ def verdict_table(source: ReportSource) -> str:
 
 
 def _verdict_rank(row: dict[str, Any]) -> int:
-    """Return the sort key of a row of a verdict: the index of its result in VERDICT_ORDER, broken
-    promises first; unknown results come last.
-    """
+    """Return the sort key of a row: its index in VERDICT_ORDER, broken first."""
     verdict = row["verdict"]
     return VERDICT_ORDER.index(verdict) if verdict in VERDICT_ORDER else len(VERDICT_ORDER)
 
@@ -105,9 +103,7 @@ def _summary_cells(row: dict[str, Any], columns: Iterable[str]) -> list[str]:
 
 
 def _bound_notes(source: ReportSource) -> list[str]:
-    """Return notes below the table of averages on what trace P is compared with: its bound by
-    theory, the limit of the bound, and the trace of a centralised filter.
-    """
+    """Return notes on what trace P is compared with: bound, limit, and central filter."""
     summary, promised = source.summary, source.promised
     concerned = promised is None or promised.limit_label  # the hybrid paper is about the filter
     notes = [f"bound: {summary['bound']}"] if concerned and not has_bound(summary) else []
@@ -122,9 +118,7 @@ def _bound_notes(source: ReportSource) -> list[str]:
 
 
 def _explain_limit(label: str) -> str:
-    """Return sentences that tell the reader what the limit called ``label`` is (of the bound on
-    trace P as links tick ever faster), and how it compares with the centralised covariance.
-    """
+    """Return sentences on what the limit ``label`` is, beside the centralised covariance."""
     weights = "1/N" if label.startswith("limit S") else "their weights"
     return (
         f"{label}: what the bound of every node tends to as links tick ever faster. It solves the "
@@ -162,9 +156,6 @@ def comparison_section(comparison: Comparison) -> str:
 
 
 def _difference_cells(entry: Entry) -> list[str]:
-    """Return the texts of three cells: the difference from the first directory, its interval, and
-    whether the interval excludes 0.
-    """
     if entry.difference is None:
         return ["-", "-", "-"]
     interval = "-"
@@ -206,9 +197,6 @@ def filters_table(comparison: StoredComparison) -> str:
 
 
 def _quantity_cells(quantity: Quantity) -> list[str]:
-    """Return the texts of three cells: the value, its difference from that of the first filter with
-    its interval, and whether the difference is certain.
-    """
     value = format_with_error(quantity.value, quantity.se)
     if not math.isfinite(quantity.difference):
         return [value, "-", "-"]
@@ -302,9 +290,7 @@ def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[st
 
 
 def _matrix_traces(matrices: FloatArray) -> FloatArray:
-    """Return the traces (T, N) of ``matrices`` (T, N, n, n), such as covariances of N nodes at T
-    times.
-    """
+    """Return the traces (T, N) of ``matrices`` (T, N, n, n)."""
     return np.asarray(np.trace(matrices, axis1=2, axis2=3))
 
 
@@ -319,9 +305,7 @@ def averages(source: ReportSource) -> list[dict[str, Any]] | None:
 
 
 def _interval_curves(mean: Any, error: Any) -> list[list[float | None]]:
-    """Return the mean (T,) and its lower and upper limit, from standard errors (T,), as lists in
-    which numbers that are not finite are None.
-    """
+    """Return mean (T,) and limits as lists, None where not finite."""
     half_width = INTERVAL_WIDTH * np.asarray(error, dtype=float)
     curves = (np.asarray(mean, dtype=float), mean - half_width, mean + half_width)
     return [to_json_value(curve.tolist()) for curve in curves]

@@ -189,9 +189,7 @@ def read_directory(directory: Path) -> RunDirectory:
 
 
 def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
-    """Return a JSON document of a run directory; raises DamagedError unless it has the keys and
-    types that ``form`` lists.
-    """
+    """Return a JSON document of a run directory that has the ``form``; raises DamagedError."""
     with add_file_name(name):
         document = read_document(directory / name)
         require_form(document, form)
@@ -290,9 +288,6 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
 
 
 def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
-    """Return the runs or ensembles that the arguments of ``netkf.compare`` name; raises
-    ScenarioError if that is no list, or a directory is not that of a finished run.
-    """
     if isinstance(directories, (str, Path)) or not isinstance(directories, Sequence):
         remedy = "give all of them in one list: netkf.compare([one, other])"
         raise ScenarioError("directories", "must be a list", directories, remedy)
@@ -304,9 +299,7 @@ def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
 def _compare_quantity(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float
 ) -> Entry:
-    """Return a ``quantity`` of one directory at ``node`` (an id, -1 for all nodes together) and its
-    difference from the ``first`` one, with an interval that misses with probability ``level``.
-    """
+    """Return a ``quantity`` at ``node`` (-1: all) and its difference from the ``first`` one."""
     value, se = other.value(quantity, node)
     entry = Entry(value, se)
     if other is first or value is None:
@@ -320,12 +313,7 @@ def _compare_quantity(
 def _pair_runs(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
 ) -> Entry | None:
-    """Return the ``entry`` (the value of ``other``) with its difference from ``first``, taken run
-    by run; None if the two do not have the same true states, or have not kept the states.
-
-    Its interval misses the true difference with probability ``level``. ``node`` is an id, -1 for
-    all nodes together.
-    """
+    """Return ``entry`` with its difference taken run by run; None without states or one truth."""
     end = min(first.rounding_from, other.rounding_from)  # errors are mostly rounding after it
     base_values, values = (finished.by_run(quantity, node, end) for finished in (first, other))
     if base_values is None or values is None or not _same_truth(first, other):
@@ -342,9 +330,7 @@ def _pair_runs(
 
 
 def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
-    """Return True if both ensembles have the same true states x in all samples (run and time) that
-    both have kept, so that differences may be taken run by run.
-    """
+    """Return True if both ensembles have the same true states in all samples that both kept."""
     base_samples, samples = first.samples, other.samples
     # The same seed is not enough: keys of the plant may differ.
     if (
@@ -368,12 +354,7 @@ def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
 def _welch_difference(
     base: tuple[float | None, float | None], entry: Entry, runs: tuple[int, int], level: float
 ) -> Entry:
-    """Return the entry with the difference of independent runs, by Welch's t interval, which misses
-    with probability ``level``.
-
-    ``base`` and ``entry`` have means and standard errors over ``runs`` runs each; the degrees of
-    freedom are those of Welch and Satterthwaite.
-    """
+    """Return the entry with the difference of independent runs, by Welch's t interval."""
     errors = [base[1], entry.se]
     if base[0] is None or entry.value is None:
         return entry
@@ -393,9 +374,7 @@ def _welch_difference(
 def _student_interval(
     mean: float, error: float, freedom: float, level: float
 ) -> tuple[float, float]:
-    """Return the limits of Student's t interval, ``mean`` +- a quantile times its standard
-    ``error``, at ``freedom`` degrees of freedom; it misses with probability ``level``.
-    """
+    """Return the ends of Student's interval for a ``mean`` with this standard ``error``."""
     width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
     return mean - width, mean + width
 

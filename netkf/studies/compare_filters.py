@@ -215,11 +215,7 @@ def compare_filters(
 
 
 def _meet_same_losses(scenario: Scenario, other: Scenario) -> bool:
-    """Return True unless messages of two filters in one slot meet different losses or delays.
-
-    In slots messages of a link are numbered from the first exchange on, and losses and delays
-    belong to numbers.
-    """
+    """Return True unless messages of two filters in one slot meet different losses or delays."""
     filters = scenario.node_filter, other.node_filter
     is_ideal = scenario.delivers_all or not all(one.talks for one in filters)
     if is_ideal or not scenario.slotted:
@@ -233,9 +229,7 @@ def _meet_same_losses(scenario: Scenario, other: Scenario) -> bool:
 
 
 def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:
-    """Simulate ``runs`` replicas of ``seed`` of a scenario with one of the compared filters on the
-    ``pool``; return their errors and NEES, run by run. ``engine`` is the name of the engine.
-    """
+    """Return the errors and NEES of ``runs`` replicas with one of the filters, run by run."""
     with explain_failures(scenario):
         task = partial(block_values, engine=choose_engine(engine, scenario))
         values: FilterValues = replicate_blocks(task, join_values, scenario, runs, seed, pool=pool)
@@ -250,12 +244,7 @@ def _make_row(
     n: int,
     level: float,
 ) -> ComparedFilter:
-    """Return the row of a filter called ``label``, with differences from the ``first`` one (None:
-    this is the first) in intervals that miss with probability ``level``.
-
-    ``values`` are the filter's averages over the runs, ``traffic`` that of replica 0; n is the
-    number of states.
-    """
+    """Return the row of a filter, with its differences from the ``first`` one (None: it is)."""
     diverged = int(values.diverged.sum())
     return ComparedFilter(
         label,
@@ -267,13 +256,7 @@ def _make_row(
 
 
 def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEntry, ...]:
-    """Return the filters to compare, in their order: each with a label and the scenario with this
-    filter in place of its own, or with the reason why it cannot run.
-
-    ``filters`` are names, tables or objects as in ``netkf.compare_filters``; ``engine`` is the name
-    of the engine that is to run them. Raises ScenarioError for what is no list of filters, for
-    filters that do not differ, and if none can run.
-    """
+    """Return the filters to compare, each with a scenario or the reason why it cannot run."""
     if isinstance(filters, str) or not isinstance(filters, Sequence) or not filters:
         rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
         raise ScenarioError("filters", rule, filters, remedy)
@@ -293,11 +276,7 @@ def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEn
 
 
 def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEntry:
-    """Return the filter ``choice`` with a label and ``scenario`` with this filter in place of its
-    own, or with the reason why it cannot run there.
-
-    ``engine`` is the name of the engine that is to run it.
-    """
+    """Return the filter ``choice`` with its scenario or the reason why it cannot run there."""
     if isinstance(choice, Filter):
         filtering = dataclasses.replace(scenario.filter, algorithm=choice)
         make = partial(dataclasses.replace, scenario, filter=filtering)
@@ -320,9 +299,7 @@ def _make_candidate(scenario: Scenario, choice: Choice, engine: str) -> FilterEn
 
 
 def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
-    """Return the ``labels`` of filters made distinct where that is possible: filters given as
-    objects of one kind, which share a label, get the settings added in which they differ.
-    """
+    """Return ``labels``; those that several filters share get the settings that differ."""
     distinct = list(labels)
     for label in {item for item in labels if labels.count(item) > 1}:
         indices = [k for k, item in enumerate(labels) if item == label]
@@ -336,9 +313,7 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
 
 
 def _differing_settings(filters: Sequence[Any]) -> list[dict[str, str]]:
-    """Return for each of several filters of one kind the settings, by name, that are not the same
-    in all of them, as short texts for labels.
-    """
+    """Return for each of several filters of one kind the settings that are not the same in all."""
     tables = [_filter_settings(algorithm) for algorithm in filters]
     names = dict.fromkeys(name for table in tables for name in table)
     differing = [name for name in names if len({table.get(name) for table in tables}) > 1]
@@ -360,11 +335,7 @@ def _make_label(kind: str, settings: Mapping[str, Any]) -> str:
 
 
 def _filter_table(scenario: Scenario, choice: Any) -> dict[str, Any]:
-    """Return the table [filter] of a scenario file for a ``choice``, the name of a kind or a table:
-    with the start and the model of the scenario's own filter, unless it has others.
-
-    Raises ScenarioError for a kind that is unknown, and for what is neither a kind nor a table.
-    """
+    """Return the table [filter] for a ``choice``, with the scenario's start and model."""
     if not isinstance(choice, (str, Mapping)):
         remedy = "give kinds, tables {kind = ...} or filters"
         raise ScenarioError("filters", "must hold filters", choice, remedy)

@@ -98,9 +98,7 @@ def run_consistency(
 
 
 def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
-    """Return the means (N,) of the ``values`` (T, N) over the T samples that are not ``blurred``
-    (T, N); nan for a node without any.
-    """
+    """Return means (N,) of ``values`` (T, N) over samples not ``blurred``; nan without any."""
     count = (~blurred).sum(axis=0)
     with np.errstate(invalid="ignore"):
         return np.asarray(
@@ -114,9 +112,7 @@ def _count_errors(scenario: Scenario) -> int:
 
 
 def _exact_squares(scenario: Scenario, run: Run) -> FloatArray | None:
-    """Return Sigma (T, N, n, n), the exact mean e e' of each node's errors e given the events of
-    the run; None if theory has none for this filter, or the network is too large.
-    """
+    """Return Sigma (T, N, n, n), E[e e'] given the events; None if unknown or too large."""
     if _count_errors(scenario) > MAX_ERRORS:
         return None
     try:
@@ -126,10 +122,7 @@ def _exact_squares(scenario: Scenario, run: Run) -> FloatArray | None:
 
 
 def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
-    """Return the expected NEES tr(P^-1 Sigma) (T, N), from ``P`` and the exact mean ``sigma`` of e
-    e' of the errors e, (T, N, n, n) each at T times and N nodes; nan if Sigma is unknown or P
-    singular.
-    """
+    """Return tr(P^-1 Sigma) (T, N); nan where Sigma is unknown or P singular."""
     expected = np.full(P.shape[:2], np.nan)
     if sigma is None:
         return expected
@@ -143,12 +136,7 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 def _mean_nis(
     scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the mean NIS (N,) of each node's own readings and its expected value (N,), over the
-    samples that rounding has not ``blurred`` (T, N).
-
-    ``sigma`` (T, N, n, n) are the exact means of e e' of the errors e, if known. Both are nan in
-    continuous time, where predictions at readings are not sampled.
-    """
+    """Return mean NIS (N,) of the nodes' own readings and its expected value; nan without slots."""
     unknown = np.full(len(run.nodes), np.nan)
     if not scenario.slotted:
         return unknown, unknown.copy()
@@ -159,20 +147,11 @@ def _mean_nis(
 
 
 class _Innovations:
-    """Innovations of a run in slots, from predictions that are samples (or one step after one).
-
-    The innovation is computed as H e + v from the error e of the prediction, by letting the sensor
-    read e instead of the state, so that a large state costs no digits. ``sigma`` (T, N, n, n) are
-    the exact means of e e', if known; samples in the mask ``blurred`` (T, N) are left
-    out.
-    """
+    """Innovations of a run in slots, from predictions that are samples (or one step after one)."""
 
     def __init__(
         self, scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
     ) -> None:
-        """Take a run with its T samples: the exact means ``sigma`` (T, N, n, n) of e e',
-        None if unknown, and the mask ``blurred`` (T, N) of errors to leave out.
-        """
         self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
         self._streams = Streams(run.seed, run.replica)
         # Samples of a predicting filter are predictions; others are predicted by one slot.
@@ -188,9 +167,7 @@ class _Innovations:
         self._noise = _plant_noise(scenario, self._streams, self._slots)
 
     def of_node(self, i: int) -> Iterator[tuple[float, float]]:
-        """Yield the NIS of the i-th node's readings and its expected value (nan if unknown) in each
-        slot where errors are not blurred; nothing without a sensor or for nonlinear readings.
-        """
+        """Yield NIS of the i-th node's linear readings and its expected value (nan: unknown)."""
         # Where the node's sensors are listed in the scenario.
         placed = self._scenario.placed_sensors.get(self._run.nodes[i], ())
         # A nonlinear reading has no H given the errors alone.
@@ -221,11 +198,7 @@ class _Innovations:
     def _prediction(
         self, k: int, i: int, noise: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """Return the error (n,) of the prediction of the i-th node, its P (n, n), and the exact
-        mean (n, n) of e e', None if unknown.
-
-        They are those of sample k or, with the plant's ``noise`` (n,) of the step, one slot later.
-        """
+        """Return error (n,), P (n, n) and E[e e'] of sample k, or of its prediction by one slot."""
         run, plant = self._run, self._scenario.slot_plant
         e, P = run.error[k, i], run.P[k, i]
         Sigma = None if self._sigma is None else self._sigma[k, i]
@@ -244,12 +217,9 @@ class _Innovations:
 
 
 def _plant_noise(scenario: Scenario, streams: Streams, slots: list[int]) -> list[FloatArray]:
-    """Return the plant's noise w (n,) of the steps x(k + 1) = F x(k) + w that end in ``slots``.
-
-    With F = 0 in place of the plant's F the state is the noise of the last step, with the same
-    draws.
-    """
+    """Return the plant's noise w (n,) of the steps x(k + 1) = F x(k) + w that end in ``slots``."""
     plant = scenario.slot_plant
+    # With F = 0 the state is the noise of the last step, with the same draws.
     memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
     path = memoryless.truth(streams.generator("plant"))
     return [path.state(slot) for slot in slots]
@@ -345,10 +315,7 @@ def consistency(
 
 
 def _without_horizon(scenario: Scenario) -> Scenario:
-    """Return the scenario without the sample at the horizon if that is a filtered estimate of nodes
-    that exchange in slots: it has no exact covariance, since the events of a run end before the
-    exchanges of the slot that begins there.
-    """
+    """Return the scenario without a filtered sample at the horizon, whose exchanges are missing."""
     node_filter = scenario.node_filter
     if not scenario.slotted or not node_filter.talks or node_filter.predicts:
         return scenario
@@ -411,9 +378,7 @@ def _blurred_from(runs: Sequence[RunConsistency]) -> float:
 
 
 def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> FloatArray:
-    """Return for each node (N,) the share of samples whose mean NEES over the runs lies between
-    ``low`` and ``high``.
-    """
+    """Return the shares (N,) of samples whose mean NEES over the runs is in ``low`` .. ``high``."""
     shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
     means = np.mean([run.samples[:shortest] for run in runs], axis=0)
     usable = np.isfinite(means).sum(axis=0)
@@ -424,12 +389,7 @@ def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> Fl
 def _judge_node(
     scenario: Scenario, runs: Sequence[RunConsistency], i: int, share_inside: float, quantile: float
 ) -> NodeConsistency:
-    """Return the result of the i-th node, with a verdict (a sentence) by whether the interval of
-    its mean NEES minus the expected one, run by run, contains 0.
-
-    The interval reaches ``quantile`` standard errors to each side. ``share_inside`` is the share of
-    the node's samples whose mean NEES over the runs lies in the chi-square bounds.
-    """
+    """Return the i-th node's row; intervals reach ``quantile`` standard errors to each side."""
     nees = np.array([run.nees[i] for run in runs])
     expected = np.array([run.expected[i] for run in runs])
     is_known = bool(np.isfinite(expected).all())
@@ -456,9 +416,7 @@ def _judge_node(
 
 
 def _verdict(scenario: Scenario, excess: float, width: float, expected: float | None) -> str:
-    """Return the verdict, a sentence, on a mean NEES that is ``excess`` (+- ``width``) above its
-    ``expected`` value, or above n if that is None: BROKEN if the two differ for certain.
-    """
+    """Return the verdict on NEES that is ``excess`` (+- ``width``) above ``expected`` (None: n)."""
     n = scenario.plant.n
     if not math.isfinite(excess):
         return "no NEES: P is singular, or P or the errors are not finite"
@@ -473,11 +431,7 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
 
 
 def _explain_bias(scenario: Scenario, conservative: bool) -> str:
-    """Return why P is larger (``conservative``) or smaller than the covariance of the errors.
-
-    Only the class that defines the combining step can say that this is its design; a wrong model or
-    another start explains it otherwise.
-    """
+    """Return why P is larger (``conservative``) or smaller than the covariance of the errors."""
     if not scenario.filters_know_the_truth:
         return f"the filters' model makes P {'conservative' if conservative else 'overconfident'}"
     bias = covariance_bias(scenario)

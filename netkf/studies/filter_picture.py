@@ -56,9 +56,6 @@ def _make_title(rows: list[ComparedFilter]) -> str:
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:
-    """Draw the quantity ``name`` of all filters, top down in the order of ``rows``, with bars of
-    two standard errors; ``label`` is that of the axis.
-    """
     values = [row.quantities[name].value for row in rows]
     bars = [2.0 * row.quantities[name].se for row in rows]
     bars = [bar if math.isfinite(bar) else 0.0 for bar in bars]

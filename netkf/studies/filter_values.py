@@ -46,9 +46,6 @@ def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine)
 
 
 def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
-    """Return squared error, largest error, NEES and whether it diverged, (R,) each, of the R runs
-    of a batch, for the comparison of filters run by run.
-    """
     values = run_values(batch, scenario)
     # (R, 3): squared error, trace of P and NEES, means over time and nodes.
     all_nodes_mean = values.averages[:, -1]
@@ -61,9 +58,7 @@ def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
 
 
 def _largest_error(batch: RunBatch, r: int, blurred_from: float) -> float:
-    """Return the largest |e| of any node in run ``r`` of a batch after time 0, before
-    ``blurred_from`` (seconds), from where on rounding blurs it; nan without a sample.
-    """
+    """Return the largest |e| of run ``r`` after time 0 and before ``blurred_from`` s, or nan."""
     length = int(batch.lengths[r])
     times = batch.times[:length]
     # The last sample of a run that diverges is not finite.
@@ -153,12 +148,8 @@ def estimate_quantities(
 
 
 def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArray]]:
-    """Return each quantity (a function of means over runs) with its influence values (R,), the
-    linear contributions of R runs of a scenario with n states.
-
-    The standard error of the quantity is that of the mean of its influence values, and paired
-    differences of two filters follow from differences of these (delta method).
-    """
+    """Return each quantity with its influence values (R,), whose mean has its error."""
+    # Delta method: differences of two filters have the error of differences of influences.
     rms = math.sqrt(float(values.square.mean()))
     # d sqrt(m) = dm / (2 sqrt(m))
     square = values.square / (2.0 * rms) if rms > 0.0 else values.square
@@ -176,9 +167,7 @@ def _standard_error(values: FloatArray) -> float:
 
 
 def _width(values: FloatArray, level: float) -> float:
-    """Return half the width of Student's interval, which misses with probability ``level``, for the
-    mean of ``values`` (R,); nan for one value.
-    """
+    """Return half of Student's interval for the mean of ``values`` (R,); nan for one value."""
     if len(values) < 2:
         return math.nan
     return float(scipy.special.stdtrit(len(values) - 1, 1.0 - level / 2.0)) * _standard_error(

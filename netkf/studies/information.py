@@ -113,18 +113,14 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
 
 
 class _Links(NamedTuple):
-    """L directed links in the order of ``sender`` and ``receiver`` (L,), node ids; ``start`` (L,)
-    is the index of the first message of each among all messages.
-    """
+    """Directed links by ``sender`` and ``receiver`` (L,); ``start`` (L,): first messages."""
 
     sender: IntArray
     receiver: IntArray
     start: IntArray
 
     def indices(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
-        """Return the indices (K,), among the messages of all links, of K messages given by the ids
-        of ``sender`` and ``receiver`` and their ``number`` on that link, (K,) each.
-        """
+        """Return the indices (K,) of messages given by sender, receiver and ``number`` (K,)."""
         if not len(self.start):
             return np.empty(0, dtype=np.int64)
         # Each pair of ids becomes one integer, which one sorted search finds for all messages.
@@ -135,10 +131,7 @@ class _Links(NamedTuple):
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
-    """Return for each of the ``rows`` (K,) of an EVENT ``log``, arrivals of messages, the row of
-    the absorb or swap event by which its node next uses what has arrived; NEVER (-1) if it does
-    not.
-    """
+    """Return the rows (K,) at which nodes use arrivals at ``rows``; NEVER without one."""
     # One sorted search for all nodes: keys order the uses by node, then by row of the log. The
     # result may be a use by the following node, which the last line rejects.
     uses = np.flatnonzero((log["kind"] == CODES["absorb"]) | (log["kind"] == CODES["swap"]))
@@ -152,13 +145,7 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
 
 
 def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
-    """Return a mask (K,) of the messages that a filter which swaps estimates really uses: it takes
-    over only one at an instant, that of the sender with the largest id, and of several from this
-    one the last sent.
-
-    ``used`` (K,) is the row of the log at which each of K messages is used, ``sender`` (K,) the id
-    of its sender, and ``sent_row`` (K,) the row at which it was sent.
-    """
+    """Return a mask (K,) of the messages used by a swap: the largest sender, and its last one."""
     order = np.lexsort((sent_row, sender, used))
     last = np.ones(len(used), dtype=bool)
     last[:-1] = used[order][1:] != used[order][:-1]
@@ -188,9 +175,7 @@ def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
 
 
 def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
-    """Return the number of events, of those at the increasing ``times`` (E,) in seconds, that
-    influence the sample at ``at`` seconds; these are the first events.
-    """
+    """Return how many events at ``times`` (E,), in seconds, influence the sample at ``at``."""
     if not scenario.slotted:
         return int(np.searchsorted(times, at, side="right"))
     plant = scenario.slot_plant
@@ -267,21 +252,14 @@ def find_flow(
 
 
 def _carry_readings(combination: str, messages: Messages) -> IntArray:
-    """Return a mask (M,) of the messages that carry the reading of their sender and nothing else,
-    by what the filter sends: its ``combination``. All others carry the sender's whole estimate.
-    """
+    """Return a mask (M,) of the messages that carry the sender's reading and nothing else."""
     if combination == "readings, then estimates":
         return np.asarray(messages.phase == 0)
     return np.full(len(messages), combination == "readings")
 
 
 def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
-    """Return the flow of information of a filter that swaps: each swap replaces all that the
-    receiver knew, and so begins a new segment (interval of rows of the log) of this node.
-
-    ``nodes`` (N,) are ids, ``rows`` is the number of rows of the log, and the mask ``used`` (M,)
-    has the messages that were used.
-    """
+    """Return the flow of a filter that swaps: each swap begins a new segment of its node."""
     swapped = np.flatnonzero(used)
     node = np.concatenate([nodes, messages.receiver[swapped]])
     start = np.concatenate([np.zeros(len(nodes), np.int64), messages.used_row[swapped]])
@@ -292,9 +270,7 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
     keys = indices * length + start
 
     def segment(segment_nodes: IntArray, row: IntArray) -> IntArray:
-        """Return the index (K,) of the segment of each of ``segment_nodes`` (K,), ids, that
-        contains the event at ``row`` (K,), as one does that begins there.
-        """
+        """Return the segments (K,) of nodes (K,) that contain the events at ``row`` (K,)."""
         sought_keys = np.searchsorted(nodes, segment_nodes) * length + row
         return np.asarray(np.searchsorted(keys, sought_keys, side="right") - 1)
 
@@ -410,12 +386,7 @@ class KeptReadings:
         }
 
     def _with_values(self, node: int, rows: IntArray) -> IntArray:
-        """Return the rows (K,) of the log at which ``node`` took a reading that had values, of the
-        ``rows`` (K',) of its sense events.
-
-        In slots a node with sensors has such an event in every slot, but a recorded sensor, which
-        reads from a table, may lack rows.
-        """
+        """Return those of the sense ``rows`` of ``node`` whose recorded sensors have a row."""
         scenario = self._scenario
         sensors = [scenario.sensors[position.entry] for position in scenario.placed_sensors[node]]
         records = [sensor.record for sensor in sensors]
@@ -489,10 +460,7 @@ def newest_information(
 
 
 def _age_key(reading: float, known: float) -> tuple[float, float]:
-    """Return a key that sorts information by age, oldest first: by the time of its newest
-    ``reading``, none (nan) first, then by the time up to which it is ``known``, the end of the log
-    (nan) last; both in seconds.
-    """
+    """Sort key, oldest first: time of the newest reading, then time up to which it is known."""
     return (
         -np.inf if np.isnan(reading) else reading,
         np.inf if np.isnan(known) else known,

@@ -140,12 +140,7 @@ class _Search:
         return largest if self._gains.get(largest, 0.0) > 0.0 else ()
 
     def drop_oldest(self, candidates: Sequence[Candidate]) -> list[Candidate]:
-        """Return ``candidates``, missing messages in the order of sending, without the oldest ones,
-        so that the search has fewer sets to try.
-
-        All that are left out change the trace together by at most NEGLIGIBLE times the decrease
-        that the limit asks for. Their number is found by bisection.
-        """
+        """Return ``candidates`` without the oldest, which change the trace by a NEGLIGIBLE part."""
         base = self.trace(())
         tolerance = NEGLIGIBLE * (base - self._limit)
 
@@ -166,12 +161,7 @@ class _Search:
     def find_set(
         self, candidates: Sequence[Candidate], size: int, max_count: int
     ) -> tuple[tuple[MessageKey, ...] | None, bool]:
-        """Return a set of ``size`` of the candidates (missing messages) whose delivery brings the
-        trace to at most the limit, else None; and True if all sets of this size were considered.
-
-        Of single messages it is the one with the smallest trace, of larger sets the first that is
-        tried. The search ends when the replayer's number of replays reaches ``max_count``.
-        """
+        """Return a set of ``size`` that reaches the limit, or None, and whether all were tried."""
         best_set: tuple[MessageKey, ...] | None = None
         best_trace = math.inf
         sets, all_listed = self._list_sets(candidates, size)
@@ -189,12 +179,7 @@ class _Search:
     def _list_sets(
         self, candidates: Sequence[Candidate], size: int
     ) -> tuple[Iterator[tuple[MessageKey, ...]], bool]:
-        """Return the sets of ``size`` candidates in decreasing order of expected gain (decrease of
-        the trace), in which they are to be tried, and True if these are all sets.
-
-        If there are more than MAX_SETS, the least promising messages are left out. Of sets with
-        equal gain those of later messages come first.
-        """
+        """Return sets by decreasing expected gain (at most MAX_SETS), and whether these are all."""
         single_gains = {c.key: self._gains.get((c.key,), 0.0) for c in candidates}
         ranked = sorted(candidates, key=lambda c: (-single_gains[c.key], -c.sent))
         count = len(ranked)
@@ -221,14 +206,7 @@ class _Search:
         index_of_key: Mapping[MessageKey, int],
         single_gains: Mapping[MessageKey, float],
     ) -> FloatArray:
-        """Return the expected gain (S,), the decrease of the trace, of each of S sets, by which
-        they are sorted.
-
-        It is the sum of the gains of its single messages and, for each pair that was replayed, of
-        the gain of the pair beyond those of its two messages. ``members`` (S, size) are the indices
-        of the sets' messages in ``index_of_key``; ``single_gains`` are those of single messages, 0
-        if not replayed.
-        """
+        """Return the expected gains (S,): of single messages, plus what replayed pairs add."""
         size, messages = members.shape[1], len(index_of_key)
         single = np.array([single_gains[key] for key in index_of_key])
         gains = np.zeros(len(members))
@@ -249,13 +227,7 @@ class _Search:
 
 
 def _are_joined(needed: np.ndarray) -> np.ndarray:
-    """Return a mask (S,) of those of S sets of missing messages all of whose members can change the
-    node's estimate.
-
-    ``needed`` (S, size) is for each member how many missing messages, itself included, must be
-    delivered for its information to reach the node; a set that has too few to carry a member on is
-    left out.
-    """
+    """Return a mask (S,) of the sets with enough messages to carry the information of each on."""
     # A message that needs k messages, itself included, needs one of each lower number: sorted, the
     # numbers are at most 1, 2, 3, ...
     return np.asarray((np.sort(needed, axis=1) <= np.arange(1, needed.shape[1] + 1)).all(axis=1))

@@ -58,9 +58,6 @@ def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine
 
 
 def _batch_metrics(values: RunValues) -> RunMetrics:
-    """Return what sweeps and searches use of the ``values`` of the R runs of a batch: squared
-    errors and traces of P (R, N) of each node, and counts of messages (R, 5).
-    """
     # averages (R, N + 1, 3): squared error, trace of P, NEES; the last row is of all nodes.
     return RunMetrics(
         mean_square=values.averages[:, :-1, 0],
@@ -99,9 +96,7 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
 
 
 def _expected_squares(scenario: Scenario, run: Run) -> FloatArray:
-    """Return E|x - xhat_i|^2 (T, N), the exact mean squared error of each node i given the events
-    of a run; raises TheoryError if theory does not know it for this scenario.
-    """
+    """Return E|x - xhat_i|^2 (T, N) given the events of a run; raises TheoryError if unknown."""
     if not scenario.slotted:
         return expected_squares(scenario, run)
     return np.asarray(np.trace(error_squares(scenario, run), axis1=2, axis2=3))
@@ -213,9 +208,7 @@ def _require_fixed_H(scenario: Scenario) -> None:
 
 
 def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
-    """Return the traces (T,) of P at the T samples of a Kalman filter in slots with ``model``, from
-    P(0) = ``start`` (n, n): of predictions if the scenario's filter predicts, else after updates.
-    """
+    """Return the traces (T,) of P of a Kalman filter in slots from P(0) = ``start``."""
     predicts = scenario.filter.algorithm.predicts
     # At most n rows with the same information: a central filter may read hundreds.
     F, Q, H = model.F, model.Q, whiten_observation(model.H, model.R)

@@ -94,18 +94,14 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:
-    """Return manifest.json of a directory, which tells what kind of results it holds; raises
-    DamagedError if it is missing or not as netkf writes it.
-    """
+    """Return manifest.json of a directory; raises DamagedError."""
     if not folder.is_dir():
         raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
     return read_checked_document(folder, "manifest.json", MANIFEST_FORM)
 
 
 def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredSweep:
-    """Return the sweep in a directory with its ``manifest``; one that was interrupted at once has a
-    table without rows. Raises DamagedError.
-    """
+    """Return the sweep in a directory; one interrupted at once has a table without rows."""
     import pandas as pd
 
     require_form(manifest["vary"], {}, "vary")
@@ -126,14 +122,7 @@ def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> S
 
 
 def _read_table(path: Path, keys: tuple[str, ...]) -> pd.DataFrame:
-    """Return the table of a sweep: a row for each point, its columns in the order of the file.
-
-    keys : keys of the scenario that were swept: columns of their values, numbers or texts
-
-    Columns other than these and ``status`` (text) hold numbers. Raises DamagedError if a column of
-    keys, counts of runs, results or the status is missing or double, if another column holds texts,
-    or if a standard error is negative.
-    """
+    """Return the table of a sweep over ``keys``; raises DamagedError."""
     import pandas as pd
 
     names = column_names(path)

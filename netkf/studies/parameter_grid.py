@@ -38,9 +38,7 @@ def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
 
 
 def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
-    """Return ``count`` evenly spaced values from ``start`` to ``stop``, which are texts of the
-    command line; integers if all are whole and both ends were written so.
-    """
+    """Return ``count`` evenly spaced values; integers if all are whole and both ends are."""
     try:
         low, high, number = float(start), float(stop), int(count)
         integers = [int(start), int(stop)]

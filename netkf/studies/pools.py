@@ -27,9 +27,7 @@ class _OpenPool(Pool):
         return self._pool.submit(job)
 
     def next_size(self, left: int, runs: int) -> int:
-        """Return the number of runs of the next block, when ``left`` of ``runs`` are not yet
-        submitted.
-        """
+        """Return the number of runs of the next block when ``left`` of ``runs`` remain."""
         return self._pool.next_size(left, runs)
 
     def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:

@@ -121,11 +121,7 @@ class Replayer:
         return self._outcomes[keys, to_horizon]
 
     def _replay(self, chosen: Chosen | None, to_horizon: bool) -> IntArray:
-        """Simulate the run again with the ``chosen`` messages delivered, or all for None, to
-        the time ``at`` or ``to_horizon``; return the EVENT rows (E,) up to ``at``.
-
-        Adds 1 to ``count`` and stores the state of the node in ``_outcomes``.
-        """
+        """Simulate with ``chosen`` (None: all) messages delivered; return EVENT rows to ``at``."""
         self.count += 1
         without_delay: Chosen = frozenset()
         if chosen is None or chosen:
@@ -157,14 +153,9 @@ def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
 
 
 def _shorten(scenario: Scenario, at: float, to_horizon: bool) -> Scenario:
-    """Return the scenario of replays for the state at ``at`` seconds, its last sample; it ends
-    there unless it runs ``to_horizon``.
-
-    Earlier samples stay: with continuous readings they decide where the readings of an interval are
-    split. The true state between two samples of sensors depends on the later one too, so that
-    errors may need the run to its horizon.
-    """
+    """Return the scenario whose last sample is at ``at`` s; it ends there or at the horizon."""
     times = scenario.times
+    # Earlier samples stay: they decide where continuous readings of an interval are split.
     probe = np.append(times[times < at], at)
     # Events at ``at`` itself, and in slots those of its slot, belong to the state: a replay ends a
     # slot later, or by more seconds than times are rounded by.

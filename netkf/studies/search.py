@@ -214,16 +214,12 @@ def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: fl
 
 
 def _is_futile(probe: Probe, target: Target, runs: int) -> bool:
-    """Return True if at least a quarter of ``runs``, the largest number allowed, are simulated and
-    the value of the ``probe`` is forecast to need more than FUTILE times ``runs``.
-    """
+    """Return True if a quarter of ``runs`` forecasts more than FUTILE times ``runs``."""
     return probe.runs >= runs // 4 and _runs_to_decide(probe, target) > FUTILE * runs
 
 
 def _runs_to_decide(probe: Probe, target: Target) -> float:
-    """Return the forecast number of runs after which the interval of a ``probe`` (a tried value of
-    the key) no longer contains the limit, if its estimate is right; nan if unknown.
-    """
+    """Return the forecast of the runs that decide a ``probe``; nan if unknown."""
     width, distance = 0.5 * (probe.high - probe.low), abs(probe.quantity - target.limit)
     if not math.isfinite(width):
         return math.nan
@@ -277,17 +273,13 @@ class Search:
         )
 
     def _detect_growth(self, first: Probe, last: Probe) -> bool:
-        """Return True if the quantity grows with the key from the probe ``first``, the lower end of
-        the range, to ``last``; upper bounds are compared with upper bounds only.
-        """
+        """Return True if the quantity grows with the key; bounds are compared with bounds only."""
         if BOUND in (first.by, last.by) and first.by != last.by:
             first, last = (decide_by_theory(self._problem, end.value) for end in (first, last))
         return last.quantity > first.quantity
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
-        """Return two neighbouring values of the key, of which the first reaches the target and the
-        second does not, from two such values, ``value`` and ``misses``, further apart.
-        """
+        """Return neighbouring values between ``value``, which meets the target, and ``misses``."""
         while len(self.probes) < MAX_PROBES[self._problem.by]:
             middle = self._value_between(*sorted((value, misses)))
             if middle is None:
@@ -309,9 +301,7 @@ class Search:
         return self.probes[-1]
 
     def _value_between(self, low: float, high: float) -> float | None:
-        """Return the value of the key to try next between ``low`` and ``high``, an integer or
-        rounded to DIGITS significant digits; None if there is none between them.
-        """
+        """Return the value to try between ``low`` and ``high``, to DIGITS, or None."""
         if self._problem.integer:
             middle = (low + high) // 2
             return int(middle) if low < middle < high else None
@@ -352,12 +342,7 @@ def advise(
 
 
 def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool) -> str:
-    """Return a text that advises on a range beyond the probe ``end``, at which the target was not
-    reached, extrapolated from it and the next one, ``inner``; empty if their quantities are not
-    positive and finite.
-
-    ``grows`` says that the quantity grows with the key.
-    """
+    """Advise on a range beyond the probe ``end``, extrapolated from it and ``inner``."""
     # The quantity is taken to be a power of the key.
     numbers = (end.value, inner.value, end.quantity, inner.quantity)
     if not all(math.isfinite(x) and x > 0.0 for x in numbers) or end.value == inner.value:
@@ -376,9 +361,7 @@ def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool
 
 
 def _advise_range(problem: SizingProblem, end: float, next_end: float) -> str:
-    """Return the text that advises to search between the values ``end`` and ``next_end`` of the
-    key, or why that is impossible; empty if there is nothing to advise.
-    """
+    """Advise to search ``end`` .. ``next_end``, or say why that is impossible."""
     if end == 0.0:
         return ""
     next_end = round(next_end) if problem.integer else float(f"{next_end:.2g}")
@@ -391,9 +374,7 @@ def _advise_range(problem: SizingProblem, end: float, next_end: float) -> str:
 
 
 def _advise_runs(probe: Probe, target: Target) -> str:
-    """Return a text on how many runs would decide the ``probe``, a value of the key that was tried;
-    empty if it is decided.
-    """
+    """Return how many runs would decide the ``probe``; empty if it is decided."""
     runs = _runs_to_decide(probe, target) if probe.target == UNDECIDED else math.nan
     if math.isnan(runs):
         return ""
@@ -405,12 +386,7 @@ def _advise_runs(probe: Probe, target: Target) -> str:
 def _describe_certainty(
     probes: tuple[Probe, ...], confidence: float, grows: bool, none_reached: bool
 ) -> str:
-    """Return a sentence for the user on how certain the answer of a search is, all of whose
-    decisions hold with probability ``confidence``, and what it assumes.
-
-    ``grows`` says that the quantity grows with the key, ``none_reached`` that no probe reaches the
-    target.
-    """
+    """Return a sentence on how certain the answer is and what it assumes."""
     if all(probe.runs == 0 for probe in probes):
         certainty = "computed, no simulation"
         if any(probe.target == NOT_SHOWN for probe in probes):

@@ -112,11 +112,7 @@ def size(
 
 
 def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> str:
-    """Return the text that tells the user what number is compared with the limit: ``simulated``
-    describes the simulated one; a bound that is tried first is put before it.
-
-    ``low`` is the value of the key at which the bound is described.
-    """
+    """Return what is compared with the limit: a bound if one is tried, then ``simulated``."""
     if problem.by != "both":
         return simulated
     bound = quantity_by_theory(problem.at(low), problem.target)[1]
@@ -124,11 +120,7 @@ def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> st
 
 
 def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
-    """Return the task that simulates a block of replicas for a probe of the key, a description of
-    the quantity that it gives, and the number of runs before the first decision.
-
-    ``low`` is the lower end of the range, at which it is tried whether expected errors are known.
-    """
+    """Return the task of a probe, a description of its quantity, and the runs before a decision."""
     quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
     # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
     if problem.target.of_errors and expected_errors_known(problem.at(low)):
@@ -144,9 +136,7 @@ def _count_looks(runs: int, first: int) -> int:
 
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
-    """Return True if the ``key`` to search has integers as values, False if it has other numbers;
-    raises ScenarioError for a range ``low`` .. ``high`` that does not fit it, or a wrong key.
-    """
+    """Return whether the ``key`` has integers as values; raises ScenarioError for a bad range."""
     is_integer = is_integer_key(scenario, key)
     for end in (low, high):
         if is_integer and not isinstance(end, int):
@@ -161,10 +151,7 @@ def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
 
 
 def _choose_method(scenario: Scenario, key: str, ends: tuple[float, float], target: Target) -> str:
-    """Return how values of ``key`` are compared with the target if the user does not say: "theory"
-    if theory gives the target's quantity exactly at both ``ends`` of the range, "both" (theory,
-    then simulation) if it gives an upper bound, else "simulation".
-    """
+    """Return "theory" if exact at both ``ends``, "both" if there is a bound, else "simulation"."""
     scenarios = [scenario.replace({key: end}) for end in ends]
     try:
         for at_end in scenarios:

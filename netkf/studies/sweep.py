@@ -121,11 +121,7 @@ def plan_sweep(
 def _simulate_points(
     plan: SweepPlan, options: PoolOptions, progress: Progress | None
 ) -> Iterator[Row]:
-    """Yield the row of each point when it is finished.
-
-    ``options`` are those of the pool of workers; ``progress`` is called with the numbers of points
-    done and of all points after each point.
-    """
+    """Yield the row of each point when it is finished."""
     with shared_pool(plan.runs, options) as pool:
         for k, point in enumerate(plan.points):
             with explain_failures(point.scenario):
@@ -137,9 +133,6 @@ def _simulate_points(
 
 
 def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
-    """Return the row of a grid point in the table of a sweep: the varied values, means over the
-    runs with standard errors, bounds by theory (nan without one), messages and status.
-    """
     quantities: dict[str, MeanEstimate] = {
         "worst_rms": square_root_of(worst_node(metrics.mean_square)),
         "mean_rms": square_root_of(all_nodes(metrics.mean_square)),
@@ -159,9 +152,6 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
 
 
 def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
-    """Return the ``status`` of a grid point in the table: "complete" or how many runs diverged, and
-    from when on rounding blurs errors, which are left out then.
-    """
     diverged = int(metrics.diverged.sum())
     status = f"{diverged} diverged" if diverged else "complete"
     blurred = float(metrics.rounding_from.min())
@@ -249,9 +239,6 @@ def _write_rows(completed: CompletedSweep) -> None:
 
 
 def _write_manifest(directory: Path, plan: SweepPlan, points_done: int, status: str) -> None:
-    """Write manifest.json of a sweep with ``points_done`` points into ``directory``; ``status`` is
-    "complete", "interrupted" or "failed".
-    """
     manifest = {
         "name": plan.base.name,
         "versions": versions(),

@@ -43,9 +43,6 @@ def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
 
 
 def _format_short(value: Any) -> str:
-    """Return the value of a varied key as a text of at most MAX_LENGTH characters for a cell of the
-    table; longer texts are cut and end with "...".
-    """
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= MAX_LENGTH else f"{text[: MAX_LENGTH - 3]}..."
 
@@ -142,9 +139,7 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
 
 
 def _worst_first(consistency: Consistency, full: bool) -> list[NodeConsistency]:
-    """Return the rows of all nodes in their order; of a table that is shortened those of nodes
-    whose P is inconsistent come first.
-    """
+    """Return the rows in order; in a shortened table inconsistent nodes come first."""
     rows = list(consistency.rows)
     if full or len(rows) <= MAX_ROWS:
         return rows
@@ -192,9 +187,7 @@ def format_filters(comparison: FilterComparison) -> str:
 
 
 def _format_quantity(cells: Quantity) -> tuple[str, str]:
-    """Return the texts of two cells: the value with its standard error, and the difference from the
-    first filter with half its interval, starred if the interval excludes 0.
-    """
+    """Return the cells of a value and of its difference, starred if its interval excludes 0."""
     difference = "-"
     if math.isfinite(cells.difference):
         width = 0.5 * (cells.high - cells.low)

@@ -106,11 +106,7 @@ def _starts_with_the_truth(scenario: Scenario) -> bool:
 
 
 def _explain_errors(scenario: Scenario) -> str:
-    """Return an addition to the text on a bound on P, which says why P in turn bounds the
-    covariance of the errors (hybrid paper, H equation 10); empty where P is that covariance.
-
-    Raises TheoryError if P need not bound it.
-    """
+    """Return why P bounds the errors (Tanwani, H (10)); raises TheoryError if it need not."""
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model differs from the truth: P need not bound the errors")
     rows = assumptions(scenario)

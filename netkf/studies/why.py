@@ -140,13 +140,7 @@ def why(
 def _check_run(
     run: Run | str | Path, scenario: Scenario | None, replica: int | None, trust: bool
 ) -> tuple[Run, Scenario]:
-    """Return the run that ``netkf.why`` is asked about, with all its events, and its scenario;
-    raises ScenarioError if there is none, or arguments contradict it.
-
-    ``run`` may be a directory: of a run, or of an ensemble, in which ``replica`` is the number of
-    the run. ``trust`` imports classes of modules in it. ``scenario`` is for a run in memory that
-    does not know its own.
-    """
+    """Return the run with its events and its scenario; raises ScenarioError."""
     name = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
         run = _read_run(run, replica, trust)
@@ -167,11 +161,7 @@ def _check_run(
 
 
 def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
-    """Return a run that is read back from its ``directory``, or run number ``replica`` (None: 0) of
-    the ensemble there; raises ScenarioError if the directory holds something else.
-
-    ``trust`` imports classes of modules in the directory.
-    """
+    """Return the run of a ``directory``, or run ``replica`` (None: 0) of the ensemble there."""
     stored = open_directory(directory, trust=trust)
     if isinstance(stored, Run):
         return stored
@@ -197,9 +187,7 @@ def _check_node(scenario: Scenario, node: int | str) -> int:
 
 
 def _check_instant(run: Run, scenario: Scenario, at: float) -> float:
-    """Return the time ``at`` (seconds) that is asked about, in slots the start of its slot; raises
-    ScenarioError if the run has no such time.
-    """
+    """Return ``at`` (seconds), in slots the start of its slot; raises ScenarioError."""
     time: float = number(low=0.0, high=scenario.horizon)("at", at)
     if run.status not in ("complete", "diverged") and not time <= max(run.times, default=-1.0):
         rule = f"lies beyond what was kept of a run that ended as {run.status}"
@@ -211,9 +199,7 @@ def _check_instant(run: Run, scenario: Scenario, at: float) -> float:
 
 
 def _require_same_events(logged: IntArray, replayed: IntArray) -> None:
-    """Raise ScenarioError unless the EVENT rows ``replayed`` (E,) of a replay, in which nothing was
-    changed, are those ``logged`` (E,) by the run: only then replays with changes say something.
-    """
+    """Raise ScenarioError unless an unchanged replay has the events of the run."""
     same = len(logged) == len(replayed) and all(
         np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
         for name in logged.dtype.names or ()
@@ -224,19 +210,10 @@ def _require_same_events(logged: IntArray, replayed: IntArray) -> None:
 
 
 class _Evidence:
-    """The evidence in the events of a run about one node at one instant.
-
-    ``missing`` are the messages that were not used; ``same_sends`` is True if the replay with all
-    messages sends the same messages as the run, so that it tells when each missing message would
-    have been used. Otherwise they are taken to be used when they were sent (at_once).
-    """
+    """The evidence in the events of a run about one node at one instant."""
 
     def __init__(self, replayer: Replayer, node: int, max_missing: int) -> None:
-        """Find the messages of the run, and search for all paths on which information reached, or
-        with up to ``max_missing`` missing messages could have reached, ``node`` (its id).
-
-        ``replayer`` replays the run as it was and with all messages delivered.
-        """
+        """Search the paths on which information reached, or could have reached, ``node``."""
         self._replayer, self._node, self._max_missing = replayer, node, max_missing
         self.scenario = replayer.scenario
         talks, links = self.scenario.node_filter.talks, self.scenario.topology.directions
@@ -264,11 +241,7 @@ class _Evidence:
         }
 
     def candidates(self) -> list[Candidate]:
-        """Return the messages that were not used in the run but from which information could have
-        reached the node, each with the least number of such missing messages (itself and those that
-        pass its information on) that would have to come for that. The smallest set is sought among
-        them.
-        """
+        """Return the unused messages whose information could have reached the node."""
         candidates = []
         # The cost of a message is 1 if it was not used in the run, else 0.
         for m in np.flatnonzero(self._flow.cost).tolist():
@@ -279,9 +252,7 @@ class _Evidence:
         return candidates
 
     def sources(self) -> tuple[InformationSource, ...]:
-        """Return what had reached the node from every other node, and from its own sensor: ages of
-        messages and readings, and what missing messages would have changed.
-        """
+        """Return what had reached the node from every other node and its own sensor."""
         scenario, at = self.scenario, self._replayer.at
         readings = KeptReadings(scenario, self._log, at)
         # Newest information of each node with at most 0, 1, ... missing messages delivered.
@@ -300,12 +271,7 @@ class _Evidence:
     def _make_source(
         self, node: int, newest_by_budget: Sequence[Newest | None], without_losses: Newest | None
     ) -> InformationSource:
-        """Return what the estimate has from ``node``: last message, newest reading and its route,
-        and the missing messages that would have brought a newer one.
-
-        ``newest_by_budget`` is the newest information with 0, 1, ... missing messages delivered,
-        ``without_losses`` that with all of them.
-        """
+        """Return what the estimate has from ``node``, and what missing messages would add."""
         reading, *with_more = [math.nan if n is None else n.reading for n in newest_by_budget]
         last, unheard = self._find_last_message(node)
         path_nodes: tuple[int, ...] = ()
@@ -340,10 +306,7 @@ class _Evidence:
         )
 
     def _find_last_message(self, sender: int) -> tuple[int | None, int]:
-        """Return the index of the last message that the node used of those that ``sender`` (an id)
-        sent to it, None without one, and the number of those sent since then that it did not use:
-        lost, late, replaced by another or still under way.
-        """
+        """Return the last used message of ``sender``, or None, and how many are unused since."""
         messages = self.messages
         # Messages are sorted by sender. Ids of its type: others would be compared in a copy.
         ids = np.array([sender, sender + 1], dtype=messages.sender.dtype)
@@ -358,23 +321,16 @@ class _Evidence:
 
 
 def _time_known(newest: Newest | None) -> float:
-    """Return the last time in seconds up to which a node's information is included in the estimate;
-    nan if that is the end of the log, or if there is no information (None).
-    """
+    """Return the time (s) up to which information is included; nan: the end of the log, or none."""
     return math.nan if newest is None else newest.known
 
 
 def _is_newer(reading: float, than: float) -> bool:
-    """Return True if the time of a ``reading`` is later than that of another, any being later than
-    none (nan).
-    """
+    """Return True if a ``reading`` is later than another; any is later than none (nan)."""
     return reading > than or (math.isnan(than) and not math.isnan(reading))
 
 
 def _describe_missing(messages: Messages, m: int, topology: Topology) -> Missing:
-    """Return message ``m`` (its index), which was not used, as tables and texts name it: its ids
-    and number, why it was not used, and its times in seconds.
-    """
     sender, receiver, number = messages.key(m)
     return Missing(
         MessageKey(topology.named(sender), topology.named(receiver), number),
@@ -387,14 +343,7 @@ def _describe_missing(messages: Messages, m: int, topology: Topology) -> Missing
 def _make_what_ifs(
     replayer: Replayer, sources: Sequence[InformationSource], smallest: SmallestSet | None
 ) -> tuple[tuple[WhatIf, ...], int]:
-    """Return the trace of P and the error in the run as it was and in replays with more messages
-    delivered, and how many replays with newer readings were left out because the run is long.
-
-    Each replay delivers one set of messages that did not arrive in the run: those that would have
-    brought newer readings of a node, all of these, the ``smallest`` set that brings the trace below
-    its limit (or the best set tried), and every message. ``sources`` tell for each other node which
-    missing messages would have brought newer readings of it.
-    """
+    """Return the replays that answer "what if", and how many were left out in a long run."""
     # Label and messages of each replay; None stands for every message.
     delivered_sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
     newer = _group_by_missing(sources)
@@ -424,10 +373,7 @@ def _make_what_ifs(
 def _group_by_missing(
     sources: Sequence[InformationSource],
 ) -> dict[tuple[MessageKey, ...], list[InformationSource]]:
-    """Return the sources (nodes whose information reached the node) grouped by the missing messages
-    that would have brought newer readings of them: one replay serves a group. The keys are tuples
-    of these messages.
-    """
+    """Group the sources by the missing messages that would have brought newer readings."""
     groups: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
     for source in sources:
         if source.missing:
@@ -436,18 +382,14 @@ def _group_by_missing(
 
 
 def _time_gained(source: InformationSource) -> float:
-    """Return by how many seconds the newest reading of a source would be newer with its missing
-    messages; inf if the node has none of it.
-    """
+    """Return by how many seconds missing messages renew a source's reading; inf without one."""
     if math.isnan(source.reading):
         return math.inf
     return source.with_more[len(source.missing) - 1] - source.reading
 
 
 def _replay_notes(evidence: _Evidence, left_out: int) -> tuple[str, ...]:
-    """Return sentences for the user on the limits of the replays, of which ``left_out`` were not
-    made because the run is long.
-    """
+    """Return sentences on the limits of the replays, of which ``left_out`` were not made."""
     notes = []
     if left_out:
         notes.append(

@@ -102,9 +102,6 @@ def _message_entries(
 
 
 def _message_entry(explanation: Explanation, key: MessageKey) -> dict[str, Any]:
-    """Return the message ``key``, which was not used in the run, as an entry of the JSON document:
-    its ids and number, why it was not used, and its times in seconds.
-    """
     missing = explanation.missing[key]
     return {
         "sender": key.sender,
@@ -144,9 +141,6 @@ def write_sentences(explanation: Explanation) -> list[str]:
 
 
 def _state_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield the sentence about the estimate of the node at the time asked about: trace of P and
-    length of the error.
-    """
     run = f"seed {explanation.seed}, replica {explanation.replica}"
     scenario = shorten(explanation.scenario, 60)
     sentence = f"Node {explanation.node} at {explanation.at:g} s ({scenario}, {run})"
@@ -160,9 +154,7 @@ def _state_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _heard_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield sentences about the neighbours from which the node has used a message, and when the
-    last ones were sent, and about messages since then that it has not used.
-    """
+    """Yield sentences on the last message of each neighbour and on those not used since."""
     neighbours = [s for s in explanation.sources if s.neighbour]
     if not neighbours:
         yield f"No other node sends to node {explanation.node}."
@@ -182,9 +174,7 @@ def _heard_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _unheard_sentence(neighbours: list[InformationSource]) -> str:
-    """Return the sentence on the messages that ``neighbours`` sent since the last one that the node
-    used from each of them.
-    """
+    """Return the sentence on messages sent since the last one that was used."""
     unheard = sum(s.unheard for s in neighbours)
     counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
     noun = "message" if unheard == 1 else "messages"
@@ -196,9 +186,7 @@ def _unheard_sentence(neighbours: list[InformationSource]) -> str:
 
 
 def _reading_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield sentences about the newest reading of each other sensor whose information the node's
-    estimate contains, and about newer ones that did not reach it because messages were lost.
-    """
+    """Yield sentences on the newest readings in the estimate, and on newer ones that were lost."""
     sensors = [s for s in explanation.sources if s.sensor and s.node != explanation.node]
     with_reading = sorted(
         (s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading
@@ -221,9 +209,6 @@ def _reading_sentences(explanation: Explanation) -> Iterator[str]:
 def _missed_reading_sentences(
     explanation: Explanation, sensors: list[InformationSource]
 ) -> Iterator[str]:
-    """Yield sentences about the missing messages that would have brought newer readings of
-    ``sensors``, nodes with sensors.
-    """
     kept_from_newer = [s for s in sensors if s.missing]
     for source in kept_from_newer[:MAX_LISTED]:
         # with_more[k - 1]: time of the newest reading with k more messages.
@@ -241,9 +226,7 @@ def _missed_reading_sentences(
 
 
 def _smallest_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield the sentences on the smallest set of missing messages that would have brought trace P
-    down to the limit, or on why none was found; none if the filter gives no P.
-    """
+    """Yield the sentences on the smallest set of missing messages; none without P."""
     # The last replay is the one in which no message is missing.
     smallest, no_losses = explanation.smallest, explanation.what_ifs[-1]
     if smallest is None:
@@ -289,9 +272,7 @@ def _smallest_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _format_limit(explanation: Explanation, smallest: SmallestSet) -> str:
-    """Return the limit that a set of messages had to bring trace P down to as text; the default
-    limit with its meaning, relative to the run in which no message is missing.
-    """
+    """Return the limit on trace P as text, with the meaning of the default."""
     usual = (1.0 + GOOD_ENOUGH) * explanation.what_ifs[-1].trace
     where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
     is_default = math.isclose(smallest.limit, usual, rel_tol=1e-9)
@@ -299,9 +280,6 @@ def _format_limit(explanation: Explanation, smallest: SmallestSet) -> str:
 
 
 def _describe_search(smallest: SmallestSet) -> str:
-    """Return a text on the effort of the search for the smallest set: how many messages could have
-    mattered, how many of them it considered, and the number of replays.
-    """
     sentence = f"{smallest.candidates} messages could have mattered"
     if smallest.considered < smallest.candidates:
         if not smallest.considered:
@@ -312,9 +290,7 @@ def _describe_search(smallest: SmallestSet) -> str:
 
 
 def _source_table(explanation: Explanation) -> str:
-    """Return the table of sources (nodes whose information could reach the node) for a terminal:
-    those with a sensor or a link to it; the others are only counted.
-    """
+    """Return the table of nodes with a sensor or a link to the node; others are counted."""
     listed = [
         s for s in explanation.sources if s.sensor or s.neighbour or s.node == explanation.node
     ]
@@ -345,10 +321,6 @@ def _source_table(explanation: Explanation) -> str:
 
 
 def _replay_table(explanation: Explanation) -> str:
-    """Return the table of replays, runs repeated with some missing messages delivered: the number
-    of these messages, trace P, its change in percent, and the length of the error if the truth is
-    known.
-    """
     truth = any(math.isfinite(w.error) for w in explanation.what_ifs)
     header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
     rows = [
@@ -398,9 +370,7 @@ def _format_time_before(explanation: Explanation, seconds: float) -> str:
 
 
 def _format_route(source: InformationSource) -> str:
-    """Return as text the nodes through which the newest reading of a source came, in the middle
-    shortened.
-    """
+    """Return the nodes of a route as text, shortened in the middle."""
     if not source.route:
         return "-"
     if len(source.route) == 1:
@@ -412,10 +382,7 @@ def _format_route(source: InformationSource) -> str:
 
 
 def _list_items(items: Sequence[object], others: str = "others") -> str:
-    """Return the first MAX_LISTED items joined by commas and "and", and the number of the others.
-
-    ``others`` is what the text calls these.
-    """
+    """Return the first MAX_LISTED items joined, and the number of the ``others``."""
     parts = [str(item) for item in items[:MAX_LISTED]]
     more = len(items) - len(parts)
     return _join_with_and([*parts, f"{more} {others}"] if more else parts)
