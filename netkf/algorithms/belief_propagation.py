@@ -280,11 +280,12 @@ def update_beliefs(
     if not arrays.keeps:
         # root = Z^-1 and xhat = centre + Z^-1 z in all lanes (False: none keeps its estimate).
         finish_lanes(
-            lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, beliefs.total, beliefs.work, False
+            lanes, nodes.root[b], nodes.xhat[b], h, scratch.xhat, beliefs.total, beliefs.work, False
         )  # fmt: skip
         return
     finish_lanes(
-        lanes, beliefs.root, beliefs.step, 0, 0, beliefs.origin, beliefs.total, beliefs.work, False
+        lanes, beliefs.root[0], beliefs.step[0], 0, beliefs.origin, beliefs.total, beliefs.work,
+        False,
     )  # fmt: skip
     # root = W Z^-1, made triangular, and xhat = centre + W Z^-1 z.
     n, origin, step = nodes.xhat.shape[2], beliefs.origin[0], beliefs.step[0, 0]
@@ -348,7 +349,7 @@ def finish_single(
     ``centre`` (1, n, 1): its root Z^-1 into ``root`` (1, 1, n, n, 1) and ``centre + Z^-1 z`` into
     ``x`` (1, 1, n, 1); ``work`` (n, n + 1, 1) is scratch.
     """
-    finish_lanes(ONE, root, x, 0, 0, centre, total, work, False)
+    finish_lanes(ONE, root[0], x[0], 0, centre, total, work, False)
 
 
 @built_in("belief-propagation")

@@ -141,7 +141,7 @@ def diffusion_slots(
                             i,
                             load(scratch.lanes, nodes.xhat, b, h, i),
                         )
-                    invert_lanes(scratch.lanes, scratch.root, nodes.root, b, h)
+                    invert_lanes(scratch.lanes, scratch.root, h, nodes.root[b], h)
                 for h in range(len(nodes.rows)):
                     combine_senders(nodes, plan, links, scratch, weights, b, s, h)
 
@@ -175,21 +175,21 @@ def combine_senders(
         return
     # sum w_j P_j^-1 as a root [Z, z] relative to the own estimate: the own term first, then the
     # others are merged into it.
-    whiten(lanes, scratch.total, own, scratch.root, scratch.xhat, h, h)
+    whiten(lanes, scratch.total, own, scratch.root, scratch.xhat, h, scratch.xhat, h)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         # A weight of 0 adds no information.
         if links.weight[m] > 0.0 and any_lane(arrived):
             weight = select(arrived, links.weight[m] / divisor, 0.0)
-            whiten(lanes, scratch.whitened, weight, scratch.root, scratch.xhat, links.sender[m], h)
+            j, x = links.sender[m], scratch.xhat
+            whiten(lanes, scratch.whitened, weight, scratch.root, x, j, x, h)
             merge_lanes(lanes, scratch.total, scratch.whitened)
     # P = (sum w_j P_j^-1)^-1, paper D (8), and the mean P sum w_j P_j^-1 x_j, (9); in lanes with
     # own weight 1 nothing changes.
     finish_lanes(
         lanes,
-        nodes.root,
-        nodes.xhat,
-        b,
+        nodes.root[b],
+        nodes.xhat[b],
         h,
         scratch.xhat,
         scratch.total,

@@ -292,21 +292,21 @@ def combine_copies(
                 arrays.has_copy[b, m, q] = 1
         # A silent neighbour counts too: its estimate is near its copy.
         copied_weight += select(load_flags(lanes, arrays.has_copy, b, m), links.weight[m], 0.0)
-        invert_lanes(lanes, arrays.inverse, arrays.root, b, m)
+        invert_lanes(lanes, arrays.inverse, m, arrays.root[b], m)
         for i in range(n):
             store(lanes, arrays.mean, m, i, load(lanes, arrays.x, b, m, i))
     # A node without any copy keeps its estimate, without rounding.
     has_no_copy = copied_weight == 0.0
     if not any_lane(copied_weight > 0.0):
         return
-    invert_lanes(lanes, arrays.inverse, arrays.root, b, own)
+    invert_lanes(lanes, arrays.inverse, own, arrays.root[b], own)
     for i in range(n):
         x = load(lanes, arrays.x, b, own, i)
         store(lanes, arrays.mean, own, i, x)
         store(lanes, scratch.xhat, h, i, x)
     # Covariance intersection: sum_j w_j P_j^-1, as roots that are merged one after the other.
     own_weight = select(copied_weight < 1.0, 1.0 - copied_weight, 0.0)
-    whiten(lanes, scratch.total, own_weight, arrays.inverse, arrays.mean, own, own)
+    whiten(lanes, scratch.total, own_weight, arrays.inverse, arrays.mean, own, arrays.mean, own)
     for m in range(links.first[h], links.first[h + 1]):
         arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
         has_copy = load_flags(lanes, arrays.has_copy, b, m)
@@ -314,11 +314,12 @@ def combine_copies(
             # The covariance of a silent neighbour's copy is enlarged by 1 / share.
             weight = select(arrived, links.weight[m], arrays.share * links.weight[m])
             weight = select(has_copy, weight, 0.0)
-            whiten(lanes, scratch.whitened, weight, arrays.inverse, arrays.mean, m, own)
+            mean = arrays.mean
+            whiten(lanes, scratch.whitened, weight, arrays.inverse, mean, m, mean, own)
             merge_lanes(lanes, scratch.total, scratch.whitened)
     # root = Z^-1 and xhat = own + Z^-1 z, but unchanged in lanes without any copy.
     finish_lanes(
-        lanes, nodes.root, nodes.xhat, b, h, scratch.xhat, scratch.total, scratch.whitened,
+        lanes, nodes.root[b], nodes.xhat[b], h, scratch.xhat, scratch.total, scratch.whitened,
         has_no_copy,
     )  # fmt: skip
 

@@ -185,7 +185,7 @@ def begin_all(
     for h in range(len(nodes.rows)):
         for i in range(nodes.xhat.shape[2]):
             store(scratch.lanes, scratch.xhat, h, i, load(scratch.lanes, nodes.xhat, b, h, i))
-        invert_lanes(scratch.lanes, scratch.root, nodes.root, b, h)
+        invert_lanes(scratch.lanes, scratch.root, h, nodes.root[b], h)
         for k in range(len(arrays.shares)):
             begin_part(
                 scratch.lanes, arrays.parts, k, arrays.shares, scratch.root, readings.y, readings.H,
@@ -235,7 +235,7 @@ def write_estimate_single(
     ``root`` and ``centre`` (1, n, 1) hold the prediction; ``inverse`` (1, n, n, 1) and ``work``
     (2, n, n + 1, 1) are scratch.
     """
-    invert_lanes(ONE, inverse, root, 0, 0)
+    invert_lanes(ONE, inverse, 0, root[0], 0)
     write_estimate(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
 
 

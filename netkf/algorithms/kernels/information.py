@@ -249,4 +249,4 @@ def write_estimate(
         weigh_part(lanes, work, spread(lanes, counts[k]), parts, (t, k, h), centre, h)
         merge_lanes(lanes, total, work)
     # False: no lane keeps its former estimate.
-    finish_lanes(lanes, root, xhat, b, h, centre, total, work, False)
+    finish_lanes(lanes, root[b], xhat[b], h, centre, total, work, False)

@@ -20,34 +20,33 @@ from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, 
 
 
 @kernel(inlined=True)
-def invert_lanes(lanes: Lanes, out: FloatArray, root: FloatArray, b: int, h: int) -> None:
-    """Write the inverse of ``root[b, h]`` (n, n, L), the lower triangular root of filter ``h`` of
-    block ``b``, into ``out[h]`` of ``out`` (H, n, n, L).
+def invert_lanes(lanes: Lanes, out: FloatArray, k: int, root: FloatArray, m: int) -> None:
+    """Write the inverse of the lower triangular ``root[m]`` (n, n, L) into ``out[k]``.
 
     Pivots are raised to SINGULAR (2^-25) times the length of their row: soon after a start from
-    P = 0 some are rounding. That makes P no smaller. Axes: H filters, L runs side by side.
+    P = 0 some are rounding. That makes P no smaller.
     """
     # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
-    n, smallest = root.shape[2], spread(lanes, TINY)
+    n, smallest = root.shape[1], spread(lanes, TINY)
     for i in range(n):
         for j in range(i + 1):
-            entry = load(lanes, root, b, h, i, j)
+            entry = load(lanes, root, m, i, j)
             smallest += NEGLIGIBLE * entry * entry
     for i in range(n):
         row = smallest
         for j in range(i + 1):
-            entry = load(lanes, root, b, h, i, j)
+            entry = load(lanes, root, m, i, j)
             row += entry * entry
-        diagonal, floor = load(lanes, root, b, h, i, i), SINGULAR * root_of(row)
+        diagonal, floor = load(lanes, root, m, i, i), SINGULAR * root_of(row)
         length = magnitude(diagonal)
         inverse = 1.0 / with_sign(select(length > floor, length, floor), diagonal)
         # Forward substitution, row i of S^-1.
         for j in range(i):
             value = spread(lanes, 0.0)
-            for m in range(j, i):
-                value -= load(lanes, root, b, h, i, m) * load(lanes, out, h, m, j)
-            store(lanes, out, h, i, j, value * inverse)
-        store(lanes, out, h, i, i, inverse)
+            for q in range(j, i):
+                value -= load(lanes, root, m, i, q) * load(lanes, out, k, q, j)
+            store(lanes, out, k, i, j, value * inverse)
+        store(lanes, out, k, i, i, inverse)
 
 
 @kernel(inlined=True)
@@ -56,25 +55,23 @@ def whiten(
     out: FloatArray,
     weight: Any,
     inverse: FloatArray,
-    xhat: FloatArray,
-    sender: int,
+    x: FloatArray,
+    m: int,
+    centre: FloatArray,
     h: int,
 ) -> None:
-    """Write ``sqrt(weight) [Z, Z (x - xhat[h])]`` of the estimate x = ``xhat[sender]`` into ``out``
-    (n, n + 1, L): a root of ``weight`` (L,) times its information, with Z = S^-1 =
-    ``inverse[sender]``.
-
-    ``inverse`` (H, n, n, L) and ``xhat`` (H, n, L) are those of all H filters of a block. Axes: L
-    runs side by side.
+    """Write ``sqrt(weight) [Z, Z (x[m] - centre[h])]`` into ``out`` (n, n + 1, L): a root of
+    ``weight`` (L,) times the information of the estimate ``x[m]`` (n, L), relative to ``centre[h]``
+    (n, L), with the inverse Z = ``inverse[m]`` (n, n, L) of its root.
     """
     n, factor = inverse.shape[1], root_of(weight)
     for i in range(n):
         mean = spread(lanes, 0.0)
         # sqrt(w) S^-1, a root of w P^-1.
         for j in range(i + 1):
-            entry = factor * load(lanes, inverse, sender, i, j)
+            entry = factor * load(lanes, inverse, m, i, j)
             store(lanes, out, i, j, entry)
-            mean += entry * (load(lanes, xhat, sender, j) - load(lanes, xhat, h, j))
+            mean += entry * (load(lanes, x, m, j) - load(lanes, centre, h, j))
         store(lanes, out, i, n, mean)
 
 
@@ -117,7 +114,6 @@ def finish_lanes(
     lanes: Lanes,
     root: FloatArray,
     xhat: FloatArray,
-    b: int,
     h: int,
     centre: FloatArray,
     total: FloatArray,
@@ -125,11 +121,11 @@ def finish_lanes(
     unchanged: Any,
 ) -> None:
     """Write the estimate of the information ``total`` (n, n + 1, L), [Z, z] relative to
-    ``centre[h]`` of ``centre`` (H, n, L), into filter ``h`` of block ``b``: Z^-1 into
-    ``root[b, h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[b, h]`` (n, L).
+    ``centre[h]`` (n, L): Z^-1 into ``root[h]`` (n, n, L) and ``centre + Z^-1 z`` into ``xhat[h]``
+    (n, L), which may be the centre itself.
 
     Lanes with the flag ``unchanged`` (L,) keep their estimate; ``whitened`` (n, n + 1, L) is
-    scratch. Axes: H filters, L runs side by side.
+    scratch.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
     n = len(total)
@@ -147,5 +143,5 @@ def finish_lanes(
         for j in range(i + 1):
             entry = load(lanes, whitened, i, j)
             mean += entry * load(lanes, total, j, n)
-            store(lanes, root, b, h, i, j, select(unchanged, load(lanes, root, b, h, i, j), entry))
-        store(lanes, xhat, b, h, i, select(unchanged, load(lanes, xhat, b, h, i), mean))
+            store(lanes, root, h, i, j, select(unchanged, load(lanes, root, h, i, j), entry))
+        store(lanes, xhat, h, i, select(unchanged, load(lanes, xhat, h, i), mean))

@@ -176,7 +176,7 @@ def update_belief(state: Simulation, evidence: EvidenceArrays, h: int) -> None:
         add_part(ONE, total, evidence.received[evidence.direction[k]], work)
     # The root Z^-1 of the covariance of e and its step Z^-1 z; False: the one lane takes both.
     finish_lanes(
-        ONE, evidence.roots, evidence.step, 0, h, evidence.origin, total, work, False
+        ONE, evidence.roots[0], evidence.step[0], h, evidence.origin, total, work, False
     )  # fmt: skip
     W, step, origin = evidence.frames[h], evidence.step[0, h], evidence.origin[h]
     values, noise = state.flow_scratch.values, state.flow_scratch.T
