@@ -13,11 +13,8 @@ from netkf.cli import pictures
 from netkf.cli.options import (
     FAILED,
     Command,
-    add_all,
-    add_json,
-    add_no_plot,
-    add_pool,
-    add_seed,
+    add_confidence,
+    add_options,
     load_scenario,
     parse_count,
     print_json,
@@ -43,21 +40,13 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--most", type=parse_count, help="runs after which --until ends (default: 20000)"
     )
-    add_seed(parser)
-    parser.add_argument(
-        "--confidence",
-        type=float,
-        default=0.99,
-        help="probability with which all intervals hold together (default: 0.99)",
-    )
+    add_options(parser, "seed")
+    add_confidence(parser, 0.99, "with which all intervals hold together")
     parser.add_argument("--out", type=Path, help="directory for the verdict, its table and picture")
     parser.add_argument(
         "--resume", action="store_true", help="add runs to the verdict in --out, up to --runs"
     )
-    add_pool(parser)
-    add_all(parser)
-    add_json(parser)
-    add_no_plot(parser)
+    add_options(parser, "pool", "all", "json", "no-plot")
 
 
 def _run(options: argparse.Namespace) -> int:

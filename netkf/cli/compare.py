@@ -5,18 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from netkf.cli.options import Command, add_json, print_json
+from netkf.cli.options import Command, add_confidence, add_options, print_json
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
-    parser.add_argument(
-        "--confidence",
-        type=float,
-        default=0.95,
-        help="probability that all marks are right (default: 0.95)",
-    )
-    add_json(parser)
+    add_confidence(parser, 0.95, "that all marks are right")
+    add_options(parser, "json")
 
 
 def _run(options: argparse.Namespace) -> int:

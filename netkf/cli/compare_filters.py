@@ -8,11 +8,8 @@ from pathlib import Path
 from netkf.cli import pictures
 from netkf.cli.options import (
     Command,
-    add_engine,
-    add_json,
-    add_no_plot,
-    add_pool,
-    add_seed,
+    add_confidence,
+    add_options,
     load_scenario,
     parse_count,
     print_json,
@@ -33,18 +30,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--runs", type=parse_count, default=100, help="runs of each filter (default: 100)"
     )
-    parser.add_argument(
-        "--confidence",
-        type=float,
-        default=0.95,
-        help="probability that all marks are right (default: 0.95)",
-    )
+    add_confidence(parser, 0.95, "that all marks are right")
     parser.add_argument("--out", type=Path, help="directory for tables and a picture")
-    add_no_plot(parser)
-    add_seed(parser)
-    add_engine(parser)
-    add_pool(parser)
-    add_json(parser)
+    add_options(parser, "no-plot", "seed", "engine", "pool", "json")
 
 
 def _run(options: argparse.Namespace) -> int:

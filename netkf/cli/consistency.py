@@ -8,11 +8,8 @@ import sys
 from netkf.cli.options import (
     FAILED,
     Command,
-    add_all,
-    add_engine,
-    add_json,
-    add_pool,
-    add_seed,
+    add_confidence,
+    add_options,
     load_scenario,
     parse_count,
     print_json,
@@ -22,17 +19,8 @@ from netkf.cli.options import (
 
 def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=parse_count, default=50, help="number of runs (default: 50)")
-    parser.add_argument(
-        "--confidence",
-        type=float,
-        default=0.99,
-        help="probability that no consistent filter is called broken (default: 0.99)",
-    )
-    add_seed(parser)
-    add_engine(parser)
-    add_pool(parser)
-    add_all(parser)
-    add_json(parser)
+    add_confidence(parser, 0.99, "that no consistent filter is called broken")
+    add_options(parser, "seed", "engine", "pool", "all", "json")
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -94,43 +94,24 @@ def add_trust(parser: argparse.ArgumentParser, folder: str) -> None:
     )
 
 
-def add_seed(parser: argparse.ArgumentParser) -> None:
-    """Add ``--seed``."""
-    parser.add_argument("--seed", type=parse_seed, help="root seed (default: the scenario's)")
+def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add the options ``--NAME`` of SHARED; "pool" stands for ``--workers`` and ``--scheduler``,
+    which exclude each other.
+    """
+    for name in names:
+        if name != "pool":
+            parser.add_argument(f"--{name}", **SHARED[name])
+            continue
+        pool = parser.add_mutually_exclusive_group()
+        text = "number of processes (default: one per core)"
+        pool.add_argument("--workers", type=parse_workers, help=text)
+        pool.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
 
 
-def add_engine(parser: argparse.ArgumentParser) -> None:
-    """Add ``--engine``."""
-    parser.add_argument(
-        "--engine",
-        default="auto",
-        choices=ENGINES,
-        help="auto takes the compiled engine if it can run the scenario, else SimPy",
-    )
-
-
-def add_pool(parser: argparse.ArgumentParser) -> None:
-    """Add ``--workers`` and ``--scheduler``, which exclude each other."""
-    pool = parser.add_mutually_exclusive_group()
-    pool.add_argument(
-        "--workers", type=parse_workers, help="number of processes (default: one per core)"
-    )
-    pool.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
-    parser.add_argument("--json", action="store_true", help="print one JSON document only")
-
-
-def add_all(parser: argparse.ArgumentParser) -> None:
-    """Add ``--all``."""
-    parser.add_argument("--all", action="store_true", help="show all rows with all that they say")
-
-
-def add_no_plot(parser: argparse.ArgumentParser) -> None:
-    """Add ``--no-plot``."""
-    parser.add_argument("--no-plot", action="store_true", help="do not draw a picture")
+def add_confidence(parser: argparse.ArgumentParser, default: float, what: str) -> None:
+    """Add ``--confidence``, the probability ``what``, such as "that all marks are right"."""
+    text = f"probability {what} (default: {default})"
+    parser.add_argument("--confidence", type=float, default=default, help=text)
 
 
 def add_vary(parser: argparse.ArgumentParser, metavar: str, text: str) -> None:
@@ -179,6 +160,20 @@ def _parse_positive(text: str, largest: int) -> int:
         rule = f"must be an integer of at least 1 and at most {largest:,}"
         raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
     return int(text)
+
+
+SHARED: dict[str, dict[str, Any]] = {
+    "seed": {"type": parse_seed, "help": "root seed (default: the scenario's)"},
+    "engine": {
+        "default": "auto",
+        "choices": ENGINES,
+        "help": "auto takes the compiled engine if it can run the scenario, else SimPy",
+    },
+    "json": {"action": "store_true", "help": "print one JSON document only"},
+    "all": {"action": "store_true", "help": "show all rows with all that they say"},
+    "no-plot": {"action": "store_true", "help": "do not draw a picture"},
+}
+"""Options of several commands, as arguments of ``add_argument``."""
 
 
 def parse_changes(settings: Sequence[str]) -> dict[str, Any]:

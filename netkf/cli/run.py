@@ -13,10 +13,7 @@ from typing import TYPE_CHECKING, Any
 from netkf.cli import pictures
 from netkf.cli.options import (
     Command,
-    add_engine,
-    add_no_plot,
-    add_pool,
-    add_seed,
+    add_options,
     load_scenario,
     parse_count,
     parse_replica,
@@ -39,10 +36,9 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--replica", type=parse_replica, help="run this replica of an ensemble (default: 0)"
     )
-    add_seed(parser)
-    add_engine(parser)
+    add_options(parser, "seed", "engine")
     parser.add_argument("--out", type=Path, help="directory of the run (default: runs/NAME-k)")
-    add_pool(parser)
+    add_options(parser, "pool")
     parser.add_argument(
         "--trace",
         choices=["full", "first", "none"],
@@ -51,7 +47,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="continue the runs of --out that were stopped"
     )
-    add_no_plot(parser)
+    add_options(parser, "no-plot")
 
 
 def _run(options: argparse.Namespace) -> int:

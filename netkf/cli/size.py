@@ -8,10 +8,8 @@ import sys
 from netkf.cli.options import (
     FAILED,
     Command,
-    add_engine,
-    add_json,
-    add_pool,
-    add_seed,
+    add_confidence,
+    add_options,
     add_vary,
     load_scenario,
     parse_count,
@@ -42,16 +40,8 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         default=1000,
         help="at most this many runs per value (default: 1000)",
     )
-    parser.add_argument(
-        "--confidence",
-        type=float,
-        default=0.95,
-        help="probability that all decisions are right (default: 0.95)",
-    )
-    add_seed(parser)
-    add_engine(parser)
-    add_pool(parser)
-    add_json(parser)
+    add_confidence(parser, 0.95, "that all decisions are right")
+    add_options(parser, "seed", "engine", "pool", "json")
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -10,11 +10,7 @@ from typing import TYPE_CHECKING
 from netkf.cli import pictures
 from netkf.cli.options import (
     Command,
-    add_engine,
-    add_json,
-    add_no_plot,
-    add_pool,
-    add_seed,
+    add_options,
     add_vary,
     load_scenario,
     parse_count,
@@ -39,11 +35,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
         "--runs", type=parse_count, default=1, help="runs at each point (default: 1)"
     )
     parser.add_argument("--out", type=Path, help="directory (default: runs/NAME-sweep-k)")
-    add_no_plot(parser)
-    add_seed(parser)
-    add_engine(parser)
-    add_pool(parser)
-    add_json(parser)
+    add_options(parser, "no-plot", "seed", "engine", "pool", "json")
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from netkf.cli.options import Command, add_json, load_scenario, print_json, print_notes
+from netkf.cli.options import Command, add_options, load_scenario, print_json, print_notes
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    add_json(parser)
+    add_options(parser, "json")
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from netkf.cli.options import (
     Command,
-    add_json,
+    add_options,
     add_trust,
     parse_count,
     parse_replica,
@@ -58,7 +58,7 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     )
     add_trust(parser, "DIR")
     parser.add_argument("--out", type=Path, help="directory for the answer and its table")
-    add_json(parser)
+    add_options(parser, "json")
 
 
 def _parse_node(text: str) -> str:

@@ -195,13 +195,9 @@ def _mark_worst(
     if not headline:
         return "No error is finite"
     median = float(np.nanmedian(values[rows]))
-    return f"{headline}, {_compare_with_median(values[rows], median)}"
-
-
-def _compare_with_median(values: FloatArray, median: float) -> str:
-    """Return the ratio of the largest value to the ``median`` as text; the median if it is 0."""
-    largest = float(np.nanmax(values))
-    return f"{largest / median:.3g} times the median" if median > 0.0 else f"median {median:.3g}"
+    largest = float(np.nanmax(values[rows]))
+    ratio = f"{largest / median:.3g} times the median" if median > 0.0 else f"median {median:.3g}"
+    return f"{headline}, {ratio}"
 
 
 def ratios_figure(data: FigureData) -> Picture:

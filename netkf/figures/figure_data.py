@@ -146,7 +146,8 @@ class FigureData:
         if np.isfinite(self.rounding_from) and self.shows_errors:
             rounding = f"Rounding of a large state blurs errors from {self.rounding_from:g} s on."
         paragraph = " ".join(filter(None, (origin, self.ending, rounding, *sentences)))
-        return [paragraph, *self._paper_notes(notes)]
+        departures = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
+        return [paragraph, *(f"Note: {n}." for n, kind in departures if notes in (kind, "both"))]
 
     @property
     def ending(self) -> str:
@@ -167,11 +168,6 @@ class FigureData:
         if self.status in ("interrupted", "failed"):
             return f"It was {self.status}: the last sample is at {last} s of {horizon}."
         return ""
-
-    def _paper_notes(self, topic: str) -> list[str]:
-        """Return the notes on departures from the paper about "bound", "nees" or "both"."""
-        notes = [(note, "nees" if "NEES" in note else "bound") for note in self.promised.notes]
-        return [f"Note: {note}." for note, kind in notes if topic in (kind, "both")]
 
     def title(self, headline: str) -> str:
         """Return the title of a figure: the ``headline``, a sentence on what the figure shows,

@@ -120,14 +120,13 @@ def _map_stable(scenario: Scenario, rates: Sequence[float]) -> np.ndarray:
     # From a threshold on all rates have a steady state, and with fewer deliveries it is not lower:
     # one walk along the border instead of all points, each of which takes up to a second.
     for row in reversed(range(len(DELIVERIES))):
-        while first < len(rates) and not _is_stable(scenario, rates[first], DELIVERIES[row]):
+        delivery = DELIVERIES[row]
+        while first < len(rates) and not has_stabilising_gains(
+            scenario.replace({RATE: rates[first], DELIVERY: delivery})
+        ):
             first += 1
         stable[row, first:] = True
     return stable
-
-
-def _is_stable(scenario: Scenario, rate: float, delivery: float) -> bool:
-    return has_stabilising_gains(scenario.replace({RATE: rate, DELIVERY: delivery}))
 
 
 def sweep_figure(name: str, table: Any, keys: Sequence[str], status: str) -> Picture:
@@ -281,7 +280,8 @@ def law_figure(data: FigureData) -> Picture:
         if sample.size:
             label = f"run, nodes {description}" if has_both else "run, all nodes"
             _draw_tail(axes, sample, colour, dashes, label)
-    headline = _tail_headline(traces)
+    median, high = np.quantile(traces[np.isfinite(traces)], (0.5, 0.99))
+    headline = f"The median trace of P is {median:.3g}; 1% of samples exceed {high:.3g}"
     law_traces = _sample_invariant_law(data)
     if law_traces is not None:
         label = f"invariant law, {LAW_SAMPLES:,} draws"
@@ -311,12 +311,6 @@ def _draw_tail(axes: Any, sample: FloatArray, colour: str, dashes: str, label: s
     """Draw the share of an increasing ``sample`` (K,) at least as large as each value."""
     share = 1.0 - np.arange(len(sample)) / len(sample)
     axes.plot(sample, share, color=colour, ls=dashes, label=label, drawstyle="steps-post")
-
-
-def _tail_headline(values: FloatArray) -> str:
-    finite = values[np.isfinite(values)]
-    median, high = np.quantile(finite, (0.5, 0.99))
-    return f"The median trace of P is {median:.3g}; 1% of samples exceed {high:.3g}"
 
 
 def _hears_one_sensor(scenario: Scenario) -> np.ndarray:

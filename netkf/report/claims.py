@@ -19,7 +19,7 @@ from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_sampl
 from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
-from netkf.runs.tables import format_number
+from netkf.runs.tables import format_number, format_with_error
 from netkf.studies.compare import Comparison
 from netkf.studies.compare_filters import ComparedFilter
 from netkf.studies.filter_values import Quantity
@@ -338,12 +338,13 @@ def _describe_bound(source: ReportSource) -> list[str]:
     # The text is like "H(12), promised by ...": the name of the bound comes first.
     bound = summary["bound"].split(",")[0]
     # The node with the largest ratio need not be one that exceeds the bound beyond its error.
-    margin = _standard_errors_allowed(len(rows), source.runs)
+    miss = (1.0 - CONFIDENCE) / len(rows)
+    margin = -float(scipy.special.stdtrit(max(1, source.runs - 1), miss))
     exceeding = [row for row in rows if source.runs > 1 and _excess(row, margin) > 0.0]
     top = max(exceeding or rows, key=lambda row: float(row["mean_trace"]) / float(row["bound"]))
     ratio = float(top["mean_trace"]) / float(top["bound"])
     numbers = (
-        f"mean trace P {format_number(top['mean_trace'])}{_format_trace_error(top)} against "
+        f"mean trace P {format_with_error(top['mean_trace'], top.get('mean_trace_se'))} against "
         f"{format_number(top['bound'])} at node {top['node']}, ratio {format_number(ratio)}"
     )
     if exceeding:
@@ -360,22 +361,11 @@ def _describe_bound(source: ReportSource) -> list[str]:
     ]
 
 
-def _standard_errors_allowed(nodes: int, runs: int) -> float:
-    """Return the standard errors above the bound that all ``nodes`` keep with CONFIDENCE."""
-    return -float(scipy.special.stdtrit(max(1, runs - 1), (1.0 - CONFIDENCE) / nodes))
-
-
 def _excess(row: dict[str, Any], margin: float) -> float:
     """Return by how much a mean trace exceeds its bound beyond ``margin`` standard errors."""
     error = float(row.get("mean_trace_se") or 0.0)
     # Where P does not depend on chance it may equal its bound, up to rounding.
     return float(row["mean_trace"]) - margin * error - (1.0 + ROUNDING) * float(row["bound"])
-
-
-def _format_trace_error(row: dict[str, Any]) -> str:
-    """Return the standard error of the mean trace in a summary row as `` +- 0.1``, or empty."""
-    error = row.get("mean_trace_se")
-    return f" +- {error:.1g}" if error is not None else ""
 
 
 def _describe_verdict(source: ReportSource) -> list[str]:

@@ -92,7 +92,7 @@ def run_data(
         "period": source.period,
         "axes": _state_axes(source, run, worst),
         "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
-        "worst": _worst_data(worst),
+        "worst": None if worst is None else worst._asdict(),
         "scale": _interval_scales(),
         "samples": _sample_columns(source, run, rows, messages, packer),
         "messages": _message_columns(thinned, run, packer),
@@ -230,11 +230,6 @@ def _is_broadcast(run: StoredRun) -> bool:
     # Messages in slots have a phase of 0 or more.
     in_slots = bool((run.log["phase"][run.log["kind"] == CODES["send"]] >= 0).any())
     return in_slots or run.count("transmit") > 0
-
-
-def _worst_data(worst: WorstSample | None) -> dict[str, Any] | None:
-    """Return the worst sample as JSON values, None without one."""
-    return None if worst is None else worst._asdict()
 
 
 def _interval_scales() -> dict[str, float]:

@@ -150,7 +150,12 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
     if isinstance(stored, StoredComparison):
         return ReportSource(label, stored.manifest, stored.base, text, filters=stored)
     if isinstance(stored, StoredVerdict):
-        manifest = _verdict_manifest(stored)
+        manifest = {
+            "seed": stored.seed,
+            "status": "complete",
+            "runs": {"done": stored.runs, "wanted": stored.runs},
+            "versions": stored.document.get("versions", {}),
+        }
         return ReportSource(label, manifest, stored.scenario, text, verdict=stored.document)
     verdict = None
     if (directory / "verdict.json").exists():
@@ -186,13 +191,6 @@ def _choose_run(
     if replica is None and not (stored.directory / "states.parquet").exists():
         return None, stored
     return stored.replica(replica or 0), stored
-
-
-def _verdict_manifest(stored: StoredVerdict) -> dict[str, Any]:
-    """Return the entries of a manifest for a verdict, whose directory has none."""
-    runs = {"done": stored.runs, "wanted": stored.runs}
-    versions = stored.document.get("versions", {})
-    return {"seed": stored.seed, "status": "complete", "runs": runs, "versions": versions}
 
 
 def _read_scenario_text(path: Path) -> str:

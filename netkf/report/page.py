@@ -309,7 +309,12 @@ def _main_sections(
         title = "What would have mended the worst sample"
         parts.append(section("mending", title, "".join(explanations)))
     if comparison is not None:
-        parts.append(section("comparison", "What differs", _difference_tables(comparison)))
+        differences = (
+            paragraph(comparison)
+            if isinstance(comparison, str)
+            else tables.comparison_section(comparison)
+        )
+        parts.append(section("comparison", "What differs", differences))
     if any(source.kind not in ("filters", "verdict") for source in sources):
         parts.append(section("figures", "Figures", _curve_area(entries)))
     figures = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
@@ -329,13 +334,6 @@ def _curve_area(entries: list[_AnalysedSource]) -> str:
     reasons = dict.fromkeys(entry.readings for entry in entries if isinstance(entry.readings, str))
     notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
     return '<div id="curves" class="curves"></div>' + "".join(notes)
-
-
-def _difference_tables(comparison: Comparison | str) -> str:
-    """Return the table of differences as HTML, or the reason why there is none."""
-    if isinstance(comparison, str):
-        return paragraph(comparison)
-    return tables.comparison_section(comparison)
 
 
 def _explain_no_live_views(sources: list[ReportSource]) -> str:

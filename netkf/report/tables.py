@@ -41,7 +41,8 @@ def verdict_table(source: ReportSource) -> str:
     table: one row for each promise, broken ones first.
     """
     verdict = source.verdict or {}
-    rows = sorted(verdict.get("rows", []), key=_verdict_rank)
+    rank = {verdict: k for k, verdict in enumerate(VERDICT_ORDER)}
+    rows = sorted(verdict.get("rows", []), key=lambda row: rank.get(row["verdict"], len(rank)))
     cells = [
         (
             "BROKEN" if row["verdict"] == "broken" else row["verdict"],
@@ -59,12 +60,6 @@ def verdict_table(source: ReportSource) -> str:
     caption = f"Promises tested on {verdict.get('runs', 0):,} runs by netkf check"
     header = ("verdict", "promise", "source", "seen", "expected", "off by", "would see", "evidence")
     return table_box(caption, header, cells, "words")
-
-
-def _verdict_rank(row: dict[str, Any]) -> int:
-    """Return the sort key of a row: its index in VERDICT_ORDER, broken first."""
-    verdict = row["verdict"]
-    return VERDICT_ORDER.index(verdict) if verdict in VERDICT_ORDER else len(VERDICT_ORDER)
 
 
 def summary_section(source: ReportSource) -> str:

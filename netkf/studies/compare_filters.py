@@ -314,7 +314,10 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
 
 def _differing_settings(filters: Sequence[Any]) -> list[dict[str, str]]:
     """Return for each of several filters of one kind the settings that are not the same in all."""
-    tables = [_filter_settings(algorithm) for algorithm in filters]
+    tables = [
+        {name: one_line(value) for name, value in part_as_table(algorithm).items()}
+        for algorithm in filters
+    ]
     names = dict.fromkeys(name for table in tables for name in table)
     differing = [name for name in names if len({table.get(name) for table in tables}) > 1]
     # A setting that a table leaves out is at its default, which the filter has as an attribute.
@@ -322,11 +325,6 @@ def _differing_settings(filters: Sequence[Any]) -> list[dict[str, str]]:
         {name: shorten(table.get(name, str(getattr(algorithm, name)))) for name in differing}
         for algorithm, table in zip(filters, tables, strict=True)
     ]
-
-
-def _filter_settings(algorithm: Any) -> dict[str, str]:
-    """Return the settings of a filter as a scenario file has them, in one line each."""
-    return {name: one_line(value) for name, value in part_as_table(algorithm).items()}
 
 
 def _make_label(kind: str, settings: Mapping[str, Any]) -> str:

@@ -36,7 +36,9 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         panels = figure.subplots(1, len(PANELS) + 1, sharey=True)
         for axes, (name, label) in zip(panels, PANELS, strict=False):
             _draw_quantity(axes, rows, name, label)
-        _draw_traffic(panels[-1], rows)
+        kilobytes = [row.bytes / 1000.0 for row in rows]
+        panels[-1].barh(range(len(rows)), kilobytes, height=0.5, color=MUTED)
+        panels[-1].set_xlabel("kB sent in a run")
         labels = [shorten(row.filter, MAX_LABEL) for row in rows]
         panels[0].set_yticks(range(len(rows)), labels, parse_math=False)
         panels[0].invert_yaxis()
@@ -70,9 +72,3 @@ def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str)
         axes.set_xlim(left=0.0)
     if name == "nees_ratio":
         axes.axvline(1.0, color=MUTED, lw=0.8, ls="--")
-
-
-def _draw_traffic(axes: Any, rows: list[ComparedFilter]) -> None:
-    """Draw the bytes that all nodes send."""
-    axes.barh(range(len(rows)), [row.bytes / 1000.0 for row in rows], height=0.5, color=MUTED)
-    axes.set_xlabel("kB sent in a run")

@@ -189,7 +189,10 @@ class _Search:
         numbers = itertools.chain.from_iterable(itertools.combinations(range(count), size))
         chosen = np.fromiter(numbers, np.intp, math.comb(count, size) * size).reshape(-1, size)
         needed = np.array([c.needed for c in ranked[:count]], dtype=np.intp)
-        chosen = chosen[_are_joined(needed[chosen])]
+        # A message that needs k messages, itself included, needs one of each lower number: sorted,
+        # the numbers are at most 1, 2, 3, ...
+        joined = np.sort(needed[chosen], axis=1) <= np.arange(1, size + 1)
+        chosen = chosen[joined.all(axis=1)]
         # Keys in sorted order, so that a set has one form whatever the ranks of its members.
         keys = sorted(c.key for c in ranked[:count])
         index_of_key = {key: k for k, key in enumerate(keys)}
@@ -224,10 +227,3 @@ class _Search:
             for i, j in itertools.combinations(range(size), 2):
                 gains += interactions[members[:, i], members[:, j]]
         return gains
-
-
-def _are_joined(needed: np.ndarray) -> np.ndarray:
-    """Return a mask (S,) of the sets with enough messages to carry the information of each on."""
-    # A message that needs k messages, itself included, needs one of each lower number: sorted, the
-    # numbers are at most 1, 2, 3, ...
-    return np.asarray((np.sort(needed, axis=1) <= np.arange(1, needed.shape[1] + 1)).all(axis=1))

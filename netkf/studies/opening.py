@@ -77,7 +77,9 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
     try:
         if not (folder / "manifest.json").exists() and (folder / "verdict.json").exists():
             return read_verdict(folder, trust)
-        manifest = _read_manifest(folder)
+        if not folder.is_dir():
+            raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
+        manifest = read_checked_document(folder, "manifest.json", MANIFEST_FORM)
         check_files(folder, manifest, ["scenario.toml"])
         scenario = load(folder / "scenario.toml", trust=trust)
         # The manifest tells what wrote the directory: only sweeps have ``vary``, and so on.
@@ -91,13 +93,6 @@ def open(directory: str | Path, *, trust: bool = False) -> Stored:
     except DamagedError as error:
         remedy = "name a directory that netkf run, sweep, check or compare-filters left"
         raise ScenarioError(name, f"cannot be opened: {error}", None, remedy) from None
-
-
-def _read_manifest(folder: Path) -> dict[str, Any]:
-    """Return manifest.json of a directory; raises DamagedError."""
-    if not folder.is_dir():
-        raise DamagedError("it is no directory" if folder.exists() else "it does not exist")
-    return read_checked_document(folder, "manifest.json", MANIFEST_FORM)
 
 
 def _read_sweep(folder: Path, scenario: Scenario, manifest: dict[str, Any]) -> StoredSweep:

@@ -209,13 +209,11 @@ def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: fl
                 f"{plan.runs:,} runs, {state}"
             )
         probe = Probe(value, *interval, simulated, state)
-        if state != UNDECIDED or simulated >= plan.runs or _is_futile(probe, target, plan.runs):
+        is_futile = (
+            simulated >= plan.runs // 4 and _runs_to_decide(probe, target) > FUTILE * plan.runs
+        )
+        if state != UNDECIDED or simulated >= plan.runs or is_futile:
             return probe
-
-
-def _is_futile(probe: Probe, target: Target, runs: int) -> bool:
-    """Return True if a quarter of ``runs`` forecasts more than FUTILE times ``runs``."""
-    return probe.runs >= runs // 4 and _runs_to_decide(probe, target) > FUTILE * runs
 
 
 def _runs_to_decide(probe: Probe, target: Target) -> float:
@@ -287,13 +285,10 @@ class Search:
             reached = self._probe(middle).target == REACHED
             value, misses = (middle, misses) if reached else (value, middle)
             # Close to an undecided value simulation noise hides the limit.
-            if self._is_undecided(misses) and max(value, misses) <= END_RATIO * min(value, misses):
+            undecided = any(p.value == misses and p.target == UNDECIDED for p in self.probes)
+            if undecided and max(value, misses) <= END_RATIO * min(value, misses):
                 break
         return value, misses
-
-    def _is_undecided(self, value: float) -> bool:
-        """Return True if a value was tried without a decision."""
-        return any(p.value == value and p.target == UNDECIDED for p in self.probes)
 
     def _probe(self, value: float) -> Probe:
         """Try a value and keep the result."""

@@ -99,9 +99,13 @@ def size(
         quantity = quantity_by_theory(problem.at(low), parsed)[1]
         return Search(problem, partial(decide_by_theory, problem)).run(low, high, 1.0, quantity)
     task, simulated, first = _choose_task(problem, low, engine_used)
-    quantity = _describe_quantity(problem, low, simulated)
-    # Bonferroni over all values and all interim looks at each of them.
-    level = (1.0 - confidence) / (MAX_PROBES["simulation"] * _count_looks(runs, first))
+    quantity = simulated
+    if chosen == "both":
+        bound = quantity_by_theory(problem.at(low), parsed)[1]
+        quantity = f"{bound}; where that is above the limit, simulated: {simulated}"
+    # Bonferroni over all values and all looks at each of them while its runs are doubled.
+    looks = 1 + math.ceil(math.log2(max(1.0, runs / first)))
+    level = (1.0 - confidence) / (MAX_PROBES["simulation"] * looks)
     with shared_pool(runs, PoolOptions(workers, executor, scheduler)) as pool:
         plan = SimulationPlan(
             task=task, runs=runs, level=level, pool=pool, progress=progress, first=first
@@ -109,14 +113,6 @@ def size(
         method = decide_by_both if chosen == "both" else decide_by_simulation
         decide = partial(method, problem, plan)
         return Search(problem, decide).run(low, high, confidence, quantity)
-
-
-def _describe_quantity(problem: SizingProblem, low: float, simulated: str) -> str:
-    """Return what is compared with the limit: a bound if one is tried, then ``simulated``."""
-    if problem.by != "both":
-        return simulated
-    bound = quantity_by_theory(problem.at(low), problem.target)[1]
-    return f"{bound}; where that is above the limit, simulated: {simulated}"
 
 
 def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
@@ -128,11 +124,6 @@ def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[Bl
         exact = ", each with its exact expected squared error given its events"
         return partial(each_replica, task, join_metrics), quantity + exact, FIRST_EXPECTED
     return partial(block_metrics, engine=engine), quantity, FIRST_BATCH
-
-
-def _count_looks(runs: int, first: int) -> int:
-    """Return the number of decisions about a value while its runs are doubled from ``first`` on."""
-    return 1 + math.ceil(math.log2(max(1.0, runs / first)))
 
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:

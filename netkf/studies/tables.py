@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from netkf.core.printable import shorten
 from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
-from netkf.studies.compare import Comparison, Entry
+from netkf.studies.compare import Comparison
 from netkf.studies.compare_filters import QUANTITIES, FilterComparison
 from netkf.studies.consistency import Consistency, NodeConsistency
 from netkf.studies.filter_values import Quantity
@@ -211,7 +211,7 @@ def format_comparison(comparison: Comparison) -> str:
     rows = [
         [
             row.quantity if row.node < 0 else f"{row.quantity} of node {row.node}",
-            *map(_format_marked, row.entries),
+            *(format_with_error(e.value, e.se) + (" *" if e.real else "  ") for e in row.entries),
         ]
         for row in comparison.rows
     ]
@@ -239,8 +239,3 @@ def format_comparison(comparison: Comparison) -> str:
             "differences of single runs are not marked: they may be chance",
         ]
     return "\n".join(lines)
-
-
-def _format_marked(entry: Entry) -> str:
-    """Return a value as text, with a star if its difference is certain."""
-    return format_with_error(entry.value, entry.se) + (" *" if entry.real else "  ")

@@ -275,7 +275,9 @@ class _Evidence:
         reading, *with_more = [math.nan if n is None else n.reading for n in newest_by_budget]
         last, unheard = self._find_last_message(node)
         path_nodes: tuple[int, ...] = ()
+        known = math.nan
         if newest_by_budget[0] is not None:
+            known = newest_by_budget[0].known
             path = route(self._reach, newest_by_budget[0].segment, 0)
             path_nodes = tuple(map(self.scenario.topology.named, path))
         # The fewest missing messages with which a newer reading would have come, if any.
@@ -297,7 +299,7 @@ class _Evidence:
             heard=math.nan if last is None else float(self.messages.sent[last]),
             arrived=math.nan if last is None else float(self.messages.arrived[last]),
             unheard=unheard,
-            known=self._replayer.at if node == self._node else _time_known(newest_by_budget[0]),
+            known=self._replayer.at if node == self._node else known,
             reading=reading,
             route=path_nodes,
             with_more=tuple(with_more),
@@ -318,11 +320,6 @@ class _Evidence:
             return None, len(unused)
         last = int(used[np.argmax(messages.used_row[used])])
         return last, int((messages.sent[unused] > messages.sent[last]).sum())
-
-
-def _time_known(newest: Newest | None) -> float:
-    """Return the time (s) up to which information is included; nan: the end of the log, or none."""
-    return math.nan if newest is None else newest.known
 
 
 def _is_newer(reading: float, than: float) -> bool:
