@@ -59,9 +59,7 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions for a scenario in slots, as rows of the table: those of the filter's
-    paper, or of any filter in slots if it has none.
-    """
+    """Return the rows for slots: those of the filter's paper, or of any filter in slots."""
     paper_rows = paper_function(scenario, "assumptions", "slot_rows")
     if paper_rows is None:
         return [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
@@ -70,9 +68,7 @@ def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions for a scenario in continuous time, as rows of the table: those of the
-    hybrid paper, or of any filter if the paper is not about this one.
-    """
+    """Return the rows for continuous time: those of the hybrid paper, or of any filter."""
     if not concerns_hybrid_paper(scenario):
         # Of what H assumes, this decides about errors of every filter.
         rows = [*_plant_rows(scenario), *start_rows(scenario, ANY)]
@@ -129,9 +125,7 @@ def _reach_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on controllability, observability and the
-    filters' model.
-    """
+    """Return the rows on controllability, observability and the filters' model."""
     plant = scenario.diffusion
     # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
     idle = unobservable_mode(plant.A.T, plant.Q)
@@ -152,9 +146,7 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
-    """Return whether (A, H) is observable with the sensors of all nodes together (None: not known),
-    and a text that says why.
-    """
+    """Return whether (A, H) of all sensors is observable (None: not known), and why."""
     if any(sensor.varying for sensor in scenario.sensors):
         return None, "H differs from reading to reading"
     A, n = scenario.diffusion.A, scenario.plant.n
@@ -184,10 +176,7 @@ def _entries(scenario: Scenario, node: int) -> tuple[int, ...]:
 
 
 def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumption, as a list of one row of the table, that sensors which sample do so at
-    Poisson or at known times, for which the bound on the mean of P is proved; empty without such
-    sensors.
-    """
+    """Return the row that sensors sample at Poisson or at known times; none without samples."""
     if not scenario.sampled_sensors:
         return []
     name = "sensors sample by Poisson clocks or at known times"
@@ -210,9 +199,7 @@ def _information(scenario: Scenario, entries: tuple[int, ...]) -> np.ndarray:
 
 
 def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on rates and laws of the clocks at which nodes
-    transmit.
-    """
+    """Return the rows on rates and laws of the clocks at which nodes transmit."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if transmits_at_samples(scenario):
@@ -256,9 +243,7 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on losses, delays and the symmetry of
-    arrivals.
-    """
+    """Return the rows on losses, delays and the symmetry of arrivals."""
     channel = scenario.network.channel
     # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
     # fixed delay only shifts it; a random delay or dependent losses do neither.

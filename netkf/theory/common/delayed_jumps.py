@@ -91,9 +91,7 @@ class DelayedJumps:
 
     @cached_property
     def _mean(self) -> tuple[FloatArray, FloatArray]:
-        """B and G (M, M), the mean effects per second of the errors and of the messages that
-        arrive.
-        """
+        """B and G (M, M), the mean effects per second of the errors and of arriving messages."""
         N, M = self.nodes, len(self.instant.drift)
         mean_drift = np.zeros((M, 2 * M))
         mean_drift[:, :M] = self.instant.drift
@@ -122,9 +120,7 @@ class DelayedJumps:
 
     @cached_property
     def _integral(self) -> FloatArray:
-        """Integrals (k + 1, k + 1) in seconds: row a weights the values at the k + 1 collocation
-        points of the delay so that their sum is the integral from 0 to point a.
-        """
+        """Integrals (k + 1, k + 1) in seconds: row a integrates collocation values from 0 to a."""
         return self.delay * chebyshev_integrals(self.points)
 
     @cached_property
@@ -145,9 +141,7 @@ class DelayedJumps:
 
     @cached_property
     def _propagators(self) -> FloatArray:
-        """The inverses (N, (k + 1) n, (k + 1) n) of ``y -> y - integral B_i y`` at the points: they
-        solve dy/ds = B_i y over the delay.
-        """
+        """Inverses (N, (k + 1) n, (k + 1) n) of ``y -> y - integral B_i y``, for dy/ds = B_i y."""
         size = (self.points + 1) * len(self.A)
         coupled = np.einsum("kl,aij->akilj", self._integral, self._drift_blocks).reshape(
             -1, size, size
@@ -155,13 +149,7 @@ class DelayedJumps:
         return np.linalg.inv(np.eye(size) - coupled)
 
     def _apply_inverse(self, y: FloatArray) -> FloatArray:
-        """Return the solution (k + 1, M, columns) of ``Y - integral B Y = y``, at the k + 1 points
-        s of the delay, for y of the same shape: the differential equation dY/ds = B Y, driven by y,
-        with B (M, M) the mean drift of the M = N n errors. It is solved in every step that treats
-        errors over a delay.
-
-        B is block diagonal, so that each node is solved by itself.
-        """
+        """Return Y (k + 1, M, columns) with ``Y - integral B Y = y``, node by node."""
         N, (K, M, columns) = self.nodes, y.shape
         by_node = y.reshape(K, N, -1, columns).swapaxes(0, 1).reshape(N, -1, columns)
         solution = (self._propagators @ by_node).reshape(N, K, -1, columns)
@@ -187,28 +175,19 @@ class DelayedJumps:
         return E @ covariance[::-1], symmetric(noise[-1])
 
     def _heard_products(self, K: FloatArray) -> FloatArray:
-        """Return H K(d - s)' (k + 1, M, M) at the k + 1 points s of the delay, for K of that shape.
-
-        The points lie symmetrically in [0, d], so that K(d - s) is K in reverse order.
-        """
+        """Return H K(d - s)' (k + 1, M, M); points are symmetric, so K(d - s) is K reversed."""
         k, M, _ = K.shape
         columns = np.ascontiguousarray(K[::-1].transpose(2, 0, 1)).reshape(M, k * M)
         return np.asarray((self._coupling @ columns).reshape(M, k, M).swapaxes(0, 1))
 
     def _driven_by(self, Phi: FloatArray) -> FloatArray:
-        """Return the right-hand side (k + 1, M, M) of the boundary value problem for white noise of
-        covariance Phi (M, M) per second, which enters its second equation (entry 0).
-        """
+        """Return the right-hand side (k + 1, M, M) for white noise of covariance Phi per second."""
         right = np.zeros((self.points + 1, *Phi.shape))
         right[0] = Phi
         return right
 
     def _driven_by_noises(self) -> FloatArray:
-        """Return the right-hand side (k + 1, M, M), at the k + 1 points of the delay, of the
-        boundary value problem for the autocovariances of the errors under the noises of plant and
-        readings. It has the part of Phi, the white noise that stands for jumps, that is due to the
-        plant's noise in messages.
-        """
+        """Return the right-hand side (k + 1, M, M) for the noises of plant and readings."""
         heard = self._mean[1] @ np.tile(self._message_noise[0], (1, self.nodes, 1))
         right = np.tensordot(self._integral, heard, 1)
         jump_noise = self._inflow(self._moments(np.zeros_like(right), noise=True))
@@ -239,12 +218,7 @@ class DelayedJumps:
         return LyapunovInverse(self._mean[0][None])
 
     def _solve_without_messages(self, right: FloatArray) -> FloatArray:
-        """Return the solution K (k + 1, M, M) of the problem with this ``right``-hand side, of the
-        same shape, if no message is heard (H = 0); GMRES uses it as preconditioner.
-
-        It is exact if entry 0 of ``right`` is symmetric: that of K then solves a Lyapunov equation.
-        The effect of an antisymmetric part, which only residuals have, is approximate.
-        """
+        """Return K (k + 1, M, M) for H = 0 (Lyapunov), the preconditioner of GMRES."""
         equation = symmetric(right[:1])
         first = (right[:1] - equation) + self._lyapunov(equation)
         return self._apply_inverse(np.concatenate([first, right[1:] + first]))
@@ -255,12 +229,7 @@ class DelayedJumps:
         return {}
 
     def _by_elimination(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the autocovariances K (k + 1, M, M) that solve a small boundary value problem, by
-        dense LU factors, which are cached in ``_factors``.
-
-        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` the white noise Phi of the
-        jumps is not given but follows from K.
-        """
+        """Return K (k + 1, M, M) by dense LU factors, which are cached."""
         if jumps not in self._factors:
             units = np.eye(right.size).reshape(right.size, *right.shape)
             columns = [-self._residual(unit, np.zeros_like(unit), jumps).ravel() for unit in units]
@@ -295,13 +264,7 @@ class DelayedJumps:
         return np.asarray(solution).reshape(right.shape)
 
     def _autocovariances(self, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the autocovariances K(s) = E[E(t) E(t - s)'] of the M errors, (k + 1, M, M) at the
-        k + 1 points s of the delay, by iterative refinement of :meth:`_solve`.
-
-        ``right`` (k + 1, M, M) is the right-hand side; with ``jumps`` the white noise Phi of the
-        jumps is not given but follows from K. Raises TheoryError if the refinement does not
-        converge.
-        """
+        """Return K (k + 1, M, M) by iterative refinement of _solve; raises TheoryError."""
         K = self._solve(right, jumps, FIRST_TOLERANCE)
         for _ in range(MAX_ROUNDS):
             change = self._solve(self._residual(K, right, jumps), jumps, CORRECTION)
@@ -311,11 +274,7 @@ class DelayedJumps:
         raise TheoryError(f"delayed mean squares were solved to {size:.1e} only")
 
     def _moments(self, K: FloatArray, noise: bool) -> FloatArray:
-        """Return E[(E, m) (E, m)'] (2 M, 2 M), of the M errors E and of the M errors m of arriving
-        messages, from their autocovariances K (k + 1, M, M) at the points of the delay.
-
-        ``noise`` adds the part of the plant's noise in messages.
-        """
+        """Return E[(E, m) (E, m)'] (2 M, 2 M) of errors and arriving messages, from K."""
         late, X = self._delay_transition, symmetric(K[0])
         across = K[-1] @ late.T
         sent = late @ X @ late.T
@@ -326,9 +285,7 @@ class DelayedJumps:
         return np.block([[X, across], [across.T, symmetric(sent)]])
 
     def _inflow(self, moments: FloatArray) -> FloatArray:
-        """Return Phi (M, M), the covariance per second that arriving messages and samples add, from
-        the ``moments`` (2 M, 2 M) of errors and messages.
-        """
+        """Return Phi (M, M), the covariance per second that messages and samples add."""
         M, Z = len(moments) // 2, moments[None]
         heard = self._message_directions.products(*self.instant.all_pairs, Z)[:, :M, :M]
         return np.asarray(symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)[0])
@@ -368,9 +325,7 @@ class DelayedJumps:
         K, M = self.points + 1, len(self.instant.drift)
 
         def next_means(y: FloatArray) -> FloatArray:
-            """Return the means (K M,) of the M errors at the K points of the next delay from those
-            ``y`` (K M,) of the last one.
-            """
+            """Return the means (K M,) at the points of the next delay from those of the last."""
             past = y.reshape(K, M)
             heard = self._integral @ (self._coupling @ past.T).T
             return self._apply_inverse((past[-1] + heard)[:, :, None]).ravel()

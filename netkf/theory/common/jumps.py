@@ -55,9 +55,7 @@ class SlotJumps:
 
     @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray]:
-        """Pairs of directions that share a draw, as two arrays (P,) of indices; each direction is
-        also paired with itself. Deliveries of other pairs are independent.
-        """
+        """Pairs (P,) of directions that share a draw; each is also paired with itself."""
         assert self.directions is not None
         same = self.directions.source[:, None] == self.directions.source
         first, second = np.nonzero(same)
@@ -65,9 +63,7 @@ class SlotJumps:
 
     @cached_property
     def _mean(self) -> FloatArray:
-        """E[D] (S, M, M), the mean change of the stacked errors in one exchange in each of S modes
-        (joint states of links with bursty losses).
-        """
+        """E[D] (S, M, M), the mean change of errors in one exchange, by mode of bursty links."""
         assert self.directions is not None
         return self.directions.mean(self.nodes, self._all)
 
@@ -89,9 +85,7 @@ class SlotJumps:
         return updated if self.directions is None else self._exchange(predicted, updated)
 
     def _exchange(self, predicted: FloatArray, updated: FloatArray) -> FloatArray:
-        """Return the second moments (S, M, M) after the exchange, from those of the errors before
-        and after the readings of the slot, ``predicted`` and ``updated`` (S, M, M), by mode.
-        """
+        """Return the second moments (S, M, M) after the exchange, by mode."""
         directions, mean = self.directions, self._mean
         assert directions is not None
         # With u the errors after readings and s those that are exchanged: E[s s'] and E[u s'].
@@ -139,9 +133,7 @@ class ClockJumps:
 
     @cached_property
     def _chains(self) -> list[IntArray]:
-        """Two-state chains of bursty losses (one for each link or direction) that make a step at
-        the ticks of each clock: for each entry of ``ticks`` an array of their indices.
-        """
+        """For each clock the indices of the bursty chains that make a step at its ticks."""
         assert self.directions is not None
         return [
             np.unique(self.directions.source[tick_directions]) for _, tick_directions in self.ticks
@@ -169,9 +161,7 @@ class ClockJumps:
 
     @cached_property
     def _pairs(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
-        """All P ordered pairs of directions of each clock, as two arrays (P,) of indices, and the
-        rates (S, P) per second, by mode, at which both messages arrive.
-        """
+        """Ordered pairs (P,) of each clock's directions, and rates (S, P) at which both arrive."""
         assert self.directions is not None
         pairs = []
         for rate, tick_directions in self.ticks:
@@ -227,20 +217,13 @@ class ClockJumps:
 
 
 def _block_slice(X: FloatArray, nodes: int, i: int) -> FloatArray:
-    """Return the block (S, n, n) of node i of X (S, N n, N n) as a view, which may be written to.
-
-    ``nodes`` is N; S counts modes.
-    """
+    """Return the block (S, n, n) of node i of X (S, N n, N n) as a view."""
     n = X.shape[1] // nodes
     return X[:, i * n : (i + 1) * n, i * n : (i + 1) * n]
 
 
 def _multiply_blocks(maps: FloatArray, X: FloatArray, nodes: int) -> FloatArray:
-    """Return ``C X C'`` (S, M, M) for the second moments X (S, M, M) in S modes, M = N n.
-
-    C is block diagonal with the N blocks ``maps`` (N, n, n), or with one block (1, n, n) for all;
-    ``nodes`` is N.
-    """
+    """Return ``C X C'`` (S, M, M) for block diagonal C of N blocks ``maps``, or one for all."""
     S, M, _ = X.shape
     n = M // nodes
     CX = (maps @ X.reshape(S, nodes, n, M)).reshape(S, M, M)
@@ -265,8 +248,6 @@ class LyapunovInverse:
 
     @staticmethod
     def _solve(T: FloatArray, U: FloatArray, Y: FloatArray) -> FloatArray:
-        """Return symmetric X (M, M) with ``A X + X A' = -Y``, where ``A = U T U'`` is a real Schur
-        form (Bartels and Stewart 1972); T, U and Y are (M, M).
-        """
+        """Return X (M, M), A X + X A' = -Y, by a real Schur form (Bartels and Stewart 1972)."""
         X, scale, _ = scipy.linalg.lapack.dtrsyl(T, T, -(U.T @ Y @ U), trana="N", tranb="T")
         return symmetric(np.asarray(U @ (X / scale) @ U.T))

@@ -85,11 +85,7 @@ def steady_error_covariance(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
-    """Return the mean-square radius (:func:`mean_square_radius`), and the steady error covariances
-    (N, n, n) of the nodes if it is below 1, else None.
-
-    With delays the radius is 0 if it is only proved to be below 1. The last 8 results are cached.
-    """
+    """Return the radius and the steady covariances (N, n, n), None unless it is below 1."""
     solve = _choose_solver(scenario)
     if solve is not None:
         _require_known_law(scenario)
@@ -118,9 +114,7 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
 
 @lru_cache(maxsize=8)
 def _make_system(scenario: Scenario) -> LinearErrors:
-    """Return the errors of all nodes as a linear system with jumps (:func:`linear_errors`), cached;
-    raises TheoryError if there is none, or it is too large for its mean squares to be computed.
-    """
+    """Return the errors as a linear system with jumps, cached; raises TheoryError."""
     system = linear_errors(scenario)
     _require_size(system.shape)
     return system
@@ -144,9 +138,7 @@ def linear_errors(scenario: Scenario) -> LinearErrors:
 
 
 def _require_known_law(scenario: Scenario) -> None:
-    """Raise TheoryError if filters have equations that are not known here, states or readings are
-    recorded, or the filters' F (or A) is not the plant's: then the errors have no law of their own.
-    """
+    """Raise TheoryError if the errors have no law: records, own equations, another model."""
     require_known_filter(scenario)
     if not scenario.is_random:
         raise TheoryError("the state or readings are recorded: their law is not known")
@@ -178,14 +170,7 @@ def is_quickly_solved(scenario: Scenario) -> bool:
 def _choose_solver(
     scenario: Scenario,
 ) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
-    """Return a special solver for filters in slots that combine estimates like this scenario's, or
-    None if there is none or the scenario runs under clocks.
-
-    It maps the scenario to the spectral radius of the mean-square dynamics of the errors and to
-    their steady covariances (N, n, n), which are None if the radius is not below 1. It is in the
-    module ``steady_errors`` of the paper's folder and has the name of the combination, such as
-    ``tracks_in_slots``.
-    """
+    """Return the special solver of the filter's paper (``steady_errors``), or None."""
     if not scenario.slotted:
         return None
     combination = scenario.node_filter.combination.replace(" ", "_")
@@ -207,9 +192,7 @@ def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | No
 
 
 def _require_size(shape: tuple[int, int, int]) -> None:
-    """Raise TheoryError for systems of a ``shape`` (S, M, M) that are too large: S joint states of
-    the links, M errors of all nodes.
-    """
+    """Raise TheoryError for S joint states of links and M errors that are too many."""
     S, M, _ = shape
     if M > MAX_ERRORS:
         raise TheoryError(
@@ -224,23 +207,12 @@ def _require_size(shape: tuple[int, int, int]) -> None:
 
 
 def _slot_map(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
-    """Return the linear map of second moments (S, M, M) over a slot, and the noise (S, M, M) that a
-    slot adds; S counts joint states of the links, M errors of all nodes.
-    """
+    """Return the map of second moments (S, M, M) over a slot, and the noise that it adds."""
     return system.step, system.step(np.zeros(system.shape), noise=True)
 
 
 def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
-    """Return the map ``X -> L^-1(inflow(X))`` of second moments X (S, M, M) of the errors of a
-    network under clocks, and ``L^-1(noise)`` (S, M, M). ``L X = -(B X + X B')`` is what errors lose
-    per second between jumps, ``inflow`` what they gain per second by jumps at ticks, and ``noise``
-    what the plant and the readings add.
-
-    The errors of all nodes have M entries together. The channels have S states (1 if they have
-    none), in each of which moments are weighted by its ``stationary`` probability. Steady moments X
-    are a fixed point of ``X = L^-1(inflow(X)) + L^-1(noise)``. The second result is None if some B
-    is not stable: errors then grow even between jumps.
-    """
+    """Return X -> L^-1(inflow(X)) and L^-1(noise) (S, M, M), L X = -(B X + X B')."""
     if max(map(growth_rate, system.flows)) >= 0.0:
         return system.inflow, None
     inverse = LyapunovInverse(system.flows)

@@ -34,9 +34,7 @@ def nodes_by_estimator(scenario: Scenario) -> list[tuple[int, ...]]:
 
 
 def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
-    """Return, for each ``[[sensors]]`` entry of the scenario, the noise covariance R (p, p) that
-    filters assume and a square root (p, p) of the true one, which may differ.
-    """
+    """Return for each sensor entry the assumed R (p, p) and a root of the true one."""
     # The gain is computed from the R that the filter assumes, the noise drawn with the true one.
     return [
         (
@@ -50,9 +48,7 @@ def _noises(scenario: Scenario) -> list[tuple[FloatArray, FloatArray]]:
 def _noise(
     path: Any, k: int, noise: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the assumed R (p, p) and the root (p, p) of the true one of reading number ``k`` (a
-    sample or a slot) of a ``path``, from those of its sensor, ``noise``.
-    """
+    """Return the assumed R and the root of the true one (p, p) of reading ``k`` of a path."""
     R, root = noise
     own, true = covariance_of(path, k, R), covariance_of(path, k, root @ root.T)
     return (R, root) if own is R else (own, np.asarray(np.linalg.cholesky(true)))
@@ -97,9 +93,7 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
     ]
 
     def observe(slot: int) -> EstimatorObservations:
-        """Return the readings of ``slot`` (0-based), H (p, n) and R (p, p), by index of the
-        estimator.
-        """
+        """Return the readings of ``slot``, H (p, n) and R (p, p), by index of the estimator."""
         observations = {}
         for estimator, paths in enumerate(estimators):
             if not paths:

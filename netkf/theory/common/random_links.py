@@ -138,17 +138,13 @@ class Directions(NamedTuple):
 
 
 def _add_blocks(blocks: FloatArray, rows: IntArray, columns: IntArray, terms: FloatArray) -> None:
-    """Add P terms (S, P, n, n) to ``blocks`` (S, N, N, n, n) in place, at the nodes ``rows`` and
-    ``columns`` (P,), of which pairs may repeat; S counts modes.
-    """
+    """Add P terms (S, P, n, n) to ``blocks`` at nodes that may repeat."""
     index: Any = (slice(None), rows, columns)
     np.add.at(blocks, index, terms)
 
 
 def _join_blocks(blocks: FloatArray) -> FloatArray:
-    """Return the matrices (S, N n, N n) that consist of ``blocks`` (S, N, N, n, n): for each of S
-    modes an (n, n) block for each pair of N nodes.
-    """
+    """Return the matrices (S, N n, N n) that consist of ``blocks`` (S, N, N, n, n)."""
     S, N, _, n, _ = blocks.shape
     return np.asarray(np.swapaxes(blocks, 2, 3).reshape(S, N * n, N * n))
 
@@ -251,20 +247,13 @@ def _require_law(scenario: Scenario) -> None:
 def _deliveries(
     scenario: Scenario, links: list[tuple[int, int]], source: IntArray, chains: int
 ) -> FloatArray:
-    """Return the delivery probabilities (S, K) of K ``links`` (sender, receiver), by mode: joint
-    state, good or bad, of the channels with bursty (Gilbert-Elliott) losses.
-
-    ``source`` (K,) is the index of the chain of each link, ``chains`` their number; with bursts
-    there are S = 2^chains modes, else one. Raises TheoryError for more than MAX_CHAINS.
-    """
+    """Return the delivery probabilities (S, K) of ``links`` by mode of the bursty channels."""
     loss = scenario.network.channel.loss
     if isinstance(loss, GilbertElliott) and loss.independent:
         return np.array([[loss.mean_delivery(link, 1.0) for link in links]])
 
     def probabilities(bad: bool) -> FloatArray:
-        """Return the delivery probability (K,) of each link if all channels are in their bad state
-        (``bad``), or all in their good one.
-        """
+        """Return the probabilities (K,) if all channels are in their bad state, or good one."""
         tables = ((link, scenario.table_probability(link)) for link in links)
         return np.array([loss.delivery_probability(link, 0, bad, table) for link, table in tables])
 
@@ -280,9 +269,7 @@ def _deliveries(
 
 
 def _source_of(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
-    """Return the link (sender, receiver) whose random draw decides if a message over ``link``
-    arrives; both directions have the same one if they fail together.
-    """
+    """Return the link whose draw decides about ``link``: one for both directions, or its own."""
     return min(link, link[::-1]) if _fail_together(scenario) else link
 
 

@@ -29,9 +29,7 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the ``function``, public as ``netkf.theory.<name>``, with a check that its first
-    argument is a Scenario.
-    """
+    """Return the public ``function`` with a check that its first argument is a Scenario."""
 
     @wraps(function)
     def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:

@@ -72,9 +72,7 @@ def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
-    """Return whether some power of the weight matrix W (N, N) of a strongly connected network is
-    positive (None: not known), as the diffusion paper assumes, and a text that says why.
-    """
+    """Return whether some power of W (N, N) is positive (None: not known), and why."""
     if len(W.indptr) - 1 > MAX_NODES:
         positive = bool((W.diagonal() > 0.0).all())  # sufficient: every node keeps a share
         evidence = f"the diameter is not computed beyond {MAX_NODES:,} nodes"
@@ -97,9 +95,7 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, that the parameter is a random walk, and on Q
-    and r of the filters.
-    """
+    """Return the rows that the parameter is a random walk, and on Q and r of the filters."""
     plant = scenario.slot_plant
     F, Q = scenario.slot_belief
     smallest = float(np.linalg.eigvalsh(Q)[0])
@@ -159,9 +155,7 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that every message arrives in time, so that
-    weights are fixed.
-    """
+    """Return the row that every message arrives in time, so that weights are fixed."""
     if is_recorded(scenario.network.channel):
         return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
     all_arrive = all_messages_arrive(scenario)

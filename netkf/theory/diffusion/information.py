@@ -98,9 +98,7 @@ def few_regressors(scenario: Scenario) -> bool:
 
 
 def _make_sources(scenario: Scenario) -> list[_Source]:
-    """Return the scalar readings of all nodes, each as phi = C s (n,) with the law of its state s
-    (m,); raises TheoryError for recorded sensors.
-    """
+    """Return the scalar readings of all nodes; raises TheoryError for recorded sensors."""
     sources = []
     for node in scenario.sensing_nodes:
         for placed_sensor in scenario.placed_sensors[node]:
@@ -124,20 +122,14 @@ def _make_sources(scenario: Scenario) -> list[_Source]:
 def _draw_pasts(
     scenario: Scenario, sources: list[_Source], runs: int, random: np.random.Generator
 ) -> list[FloatArray]:
-    """Return for each source (a random process that makes regressors) its states (runs, m) at
-    ``runs`` random slots, the same slots for all sources; m differs from source to source. They are
-    the pasts for which the excitation of the next slots is computed.
-    """
+    """Return for each source its states (runs, m) at random slots, the same for all."""
     last = max(1, int(scenario.horizon / scenario.slot_plant.period))
     slots = random.integers(last, size=runs)
     return [_draw_states(source, slots, random) for source in sources]
 
 
 def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator) -> FloatArray:
-    """Return the states (K, m) of a ``source`` of regressors (phi = C s with s <- A s + noise) at K
-    ``slots`` (K,), each drawn from the Gaussian law that s has in that slot; 1 for a fixed
-    regressor.
-    """
+    """Return states (K, m) of a ``source`` at ``slots`` (K,) from its law; 1 if fixed."""
     normals = random.standard_normal((len(slots), len(source.start)))
     if not source.drive.size:
         return np.ones((len(slots), 1))
@@ -154,11 +146,7 @@ def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator
 
 
 def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) -> list[LevelRow]:
-    """Return the row of the table of excitation levels (:func:`information_level`) for each sensor
-    alone; sensors of one kind whose regressor is fixed share its numbers.
-
-    ``past`` holds the states (K, m) of each source in K pasts, ``window`` is h in slots.
-    """
+    """Return the row of each sensor alone; fixed regressors of one kind share its numbers."""
     rows: list[LevelRow | None] = [None] * len(sources)
     for group in _group_by_kind(sources):
         for k in group:
@@ -169,11 +157,7 @@ def _sensor_rows(sources: list[_Source], past: list[FloatArray], window: int) ->
 
 
 def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window: int) -> LevelRow:
-    """Return the row of the table of excitation levels (:func:`information_level`) for the given
-    ``sources`` of regressors: the whole network (``node`` -1), or one sensor.
-
-    ``past`` holds the states (K, m) of each source in K pasts, ``window`` is h in slots.
-    """
+    """Return the row of ``sources``: the whole network (``node`` -1), or one sensor."""
     values = _levels(sources, past, window)
     mean = float(values.mean())
     error = QUANTILE * float(values.std(ddof=1)) / np.sqrt(len(values))
@@ -205,13 +189,7 @@ def _search_least(
 def _search(
     sources: list[_Source], past: list[FloatArray], start: list[FloatArray], window: int
 ) -> list[float]:
-    """Return the level (least eigenvalue of the mean information of the next slots) at the past
-    ``start``, and the least one found from it by the simplex method of Nelder and Mead.
-
-    ``start`` holds one state (m,) of each source. The search stays within the range of the pasts
-    drawn, ``past`` with (K, m) states of each source, and is left out for a level of 0 and for
-    pasts of more than MAX_SEARCHED numbers. ``window`` is h in slots.
-    """
+    """Return the level at the past ``start`` and the least one from it by Nelder and Mead."""
     moving = [k for k, source in enumerate(sources) if source.drive.size]
     low = [np.minimum(past[k].min(axis=0), 0.0) for k in moving]
     high = [np.maximum(past[k].max(axis=0), 0.0) for k in moving]
@@ -219,9 +197,7 @@ def _search(
     ends = np.cumsum([0, *(len(sources[k].start) for k in moving)])
 
     def level(x: FloatArray) -> float:
-        """Return the level (least eigenvalue of the mean information) at the past ``x``, the states
-        of all sources that are not fixed, side by side.
-        """
+        """Return the level at the past ``x``, the states of all varying sources side by side."""
         # _levels takes many pasts at once: here it is one.
         states = [s[None] for s in start]
         for index, k in enumerate(moving):
@@ -242,12 +218,7 @@ def _search(
 
 
 def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> FloatArray:
-    """Return the levels lambda_k (K,), paper D (19), of the ``sources`` of regressors together, for
-    K pasts.
-
-    ``past`` holds the states (K, m) of each source, ``window`` is h in slots. A level is the least
-    eigenvalue of the mean excitation by the sources, 0 if it is below rounding.
-    """
+    """Return the levels lambda_k (K,), D (19), for K pasts; 0 below rounding."""
     n = len(sources[0].C)
     total = np.zeros((len(past[0]), n, n))
     for group in _group_by_kind(sources):
@@ -265,9 +236,7 @@ def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> Floa
 
 
 def _group_by_kind(sources: list[_Source]) -> list[list[int]]:
-    """Return the indices of the sources of each kind: those with the same A, C and drive, which
-    differ in their pasts only.
-    """
+    """Return the indices of the sources with the same A, C and drive."""
     groups: dict[tuple[bytes, ...], list[int]] = {}
     for k, source in enumerate(sources):
         key = tuple(part.tobytes() for part in (source.A, source.C, source.drive))
@@ -276,10 +245,7 @@ def _group_by_kind(sources: list[_Source]) -> list[list[int]]:
 
 
 def _window_excitation(source: _Source, states: FloatArray, window: int) -> FloatArray:
-    """Return the sum (K, n, n) of ``E[phi phi' / (1 + |phi|^2)]``, with phi the regressor of a
-    ``source``, over the ``window`` slots after K pasts, in which the source has the ``states``
-    (K, m).
-    """
+    """Return sums (K, n, n) of ``E[phi phi' / (1 + |phi|^2)]`` over the ``window``."""
     mean, cov, n = states, np.zeros_like(source.A), len(source.C)
     total = np.zeros((len(states), n, n))
     for _ in range(window):  # mean and covariance of s in each slot

@@ -55,10 +55,7 @@ def tracking_level(
 
 
 def _draw_noises(scenario: Scenario, samples: int, random: np.random.Generator) -> FloatArray:
-    """Return draws (samples,) of xi, the norm of all noises of a slot, paper D (29): that of the
-    sensors' noises plus that of the parameter's increment; raises TheoryError if a noise is
-    recorded.
-    """
+    """Return draws (samples,) of xi, D (29); raises TheoryError if a noise is recorded."""
     if not scenario.slotted or not scenario.is_random:
         raise TheoryError("D (29) needs noises in slots with a law, not a record")
     squares = np.zeros(samples)

@@ -32,9 +32,7 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumption, as a list of one row of the table, that the mean matching (the
-    probabilities that nodes swap in a slot) is irreducible and aperiodic, G C.1.
-    """
+    """Return the row that the mean matching is irreducible and aperiodic, G C.1."""
     name = "the mean matching is irreducible and aperiodic"
     try:
         mean = _mean_swaps(scenario)
@@ -63,9 +61,7 @@ def _mean_swaps(scenario: Scenario) -> FloatArray:
 
 
 def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumption, as a list of one row of the table, of weak detectability, G D.1: the
-    readings of the nodes along some walk over paired nodes determine the state.
-    """
+    """Return the row of weak detectability, G D.1: readings along some walk suffice."""
     name = "some walk on the network detects the state (weak detectability)"
     try:
         walk = detecting_walk(scenario)
@@ -86,9 +82,7 @@ def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumption, as a list of one row of the table, that every exchange is a swap of
-    the two nodes' pairs (estimate, covariance), also where messages are lost.
-    """
+    """Return the row that every exchange is a swap, also where messages are lost."""
     channel = scenario.network.channel
     # A swap needs both messages: if one is lost, its pair exists twice and the other is gone.
     # The exact class: one that derives from it may lose messages.

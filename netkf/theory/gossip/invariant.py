@@ -71,12 +71,7 @@ def switched_samples(scenario: Scenario, samples: int, seed: int) -> SwitchedSam
 def _draw_before(
     rows: FloatArray, following: np.ndarray, slots: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Return the positions (K, slots) of K chains in the slots before those in ``following``
-    (K, S), drawn backwards in time.
-
-    ``rows`` (N, N) are cumulative transition probabilities of the reversed chain. If S is 0 the
-    last position is drawn from the uniform law.
-    """
+    """Return positions (K, slots) of K chains drawn backwards from ``following`` (K, S)."""
     count, N = len(following), len(rows)
     positions = np.empty((count, slots), dtype=following.dtype)
     node = following[:, 0] if following.shape[1] else None

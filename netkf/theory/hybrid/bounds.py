@@ -71,12 +71,7 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
 
 
 def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
-    """Return the bound on the mean of each node's P over time, the solution of the Riccati
-    equations of all nodes, coupled by the link rates (H equation 12).
-
-    It is (T, N, m) at T ``times`` (seconds), for each node the m = n (n + 1) / 2 entries of the
-    upper triangle of its covariance.
-    """
+    """Return the packed bound (T, N, m) of H(12) at ``times``, m = n (n + 1) / 2."""
     equations = packed.equations
     # Without delay the right-hand side is quadratic, and Taylor series are fastest unless stiff.
     if equations.delay == 0.0 and not equations.samples and not equations.jumps:
@@ -90,17 +85,13 @@ def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
 
 
 def _covariance_scale(packed: PackedRiccati) -> float:
-    """Return the size against which entries of covariances count as zero: the largest entry of the
-    covariances at the start and of Q.
-    """
+    """Return the largest entry of the first covariances and Q, for which entries count as 0."""
     sizes = (np.abs(packed.start).max(), np.abs(packed.equations.Q).max())
     return max(*(float(size) for size in sizes), 1e-300)
 
 
 def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray:
-    """Return P (T, N, n, n) at T ``times`` (seconds) of N nodes that receive nothing: the Riccati
-    flow of each by itself, from its ``equations.start``.
-    """
+    """Return P (T, N, n, n) at ``times`` of nodes that receive nothing."""
     P = np.empty((len(times), *equations.start.shape))
     tables: dict[bytes, RiccatiTable] = {}
     mean = np.zeros(len(equations.A))  # the kernel moves a mean along with P
@@ -180,12 +171,7 @@ class _PiecewiseSolution:
                 )
 
     def _piece_end(self, begin: float, last: float) -> float:
-        """Return the latest end of the piece from ``begin``, at most ``last``, all in seconds.
-
-        A piece as long as the delay takes all its delayed terms from the pieces before. If the
-        delay is much shorter than the time between messages, a piece is half of that time long
-        instead, and ``_iterate`` finds the delayed terms that lie inside it.
-        """
+        """Return the latest end of the piece from ``begin``, at most ``last``, in seconds."""
         delay = self._packed.equations.delay
         if delay == 0.0:
             return last
@@ -196,17 +182,13 @@ class _PiecewiseSolution:
         return min(last, begin + max(delay, 0.5 / max(inflow, 1e-300)))
 
     def _append(self, end: float, output: Callable[[float], FloatArray]) -> None:
-        """Add a piece that ends at ``end`` (seconds), given by its dense ``output``, a function
-        from the time to the solution (N m,); the next piece begins at its end value.
-        """
+        """Add a piece until ``end`` (seconds) with its dense ``output``."""
         self._outputs.append(output)
         self._piece_ends.append(end)
         self._start_value = output(end).reshape(self._packed.start.shape)
 
     def _iterate(self, begin: float, end: float, slope: Slope) -> None:
-        """Append a piece from ``begin`` to ``end`` (seconds), longer than the delay, by Picard
-        iteration; raises TheoryError if that does not converge.
-        """
+        """Append a piece longer than the delay by Picard iteration; raises TheoryError."""
         start = self._start_value
         probes = np.linspace(begin, end, 9)[1:]
         self._append(end, lambda _: start.reshape(-1))  # first guess: constant
@@ -225,15 +207,11 @@ class _PiecewiseSolution:
         raise TheoryError(f"late arrivals did not converge between {begin:g} and {end:g} s")
 
     def _slope(self, begin: float) -> Slope:
-        """Return the right-hand side of H(12) as a function of the time and the solution (N m,),
-        for a piece that begins at ``begin`` (seconds).
-        """
+        """Return the right-hand side of H(12) for a piece from ``begin`` (seconds)."""
         packed, silent, delay = self._packed, self._without_arrivals, self._packed.equations.delay
 
         def slope(t: float, y: FloatArray) -> FloatArray:
-            """Return dy/dt (N m,) of the packed covariances ``y`` (N m,) at time ``t``
-            (seconds).
-            """
+            """Return dy/dt (N m,) of the packed covariances ``y`` (N m,) at ``t`` (seconds)."""
             Y = y.reshape(packed.start.shape)
             if not np.abs(y).max() < OVERFLOW:
                 raise TheoryError(f"Tanwani's H(12) grows beyond {OVERFLOW:g} before {t:g} s")
@@ -248,12 +226,7 @@ class _PiecewiseSolution:
     def _integrate(
         self, begin: float, end: float, slope: Slope, growth: float = math.inf
     ) -> tuple[Callable[[float], FloatArray], float]:
-        """Return the solution (N m,) from time ``begin`` on as a function of time, and its last
-        time.
-
-        That is ``end`` (seconds), or earlier if the solution has grown by a factor ``growth``.
-        Raises TheoryError if the solver fails or the defect of the solution is too large.
-        """
+        """Return the solution from ``begin`` and its last time: ``end``, or at ``growth``."""
         first_error: TheoryError | None = None
         for step_count in PARTS:  # shorter steps reduce the error of the dense output between them
             max_step = (end - begin) / step_count if step_count > 1 else np.inf
@@ -276,12 +249,7 @@ class _PiecewiseSolution:
     def _integrate_piece(
         self, begin: float, end: float, slope: Slope, max_step: float, growth: float
     ) -> Any:
-        """Solve from ``begin`` to ``end`` (seconds) by an explicit method unless the equations are
-        stiff, else by an implicit one; return the result of scipy's ``solve_ivp``.
-
-        Steps last at most ``max_step`` seconds; the implicit solver stops where an entry has grown
-        by the factor ``growth``.
-        """
+        """Return solve_ivp's result: explicit unless stiff, then implicit until ``growth``."""
         equations = self._packed.equations
         with np.errstate(over="ignore", invalid="ignore"):
             # Without delays and samples the Taylor series have found the equations stiff before.
@@ -302,9 +270,7 @@ class _PiecewiseSolution:
             )
 
     def _solve(self, begin: float, end: float, slope: Slope, **method: Any) -> Any:
-        """Return the solution of a piece from ``begin`` to ``end`` (seconds) by scipy's
-        ``solve_ivp`` with the options ``method``, from ``_start_value`` on.
-        """
+        """Return solve_ivp's result for a piece with the options ``method``."""
         # It takes 0.4 s to import.
         import scipy.integrate
 
@@ -344,24 +310,16 @@ class _PiecewiseSolution:
         )
 
     def _jacobian(self, t: float, y: FloatArray) -> Any:
-        """Return the sparse Jacobian (N m, N m), per second, of the right-hand side at the packed
-        solution ``y`` (N m,), as the implicit solver asks for it; the time ``t`` does not matter.
-        """
+        """Return the sparse Jacobian (N m, N m), per second, at the packed ``y`` (N m,)."""
         linear = self._packed.linear(self._packed.unpack(y.reshape(self._packed.start.shape)))
         # With a delay the arrivals are known from earlier pieces and do not depend on y.
         return linear.matrix(arriving=self._packed.equations.delay == 0.0)
 
 
 def _growth_event(limit: float) -> Callable[[float, FloatArray], float]:
-    """Return an event for scipy's ``solve_ivp``, a function of the time and the solution (N m,),
-    that ends it where the largest entry exceeds ``limit``, so that tolerances can be chosen anew;
-    never if that is infinite.
-    """
+    """Return an event of solve_ivp where the largest entry exceeds ``limit``."""
 
     def margin(_: float, y: FloatArray) -> float:
-        """Return ``limit`` less the largest entry of ``y`` (N m,): the solver stops where
-        it is 0.
-        """
         return limit - float(np.abs(y).max()) if math.isfinite(limit) else 1.0
 
     margin.terminal = True  # type: ignore[attr-defined]
@@ -372,9 +330,6 @@ class _SampleJumps:
     """Jumps of the solution: samples at known times, and the arrivals of messages sent at them."""
 
     def __init__(self, packed: PackedRiccati) -> None:
-        """Take the samples at known times from the equations ``packed``, and the times at which
-        messages sent at them arrive.
-        """
         self._packed = packed
         equations = packed.equations
         self._samples = {jump.time: jump for jump in equations.jumps}
@@ -393,11 +348,7 @@ class _SampleJumps:
         return time in self._samples or time in self._arrivals
 
     def apply(self, time: float, Y: FloatArray) -> FloatArray:
-        """Return the packed bound Y (N, m) just after ``time`` (seconds), at which sensors sample
-        or messages arrive that were sent at samples.
-
-        Messages that nodes send at their samples are stored in ``_arrivals`` until they arrive.
-        """
+        """Return the packed bound Y (N, m) just after samples or their messages at ``time``."""
         packed, equations = self._packed, self._packed.equations
         jump = self._samples.get(time)
         if jump is not None:
@@ -419,9 +370,7 @@ class _SampleJumps:
 
 
 def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
-    """Return the Joseph form ``(I - K H) P (I - K H)' + K R K'`` (n, n) of the update of a
-    covariance P (n, n) by readings with H (p, n) and R (p, p).
-    """
+    """Return ``(I - K H) P (I - K H)' + K R K'`` (n, n), the Joseph form of an update."""
     H, R = observation.H, observation.R
     K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
     closed = np.eye(len(P)) - K @ H
@@ -429,16 +378,10 @@ def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
 
 
 def _limit_evaluations(slope: Slope) -> Slope:
-    """Return the right-hand side ``slope`` of a differential equation as a function that raises
-    StiffError after MAX_EXPLICIT_EVALUATIONS calls, so that an explicit solver gives up and an
-    implicit one is tried.
-    """
+    """Return ``slope`` as a function that raises StiffError after too many calls."""
     evaluations_left = MAX_EXPLICIT_EVALUATIONS
 
     def limited(t: float, y: FloatArray) -> FloatArray:
-        """Return dy/dt (N m,) at ``y`` (N m,) and time ``t`` (seconds); raises StiffError after too
-        many evaluations.
-        """
         nonlocal evaluations_left
         evaluations_left -= 1
         if evaluations_left < 0:
@@ -449,12 +392,7 @@ def _limit_evaluations(slope: Slope) -> Slope:
 
 
 def _check_defect(slope: Slope, output: Any) -> None:
-    """Check a numerical solution against its differential equation: compare its change over steps
-    of the solver with the integral of the ``slope``.
-
-    ``output`` is the dense solution (N m,) of ``solve_ivp``, of which up to MAX_CHECKED_STEPS steps
-    are checked. Raises TheoryError if they differ by more than DEFECT_TOLERANCE, relative.
-    """
+    """Compare the change over steps with the integral of ``slope``; raises TheoryError."""
     times = output.ts
     steps = np.unique(np.linspace(0, len(times) - 2, MAX_CHECKED_STEPS).astype(int))
     for k in steps:

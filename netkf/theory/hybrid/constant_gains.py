@@ -64,13 +64,7 @@ def constant_gain_bound(
 def _linear_equation(
     scenario: Scenario, gains: Sequence[ArrayLike] | None
 ) -> tuple[LinearisedRiccati, FloatArray]:
-    """Return the equation of the bound with constant gains L_i, dP/dt = map(P) + constant: the
-    linear map of the nodes' upper triangles (N, m), m = n (n + 1) / 2, and the constant term
-    (N, m), ``L_i R_i L_i' + Q``.
-
-    ``gains`` are L_i (n, p_i) for each of N nodes, None for those of the steady state of H(12).
-    Raises TheoryError for sampled sensors, jumps, delays and wrong shapes.
-    """
+    """Return map and constant of dP/dt = map(P) + ``L_i R_i L_i' + Q``; raises TheoryError."""
     equations = coupled_riccati(scenario)
     if equations.samples or equations.jumps or equations.delay:
         raise TheoryError("constant gains are for sensors in continuous time and no delay")
@@ -90,11 +84,7 @@ def _linear_equation(
 
 
 def _steady(linear: LinearisedRiccati, constant: FloatArray) -> FloatArray:
-    """Return the steady state (N, n, n) of the ``linear`` map with the ``constant`` term (N, m), m
-    = n (n + 1) / 2.
-
-    Raises TheoryError if the gains do not stabilise the filters.
-    """
+    """Return the steady state (N, n, n) of map and constant; raises TheoryError if unstable."""
     if not is_stable(linear):
         raise TheoryError("constant gains do not stabilise the filters: there is no steady state")
     return linear.packed.unpack(solve_map(linear, constant))

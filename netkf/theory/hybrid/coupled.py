@@ -132,9 +132,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
 
 
 def _reason_of_samples(scenario: Scenario) -> str | None:
-    """Return the reason why the bound on the mean covariance does not cover the sensors that sample
-    at random times (docs/poisson_samples.md proves it for Poisson times), or None if it does.
-    """
+    """Return why the bound does not cover sensors that sample, or None if it does."""
     if not scenario.is_linear:
         return f"not promised: {NONLINEAR}"
     for node, placed_sensor in randomly_sampled_sensors(scenario):
@@ -278,12 +276,7 @@ def left_weights(scenario: Scenario) -> FloatArray:
 
 
 def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
-    """Return the indices (K,) of the nodes whose information reaches all others by way of the rates
-    c (N, N), receiver by sender; None if no node's does.
-
-    They are the one strongly connected component that receives nothing from outside; with two such
-    components the coupling has two left null vectors.
-    """
+    """Return the nodes (K,) heard by all others by way of the rates c, or None."""
     # Row i of c has the senders that node i receives from.
     count, part = scipy.sparse.csgraph.connected_components(c, connection="strong")
     hears, heard = c.nonzero()
@@ -294,11 +287,7 @@ def _heard_by_all(c: scipy.sparse.csr_array) -> np.ndarray | None:
 
 
 def _stationary(c: scipy.sparse.csr_array) -> FloatArray:
-    """Return the weights w (M,) of M nodes' information in the limit of fast links: the left null
-    vector, ``w (D - c) = 0`` with sum 1, of the Laplacian of the rates c (M, M), D their row sums.
-
-    The nodes must be strongly connected. Raises TheoryError if the residual is too large.
-    """
+    """Return the weights w (M,) of fast links, ``w (D - c) = 0``; raises TheoryError."""
     size = c.shape[0]
     if size == 1 or _is_symmetric(c):
         return np.full(size, 1.0 / size)

@@ -54,9 +54,7 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _require_limit(scenario: Scenario) -> None:
-    """Raise TheoryError for filters and clocks that H(13), the equation of the limit S for fast
-    links, is not about.
-    """
+    """Raise TheoryError for filters and clocks that H(13) is not about."""
     algorithm = scenario.filter.algorithm
     if not algorithm.talks:
         return

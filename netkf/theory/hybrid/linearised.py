@@ -89,9 +89,7 @@ def is_stable(linear: LinearisedRiccati) -> bool:
 
 
 def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
-    """Return the solution X (N, m) of ``L(X) = -right`` by sparse elimination, for ``right`` (N, m)
-    and the linear map L; nan where L is singular.
-    """
+    """Return X (N, m) of ``L(X) = -right`` by sparse elimination; nan where L is singular."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
         # A singular map yields nan, which the caller takes as unstable.
@@ -126,9 +124,7 @@ def _solve_by_gmres(
         return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)
 
     def precondition(x: FloatArray) -> FloatArray:
-        """Return an approximate solution (N m,) of ``L(X) = x``: the mean over nodes exactly, then
-        each node alone.
-        """
+        """Return ``L^-1 x`` (N m,) roughly: the mean over nodes exactly, then each node alone."""
         shared = np.tile(x.reshape(right.shape).mean(axis=0) @ coarse, len(right))
         return shared + solve_alone(x - apply(shared))
 

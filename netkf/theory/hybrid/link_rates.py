@@ -67,10 +67,7 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     equations, S = _require_talk(scenario), limit_covariance(scenario)
 
     def excess(log_factor: float) -> float:
-        """Return the logarithm of the distance between the steady bound and its limit S for fast
-        links over ``delta``, the distance asked for, with all link rates times exp(``log_factor``);
-        its root is the answer.
-        """
+        """Return log(distance / delta) with all link rates times exp(``log_factor``)."""
         distance = _distance(equations, S, math.exp(log_factor))
         if distance is None:
             return NO_STEADY_STATE
@@ -94,9 +91,7 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
 
 
 def _require_talk(scenario: Scenario) -> CoupledRiccati:
-    """Return the coupled Riccati equations H(12) of a scenario, which bound the mean of each
-    filter's P; raises TheoryError if no message ever arrives.
-    """
+    """Return the equations H(12) of a scenario; raises TheoryError if no message arrives."""
     equations = coupled_riccati(scenario)
     if not equations.coupling.nnz:
         raise TheoryError("no message ever arrives, so that rates of links change nothing")
@@ -104,19 +99,13 @@ def _require_talk(scenario: Scenario) -> CoupledRiccati:
 
 
 def _distance(equations: CoupledRiccati, S: FloatArray, factor: float) -> float | None:
-    """Return ``max_i |calP_i - S|_F`` with all link rates times ``factor``; None if there is no
-    steady state.
-
-    calP_i (n, n) is the steady bound of node i, S (n, n) the limit for fast links.
-    """
+    """Return ``max_i |calP_i - S|_F`` with link rates times ``factor``; None if unbounded."""
     P = steady_state(equations.scale_rates(factor))
     return None if P is None else float(np.linalg.norm(P - S, axis=(1, 2)).max())
 
 
 def _with_rate(scenario: Scenario, factor: float) -> LinkRate:
-    """Return ``factor`` with the rate (1/s) that it stands for if all clocks of the scenario have
-    the same rate, else with nan.
-    """
+    """Return ``factor`` and its rate (1/s) if all clocks have one rate, else nan."""
     clock = scenario.network.activation
     rate = getattr(clock, "rate", None)
     if rate is None or getattr(clock, "rates", None):

@@ -73,9 +73,7 @@ class PackedRiccati:
         return shifted
 
     def _set_drift(self, A: FloatArray, Q: FloatArray) -> None:
-        """Set the map ``_drift_map`` (m, m) of rows by A P + P A', for A (n, n), and the rows
-        ``_Q`` of the noise Q (n, n), or (N, n, n) by node.
-        """
+        """Set the map (m, m) of rows by A P + P A', and the rows of the noise Q."""
         drift = A @ self._basis
         self._drift_map = self.pack(drift + np.swapaxes(drift, 1, 2))
         self._Q = self.pack(Q)
@@ -295,9 +293,7 @@ class LinearisedRiccati(NamedTuple):
 
 
 def _low_rank_factors(G: FloatArray) -> FloatArray:
-    """Return C (S, n, r) with ``C C' = G`` for S positive semidefinite matrices G (S, n, n), r the
-    largest of their ranks.
-    """
+    """Return C (S, n, r) with ``C C' = G`` for semidefinite G (S, n, n)."""
     # Scaled to a diagonal of ones, so that the units of the states do not matter to what is small.
     scale = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
     divided = 1.0 / np.where(scale > 0.0, scale, 1.0)

@@ -53,9 +53,7 @@ def expected_squares(scenario: Scenario, run: Run) -> FloatArray:
 
 
 def _require_exact_model(scenario: Scenario) -> None:
-    """Raise TheoryError unless the filters are those of the hybrid paper, with sensors that give
-    increments and messages without delay, for whose errors the quadrature is.
-    """
+    """Raise TheoryError unless the quadrature holds: increments, messages without delay."""
     if scenario.slotted or scenario.sampled_sensors or not scenario.is_random:
         raise TheoryError("mean squares by quadrature are for random increments")
     if scenario.node_filter.combination != "convex" or overridden(scenario.filter.algorithm):
@@ -71,11 +69,7 @@ def _require_exact_model(scenario: Scenario) -> None:
 def _arrivals_in_order(
     scenario: Scenario, run: Run
 ) -> tuple[FloatArray, np.ndarray, np.ndarray, np.ndarray, FloatArray]:
-    """Return the arrivals of a run as arrays: the T instants (T,) in seconds, and of the M messages
-    the indices of receivers and senders and the weights, (M,) each.
-
-    The second array (T + 1,) has the index of the first message of each instant, then M.
-    """
+    """Return instants (T,), first messages (T + 1,), and receivers, senders, weights (M,)."""
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     index = scenario.topology.index
     index_of = np.zeros(max(index) + 1, dtype=np.int64)

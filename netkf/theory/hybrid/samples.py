@@ -156,11 +156,7 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
 def _arrival_rates(
     scenario: Scenario, senders: list[int], rates: FloatArray
 ) -> scipy.sparse.csr_array:
-    """Return ``heard`` (N, S), sparse: the rate (1/s) at which messages that the node of sensor k
-    sends at its samples arrive at node i, times their weight.
-
-    ``senders`` are the S indices of the sensors' nodes, ``rates`` (S,) the samples per second.
-    """
+    """Return ``heard`` (N, S), sparse: weighted rates (1/s) of messages sent at samples."""
     heard = np.zeros((len(scenario.nodes), len(senders)))
     for (i, j), weight in mean_link_weights(scenario).items():
         for k, sender in enumerate(senders):
@@ -211,9 +207,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
 
 
 def _sent_weights(scenario: Scenario, senders: list[int]) -> FloatArray | None:
-    """Return the weights (N, N), receiver by sender, of the messages that the nodes with the
-    indices ``senders`` send at a sample; None if nodes do not transmit at samples.
-    """
+    """Return the weights (N, N) of messages sent at a sample; None if nodes send none."""
     weights = mean_link_weights(scenario)
     if not weights:
         return None

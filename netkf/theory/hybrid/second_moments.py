@@ -85,10 +85,7 @@ class _SecondMomentEquation:
             self._add_link(scenario, i, j, index[i], index[j])
 
     def _add_link(self, scenario: Scenario, i: int, j: int, a: int, b: int) -> None:
-        """Add the outcomes of an activation of link (i, j) between the nodes of index a and b: to
-        ``_mixing`` their mean effect, to ``_outcomes`` (a, b, rate in 1/s, weights of a and of b on
-        the other).
-        """
+        """Add the outcomes of an activation of link (i, j) between the nodes a and b."""
         clock, channel = scenario.network.activation, scenario.network.channel
         assert isinstance(clock, Poisson)
         rate, loss = clock.mean_rate((i, j)), channel.loss
@@ -108,9 +105,6 @@ class _SecondMomentEquation:
         ]
 
     def __call__(self, flat: FloatArray) -> FloatArray:
-        """Return dY/dt, flat, for second moments Y given as a ``flat`` array of (N n n)^2
-        entries.
-        """
         Y = np.asarray(flat, dtype=np.float64).reshape(self._shape)
         # L Y + Y L'
         change = np.einsum("aij,ajbk->aibk", self._drift_maps, Y)

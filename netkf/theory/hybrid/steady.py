@@ -63,9 +63,7 @@ def has_steady_state(scenario: Scenario) -> bool:
 
 @lru_cache(maxsize=8)
 def _steady_state_of(scenario: Scenario) -> FloatArray | None:
-    """Return the steady state (N, n, n) of H(12), None if there is none; cached because several
-    promises and assumptions are about it. Raises TheoryError if H(12) does not apply.
-    """
+    """Return the steady state (N, n, n) of H(12), or None; cached; raises TheoryError."""
     return steady_state(coupled_riccati(scenario))
 
 
@@ -128,11 +126,7 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
 
 
 def _stabilising_covariances(packed: PackedRiccati) -> FloatArray | None:
-    """Return covariances (N, n, n) whose gains stabilise H(12), the coupled Riccati equations of N
-    nodes, so that Newton's method can start from them; None if there are none.
-
-    Raises TheoryError for samples at known times.
-    """
+    """Return covariances (N, n, n) whose gains stabilise H(12), or None."""
     equations = packed.equations
     if equations.jumps:
         raise TheoryError("samples at known times lead to a cycle, not to a steady state")
@@ -206,9 +200,7 @@ def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
 
 
 def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
-    """Return the text of an error that says why the bound on the mean of P, H(12), has no steady
-    state and what would give one.
-    """
+    """Return why H(12) has no steady state, and what would give one."""
     if not equations.talks:
         unsteady = np.isnan(steady_by_node(scenario)[:, 0, 0])
         unsteady_nodes = [
@@ -274,11 +266,7 @@ def threshold_factor(equations: CoupledRiccati) -> float | None:
 def _steady_at(
     equations: CoupledRiccati, factor: float, first: FloatArray | None
 ) -> FloatArray | None:
-    """Return the steady state (N, n, n) of the coupled Riccati ``equations`` of N nodes, to a few
-    digits, with link rates times ``factor``, for the search for the least factor that has one.
-
-    None if there is none. The search starts from ``first`` (N, n, n), if given.
-    """
+    """Return the steady state (N, n, n) with link rates times ``factor``, or None."""
     packed = PackedRiccati(equations.scale_rates(factor))
     P = _find_stabilising(packed, first)
     if P is None:

@@ -76,9 +76,7 @@ def solve_by_taylor_series(
 
 
 def _step_length(series: FloatArray, sizes: FloatArray) -> float:
-    """Return the step, in spans, at which the last two terms are TERM_TOLERANCE of ``sizes`` (N,),
-    at all nodes; ``series`` (ORDER + 1, N, m) are the Taylor coefficients.
-    """
+    """Return the step, in spans, at which the last terms are TERM_TOLERANCE of ``sizes``."""
     length = np.inf
     for k in (ORDER - 1, ORDER):
         # |c_k| s^k = TERM_TOLERANCE sizes
@@ -89,9 +87,7 @@ def _step_length(series: FloatArray, sizes: FloatArray) -> float:
 
 
 def _evaluate(series: FloatArray, fractions: FloatArray) -> FloatArray:
-    """Return (K + 1, N, m): the polynomial with coefficients ``series`` (T, N, m) at K
-    ``fractions`` (K,) of a span, and its derivative at the last of them.
-    """
+    """Return (K + 1, N, m): ``series`` at ``fractions`` (K,), and the derivative at the last."""
     orders = np.arange(len(series))
     weights = np.empty((len(fractions) + 1, len(series)))
     weights[:-1] = fractions[:, None] ** orders

@@ -31,9 +31,7 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
-    """Return whether no node counts a reading more than once in its estimate, as weights and
-    averaging may make it do, and a text with the largest number of times.
-    """
+    """Return whether no node counts a reading more than once, and the largest count."""
     weights, delay = step_weights(scenario), scenario.network.channel.delay.fixed
     steps = scenario.node_filter.exchange_steps(0)
     # A node that hears nothing counts its own reading in full, whatever the weights.

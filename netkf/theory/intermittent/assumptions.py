@@ -49,9 +49,7 @@ def _reachable_readings(scenario: Scenario) -> dict[int, FloatArray]:
 
 
 def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumption, as a list of one row of the table, that (F, H) is detectable at every
-    node from all readings that can reach it.
-    """
+    """Return the row that (F, H) is detectable at every node from all that reaches it."""
     F = scenario.slot_plant.F
     name = "(F, H) is detectable at every node"
     try:
@@ -67,9 +65,7 @@ def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, that readings arrive independently, and often
-    enough for a bounded mean of P.
-    """
+    """Return the rows that readings arrive independently, and often enough."""
     channel = scenario.network.channel
     loss = channel.loss
     # R (12) needs independent arrivals of positive probability.
@@ -100,10 +96,7 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row of the table on the condition of paper R (32), enough for a bounded mean of
-    P: some gains make errors contract in the mean square. Its evidence is about the node at which
-    readings arrive least sufficiently.
-    """
+    """Return the row on R (32): some gains make errors contract in the mean square."""
     F, sensing = scenario.slot_plant.F, set(scenario.sensing_nodes)
     least_sufficient: tuple[float, int, list[float]] | None = None
     for node, H in _reachable_readings(scenario).items():
@@ -137,9 +130,7 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:
-    """Return the mean delivery probability of each link of ``heard``, pairs (sender, receiver), in
-    their order.
-    """
+    """Return the mean delivery probability of each link of ``heard``."""
     loss = scenario.network.channel.loss
     return [loss.mean_delivery(link, scenario.table_probability(link)) for link in heard]
 
@@ -147,12 +138,7 @@ def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]
 def _arrival_sets(
     scenario: Scenario, own_H: FloatArray, heard: list[tuple[int, int]]
 ) -> list[tuple[float, FloatArray]]:
-    """Return for every set of readings that may reach a node its probability and its stacked H
-    (p, n).
-
-    ``own_H`` (p_0, n) is the node's own, which it always has; ``heard`` are the k links
-    (sender, node) that can bring readings, so that there are 2^k sets.
-    """
+    """Return each set of readings that may reach a node: probability and H (p, n)."""
     sets, probabilities = [], _deliveries(scenario, heard)
     # All 2^k outcomes of the k links, which fail independently.
     for arrived in itertools.product((False, True), repeat=len(heard)):

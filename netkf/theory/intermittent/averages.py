@@ -83,11 +83,7 @@ def _evaluate(
     root: FloatArray,
     arrived: np.ndarray,
 ) -> list[FloatArray]:
-    """Return the values of the ``function`` at P_0, P_1, ..., one for each slot, as arrays (K,) of
-    pieces of limited size.
-
-    ``root`` (n, n) is that of P_0, and ``arrived`` (slots,) is true in slots with a reading.
-    """
+    """Return values of ``function`` at P_0, P_1, ..., in pieces (K,) of limited size."""
     F, Q, H, R = system
     modes, root_Q = reading_modes([(H[:0], R[:0, :0]), (H, R)], len(F)), square_root(Q)
     piece, values_of_pieces = max(1, MAX_ENTRIES // len(F) ** 2), []

@@ -158,9 +158,7 @@ def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArr
 
 
 def _optimal_gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the predictor's gain ``F P H' (H P H' + R)^-1`` (n, p), for P and F (n, n), H (p, n)
-    and R (p, p).
-    """
+    """Return the predictor's gain ``F P H' (H P H' + R)^-1`` (n, p)."""
     return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P @ F.T).T)
 
 
@@ -225,10 +223,7 @@ def critical_certificate(F: ArrayLike, H: ArrayLike) -> CriticalProbability:
 
 
 def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple[float, float]:
-    """Return a lower and an upper bound on the critical delivery probability, paper R (31) and
-    paper R (32), for F (n, n) and H (p, n), with the ``search`` over gains for them; raises
-    TheoryError if the upper one is not found.
-    """
+    """Return the bounds R (31), R (32) on the critical probability; raises TheoryError."""
     moduli, alpha = np.abs(eigenvalues(F)), growth_factor(F)
     lower = max(0.0, 1.0 - 1.0 / alpha**2) if alpha > 0.0 else 0.0
 
@@ -275,9 +270,6 @@ class _GainSearch:
     """
 
     def __init__(self, F: FloatArray, readings: Sequence[FloatArray]) -> None:
-        """Take F (n, n) and the ``readings`` H_s (p, n) of each set s of readings that may
-        arrive.
-        """
         self._F, self._readings = F, readings
         n = len(F)
         rows, columns = np.triu_indices(n)
@@ -289,10 +281,7 @@ class _GainSearch:
         self._pick = rows * n + columns
 
     def best(self, probabilities: Sequence[float]) -> tuple[float, list[FloatArray], FloatArray]:
-        """Return the least spectral radius of the mean-square dynamics L over all gains, the gains
-        K_s (n, p) that attain it, and the Perron matrix (n, n) of L with them, for the
-        ``probabilities`` p_s of the sets of readings.
-        """
+        """Return the least radius over all gains, these gains, and the Perron matrix (n, n)."""
         n = len(self._F)
         gains = self._improve([np.zeros((n, len(H))) for H in self._readings], np.eye(n))
         gains = self._first_gains(probabilities, gains)
@@ -355,10 +344,7 @@ class _GainSearch:
         return np.asarray(np.ldexp(matrix, -np.frexp(np.trace(matrix))[1]))
 
     def _improve(self, gains: list[FloatArray], X: FloatArray) -> list[FloatArray]:
-        """Return the gains ``K_s = -F X H_s' (H_s X H_s')^-1`` , which minimise ``L(X) =
-        sum_s p_s (F + K_s H_s) X (F + K_s H_s)'`` for a given X (n, n); like ``gains``, one for
-        each H_s and with the shape of H_s'.
-        """
+        """Return K_s = -F X H_s' (H_s X H_s')^-1, the gains that minimise L(X)."""
         # In the kernel of H X H' any gain is optimal: the pseudo-inverse keeps the present one.
         improved = []
         for K, H in zip(gains, self._readings, strict=True):
@@ -368,10 +354,7 @@ class _GainSearch:
         return improved
 
     def _operator(self, probabilities: Sequence[float], gains: list[FloatArray]) -> FloatArray:
-        """Return the mean-square dynamics L with these ``probabilities`` and ``gains`` (n, p) of
-        the sets of readings, as a matrix (m, m) on the m = n (n + 1) / 2 entries of upper
-        triangles.
-        """
+        """Return the mean-square dynamics L as a matrix (m, m) on upper triangles."""
         kron = np.zeros((len(self._F) ** 2,) * 2)
         for p, K, H in zip(probabilities, gains, self._readings, strict=True):
             closed = self._F + K @ H
@@ -381,10 +364,7 @@ class _GainSearch:
     def _perron(
         self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> tuple[float, FloatArray]:
-        """Return the spectral radius of the mean-square dynamics L with these ``probabilities`` and
-        ``gains`` (n, p), and its Perron matrix X (n, n), the semidefinite eigenvector of the
-        radius, of positive trace.
-        """
+        """Return the radius of L and its Perron matrix X (n, n), semidefinite of positive trace."""
         values, vectors = np.linalg.eig(self._operator(probabilities, gains))
         k = int(np.argmax(values.real))
         vector = (self._expand @ vectors[:, k]).real

@@ -79,10 +79,7 @@ def _count_numbers(shape: Shape) -> int:
 
 
 def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
-    """Return the spectral radius ``value`` found for the positive map ``T``, with eigenvector X
-    (S, M, M), which X does not prove, if a different search, for the eigenvalue of largest modulus
-    from another start, finds the same; raises TheoryError if not.
-    """
+    """Return the radius ``value`` if a search from another start finds it; else TheoryError."""
     start = X + np.diag(np.linspace(0.5, 1.5, X.shape[-1])) * np.trace(X.sum(axis=0))
     second_value, _ = _extreme_eigenvalue(T, start, "LM")
     if not abs(second_value - value) <= 1e-8 * value:
@@ -122,9 +119,7 @@ def _extreme_eigenvalue(
 
 
 def _least_factor(T: PositiveMap, X: FloatArray) -> float:
-    """Return the least c with ``T(X) <= c X`` for X (S, M, M), which bounds the radius of T from
-    above; inf if X is not positive definite.
-    """
+    """Return the least c with ``T(X) <= c X``, a bound on the radius; inf if X is not > 0."""
     try:
         roots = np.linalg.cholesky(X)
     except np.linalg.LinAlgError:
@@ -133,20 +128,14 @@ def _least_factor(T: PositiveMap, X: FloatArray) -> float:
 
 
 def _largest_ratio(image: FloatArray, L: FloatArray) -> float:
-    """Return the largest eigenvalue of ``L^-1 image L^-T`` for a symmetric ``image`` (M, M) and a
-    lower triangular L (M, M): the least c with ``image <= c L L'``.
-    """
+    """Return the least c with ``image <= c L L'`` for triangular L (M, M)."""
     half = scipy.linalg.solve_triangular(L, image, lower=True)
     scaled = scipy.linalg.solve_triangular(L, half.T, lower=True)
     return float(np.linalg.eigvalsh(symmetric(scaled))[-1])
 
 
 def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:
-    """Return True if every entry of the ``residual`` (S, M, M) of S equations is below
-    ``tolerance`` times the standard deviations of its row and column.
-
-    Their squares are the diagonal of the sum of the S second moments X (S, M, M).
-    """
+    """Return True if ``residual`` is below ``tolerance`` times the deviations of X's diagonal."""
     variances = np.abs(np.diagonal(X, axis1=1, axis2=2)).sum(axis=0)
     deviations = np.sqrt(variances)
     # Small variances must be accurate too, beside large ones of other states.
@@ -155,18 +144,14 @@ def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:
 
 
 def _triangle_indices(shape: Shape) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the indices of the entries in the upper triangles of a stack of the ``shape``
-    (S, M, M): of matrices, rows and columns, three arrays of S M (M + 1) / 2 entries.
-    """
+    """Return matrices, rows and columns of the entries in S upper triangles."""
     rows, columns = np.triu_indices(shape[-1])
     matrices = np.repeat(np.arange(shape[0]), len(rows))
     return matrices, np.tile(rows, shape[0]), np.tile(columns, shape[0])
 
 
 def _dense_matrix(T: PositiveMap, shape: Shape) -> FloatArray:
-    """Return T as a matrix (m, m) on the m = S M (M + 1) / 2 entries of the upper triangles of a
-    stack of the ``shape`` (S, M, M).
-    """
+    """Return T as a matrix (m, m) on the entries of S upper triangles."""
     triangle, columns = _triangle_indices(shape), []
     for s, i, j in zip(*triangle, strict=True):
         unit = np.zeros(shape)
@@ -176,9 +161,7 @@ def _dense_matrix(T: PositiveMap, shape: Shape) -> FloatArray:
 
 
 def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
-    """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination, for ``right``
-    (S, M, M).
-    """
+    """Return the solution (S, M, M) of ``X - T(X) = right`` by elimination."""
     s, i, j = triangle = _triangle_indices(right.shape)
     X = np.zeros_like(right)
     X[s, i, j] = X[s, j, i] = np.linalg.solve(
@@ -188,9 +171,7 @@ def _solve_by_elimination(T: PositiveMap, right: FloatArray) -> FloatArray:
 
 
 def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
-    """Return an approximate solution (S, M, M) of ``X - T(X) = right``, for ``right`` (S, M, M), to
-    a relative residual of about 1e-8.
-    """
+    """Return the solution of ``X - T(X) = right`` to a relative residual of about 1e-8."""
     x, _ = scipy.sparse.linalg.gmres(
         _linear_operator(lambda X: X - T(X), right.shape),
         right.ravel(),
@@ -203,9 +184,7 @@ def _by_gmres(T: PositiveMap, right: FloatArray) -> FloatArray:
 
 
 def _linear_operator(apply: PositiveMap, shape: Shape) -> scipy.sparse.linalg.LinearOperator:
-    """Return ``apply``, a map on stacks of the ``shape`` (S, M, M), as a linear operator on vectors
-    (S M M,), of which it uses the symmetric part.
-    """
+    """Return ``apply`` as a linear operator on vectors (S M M,) of symmetric stacks."""
     size = int(np.prod(shape))
     return scipy.sparse.linalg.LinearOperator(
         (size, size),

@@ -370,9 +370,7 @@ def _side_by_side(matrices: FloatArray) -> FloatArray:
 
 
 def _balancing_scale(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
-    """Return the scale of covariances for which the off-diagonal blocks Q and G of the Hamiltonian
-    of A, Q and G, each (n, n), have about equal norms, so that steps are longest.
-    """
+    """Return the scale for which the Hamiltonian's blocks Q and G have equal norms."""
     q, g = float(np.abs(Q).max(initial=0.0)), float(np.abs(G).max(initial=0.0))
     # Equal blocks Q / c and G c need c = sqrt(q / g). Without G, c = q makes Q / c of size 1;
     # without Q, c makes G c as large as A.

@@ -514,9 +514,7 @@ def flow_start(
 
 @kernel
 def _add_product(out: FloatArray, first: int, a: FloatArray, b: FloatArray, scale: float) -> None:
-    """Add ``scale a b`` (r, c) to c columns of ``out`` in place, from ``first`` on, for a (r, k)
-    and b (k, c).
-    """
+    """Add ``scale a b`` (r, c) to the columns of ``out`` from ``first`` on."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
             total = 0.0

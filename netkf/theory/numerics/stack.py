@@ -168,9 +168,7 @@ class GaussianStack:
         return np.asarray(stacked @ stacked.T)
 
     def _grow(self) -> int:
-        """Double the storage, at least to 4 vectors, and return a free index (which is then in
-        use).
-        """
+        """Double the storage, at least to 4 vectors, and return a free index."""
         count = len(self.table)
         added = max(4, 2 * count) - count
         self.table, self.matrices = (

@@ -59,9 +59,7 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
 
 
 def _used_bits(scenario: Scenario, run: Run) -> dict[int, list[tuple[int, int]]]:
-    """Return by slot who used whose bits, as sorted pairs of node ids (receiver, sender); a sender
-    uses its own.
-    """
+    """Return by slot the pairs (receiver, sender) of used bits; a sender uses its own."""
     bits: dict[int, set[tuple[int, int]]] = {}
     rows = run.log[run.log["kind"] == CODES["deliver"]]
     slots = scenario.slot_plant.slots_of(rows["t"])

@@ -37,9 +37,7 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on controllability, observability and the
-    filters' model.
-    """
+    """Return the rows on controllability, observability and the filters' model."""
     F, Q = scenario.slot_belief
     # (F, Q^1/2) is controllable if and only if (F', Q) is observable.
     idle = unobservable_mode(F.T, Q)
@@ -60,9 +58,7 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _observability_row(scenario: Scenario) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that all sensors together observe every mode of
-    the plant.
-    """
+    """Return the row that all sensors together observe every mode of the plant."""
     F, _ = scenario.slot_belief
     informations = [model.information for model in scenario.slot_models]
     hidden = unobservable_mode(F, np.sum(informations, axis=0))
@@ -104,9 +100,7 @@ def _graph_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that links fail anew in each averaging step;
-    ``reason`` says why they have no ``law``, if it is None.
-    """
+    """Return the row that links fail anew in each step; ``reason`` says why ``law`` is None."""
     name, source = "links fail anew in each averaging step", "P Assumption 3"
     filter_ = push_sum_filter(scenario)
     if law is None:
@@ -121,9 +115,7 @@ def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> 
 
 
 def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that both directions of a link fail together;
-    ``law`` has the links' probabilities, None if they have none.
-    """
+    """Return the row that both directions of a link fail together."""
     joint = scenario.network.channel.symmetric
     if law is not None:
         # Both directions have one probability, and each is up exactly if both are.
@@ -139,9 +131,7 @@ def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionR
 
 
 def _connection_row(scenario: Scenario) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that the links which are up connect all nodes
-    with a positive probability: the disconnection probability p_d is below 1.
-    """
+    """Return the row that links which are up may connect all nodes: p_d below 1."""
     name, source = "p_d < 1: the network is whole at times", "P Assumption 3"
     try:
         cut = disconnection_probability(scenario)
@@ -153,9 +143,7 @@ def _connection_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on the consensus gain delta of averaging steps
-    z <- (I - L / delta) z, with L the Laplacian of the graph.
-    """
+    """Return the rows on the consensus gain delta of z <- (I - L / delta) z."""
     # One step multiplies disagreement by I - L / delta, of norm below 1 for delta > rho(L) / 2.
     delta, bound = push_sum_filter(scenario).delta, consensus_gain_bound(scenario)
     local = f"nodes can tell from degrees that rho(L) <= {min(bound.local, bound.nodes)}"
@@ -176,9 +164,7 @@ def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _stop_row(scenario: Scenario) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that no gain is frozen before push-sum has
-    converged: the filter's option ``stop`` lets a node stop exchanging masses.
-    """
+    """Return the row that ``stop`` freezes no gain before push-sum has converged."""
     filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
         loss.mean_delivery(direction, scenario.table_probability(direction)) == 1.0
@@ -200,10 +186,7 @@ def _stop_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the conditions under which the errors' means vanish and their mean squares stay
-    bounded, as rows of the table: for each the exact one, and that of the paper, whose theorems
-    certify it if there are enough averaging steps (gamma).
-    """
+    """Return the rows on bounded means and mean squares: exact, and as certified."""
     return [
         _exact_row(
             ("the estimates become unbiased", "P (30), derived"),
@@ -222,12 +205,7 @@ def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
 def _exact_row(
     name: tuple[str, str], measure: Callable[[], float], heavy: bool = False
 ) -> AssumptionRow:
-    """Return a row of the table of assumptions that holds if the spectral radius of the errors'
-    dynamics that ``measure`` computes is below 1.
-
-    name  : the row's text and its equation
-    heavy : mention heavy tails of averages over runs
-    """
+    """Return the row that holds if the radius that ``measure`` computes is below 1."""
     try:
         radius = measure()
     except TheoryError as error:
@@ -243,10 +221,7 @@ def _exact_row(
 
 
 def _certified_row(scenario: Scenario, moment: Moment, source: str) -> AssumptionRow:
-    """Return the row of the table that says whether gamma, the number of averaging steps in a slot,
-    is at least the one for which the paper's theorem ``source`` certifies stable errors: in the
-    mean, or in the mean square (``moment``).
-    """
+    """Return the row that gamma is certified by the theorem ``source`` for this ``moment``."""
     gamma = push_sum_filter(scenario).gamma
     name = f"gamma is certified for the {moment.replace('-', ' ')}"
     try:

@@ -135,9 +135,7 @@ class Averaging:
 
     @cached_property
     def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Covariance matrix of (b_ij, b_ji) over delta^2 of each of E links, row by row, (E,) each;
-        b_ij = 1 if i hears j in an averaging step, else 0.
-        """
+        """Covariances (E,) of (b_ij, b_ji) / delta^2 of each link; b_ij = 1 if i hears j."""
         first, second = self.hears.T
         # cov(b_ij, b_ji) = P(both) - p q; variances p (1 - p) and q (1 - q)
         covariance = (self.both - first * second) / self.delta**2
@@ -146,11 +144,7 @@ class Averaging:
 
     @cached_property
     def _moments(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (N, N) and mean Kronecker square (N^2, N^2) of M^gamma if one draw of the links is
-        held over all steps of a slot: averages over all outcomes of the draw.
-
-        Raises TheoryError if there are too many.
-        """
+        """Mean and mean Kronecker square of M^gamma for one draw held; raises TheoryError."""
         N = self.nodes
         outcomes = self._link_outcomes
         count = math.prod(len(probability) for probability, _ in outcomes)
@@ -177,10 +171,7 @@ class Averaging:
 
     @cached_property
     def _link_outcomes(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Probabilities (K,) and terms (K, N^2) of the K possible outcomes of each link in a step:
-        both ends hear each other, one of them, or none. The step's matrix M is the identity less
-        the term of each link.
-        """
+        """Probabilities (K,) and terms (K, N^2) of the outcomes of each link in a step."""
         N, outcomes = self.nodes, []
         for (i, j), (first_hears, second_hears), both_hear in zip(
             self.links, self.hears, self.both, strict=True
@@ -207,11 +198,7 @@ class Averaging:
 def _tabulate(
     outcomes: list[tuple[FloatArray, FloatArray]], size: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the probabilities (K,) of all K joint outcomes of several independent links, and the
-    sums (K, size) of the links' terms of the averaging matrix in each.
-
-    ``outcomes`` has for each link the probabilities (k,) and terms (k, size) of its own k outcomes.
-    """
+    """Return probabilities (K,) and sums (K, size) of joint outcomes of independent links."""
     probabilities, sums = np.ones(1), np.zeros((1, size))
     for probability, terms in outcomes:
         probabilities = np.outer(probabilities, probability).reshape(-1)

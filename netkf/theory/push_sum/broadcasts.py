@@ -89,12 +89,7 @@ def leader_agreement(scenario: Scenario, slots: int, leader: int | None = None) 
 
 
 def _spread(law: FloatArray, missed: FloatArray) -> FloatArray:
-    """Return the probabilities (2^N,) of all sets of informed nodes one slot later, from those now,
-    ``law`` (2^N,); a node is informed if it knows the leader, and it tells its neighbours.
-
-    The index of a set is a bit mask of node indices; ``missed`` (N, N) is the probability that node
-    i (row) does not hear node j (column) in a slot.
-    """
+    """Return the law (2^N,) of the set (bit mask) of informed nodes one slot later."""
     N, next_law = len(missed), np.zeros_like(law)
     for informed in np.flatnonzero(law).tolist():
         members = [k for k in range(N) if informed >> k & 1]

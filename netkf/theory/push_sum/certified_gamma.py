@@ -59,9 +59,7 @@ def gamma_constants(scenario: Scenario) -> GammaConstants:
 
 @lru_cache(maxsize=8)
 def _bound_constants(scenario: Scenario) -> GammaConstants:
-    """Return the constants of :func:`gamma_constants`, cached: both theorems use them, and the
-    probability that link failures disconnect the network takes time.
-    """
+    """Return the constants of :func:`gamma_constants`, cached for both theorems."""
     steps = estimation_steps(scenario)
     law, P, N = steps.averaging, steps.limits.P, steps.limits.N
     _require_conditions(scenario, law, P)
@@ -86,9 +84,7 @@ def _bound_constants(scenario: Scenario) -> GammaConstants:
 
 
 def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> None:
-    """Raise TheoryError if a condition of P Theorems 5 and 6 fails for the ``law`` of averaging and
-    the limit P_inf, ``P`` (n, n).
-    """
+    """Raise TheoryError if a condition of P Theorems 5 and 6 fails."""
     laplacian_radius = consensus_gain_bound(scenario).radius
     if not law.delta > laplacian_radius:
         raise TheoryError(
@@ -104,18 +100,14 @@ def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> No
 
 
 def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
-    """Return the probability p_d that link failures disconnect the network in an averaging step, or
-    the upper end of its interval where it is only estimated.
-    """
+    """Return p_d, or the upper end of its interval where it is only estimated."""
     links, nodes = law.links, scenario.nodes
     up = {(nodes[i], nodes[j]): float(p) for (i, j), p in zip(links, law.both, strict=True)}
     return disconnection_probability(scenario.topology, up).high
 
 
 def _weighted_norm(A: FloatArray, P: FloatArray) -> float:
-    """Return |A|_P = sup over z of sqrt(z' A' P A z / z' P z), paper P (35), for A (n, n) and a
-    positive definite P (n, n).
-    """
+    """Return |A|_P = sup_z sqrt(z' A' P A z / z' P z), P (35), for A (n, n) and P > 0."""
     # The largest generalised eigenvalue of (A' P A, P).
     return float(np.sqrt(scipy.linalg.eigh(A.T @ P @ A, P, eigvals_only=True)[-1]))
 
@@ -179,10 +171,7 @@ def _check_moment(moment: str) -> Moment:
 
 
 def _least_certified(certified: Callable[[int], bool], constants: GammaConstants) -> int:
-    """Return the smallest gamma for which ``certified`` is true, by doubling and bisection, since
-    the theorems' bounds decrease with gamma; raises TheoryError, with the ``constants`` of the
-    bounds, if there is none up to MAX_STEPS.
-    """
+    """Return the smallest certified gamma, by bisection; raises TheoryError beyond MAX_STEPS."""
     high = 1
     while not certified(high):
         high *= 2

@@ -34,10 +34,7 @@ def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
 
 
 def _covariance(steps: EstimationSteps, value: float) -> FloatArray:
-    """Return the steady covariance (N, n, n) of the nodes' errors under the estimation ``steps``,
-    whose mean-square radius (spectral radius of the second moments' recursion) is ``value``; raises
-    TheoryError unless it is below 1.
-    """
+    """Return the steady covariance (N, n, n); raises TheoryError unless ``value`` is below 1."""
     if not contracts(value):
         raise TheoryError(
             f"no steady error covariance: the mean-square radius is {value:.6g}, not below 1; "

@@ -98,12 +98,7 @@ def _scenario_probability(scenario: Scenario, seed: int, samples: int | None) ->
 def _probability(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int | None
 ) -> Probability:
-    """Return the probability p_d that the links which are up do not connect all nodes: exact if
-    the method over partitions of nodes into connected parts needs few enough of them, else an
-    estimate from ``samples`` draws with ``seed``.
-
-    ``nodes`` is their number; ``probabilities`` are those that a link (pair of node indices) is up.
-    """
+    """Return p_d: exact with few enough partitions, else estimated from ``samples`` draws."""
     neighbours: list[dict[int, float]] = [{} for _ in range(nodes)]
     for (i, j), p in probabilities.items():
         if p > 0.0:
@@ -122,11 +117,7 @@ def _probability(
 def _link_probabilities(
     graph: Any, delivery: float | Mapping[Edge, float] | None
 ) -> tuple[int, dict[tuple[int, int], float]]:
-    """Return the number of nodes and the probability of each link, by the indices of its ends.
-
-    ``graph`` and ``delivery`` are those of ``disconnection_probability``. Raises TheoryError for
-    directed graphs and links without a probability in [0, 1].
-    """
+    """Return the number of nodes and the probability of each link; raises TheoryError."""
     if isinstance(graph, Scenario):
         if delivery is None:
             delivery = _channel_probabilities(graph)
@@ -166,11 +157,7 @@ def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
 
 
 def _link_probability(link: Edge, delivery: float | Mapping[Edge, float] | None) -> float:
-    """Return the probability that a ``link`` is up: ``delivery``, or its entry for the link in
-    either direction.
-
-    Raises TheoryError if there is none, or none in [0, 1].
-    """
+    """Return the probability that a ``link`` is up; raises TheoryError."""
     p: Any = None
     if isinstance(delivery, Mapping):
         p = delivery.get(link, delivery.get(link[::-1]))
@@ -189,10 +176,7 @@ def _link_probability(link: Edge, delivery: float | Mapping[Edge, float] | None)
 
 
 def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
-    """Return the probability that each link is up, in both directions together.
-
-    Raises TheoryError if the directions of a link fail independently, and for recorded losses.
-    """
+    """Return the probability that each link is up in both directions; raises TheoryError."""
     channel, probabilities = scenario.network.channel, {}
     for i, j in scenario.topology.links:
         forward, backward = (
@@ -208,9 +192,7 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
 
 
 def _is_connected(neighbours: list[dict[int, float]]) -> bool:
-    """Return True if the links connect all nodes; ``neighbours`` has the probabilities of the links
-    of each node, by the index of the other end.
-    """
+    """Return True if the links connect all nodes."""
     reached, waiting = {0}, [0]
     while waiting:
         for node in neighbours[waiting.pop()].keys() - reached:
@@ -351,11 +333,7 @@ def _renumber(labels: list[int]) -> tuple[int, ...]:
 def _estimate(
     nodes: int, probabilities: dict[tuple[int, int], float], seed: int, samples: int
 ) -> Probability:
-    """Return the fraction of ``samples`` draws of the links, with ``seed``, that do not connect all
-    ``nodes`` (their number), with its Clopper-Pearson interval.
-
-    ``probabilities`` are those that a link (pair of node indices) is up.
-    """
+    """Return the share of ``samples`` draws that are disconnected, with Clopper-Pearson ends."""
     edges, edge_probabilities = (
         np.array(list(probabilities)),
         np.array(list(probabilities.values())),

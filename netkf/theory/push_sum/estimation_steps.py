@@ -126,9 +126,7 @@ def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averagin
 
 
 def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
-    """Return the probabilities (E, 2), for each of E links, that its first end hears the second,
-    and vice versa; ``delivery`` for all, if given.
-    """
+    """Return the probabilities (E, 2) that each end of a link hears the other."""
     loss, links = scenario.network.channel.loss, scenario.topology.links
     if delivery is not None:
         if not 0.0 <= delivery <= 1.0:

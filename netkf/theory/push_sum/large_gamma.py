@@ -92,9 +92,7 @@ def push_sum_covariances(scenario: Scenario, gammas: Sequence[int]) -> FloatArra
 
 
 def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
-    """Raise TheoryError unless gamma averaging steps converge to the mean of all nodes as gamma
-    grows, as paper P Theorem 4 assumes.
-    """
+    """Raise TheoryError unless averaging converges to the mean, as P Theorem 4 assumes."""
     law = steps.averaging
     if law.held and not law.deterministic:
         raise TheoryError('P Theorem 4 needs links = "fresh": a draw that is held cuts the network')
@@ -108,9 +106,6 @@ def _require_averaging(scenario: Scenario, steps: EstimationSteps) -> None:
 
 
 def _steady_mean(steps: EstimationSteps, noise: FloatArray) -> FloatArray:
-    """Return the steady covariance X (n, n) of the mean of all nodes' errors, which solves
-    ``X = A_C X A_C' + noise`` with A_C the mean of their closed loops; ``noise`` (n, n) is what a
-    slot adds to it.
-    """
+    """Return X (n, n), X = A_C X A_C' + noise, with A_C the mean closed loop."""
     central = steps.closed.mean(axis=0)
     return symmetric(np.asarray(scipy.linalg.solve_discrete_lyapunov(central, noise)))

@@ -43,9 +43,7 @@ def push_sum_radius(scenario: Scenario) -> float:
 
 @lru_cache(maxsize=8)
 def _cached_radius(scenario: Scenario) -> float:
-    """Return the mean-square radius (:func:`push_sum_radius`), cached: the tables of assumptions
-    and results and the error covariance all use it.
-    """
+    """Return :func:`push_sum_radius`, cached for tables and covariance."""
     return radius(estimation_steps(scenario))
 
 
@@ -84,9 +82,7 @@ def mean_radius(steps: EstimationSteps) -> float:
 
 
 def _mean_radius(law: Averaging, closed: FloatArray) -> float:
-    """Return the spectral radius, per slot, of the mean errors of one group of n states, with the
-    closed loops ``closed`` (N, n, n) of the nodes.
-    """
+    """Return the radius of the mean errors, per slot, with loops ``closed`` (N, n, n)."""
     N, n, _ = closed.shape
     if N * n > DENSE_ROWS and not law.enumerated:
         return _mean_radius_by_arnoldi(law, closed)
@@ -96,10 +92,7 @@ def _mean_radius(law: Averaging, closed: FloatArray) -> float:
 
 
 def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
-    """Return the spectral radius of the mean errors' dynamics of a large network by Arnoldi's
-    method, with the closed loops ``closed`` (N, n, n) of the nodes; raises TheoryError if it does
-    not converge.
-    """
+    """Return the same for large networks by Arnoldi's method; raises TheoryError."""
     N, n, _ = closed.shape
 
     def step(e: FloatArray) -> FloatArray:
@@ -142,10 +135,7 @@ def _groups(closed: FloatArray) -> list[FloatArray]:
 
 
 def _radius(law: Averaging, closed: FloatArray) -> float:
-    """Return the mean-square radius for one group of n states: the spectral radius of the map T of
-    the errors' second moments, with the closed loops ``closed`` (N, n, n) of the nodes and the
-    ``law`` of averaging. Raises TheoryError if the group is too large or the radius not found.
-    """
+    """Return the mean-square radius for one group of n states; raises TheoryError."""
     if law.deterministic:  # M is fixed, so that T is the square of the mean dynamics
         return _mean_radius(law, closed) ** 2
     size = closed.shape[0] * closed.shape[1]

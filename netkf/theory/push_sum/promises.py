@@ -53,9 +53,7 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
         return [probability.low, probability.high]
 
     def corollary() -> dict[str, float]:
-        """Return the gamma that the paper's Corollary 2 calls sufficient for unbiased estimates,
-        and what its Theorem 5 says of it, by name.
-        """
+        """Return the gamma of Corollary 2, and what Theorem 5 says of it."""
         return corollary_2(scenario)._asdict()
 
     functions: dict[str, Callable[[], Any]] = {
@@ -75,9 +73,7 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
 
 
 def _exact_gamma(scenario: Scenario) -> int:
-    """Return the least gamma (number of averaging steps in a slot), up to MAX_STEPS, with stable
-    mean-square errors; raises TheoryError if the network is too large to look for it quickly.
-    """
+    """Return the least gamma with stable mean squares; raises TheoryError if it takes long."""
     if not searches_gamma(scenario):
         raise TheoryError(
             f"not looked for: the nodes have more than {MAX_SEARCHED} states together; "
@@ -87,10 +83,7 @@ def _exact_gamma(scenario: Scenario) -> int:
 
 
 def _leader_slots(scenario: Scenario) -> int:
-    """Return the slots of a leader's election by max-consensus until all nodes know the leader (the
-    one node that starts with a push-sum weight) with probability AGREEMENT; raises TheoryError if
-    there are more than MAX_LEADER_SLOTS.
-    """
+    """Return the slots until all know the leader with probability AGREEMENT; TheoryError."""
     probabilities = leader_agreement(scenario, MAX_LEADER_SLOTS)
     undecided = probabilities < AGREEMENT
     if undecided.all():
@@ -112,9 +105,7 @@ def slot_lines(results: dict[str, Any], number: Callable[[Any], str]) -> list[st
     """
 
     def text(name: str, make: Callable[[Any], str] = number) -> str:
-        """Return the value ``name`` of the results as text, which ``make`` formats, or the reason
-        why there is none.
-        """
+        """Return the value ``name`` as text by ``make``, or the reason why there is none."""
         value = results[name]
         return value["reason"] or make(value["value"])
 

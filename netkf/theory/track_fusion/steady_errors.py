@@ -70,12 +70,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
 
 
 def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
-    """Return the mean covariance (n, n), over losses, of the error of the estimate that node i (an
-    index) reports: the best combination of its own Kalman filter (its track) and those heard.
-
-    ``joint`` (N, N, n, n) are the covariances of all steady tracks. Raises TheoryError if more than
-    MAX_NEIGHBOURS links to the node have losses.
-    """
+    """Return the mean covariance (n, n) of what node i reports; raises TheoryError."""
     probabilities = _hearing_probabilities(scenario, scenario.nodes[i])
     certain = [j for j, p in probabilities.items() if p == 1.0]
     unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
@@ -107,9 +102,7 @@ def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
 
 
 def _fuse_tracks(joint: FloatArray, order: list[int]) -> FloatArray:
-    """Return the covariance (n, n) of the best combination of the tracks with indices ``order``,
-    the node's own first, from the covariances ``joint`` (N, N, n, n) of all tracks.
-    """
+    """Return the covariance (n, n) of the best combination of the tracks ``order``."""
     P: FloatArray = joint[order[0], order[0]]
     if len(order) == 1:
         return P
