@@ -11,7 +11,7 @@ from netkf.checks.evidence import Assumption, Finding, Promise, error_test, find
 from netkf.checks.laws import NEES_TOLERANCE, exact_start
 from netkf.checks.paper import PaperChecks
 from netkf.checks.samples import RunSamples
-from netkf.checks.statistics import student_interval
+from netkf.laws.intervals import student_interval
 from netkf.scenario.scenario import Scenario
 
 

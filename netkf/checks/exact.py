@@ -30,7 +30,6 @@ from netkf.checks.laws import (
     find_largest,
     pool,
 )
-from netkf.checks.parts.moments import whitening_matrix
 from netkf.checks.points import (
     check_slots,
     checked_samples,
@@ -40,14 +39,10 @@ from netkf.checks.points import (
 )
 from netkf.checks.rounding import EPS, OPERATIONS, compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples, with_departure
-from netkf.checks.statistics import (
-    POWER,
-    Interval,
-    deviation_interval,
-    quadratic_interval,
-    scale_interval,
-)
+from netkf.checks.statistics import quadratic_interval
 from netkf.core.errors import TheoryError
+from netkf.laws.intervals import POWER, Interval, deviation_interval, scale_interval
+from netkf.laws.noise import MIN_VARIANCE_SHARE, whiten
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.errors import diagonal_blocks, error_law
@@ -453,7 +448,9 @@ def check_bias(samples: RunSamples, level: float) -> Finding:
     z = (vectors.T @ vector)[varying] / np.sqrt(values[varying])
     covariances = Sigma.reshape(-1, n, n)
     typical = covariances[np.isfinite(covariances).all(axis=(1, 2))].mean(axis=0)
-    spread = whitening_matrix(typical) @ (vectors[:, varying] / np.sqrt(values[varying]))
+    spread = whiten(typical, MIN_VARIANCE_SHARE).factor @ (
+        vectors[:, varying] / np.sqrt(values[varying])
+    )
     length = _length_interval(spread, z, level)
     message = "bias that all errors share, in standard deviations of an error,"
     finding = find_largest([(length, "all nodes and times")], BIAS_TOLERANCE, message)

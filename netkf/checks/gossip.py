@@ -45,14 +45,9 @@ from netkf.checks.paper import PaperChecks
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay, with_departure
-from netkf.checks.statistics import (
-    band_around,
-    band_width,
-    deviation_interval,
-    probability_interval,
-    round_digits,
-)
+from netkf.checks.statistics import band_around, band_width, round_digits
 from netkf.core.errors import TheoryError
+from netkf.laws.intervals import deviation_interval, probability_interval
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario

@@ -31,8 +31,9 @@ from netkf.checks.laws import exact_start, find_largest
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_times, sampled_indices
 from netkf.checks.samples import RunSamples, check_replay
-from netkf.checks.statistics import Interval, affine, eigenvalue_interval
+from netkf.checks.statistics import affine, eigenvalue_interval
 from netkf.core.errors import ScenarioError, TheoryError
+from netkf.laws.intervals import Interval
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import Poisson, Renewal
 from netkf.scenario.scenario import Scenario

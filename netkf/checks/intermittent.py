@@ -49,14 +49,9 @@ from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
 from netkf.checks.rounding import compare_identities, first_wrong
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay, with_departure
-from netkf.checks.statistics import (
-    deviation_interval,
-    distance_to_law,
-    law_distance,
-    pearson_test,
-    probability_interval,
-)
+from netkf.checks.statistics import distance_to_law, law_distance, pearson_test
 from netkf.core.errors import TheoryError
+from netkf.laws.intervals import deviation_interval, probability_interval
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import contracts, growth_factor
 from netkf.network.matchings import Broadcast

@@ -9,13 +9,8 @@ import numpy as np
 
 from netkf.checks.evidence import Assumption, Finding, find_unknown
 from netkf.checks.rounding import EPS, OPERATIONS
-from netkf.checks.statistics import (
-    Interval,
-    deviation_interval,
-    law_distance,
-    law_excess,
-    scale_interval,
-)
+from netkf.checks.statistics import law_distance, law_excess
+from netkf.laws.intervals import Comparison, Interval, deviation_interval, scale_interval
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
@@ -74,6 +69,28 @@ def find_largest(
         return max(interval.expected_high(factor) for interval, _ in distances)
 
     return finding._replace(seen=chosen.seen, expected=chosen.expected, forecast=forecast)
+
+
+def find(comparison: Comparison, tolerance: float) -> Finding:
+    """Return the finding of a ``comparison`` of draws with the law that a part states.
+
+    If any distance is significant it is the most significant one; otherwise that of all values
+    together, which is more precise, and the message adds the largest distance of a part.
+    """
+    distances, text, overall = comparison
+    if not distances:
+        return Finding((0.0, -np.inf, 0.0), tolerance, text)
+    finding = find_largest(distances[: overall or None], tolerance, text)
+    if comparison.worst is not None:
+        everything = finding.detectable
+        return find_largest(distances, tolerance, text)._replace(detectable=everything)
+    if len(distances) == overall or not overall:
+        return finding
+    largest, label = max(distances[overall:], key=lambda item: item[0].value)
+    text = f"{finding.message}; furthest off {label}: {largest.value:.3g}"
+    if np.isfinite(largest.detectable):
+        text += f", {largest.detectable:.2g} is detectable"
+    return finding._replace(message=text)
 
 
 EVERYTHING = "all times, nodes and runs together"

@@ -43,13 +43,9 @@ from netkf.checks.samples import (
     check_replay,
     relative_difference,
 )
-from netkf.checks.statistics import (
-    Interval,
-    affine,
-    deviation_interval,
-    quadratic_interval,
-)
+from netkf.checks.statistics import affine, quadratic_interval
 from netkf.core.errors import TheoryError
+from netkf.laws.intervals import Interval, deviation_interval
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory import (

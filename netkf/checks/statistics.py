@@ -1,172 +1,24 @@
-"""Confidence intervals that hold at a stated level for every number of samples.
+"""Intervals of laws of covariances, which hold at a stated level for every number of samples.
 
-All samples are independent replicas, one value each. A level is the probability with which an
-interval may miss the truth. Laws of covariances are compared by indicators and ranks, never by
-means, which need not exist.
+All samples are independent replicas, one value each. Laws are compared by indicators and ranks,
+never by means, which need not exist.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import scipy.special
 
+from netkf.laws.intervals import POWER, Interval, noncentrality, scale_interval
 from netkf.linalg.arrays import FloatArray
 
 DIGITS = 9
 """Significant digits to which covariances are compared."""
 MIN_EXPECTED = 5.0
 """Expected count of a cell below which Pearson's statistic is not chi-square."""
-POWER = 0.9
-"""Probability with which a deviation of the detectable size is detected."""
-_MIDDLES = (np.arange(2000) + 0.5) / 2000.0  # of equal parts of [0, 1]
-
-
-class Interval(NamedTuple):
-    """An estimate and an interval that misses the truth with at most the stated probability.
-
-    value, low, high : estimate and limits
-    detectable : distance of the truth from its expected value at which the interval excludes the
-        expected value with probability POWER
-    seen, expected : of an interval for a distance, the estimate and the expected value
-    again : function (value, factor) that returns the limits around another value with ``factor``
-        times the samples; by default their distance shrinks as 1 / sqrt(factor)
-    """
-
-    value: float
-    low: float
-    high: float
-    detectable: float = math.nan
-    seen: float = math.nan
-    expected: float = math.nan
-    again: Callable[[float, float], tuple[float, float]] | None = None
-
-    def limits(self, value: float, factor: float) -> tuple[float, float]:
-        """Return the limits around ``value`` with ``factor`` times the samples."""
-        if self.again is not None:
-            return self.again(value, factor)
-        root = math.sqrt(factor)
-        return value - (self.value - self.low) / root, value + (self.high - self.value) / root
-
-    def expected_high(self, factor: float) -> float:
-        """Return the upper limit expected with ``factor`` times the samples, if the distance found
-        is sampling error.
-        """
-        # Sampling error shrinks as 1 / sqrt(samples); a value of 0 or below is kept.
-        value = self.value / math.sqrt(factor) if self.value > 0.0 else self.value
-        return self.limits(value, factor)[1]
-
-
-def detectable_shift(deviation: float, level: float) -> float:
-    """Return the shift that a two-sided test at ``level`` detects with probability POWER, for a
-    normal estimate with standard deviation ``deviation``.
-    """
-    return deviation * float(_normal_quantile(1.0 - level / 2.0) + _normal_quantile(POWER))
-
-
-def detectable_shift_of_student(count: float, level: float) -> float:
-    """Return the shift, in true standard deviations of an estimate, that Student's test at
-    ``level`` with ``count`` - 1 degrees of freedom detects with probability POWER.
-
-    It is the noncentrality at which the quantile 1 - POWER of the noncentral t law is Student's
-    critical value; the other tail has a negligible part of the power.
-    """
-    freedom = max(count - 1.0, 1.0)
-    critical = -float(scipy.special.stdtrit(freedom, level / 2.0))
-    return noncentrality(freedom, critical)
-
-
-@lru_cache(maxsize=1024)
-def noncentrality(freedom: float, critical: float) -> float:
-    """Return the noncentrality at which a t variable with ``freedom`` degrees of freedom exceeds
-    ``critical`` with probability POWER.
-    """
-    # (z + shift) / sqrt(u / freedom) > critical, z normal and u chi-square: by quadrature over the
-    # quantiles of u, since scipy's noncentral t fails for the small levels used here.
-    u = scipy.special.gammaincinv(0.5 * freedom, _MIDDLES) * 2.0 / freedom
-    limits = critical * np.sqrt(u)
-    low, high = 0.0, float(limits.max()) + 10.0
-    for _ in range(60):
-        shift = 0.5 * (low + high)
-        power = float(scipy.special.ndtr(shift - limits).mean())
-        low, high = (low, shift) if power > POWER else (shift, high)
-    return 0.5 * (low + high)
-
-
-def student_interval(value: float, deviation: float, count: float, level: float) -> Interval:
-    """Return Student's t interval for an estimate ``value``, whose standard ``deviation`` was
-    estimated from ``count`` independent values (or an effective number of them).
-
-    The interval misses the truth with at most the probability ``level``.
-    """
-
-    def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another mean and ``factor`` times the samples."""
-        quantile = -float(scipy.special.stdtrit(factor * count - 1.0, level / 2.0))
-        reach = deviation / math.sqrt(factor) * quantile
-        return value - reach, value + reach
-
-    low, high = limits(value, 1.0)
-    detectable = deviation * detectable_shift_of_student(count, level)
-    return Interval(value, low, high, detectable, again=limits)
-
-
-def _normal_quantile(probability: float) -> float:
-    """Return the value that a standard normal variable does not exceed with this
-    ``probability``.
-    """
-    return float(scipy.special.ndtri(probability))
-
-
-def probability_interval(successes: int, trials: int, level: float) -> Interval:
-    """Return the exact interval of Clopper and Pearson (1934) for the probability of a success,
-    from ``successes`` in independent ``trials``; it misses with probability ``level``.
-    """
-    low = high = detectable = math.nan
-
-    def limits(share: float, factor: float) -> tuple[float, float]:
-        """Return the Clopper-Pearson limits for another share and ``factor`` times the trials."""
-        hits = min(max(share, 0.0), 1.0) * trials * factor
-        missed = trials * factor - hits
-        low = float(scipy.special.betaincinv(hits, missed + 1, level / 2)) if hits else 0.0
-        high = float(scipy.special.betaincinv(hits + 1, missed, 1 - level / 2)) if missed else 1.0
-        return low, high
-
-    if trials:
-        low, high = limits(successes / trials, 1.0)
-        # Half a success and half a failure are added: a fraction of 0 or 1 has a variance too.
-        detectable = _binomial_shift((successes + 0.5) / (trials + 1.0), trials, level)
-    return Interval(successes / max(trials, 1), low, high, detectable, again=limits)
-
-
-def _binomial_shift(p: float, trials: int, level: float) -> float:
-    """Return the error of a probability ``p`` that an exact two-sided binomial test at ``level``
-    detects with probability POWER, in ``trials``; the larger one of both directions, of those in
-    which an error can be so large that it is detected.
-    """
-    # Of the rarer outcome: q rises where p > 1/2 falls.
-    up = _binomial_rise(p, trials, level), _binomial_rise(1.0 - p, trials, level)
-    possible = [shift for shift in up if math.isfinite(shift)]
-    return max(possible, default=math.nan)
-
-
-def _binomial_rise(p: float, trials: int, level: float) -> float:
-    """Return by how much a probability must exceed ``p`` for its test to be significant with
-    probability POWER; nan if no number of successes is significant.
-    """
-    # The least number of successes that has at most the probability level / 2: by bisection.
-    low, high = 0, trials + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        tail = float(scipy.special.betainc(middle, trials - middle + 1, p))
-        low, high = (low, middle) if tail <= 0.5 * level else (middle, high)
-    if high > trials:
-        return math.nan
-    return float(scipy.special.betaincinv(high, trials - high + 1, POWER)) - p
 
 
 def affine(interval: Interval, scale: float, shift: float) -> Interval:
@@ -179,48 +31,6 @@ def affine(interval: Interval, scale: float, shift: float) -> Interval:
 
     value, low, high = (scale * end + shift for end in interval[:3])
     return Interval(value, low, high, scale * interval.detectable, again=limits)
-
-
-def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> Interval:
-    """Return ``interval`` with another forecast of its limits with more runs, for an estimate whose
-    samples do not grow in proportion to the runs: ``factor`` times the runs mean
-    ``sample_factor(factor)`` times the samples.
-    """
-
-    def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for ``factor`` times the runs, as :meth:`Interval.limits` asks."""
-        actual = sample_factor(factor)
-        # The caller has divided the value by sqrt(factor); it shrinks by sqrt(actual) only.
-        return interval.limits(value * math.sqrt(factor / actual), actual)
-
-    return interval._replace(again=limits)
-
-
-def deviation_interval(expected: float, interval: Interval) -> Interval:
-    """Return an interval for the distance |quantity - expected| from the ``interval`` of a
-    quantity that should be ``expected``; it excludes 0 if and only if the given one excludes that.
-    """
-    covers = interval.low <= expected <= interval.high
-    ends = abs(interval.low - expected), abs(interval.high - expected)
-    low = 0.0 if covers else min(ends)
-    distance = abs(interval.value - expected)
-    # A forecast keeps the estimate on the same side of the expected value, only nearer to it.
-    side = math.copysign(1.0, interval.value - expected)
-
-    def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return 0 and the largest distance for another value and ``factor`` times the samples."""
-        ends = interval.limits(expected + side * value, factor)
-        return 0.0, max(abs(end - expected) for end in ends)
-
-    return Interval(
-        distance,
-        low,
-        max(ends),
-        interval.detectable,
-        seen=interval.value,
-        expected=expected,
-        again=limits,
-    )
 
 
 def band_width(samples: int, level: float) -> float:
@@ -302,7 +112,7 @@ def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -
 
     # At any one point the standard deviation of the difference is at most sqrt(1/(4a) + 1/(4b)).
     spread = 0.5 * math.sqrt(1.0 / a + 1.0 / b)
-    detectable = min(1.0, width + _normal_quantile(POWER) * spread)
+    detectable = min(1.0, width + float(scipy.special.ndtri(POWER)) * spread)
     ends = max(0.0, value - width), min(1.0, value + width)
     return Interval(value, *ends, detectable, again=limits)
 
@@ -324,7 +134,7 @@ def distance_to_law(
     value = float(max(above.max(), below.max()))
     width = band_width(len(values), level)
     spread = 0.5 / math.sqrt(len(values))
-    detectable = min(1.0, width + _normal_quantile(POWER) * spread)
+    detectable = min(1.0, width + float(scipy.special.ndtri(POWER)) * spread)
     return band_around(value, width, detectable)
 
 
@@ -343,35 +153,6 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
 
     ends = max(0.0, value - width), min(1.0, value + width)
     return Interval(value, *ends, detectable, again=limits)
-
-
-def scale_interval(total: float, freedom: float, level: float) -> Interval:
-    """Return the interval for c if ``total`` is c times a chi-square variable with ``freedom``
-    degrees of freedom; its estimate is total / freedom.
-
-    The interval misses the truth with at most the probability ``level``.
-    """
-
-    def quantiles(freedom: float) -> tuple[float, float]:
-        """Return the quantiles of chi-square with ``freedom`` degrees, exceeded with probabilities
-        level / 2 and 1 - level / 2.
-        """
-        tails = 1.0 - level / 2.0, level / 2.0
-        upper, lower = (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p)) for p in tails)
-        return upper, lower
-
-    def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another variance and ``factor`` times the samples."""
-        total_freedom = factor * freedom
-        upper, lower = quantiles(total_freedom)
-        return value * total_freedom / upper, value * total_freedom / lower
-
-    upper, lower = quantiles(freedom)
-    # The c above (and below) 1 at which the interval excludes 1 with probability POWER.
-    up = upper / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, 1.0 - POWER)))
-    down = lower / (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, POWER)))
-    detectable = max(up - 1.0, 1.0 - down)
-    return Interval(total / freedom, total / upper, total / lower, detectable, again=limits)
 
 
 def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:

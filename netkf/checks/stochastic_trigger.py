@@ -14,8 +14,8 @@ from netkf.checks.exact import summarise_exactly, with_promised_filter
 from netkf.checks.kalman_consensus import EquationChecks
 from netkf.checks.laws import find_largest
 from netkf.checks.samples import ReplicaSummary, RunSamples
-from netkf.checks.statistics import deviation_interval, student_interval
 from netkf.checks.track_fusion import EXACT
+from netkf.laws.intervals import deviation_interval, student_interval
 from netkf.scenario.scenario import Scenario
 from netkf.theory.stochastic_trigger.errors import all_hear_all
 from netkf.theory.stochastic_trigger.rates import expected_sends

@@ -12,6 +12,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
+from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw
 from netkf.linalg.arrays import FloatArray
 
 Entity = Any
@@ -66,6 +67,13 @@ class Clock(Component):
     def memoryless(self) -> bool:
         """True if the ticks are a Poisson process."""
         return False
+
+    @property
+    def gaps(self) -> WaitingLaw | Lattice | None:
+        """The law of the gaps between ticks in units of their mean, 1 / ``mean_rate``; the lattice
+        on which ticks lie; None if neither is known before a run.
+        """
+        return EXPONENTIAL if self.memoryless else None
 
 
 class ClockPosition(NamedTuple):

@@ -20,6 +20,7 @@ from netkf.core.fields import (
     positive,
     probability,
 )
+from netkf.core.laws import Chain, WaitingLaw, exponential_law, lognormal_law, uniform_law
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
 
@@ -73,6 +74,11 @@ class Loss(Component):
     def independent(self) -> bool:
         """True if the outcomes of different activations are independent."""
         return True
+
+    @property
+    def chain(self) -> Chain | None:
+        """The chain of two states by which losses follow each other, if there is one."""
+        return None
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError if the fields do not fit the graph."""
@@ -230,6 +236,12 @@ class GilbertElliott(Loss):
         # Then both rows of the transition matrix are equal.
         return sum(self.transitions) == 1.0
 
+    @property
+    def chain(self) -> Chain:
+        """The chain of the two states of a link."""
+        delivery = (self.delivery_probability((0, 1), 0, bad, 1.0) for bad in (False, True))
+        return Chain(*self.transitions, *delivery)
+
 
 @dataclass(frozen=True, eq=False)
 class Delay(Component):
@@ -253,6 +265,13 @@ class Delay(Component):
     def is_random(self) -> bool:
         """True if ``draw`` is called."""
         return self.fixed is None
+
+    @property
+    def law(self) -> WaitingLaw | None:
+        """The law of the delays of independent messages in seconds; None if it is constant, or
+        unknown before a run.
+        """
+        return None
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
         """Return the seconds that message number ``message`` takes from link[0] to link[1].
@@ -302,6 +321,11 @@ class ExponentialDelay(Delay):
 
     mean: float = field(positive)
 
+    @property
+    def law(self) -> WaitingLaw:
+        """The exponential law of that mean."""
+        return exponential_law(self.mean)
+
     def draw(self, random: np.random.Generator) -> float:
         """Draw a delay in seconds."""
         return self.mean * random.standard_exponential()
@@ -325,6 +349,11 @@ class UniformDelay(Delay):
         """The field ``high``, in seconds."""
         return self.high
 
+    @property
+    def law(self) -> WaitingLaw | None:
+        """The uniform law, None if both ends are equal."""
+        return uniform_law(self.low, self.high) if self.high > self.low else None
+
     def draw(self, random: np.random.Generator) -> float:
         """Draw a delay in seconds."""
         return self.low + (self.high - self.low) * random.random()
@@ -336,6 +365,11 @@ class LognormalDelay(Delay):
 
     mean: float = field(positive)
     sigma: float = field(number(low=0.0))
+
+    @property
+    def law(self) -> WaitingLaw | None:
+        """The lognormal law, None without spread."""
+        return lognormal_law(self.mean, self.sigma) if self.sigma > 0.0 else None
 
     def draw(self, random: np.random.Generator) -> float:
         """Draw a delay in seconds."""

@@ -27,6 +27,7 @@ from netkf.core.fields import (
     source_file,
     tuple_of,
 )
+from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw, gamma_law, uniform_law, weibull_law
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology, demand_links, demand_nodes
 
@@ -269,6 +270,17 @@ class Renewal(LinkClock):
         """True for gamma and weibull gaps of shape 1, which are exponential."""
         return self.shape == 1.0
 
+    @property
+    def gaps(self) -> WaitingLaw | Lattice:
+        """The law of gaps in units of their mean, or the lattice of constant ones."""
+        if self.memoryless:
+            return EXPONENTIAL
+        if self.shape is not None:
+            return (gamma_law if self.distribution == "gamma" else weibull_law)(self.shape)
+        if self.low is not None and self.high is not None and self.low < self.high:
+            return uniform_law(self.low / self._mean, self.high / self._mean)
+        return Lattice(self._mean, self._mean)  # the first tick is one gap after time 0
+
     def ticks(
         self,
         entity: Entity,
@@ -342,6 +354,13 @@ class Periodic(LinkClock):
     def mean_rate(self, entity: Entity) -> float:
         """Return one over the period, in ticks per second."""
         return 1.0 / self.period
+
+    @property
+    def gaps(self) -> Lattice:
+        """The lattice of the ticks: with phase 0 it begins one period after time 0."""
+        if isinstance(self.phase, str):
+            return Lattice(self.period, 0.0, self.jitter, random_phase=True)
+        return Lattice(self.period, self.phase or self.period, self.jitter)
 
     def ticks(
         self,

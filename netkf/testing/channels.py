@@ -8,15 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.parts.delays import delay_law
-from netkf.checks.parts.network_rows import loss_twice
-from netkf.checks.parts.sources import stated_part
+from netkf.laws.delays import DelayCounts, compare_delays, count_delays
+from netkf.laws.losses import (
+    LossLaw,
+    compare_bursts,
+    compare_coincidences,
+    compare_losses,
+    count_outcomes,
+)
+from netkf.laws.noise import compare_with
+from netkf.laws.stating import stated_law, stated_part
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import (
     Channel,
     ChannelSampler,
     Delay,
-    GilbertElliott,
     Loss,
     stream_purposes,
 )
@@ -24,12 +30,7 @@ from netkf.network.channels import delay_depends_on_message as overrides_message
 from netkf.network.graphs import Complete, Link, Topology
 from netkf.rng.streams import Streams
 from netkf.testing.generators import RecordingGenerator, describe_calls
-from netkf.testing.noise import (
-    divergence,
-    kolmogorov_distance,
-    largest_deviation,
-    minus_log_level,
-)
+from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import WatchedPart, demand, fail, guard_user_code, make_part
 
 CHAINS, LENGTH = 400, 50
@@ -41,8 +42,10 @@ MESSAGES = (0, 1, 2, 7, 1000)
 TABLE = (1.0, 0.6, 0.85)
 """Delivery probabilities of a graph without a table of its own: directed links take them in turn.
 """
-PROBABILITY_TOLERANCE, MAX_LAG = 1e-9, 3
-"""Difference of probabilities that is rounding, and messages apart at which outcomes are tested."""
+PROBABILITY_TOLERANCE, MAX_LAG, FOREVER = 1e-9, 3, 1e300
+"""Difference of probabilities that is rounding, messages apart at which outcomes are tested, and
+the end in seconds of a run that shows all delays.
+"""
 
 
 def check_channel(channel: Any, /, topology: Topology | None = None, **settings: Any) -> None:
@@ -63,10 +66,11 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
     by a third of that; for losses in bursts, sqrt(1 + r) / sqrt(1 - r) times as much, where r is
     the correlation of neighbouring outcomes. If ``independent`` is True: a correlation of 0.08 of
     outcomes 1, 2 or 3 messages apart, or of two links with streams of their own. From 20,000
-    delays: a correlation of 0.06 of neighbouring ones. If a class derives from a built-in delay, or
-    from GilbertElliott, and states nothing of its own: a law of delays at a distance of 0.035 from
-    that of its parent, or a probability of two losses in a row that is off by 0.02. A correct class
-    fails once in a million checks.
+    delays: a correlation of 0.06 of neighbouring ones. Of a class that states the ``law`` of its
+    delays or the ``chain`` of its losses, or derives from a built-in class that does and states
+    nothing of its own: a sixteenth of the law that has 0.013 more or fewer delays, a mean rank of
+    the delays on one link that is off by 0.06, and a probability of a loss after a loss that is off
+    by 0.05. A correct class fails once in a million checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
@@ -235,119 +239,49 @@ def _check_channel_state(watched: WatchedPart) -> None:
 
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
-    """Check simulated outcomes on all directed ``links`` against ``mean_delivery``, ``independent``
-    and the law of bursts of a class derived from GilbertElliott.
-
-    ``links`` has for each link its entry in the graph's table of probabilities; ``seed`` is that of
-    the simulations.
+    """Check simulated outcomes on all directed ``links``, with their entries in the graph's table,
+    against ``mean_delivery``, ``independent`` and the chain that the class states.
     """
     part, where = watched.part, f"{watched.name}.mean_delivery"
     stated = np.array([part.mean_delivery(link, p) for link, p in links.items()])
     if np.isnan(stated).all() and not part.independent:
         return
     with guard_user_code(watched.name):
-        delivered = _simulate_deliveries(part, links, seed)
-    rule = "must be the delivered fraction in the long run"
-    # All links that state a mean together, then each link by itself.
-    for group in [~np.isnan(stated), *np.eye(len(links), dtype=bool)]:
-        if not group.any() or np.isnan(stated[group]).any():
-            continue
-        outcomes = delivered[:, :, group]
-        deviation = _fraction_deviation(outcomes, stated[group], part.independent)
-        if deviation is not None:
-            group_name = list(links)[int(np.argmax(group))] if group.sum() == 1 else "all links"
-            mean = stated[group].mean()
-            fail(
-                where,
-                rule,
-                f"{mean:.4g}, and {mean + deviation:.4g} of {outcomes.size:,} simulated messages "
-                f"came over {group_name}",
-            )
+        lost = _simulate_losses(part, links, seed)
+    law, known = _loss_law(part, tuple(links), 1.0 - stated), np.flatnonzero(~np.isnan(stated))
+    if len(known):
+        counts = count_outcomes(lost[..., known], np.full(len(known), -1))
+        of_known = law._replace(lost=law.lost[known], links=[law.links[k] for k in known.tolist()])
+        shares = compare_losses(of_known, counts, family_level())
+        demand_agreement(shares, where, "must be the delivered fraction in the long run")
     if part.independent:
-        _check_independent(watched, delivered, tuple(links))
-    elif type(chain := stated_part(part, "loss")) is GilbertElliott:
-        _check_bursts(watched, chain, delivered)
+        rule = "must be False where outcomes of neighbouring activations or links are related"
+        labels = [str(list(link)) for link in links]
+        coincidences = compare_coincidences(lost, range(MAX_LAG + 1), labels, family_level())
+        remedy = "return False: theory relies on it"
+        demand_agreement(coincidences, f"{watched.name}.independent", rule, remedy)
+    elif law.chain is not None and len(known) == len(links):
+        parent = type(stated_part(part, "loss")).__name__
+        bursts = compare_bursts(law, count_outcomes(lost, law.opposite), family_level())
+        rule = f"losses must follow each other as in {parent}, from which it derives"
+        remedy = "define mean_delivery too if it differs by design"
+        demand_agreement(bursts, f"{watched.name}.next_state", rule, remedy)
 
 
-def _check_bursts(watched: WatchedPart, chain: GilbertElliott, delivered: FloatArray) -> None:
-    """Check how often two messages in a row are lost, from the outcomes ``delivered`` (C, K, L), 0
-    or 1, of C runs, K messages and L links, against the built-in ``chain`` with the same
-    parameters.
+def _loss_law(part: Loss, links: tuple[Link, ...], lost: FloatArray) -> LossLaw:
+    """Return what a loss states on directed ``links`` that have streams of their own."""
+    opposite = np.full(len(links), -1)
+    chain = stated_law(part, "loss")
+    return LossLaw(
+        lost, part.independent, chain, False, False, False, opposite, at_once=False, links=links
+    )
+
+
+def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndarray:
+    """Return the mask (CHAINS, LENGTH, L) of the messages over L directed links that the engine
+    would lose; each link has random streams of its own.
     """
-    lost, expected = 1.0 - delivered, loss_twice(chain)
-    excess = (lost[:, 1:] * lost[:, :-1]).mean(axis=1) - expected
-    deviation = largest_deviation(excess.reshape(-1, 1))
-    if deviation is not None:
-        frequency = f"{expected + deviation.mean:.4g} (+- {deviation.error:.2g})"
-        fail(
-            f"{watched.name}.next_state",
-            "losses must follow each other as in GilbertElliott, from which it derives",
-            f"two in a row: {frequency} instead of {expected:.4g}",
-            "define mean_delivery too if it differs by design",
-        )
-
-
-def _fraction_deviation(
-    delivered: FloatArray, stated: FloatArray, independent: bool
-) -> float | None:
-    """Return the difference of the delivered fraction from the mean of the ``stated`` ones (L,), or
-    None if it is not significant.
-
-    ``delivered`` (C, K, L) are outcomes 0 or 1 of C runs, K messages and L links; ``independent``
-    says whether they are independent, as the class states.
-    """
-    difference = float((delivered.mean(axis=(0, 1)) - stated).mean())
-    if independent:
-        p, f = stated.mean(), stated.mean() + difference
-        # With unequal probabilities the bound is on the safe side: sums of outcomes vary less.
-        exponent = delivered.size * divergence(np.array([f]), np.array([p]))[0]
-        return difference if exponent > minus_log_level(1 + delivered.shape[2]) else None
-    means = (delivered.mean(axis=1) - stated).reshape(-1, 1)
-    # A difference as small as 12 runs of a link can make alone, all delivered instead of all lost,
-    # is not significant: the means of runs may be far from normal, most of them 0 or 1.
-    threshold = 12.0 / (CHAINS * len(stated))
-    deviation = largest_deviation(means, min_values=100)
-    return difference if deviation is not None and abs(difference) > threshold else None
-
-
-def _check_independent(
-    watched: WatchedPart, delivered: FloatArray, links: tuple[Link, ...]
-) -> None:
-    """Check that the outcomes ``delivered`` (C, K, L), 0 or 1, of C runs, K messages and L links
-    are independent of those of other links, and of those up to MAX_LAG messages later, as the loss
-    states by ``independent``.
-    """
-    p = delivered.mean(axis=(0, 1))
-    expected = np.outer(p, p)
-    for lag in range(MAX_LAG + 1):
-        early, late = delivered[:, : LENGTH - lag], delivered[:, lag:]
-        count = early[..., 0].size
-        # Entry [l, m]: how often message k over link l and message k + lag over link m arrive.
-        both = np.einsum("ckl,ckm->lm", early, late) / count
-        unlikely = count * divergence(both, expected) > minus_log_level(both.size)
-        if lag == 0:
-            np.fill_diagonal(unlikely, False)
-        if unlikely.any():
-            index = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
-            first, second = (list(links[k]) for k in index)
-            relation = "neighbouring activations" if first == second else "different links"
-            fail(
-                f"{watched.name}.independent",
-                f"must be False where outcomes of {relation} are related",
-                f"message k over link {first} and message k + {lag} over link {second}: both "
-                f"arrive in {both[index]:.4g} of cases instead of {expected[index]:.4g}",
-                "return False: theory relies on it",
-            )
-
-
-def _simulate_deliveries(part: Loss, links: dict[Link, float], seed: int) -> FloatArray:
-    """Return outcomes (CHAINS, LENGTH, L) of messages over L directed links: 1 if the engine would
-    deliver the message, else 0.
-
-    ``links`` has for each link its entry in the graph's table of probabilities. As in the engine,
-    each directed link has random streams of its own, derived from ``seed``.
-    """
-    delivered, channel = np.zeros((CHAINS, LENGTH, len(links))), Channel(loss=part)
+    lost, channel = np.zeros((CHAINS, LENGTH, len(links)), dtype=bool), Channel(loss=part)
     for chain in range(CHAINS):
         # All seeds in one call: each alone takes longer than the draws.
         streams = Streams(seed + 7, chain).with_seeds(stream_purposes(channel), tuple(links))
@@ -358,8 +292,8 @@ def _simulate_deliveries(part: Loss, links: dict[Link, float], seed: int) -> Flo
                 part.delivery_probability(link, message, is_bad, table_probability)
                 for message, is_bad in enumerate(bad.tolist())
             ]
-            delivered[chain, :, k] = uniform < probabilities
-    return delivered
+            lost[chain, :, k] = uniform >= probabilities
+    return lost
 
 
 def _make_generator(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
@@ -401,29 +335,20 @@ def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
             got = f"{seconds:g} s for link {list(link)} instead of {stated.fixed:g}"
             demand(is_equal, where, rule, got, remedy)
         return
-    link_indices = np.arange(DELAYS) % len(links)
+    if (law := stated_law(part, "delay")) is None:
+        return
+    directions = np.repeat(np.arange(len(links)), DELAYS // len(links))
     with guard_user_code(where):
         random = Streams(7, 0).generator("delay")
         delays = [
             part.message_delay(links[index], k, part.draw(random))
-            for k, index in enumerate(link_indices.tolist())
+            for k, index in enumerate(directions.tolist())
         ]
-    # Values of the stated distribution function: uniform in [0, 1] if the law is right.
-    uniform = delay_law(stated, np.array(delays))
-    if uniform is None or np.isnan(uniform).any():
-        return
-    # Means over all links (column 0) and over each link.
-    centred = uniform[:, None] - 0.5
-    of_link = link_indices[:, None] == np.arange(len(links))
-    deviation = largest_deviation(np.concatenate([centred, centred * of_link], axis=1))
-    distance = kolmogorov_distance(uniform)
-    # P(sqrt(N) D > x) <= 2 exp(-2 x^2), Massart 1990.
-    limit = math.sqrt(0.5 * minus_log_level(1) / uniform.size)
-    if deviation is not None or distance > limit:
-        column = deviation.position[0] if deviation is not None else 0
-        group_name = list(links[column - 1]) if column else "all links"
-        text = f"a distance of {distance:.3g} from it, furthest off {group_name}"
-        fail(where, rule, text, remedy)
+    sent = np.zeros(len(delays))
+    counts = count_delays(law, sent, np.array(delays), directions, len(links), FOREVER)
+    several = DelayCounts(*(count[None] for count in counts))
+    for comparison in compare_delays(several, links, 2.0 * family_level()):
+        demand_agreement(comparison, where, rule, remedy)
 
 
 def _check_draws(watched: WatchedPart) -> None:
@@ -443,12 +368,12 @@ def _check_draws(watched: WatchedPart) -> None:
 
     # Ranks, so that long tails do not hide a correlation; equal delays have equal ranks.
     centred = (rankdata(delays) - 0.5) / len(delays) - 0.5
-    deviation = largest_deviation((centred[1:] * centred[:-1])[:, None]) if varies else None
-    if deviation is not None:
-        # The variance of uniform numbers in [-0.5, 0.5] is 1/12.
-        correlation = f"{12.0 * deviation.mean:.3g} (+- {12.0 * deviation.error:.2g})"
+    if varies:
+        one, other = centred[1:, None], centred[:-1, None]
         rule = "delays of neighbouring messages must be independent"
-        fail(where, rule, f"a correlation of ranks of {correlation}")
+        demand_agreement(
+            compare_with(one, other, ["a delay"], ["the one before"], family_level()), where, rule
+        )
 
 
 def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:

@@ -7,35 +7,45 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import ndtri
 
-from netkf.checks.parts.sources import stated_part
-from netkf.checks.parts.ticks import (
-    TickSample,
-    distance_from_lattice,
-    gap_law,
-    lattice_ranks,
-    ticks_on_lattice,
-)
-from netkf.core.clock import ClockPosition, Entity
+from netkf.core.clock import ClockPosition, Entity, generate_ticks
 from netkf.core.errors import ScenarioError
+from netkf.core.laws import EXPONENTIAL, Lattice
+from netkf.laws.intervals import Comparison, deviation_interval
+from netkf.laws.noise import compare_correlations
+from netkf.laws.stating import stated_law, stated_part
+from netkf.laws.ticks import (
+    ClockGroup,
+    TickCounts,
+    compare_clocks,
+    compare_gaps,
+    count_ticks,
+    rates_of_all,
+    rates_of_each,
+    slack_of_start,
+)
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Complete, Link
 from netkf.rng.streams import Streams
 from netkf.testing.generators import RecordingGenerator
-from netkf.testing.noise import FAMILIES, LEVEL, kolmogorov_distance, largest_deviation
+from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.watching import WatchedPart, demand, fail, guard_user_code, make_part
 
 BLOCKS = ((600,), (1,) * 600, (7, 64, 1, 256, 272))
 """Ways to ask for 600 ticks: the number of ticks in each block."""
-CHAINS, LENGTH = 800, 100
-"""Simulated runs of all entities together, and ticks in a run."""
+CHAINS, LENGTH, GAPS = 800, 100, 75
+"""Simulated runs of all entities together, mean number of ticks in a run, and gaps of each run
+between which correlations are tested.
+"""
 MAX_ENTITIES = 12  # links, directions or nodes whose clocks are checked
 INTERLEAVED_TICKS = 40
 """Ticks of each entity that are compared alone and with ticks of other entities in between."""
-RATE_TOLERANCE = 2e-3
-"""Relative difference from the stated mean gap that is allowed besides chance."""
+
+
+REMEDY = "use the generator given"
+STATE_IT = "define mean_rate and memoryless too if it differs by design"
 
 
 def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> None:
@@ -49,14 +59,14 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
     and two generators give different times; a clock that stopped stays stopped.
 
     Statistical checks find these errors with probability 0.9. From 80,000 ticks of all links
-    together, where gaps have a standard deviation of c times their mean (c = 1 for a Poisson
-    process): a rate that differs from ``mean_rate`` by 2.6 c + 0.2 %, and the rate of one of N
+    together: of Poisson clocks a rate that differs from ``mean_rate`` by 2.8 %, of others, with
+    gaps of a standard deviation of c times their mean, by 2.6 c + 1 %, and the rate of one of N
     links that differs by sqrt(N) times as much (6 links: 7.5 %); if ``mean_rate`` is nan, a rate of
-    one link that differs from the others by as much. If the clock states that it is
-    ``memoryless``: gaps at a distance of 0.013 from the exponential law, and a correlation of 0.03
-    of neighbouring gaps or of the gaps of two links. A class that derives from Renewal or Periodic,
-    and states no rate of its own, is compared with the law of its parent as closely. A correct
-    class fails once in a million checks.
+    one link that differs from the others by as much. A class that states that it is
+    ``memoryless``, or its law by ``gaps``, or derives from Renewal or Periodic and states nothing
+    of its own, is compared with that law: a sixteenth of it that has 0.007 more or fewer gaps, and
+    a correlation of 0.03 of neighbouring ones; of memoryless clocks a correlation of 0.08 of the
+    gaps of two links. A correct class fails once in a million checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
@@ -78,7 +88,7 @@ def check_clock_object(part: Any, link: Link | None, seed: int) -> None:
     _check_interleaved(watched, entities)
     # Rates and laws need a clock that does not stop.
     if len(_read_ticks(watched, entities[0], BLOCKS[0])) == sum(BLOCKS[0]):
-        _check_gaps(watched, entities, seed)
+        _check_laws(watched, entities, seed)
     watched.finish()
 
 
@@ -239,177 +249,133 @@ def _first_difference(one: FloatArray, other: FloatArray) -> int:
     return int(unequal[0]) if unequal.size else shorter
 
 
-def _check_gaps(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:
-    """Check the mean and the law of the gaps between ticks against what the user's clock states,
-    from runs of all ``entities`` (links, directions or nodes with a clock) simulated with ``seed``.
-    """
+def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:
+    """Check rates and laws of gaps against what the class states, in runs of all ``entities``."""
     part, runs = watched.part, max(2, CHAINS // len(entities))
-    stated = np.array([watched.call("mean_rate", entity) for entity in entities])
-    not_positive = stated[stated <= 0.0]
-    where = f"{watched.name}.mean_rate"
-    demand(not not_positive.size, where, "must be above 0, or nan", not_positive[:1].tolist())
-    chains = []
+    rates = np.array([watched.call("mean_rate", entity) for entity in entities])
+    wrong, where = rates[rates <= 0.0], f"{watched.name}.mean_rate"
+    demand(not wrong.size, where, "must be above 0, or nan", wrong[:1].tolist())
     with guard_user_code(f"{watched.name}.ticks"):
-        for k, entity in enumerate(entities):
-            chains += [_read_chain(part, entity, seed, r, k) for r in range(runs)]
-    if min(map(len, chains)) < LENGTH:
-        return  # the clock stopped by chance: there are no gaps of a long run
-    times = np.array(chains)
-    gaps = np.diff(times, prepend=0.0).reshape(len(entities), runs, LENGTH)
-    _check_generators_used(watched, entities, gaps)
-    _check_rates(watched, entities, gaps, stated)
+        horizon = LENGTH / float(np.nanmedian(rates)) if not np.isnan(rates).all() else 0.0
+        if not horizon:
+            horizon = float(_read_ticks(watched, entities[0], (LENGTH,))[-1])
+        times = [
+            [_draw_ticks(part, entity, seed, run, k, horizon) for k, entity in enumerate(entities)]
+            for run in range(runs)
+        ]
+    # Clocks without a stated rate are compared with the median of all.
+    found = np.median(np.mean([[len(ticks) for ticks in one] for one in times], axis=0)) / horizon
+    law = stated_law(part, "activation")
+    labels = tuple(str(list(entity)) for entity in entities)
+    group = ClockGroup(
+        entities, np.where(np.isnan(rates), found, rates), (law,) * len(entities), labels
+    )
+    counts = _stack([_count(group, one, horizon) for one in times])
     if part.memoryless:
-        mean_gaps = np.where(np.isnan(stated), gaps[:, :, 1:].mean(axis=(1, 2)), 1.0 / stated)
-        _check_exponential(watched, entities, gaps / mean_gaps[:, None, None])
-    else:
-        _check_stated_law(watched, gaps, times)
-
-
-def _check_stated_law(watched: WatchedPart, gaps: FloatArray, times: FloatArray) -> None:
-    """Check ``gaps`` (E, runs, length) of E entities, and the ``times`` (E runs, length) of
-    periodic ticks, against the law of the built-in clock from which a class derives, unless it
-    defines its own ``mean_rate``.
-    """
-    stated, where = stated_part(watched.part, "activation"), f"{watched.name}.ticks"
-    parent = f"{type(stated).__name__}, from which it derives"
-    remedy = "define mean_rate and memoryless too if it differs by design"
-    if ticks_on_lattice(stated):
-        number = np.tile(np.arange(times.shape[1]), len(times))
-        ticks = TickSample(
-            times.ravel(), number, np.full(number.shape, times.shape[1]), number == 0
+        _check_generators_used(watched, entities, times)
+    _check_rates(watched, group, counts, np.isnan(rates), horizon)
+    _check_gaps(watched, group, counts, times, horizon)
+    if law is EXPONENTIAL:
+        where, rule = f"{watched.name}.ticks", "ticks of links must be independent"
+        demand_agreement(
+            compare_clocks(group, counts.ticks, horizon, family_level()), where, rule, REMEDY
         )
-        distance = distance_from_lattice(stated, ticks)
-        demand(
-            distance <= 1e-9 * times.max(),
-            where,
-            f"must tick at the times of {parent}",
-            f"{distance:.3g} s beside one of them",
-            remedy,
-        )
-        _check_phases(lattice_ranks(stated, ticks, math.inf), number == 0, where, parent, remedy)
-    uniform = gap_law(stated, gaps.reshape(-1)).reshape(gaps.shape)
-    if np.isfinite(uniform).all():
-        _check_uniform(uniform, where, f"gaps must have the law of {parent}", remedy)
+        demand_agreement(_compare_gaps_of_links(group, times), where, rule, REMEDY)
 
 
-def _check_phases(
-    uniform: FloatArray, is_first: np.ndarray, where: str, parent: str, remedy: str
-) -> None:
-    """Check that the numbers ``uniform`` (K,) of K ticks, nan for some, which are uniform in [0, 1]
-    under the law of a periodic clock, are: those of first ticks (``is_first``, (K,)), which tell
-    the phase, and those of others, which tell the jitter.
+def _draw_ticks(
+    part: Any, entity: Entity, seed: int, run: int, stream: int, horizon: float
+) -> FloatArray:
+    """Return the ticks (K,) of an ``entity`` in a ``run`` of ``seed``, from generators numbered
+    ``stream``.
     """
-    for rows, noun in ((is_first, "phases"), (~is_first, "jitter")):
-        values = uniform[rows & np.isfinite(uniform)]
-        if len(values):
-            limit = math.sqrt(0.5 * math.log(2.0 * FAMILIES / LEVEL) / len(values))
-            distance = kolmogorov_distance(values)
-            text = f"{noun} at a distance of {distance:.3g} from it"
-            demand(distance <= limit, where, f"must have the law of {parent}", text, remedy)
+    streams = Streams(seed, run)
+    random = streams.generator("testing", stream)
+    return generate_ticks(part, entity, lambda: streams.generator("phase", stream), random, horizon)
 
 
-def _read_chain(part: Any, entity: Entity, seed: int, run: int, stream: int) -> FloatArray:
-    """Return the first LENGTH ticks (LENGTH,) of the clock of an ``entity`` (a link, direction or
-    node) in a ``run`` of ``seed``, in seconds, fewer if the clock stops.
+def _count(group: ClockGroup, times: list[FloatArray], horizon: float) -> TickCounts:
+    """Return the counts of one run of all clocks."""
+    owners = np.repeat(np.arange(len(times)), [len(ticks) for ticks in times])
+    return count_ticks(group, np.concatenate(times), owners, horizon)
 
-    ``stream`` numbers the generators of the entity; entities with different numbers are
-    independent.
-    """
-    random = Streams(seed, run).generator("testing", stream)
-    origin = part.origin(entity, lambda: Streams(seed, run).generator("phase", stream))
-    # From tick number 0 and time 0 on.
-    return np.asarray(part.ticks(entity, origin, 0, 0.0, random, LENGTH))
+
+def _stack(counts: list[TickCounts]) -> TickCounts:
+    """Return the counts of several runs as one, with a first axis over runs."""
+    return TickCounts(*(np.array(column) for column in zip(*counts, strict=True)))
 
 
 def _check_generators_used(
-    watched: WatchedPart, entities: tuple[Entity, ...], gaps: FloatArray
+    watched: WatchedPart, entities: tuple[Entity, ...], times: list[list[FloatArray]]
 ) -> None:
-    """Check that the random ``gaps`` (E, runs, length) of a memoryless clock differ between runs
-    and between the E ``entities``, which have different generators.
-    """
-    varies = gaps.std(axis=2).min() > 1e-9 * gaps.mean()
-    if not (varies and watched.part.memoryless):
-        return
+    """Check that ticks differ between runs and entities, which have different generators."""
     where, rule = f"{watched.name}.ticks", "must draw from the generator given"
-    is_same = np.array_equal(gaps[:, 0], gaps[:, 1])
+    first, *others = times[0]
+    count = min(len(first), len(times[1][0]))
+    is_same = np.array_equal(first[:count], times[1][0][:count])
     demand(not is_same, where, rule, "equal times from two generators")
-    for a in range(1, len(entities)):
-        is_same = np.array_equal(gaps[a] / gaps[a].mean(), gaps[0] / gaps[0].mean())
-        text = f"equal times of {list(entities[0])} and {list(entities[a])} from two generators"
+    for entity, ticks in zip(entities[1:], others, strict=True):
+        count = min(len(first), len(ticks), GAPS)
+        is_same = np.array_equal(first[:count] / first[0], ticks[:count] / ticks[0])
+        text = f"equal times of {list(entities[0])} and {list(entity)} from two generators"
         demand(not is_same, where, rule, text)
 
 
 def _check_rates(
-    watched: WatchedPart, entities: tuple[Entity, ...], gaps: FloatArray, stated: FloatArray
+    watched: WatchedPart, group: ClockGroup, counts: TickCounts, unknown: np.ndarray, horizon: float
 ) -> None:
-    """Check the mean of ``gaps`` (E, runs, length) between ticks, in seconds, of the clocks of E
-    entities (links, directions or nodes) against their ``stated`` rates (E,) in 1/s; entities with
-    nan are compared with the median of all.
+    """Check the rates of all clocks together and of each; those of ``unknown`` rate (E,) with the
+    median of all.
     """
     where, rule = f"{watched.name}.mean_rate", "must be the mean ticks per second in the long run"
-    is_stated = ~np.isnan(stated)
-    # Without the first gap, which may be a random phase.
-    means = gaps[:, :, 1:].mean(axis=2)
-    expected = np.where(
-        is_stated, 1.0 / np.where(is_stated, stated, 1.0), np.median(means.mean(axis=1))
-    )
-    relative = means / expected[:, None] - 1.0
-    # Name, relative deviations of the mean gaps of runs, and whether the rate is stated.
-    groups: list[tuple[str, FloatArray, bool]]
-    groups = [("all links", relative[is_stated].reshape(-1), True)]
-    groups += [(f"{list(e)}", relative[k], bool(is_stated[k])) for k, e in enumerate(entities)]
-    for name, deviations, has_rate in groups:
-        if not len(deviations) or (not has_rate and len(entities) < 2):
-            continue
-        error = float(deviations.std(ddof=1)) / math.sqrt(len(deviations))
-        # Student's quantile, because the error is estimated from a few runs.
-        limit = float(stdtrit(len(deviations) - 1, 1.0 - 0.5 * LEVEL / (FAMILIES * len(groups))))
-        mean = float(deviations.mean())
-        if abs(mean) > limit * error + RATE_TOLERANCE:
-            reference = "that it states" if has_rate else "of other links"
-            text = f"{1.0 + mean:.4g} (+- {error:.2g}) of the mean gap {reference}, over {name}"
-            remedy = "" if has_rate else "define mean_rate if links differ by design"
-            fail(where, rule, text, remedy)
+    ticks, distances = counts.ticks.sum(axis=1), []
+    slack = slack_of_start(group, ticks)
+    if not unknown.any():
+        total = float(slack.sum())
+        distances = rates_of_all(group, counts.ticks, total, horizon, 0.5 * family_level())
+    if not unknown.any() or len(unknown) > 1:
+        singles = rates_of_each(group, ticks, slack, horizon, 0.5 * family_level())
+        distances += list(zip(singles, group.labels, strict=True))
+    text = "ticks over the stated number"
+    remedy = "define mean_rate if links differ by design" if unknown.any() else ""
+    demand_agreement(Comparison(distances, text), where, rule, remedy)
 
 
-def _check_exponential(
-    watched: WatchedPart, entities: tuple[Entity, ...], gaps: FloatArray
+def _check_gaps(
+    watched: WatchedPart,
+    group: ClockGroup,
+    counts: TickCounts,
+    times: list[list[FloatArray]],
+    horizon: float,
 ) -> None:
-    """Check that ``gaps`` (E, runs, length) of E entities, divided by their means, are independent
-    and exponential, by Kolmogorov's test and correlations of neighbouring gaps and of entities.
+    """Check gaps against their stated law, and neighbouring ones for independence; of a lattice
+    the times of ticks, the jitter and the phases.
     """
-    where, rule = f"{watched.name}.memoryless", "must be False where ticks are no Poisson process"
-    remedy = "return False: theory relies on it"
-    unit = _check_uniform(-np.expm1(-gaps), where, rule, remedy)
-    for a in range(len(entities)):
-        for b in range(a):
-            deviation = largest_deviation((unit[a] * unit[b]).reshape(-1, 1))
-            if deviation is not None:
-                pair = f"{list(entities[b])} and {list(entities[a])}"
-                fail(
-                    f"{watched.name}.ticks",
-                    "ticks of links with streams of their own must be independent",
-                    f"a correlation of {deviation.mean:.3g} of {pair}",
-                    "use the generator given",
-                )
+    law, part, where = group.gaps[0], watched.part, f"{watched.name}.ticks"
+    parent = f"{type(stated_part(part, 'activation')).__name__}, from which it derives"
+    rule, remedy = f"gaps must have the law of {parent}", STATE_IT
+    if part.memoryless:
+        where, remedy = f"{watched.name}.memoryless", "return False: theory relies on it"
+        rule = "must be False where ticks are no Poisson process"
+    if isinstance(law, Lattice):
+        off, rule = float(counts.off.max()), f"must have the law of {parent}"
+        beside = f"{off:.3g} s beside one of them"
+        demand(off <= 1e-9 * horizon, where, f"must tick at the times of {parent}", beside, remedy)
+        first = _stack([_count(group, [ticks[:1] for ticks in one], horizon) for one in times])
+        demand_agreement(compare_gaps(first, family_level())[0], where, rule, remedy)
+    shares, correlation = compare_gaps(counts, family_level())
+    demand_agreement(shares, where, rule, remedy)
+    if correlation is not None:
+        distance = deviation_interval(0.0, correlation)
+        comparison = Comparison([(distance, "neighbouring gaps")], "largest correlation")
+        demand_agreement(comparison, where, rule, remedy)
 
 
-def _check_uniform(uniform: FloatArray, where: str, rule: str, remedy: str) -> FloatArray:
-    """Check that ``uniform`` (E, runs, length), the values of the stated distribution function at
-    the gaps of E entities, is uniform in [0, 1] and that neighbouring gaps are uncorrelated.
-
-    Returns the same numbers scaled to mean 0 and variance 1. Messages say ``where`` the fault is
-    (the method), the broken ``rule`` and the ``remedy``.
-    """
-    distance = kolmogorov_distance(uniform.reshape(-1))
-    # P(sqrt(N) D > x) <= 2 exp(-2 x^2), Massart 1990.
-    limit = math.sqrt(0.5 * math.log(2.0 * FAMILIES / LEVEL) / uniform.size)
-    text = f"gaps at a distance of {distance:.3g} from the law"
-    demand(distance <= limit, where, rule, text, remedy)
-    # Correlations of these instead of the gaps, of which a few long ones would dominate.
-    unit = np.asarray(math.sqrt(12.0) * (uniform - 0.5))
-    deviation = largest_deviation((unit[:, :, 1:] * unit[:, :, :-1]).reshape(-1, 1))
-    if deviation is not None:
-        correlation = f"{deviation.mean:.3g} +- {deviation.error:.2g}"
-        fail(where, rule, f"neighbouring gaps with a correlation of {correlation}", remedy)
-    return unit
+def _compare_gaps_of_links(group: ClockGroup, times: list[list[FloatArray]]) -> Comparison:
+    """Compare correlations between the first GAPS gaps of Poisson clocks, made normal, with 0."""
+    z = np.full((len(times), GAPS, len(group.rates)), np.nan)
+    for run, one in enumerate(times):
+        for k, ticks in enumerate(one):
+            gaps = np.diff(ticks[:GAPS], prepend=0.0)
+            z[run, : len(gaps), k] = ndtri(-np.expm1(-np.maximum(gaps * group.rates[k], 1e-12)))
+    return compare_correlations(np.minimum(z, 7.0), group.labels, family_level(), lags=())

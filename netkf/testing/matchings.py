@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError
+from netkf.laws.losses import PairCounts, compare_coincidences, compare_matchings
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.rng.streams import Streams
-from netkf.testing.noise import divergence, largest_deviation, minus_log_level
+from netkf.testing.noise import demand_agreement, family_level
 from netkf.testing.topologies import is_edge_transitive, small_networks
 from netkf.testing.watching import (
     WatchedPart,
@@ -23,7 +24,7 @@ from netkf.testing.watching import (
 )
 
 # With 20,000 slots the error of frequencies is half a percent; repeatability needs fewer slots.
-SLOTS, REPEATED_SLOTS, MAX_LAG = 20_000, 200, 3
+SLOTS, REPEATED_SLOTS, RUN, MAX_LAG = 20_000, 200, 50, 3  # RUN: slots that count as one run
 
 
 def check_matching(matching: Any, /, topology: Topology | None = None, **settings: Any) -> None:
@@ -119,7 +120,6 @@ def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: in
             fail(where, rule, got, "use only the generator given")
     mean = _stated_mean(watched, topology)
     _check_frequencies(watched, topology, is_paired, mean)
-    _check_slots_independent(where, topology, is_paired)
     if is_paired.any(axis=0).any() and (is_paired[0] != is_paired).any():
         others = _draw_matchings(part, topology, where, _make_generator(seed, 1), SLOTS // 10)
         is_same = np.array_equal(others, is_paired[: len(others)])
@@ -193,45 +193,26 @@ def _stated_mean(watched: WatchedPart, topology: Topology) -> FloatArray | None:
 def _check_frequencies(
     watched: WatchedPart, topology: Topology, is_paired: np.ndarray, mean: FloatArray | None
 ) -> None:
-    """Check how often links are paired: ``is_paired`` (slots, L) against the stated ``mean`` (L,).
+    """Check how often links are paired, ``is_paired`` (slots, L), against the stated ``mean`` (L,),
+    and that slots up to MAX_LAG apart are independent.
 
     Without a mean, all links of a symmetric graph must be paired equally often.
     """
-    frequencies, slots = is_paired.mean(axis=0), len(is_paired)
-    if mean is None:
-        if not is_edge_transitive(topology):
-            return
-        mean = np.full(len(frequencies), frequencies.mean())
-        rule = "must not prefer one of equal links"
-    else:
-        rule = "must pair links as often as mean says"
-        deviation = largest_deviation(is_paired.sum(axis=1)[:, None] - mean.sum())
-        if deviation is not None:
-            text = f"{deviation.mean + mean.sum():.4g} (+- {deviation.error:.2g}) pairs a slot"
-            fail(f"{watched.name}.draw", rule, f"{text} instead of {mean.sum():.4g}")
-    unlikely = slots * divergence(frequencies, mean) > minus_log_level(len(frequencies))
-    if unlikely.any():
-        k = int(np.argmax(unlikely * np.abs(frequencies - mean)))
-        text = f"{frequencies[k]:.4g} for link {list(topology.links[k])} in {slots:,} slots"
-        graph = f"on {len(topology.nodes)} nodes and {len(topology.links)} links"
-        fail(f"{watched.name}.draw", rule, f"{text} instead of {mean[k]:.4g}, {graph}")
-
-
-def _check_slots_independent(where: str, topology: Topology, is_paired: np.ndarray) -> None:
-    """Check that any two of L links are paired independently up to MAX_LAG slots apart, from
-    ``is_paired`` (slots, L); messages blame the method ``where``.
-    """
-    p, slots = is_paired.mean(axis=0), len(is_paired)
-    expected = p[:, None] * p
-    for lag in range(1, MAX_LAG + 1):
-        # Entry [l, m]: how often link l is paired and, lag slots later, link m.
-        both = is_paired[:-lag].T.astype(float) @ is_paired[lag:] / (slots - lag)
-        unlikely = (slots - lag) * divergence(both, expected) > minus_log_level(both.size)
-        if not unlikely.any():
-            continue
-        index = np.unravel_index(int(np.argmax(unlikely * np.abs(both - expected))), both.shape)
-        first, second = (list(topology.links[k]) for k in index)
-        text = f"link {first} and then {second} in {both[index]:.4g} of slots"
-        rule = f"matchings of slots that are {lag} apart must be independent"
-        remedy = "remember nothing, and draw from the generator given"
-        fail(where, rule, f"{text} instead of {expected[index]:.4g}", remedy)
+    where, links, runs = f"{watched.name}.draw", topology.links, len(is_paired) // RUN
+    graph = f"on {len(topology.nodes)} nodes and {len(links)} links"
+    rule = "must pair links as often as mean says"
+    if mean is None and is_edge_transitive(topology):
+        mean, rule = np.full(len(links), is_paired.mean()), "must not prefer one of equal links"
+    slots = is_paired[: runs * RUN].reshape(runs, RUN, -1)
+    if mean is not None:
+        again = (slots[:, 1:] & slots[:, :-1]).sum(axis=1)
+        counts = PairCounts(slots.sum(axis=1), again, np.full(runs, float(RUN)))
+        found = compare_matchings(mean, counts, links, family_level())
+        demand_agreement(found._replace(text=f"{graph}, {found.text}"), where, rule)
+    labels, lags = [f"link {list(link)}" for link in links], range(1, MAX_LAG + 1)
+    demand_agreement(
+        compare_coincidences(is_paired[None], lags, labels, family_level()),
+        where,
+        "matchings of slots must be independent",
+        "remember nothing, and draw from the generator given",
+    )

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.core.errors import NetkfError
+from netkf.laws.noise import whiten
 from netkf.linalg.arrays import FloatArray, is_semidefinite
 from netkf.linalg.spectra import eigenvalues, growth_factor, growth_rate
 from netkf.plants.diffusion import Diffusion
@@ -24,7 +25,6 @@ from netkf.testing.noise import (
     check_independent,
     check_uncorrelated,
     check_white,
-    compute_whitening,
 )
 from netkf.testing.watching import (
     WatchedPart,
@@ -182,7 +182,7 @@ def _check_starts(
     ``where`` is the method that messages blame, ``seed`` that of the generators. ``is_inherited``
     says that the class does not override the method behind ``start``.
     """
-    whitening = compute_whitening(part.start_cov)
+    whitening = whiten(part.start_cov)
     count = STARTS if len(whitening.factor) else FEW_STARTS
     with guard_user_code(where):
         starts = _draw_starts(part, seed, start, is_inherited, count)
@@ -241,7 +241,7 @@ def _check_noise(
     It must be white with the covariance S (q, q), and independent of the states. ``rule`` is the
     message if it is not 0 in the directions in which S has no noise.
     """
-    whitening = compute_whitening(S)
+    whitening = whiten(S)
     size = 1.0 + float(np.abs(states).max())
     error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size
     text = f"{error:.3g} of the state left over without noise"
@@ -253,7 +253,7 @@ def _check_noise(
     # The states before each step, and x(0) in units of its own deviations.
     flat_states = states.reshape(-1, states.shape[-1])
     check_independent(e.reshape(len(flat_states), -1), flat_states, labels, "the state before")
-    start_factor = compute_whitening(np.atleast_2d(np.cov(states[:, 0].T))).factor
+    start_factor = whiten(np.atleast_2d(np.cov(states[:, 0].T))).factor
     if start_factor.size and len(e) > 1:
         start = (states[:, 0] - states[:, 0].mean(axis=0)) @ start_factor.T
         check_uncorrelated(start, e[:, 0], labels._replace(noise="x(0) and the noise"), "after it")

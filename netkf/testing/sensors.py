@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from netkf.core.clock import Clock
+from netkf.laws.intervals import Comparison
+from netkf.laws.noise import whiten
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
@@ -18,8 +20,9 @@ from netkf.testing.noise import (
     check_independent,
     check_uncorrelated,
     check_white,
-    compute_whitening,
-    largest_deviation,
+    demand_agreement,
+    family_level,
+    mean_interval,
 )
 from netkf.testing.readings import (
     STEP,
@@ -229,7 +232,7 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
     """
     labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     runs = max(2, READINGS // (LENGTH * len(nodes)))
-    factor = compute_whitening(reader.sensor.R).factor
+    factor = whiten(reader.sensor.R).factor
     noise = np.empty((len(nodes), runs, LENGTH, reader.p))
     H = np.empty((len(nodes), runs, LENGTH, reader.p, reader.n))
     numbers = list(range(LENGTH))
@@ -296,7 +299,7 @@ def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, se
     """Check that the noise of increments of ``node`` (its id) at the constant state ``x`` (n,) is
     white with the stated R (p, p), in RUNS runs of STEPS steps with ``seed``.
     """
-    factor = compute_whitening(reader.sensor.R).factor
+    factor = whiten(reader.sensor.R).factor
     whitened = []
     for run in range(RUNS):
         pieces = reader.read_pieces(Streams(seed, run), node, x, STEPS, cut=True)
@@ -334,7 +337,7 @@ def _check_regressors(
     )
     noise_labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     for k in slots:
-        whitening = compute_whitening(sensor.C @ cov @ sensor.C.T)
+        whitening = whiten(sensor.C @ cov @ sensor.C.T)
         deviation = H[:, :, k] - sensor.C @ mean
         size = 1.0 + float(np.abs(mean).max())
         error = float(np.abs(deviation @ whitening.null_space.T).max(initial=0.0)) / size
@@ -363,7 +366,7 @@ def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: Noise
     s = H @ np.linalg.pinv(sensor.C).T
     steps = s[:, 1:] - s[:, :-1] @ sensor.A.T
     drive_cov = sensor.B @ sensor.xi_cov @ sensor.B.T
-    unit = steps @ compute_whitening(drive_cov).factor.T
+    unit = steps @ whiten(drive_cov).factor.T
     check_white(unit, labels._replace(noise="the steps of H"))
 
 
@@ -410,13 +413,12 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
         for node in nodes
         for run in range(runs)
     ]
-    relative = np.array(counts)[:, None] / EXPECTED_SAMPLES - 1.0
-    deviation = largest_deviation(relative, min_values=TIMES_RUNS // 2)
+    distance = mean_interval(np.array(counts) / EXPECTED_SAMPLES, 1.0, family_level())
     # The phase of a clock may add or remove one tick in each run.
-    if deviation is not None and abs(deviation.mean) > 1.0 / EXPECTED_SAMPLES:
-        text = f"{1.0 + deviation.mean:.4g} (+- {deviation.error:.2g}) of the stated number of"
+    if distance.value > 1.0 / EXPECTED_SAMPLES:
         rule = "must be as many as the mean rate of `sampling` states"
-        fail(where, rule, f"{text} samples")
+        comparison = Comparison([(distance, "all nodes")], "samples over the stated number")
+        demand_agreement(comparison, where, rule)
 
 
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:

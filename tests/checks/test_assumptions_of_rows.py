@@ -22,10 +22,10 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.laws import find_largest
 from netkf.checks.mode_sequences import sensing_neighbours
-from netkf.checks.parts.clock_rows import largest_correlation
-from netkf.checks.parts.network_rows import _mean_correlation
 from netkf.checks.report import verdict_text
-from netkf.checks.statistics import Interval
+from netkf.laws.intervals import Interval
+from netkf.laws.losses import mean_correlation
+from netkf.laws.ticks import largest_correlation
 from netkf.parts import Bernoulli, Hybrid
 from netkf.scenario.reading import from_table
 from netkf.theory.common.random_links import all_messages_arrive, delivery_of
@@ -137,7 +137,7 @@ def test_rare_losses_of_links_are_not_taken_for_correlated(q, windows, sent):
     for _ in range(300):
         excess, variance = rare_losses(random, q, windows, 6, sent)
         found = largest_correlation(excess, variance, level)
-        mean = _mean_correlation(excess, variance, level)
+        mean = mean_correlation(excess, variance, level)
         accused += (found is not None and found[0].low > 0.0) or (
             mean is not None and not mean.low <= 0.0 <= mean.high
         )

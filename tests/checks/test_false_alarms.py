@@ -11,10 +11,10 @@ from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.checks import exact, statistics
 from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
-from netkf.checks.parts.network_rows import _share_of_bounded_runs
 from netkf.checks.rounding import compare_identities
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError, TheoryError
+from netkf.laws.losses import share_of_bounded_runs
 from netkf.parts import Bernoulli, ExponentialDelay, Filter, Hybrid, Poisson, number, setting
 from netkf.scenario.reading import from_table
 from netkf.theory.common.stacked_errors import integration_steps
@@ -386,8 +386,8 @@ def test_limits_for_runs_of_any_law_hold():
     missed = 0
     for _ in range(500):
         lost, sent = 12.0 * (random.random(runs) < q), np.full(runs, 12)
-        found = _share_of_bounded_runs(lost - 12.0 * q, sent, q, level)
+        found = share_of_bounded_runs(lost - 12.0 * q, sent, q, level)
         missed += not found.low <= q <= found.high
     assert missed <= 0.05 * 500
-    found = _share_of_bounded_runs(np.full(runs, 12.0 * 0.6), np.full(runs, 12), 0.2, level)
+    found = share_of_bounded_runs(np.full(runs, 12.0 * 0.6), np.full(runs, 12), 0.2, level)
     assert found.low > 0.2

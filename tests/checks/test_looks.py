@@ -16,20 +16,19 @@ from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED, Evidence, Promise, judge
 from netkf.checks.laws import find_largest
 from netkf.checks.looks import is_decided, keep_decisions, level_of_look, next_runs
-from netkf.checks.parts.clock_rows import _poisson_interval
-from netkf.checks.parts.moments import correlation_interval
 from netkf.checks.report import verdict_text
-from netkf.checks.statistics import (
-    band_around,
-    band_width,
+from netkf.checks.statistics import band_around, band_width
+from netkf.checks.storage import load_verdict, save_verdict
+from netkf.cli.main import main
+from netkf.core.errors import ScenarioError
+from netkf.laws.intervals import (
+    correlation_interval,
     deviation_interval,
+    poisson_interval,
     probability_interval,
     scale_interval,
     student_interval,
 )
-from netkf.checks.storage import load_verdict, save_verdict
-from netkf.cli.main import main
-from netkf.core.errors import ScenarioError
 from netkf.scenario.reading import from_table
 from tests.checks.test_check import GOSSIP, INTERMITTENT
 
@@ -122,7 +121,7 @@ KINDS = {
     ),
     "few ticks": (
         lambda random: lambda most: random.poisson(0.7, most),
-        lambda total, runs: deviation_interval(1.0, _poisson_interval(total, 0.7 * runs, LEVEL)),
+        lambda total, runs: deviation_interval(1.0, poisson_interval(total, 0.7 * runs, LEVEL)),
         0.2,
         50,
     ),

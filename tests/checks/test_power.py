@@ -11,9 +11,9 @@ import scipy.stats
 
 from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
 from netkf.checks.exact import _compare_pooled, _pool_nees, check_expected_nees, max_replayed
-from netkf.checks.parts.clock_rows import _count_interval
 from netkf.checks.points import check_times, errors_at_once, probe_times
 from netkf.checks.samples import stack_summaries
+from netkf.laws.ticks import count_interval
 from netkf.scenario.reading import load
 from netkf.theory.common.replay import ErrorLaw
 from tests.checks.power import STUDIES, measured_power
@@ -59,11 +59,11 @@ def test_rows_would_have_found_small_errors_at_the_default(ring):
 def test_one_clock_that_is_off_is_found_as_stated():
     """A rate that is 2 % off, among six clocks, in the ticks that are drawn for that."""
     random, mean, runs, level = np.random.default_rng(4), 40.0, 2000, 1.5e-4 / 6.0
-    size = _count_interval(random.poisson(mean, runs), mean, level, True, 0.0).detectable
+    size = count_interval(random.poisson(mean, runs), mean, level, True, 0.0).detectable
     assert size <= 0.02
     for factor in (1.0 + size, 1.0 - size):
         off = [
-            _count_interval(random.poisson(factor * mean, runs), mean, level, True, 0.0).low
+            count_interval(random.poisson(factor * mean, runs), mean, level, True, 0.0).low
             for _ in range(300)
         ]
         assert np.mean(np.array(off) > 0.0) == pytest.approx(0.9, abs=0.06)

@@ -11,27 +11,32 @@ import pytest
 import scipy.stats
 
 from netkf.checks.exact import _length_interval
-from netkf.checks.parts.clock_rows import (
-    _correlation_of_columns,
-    _count_interval,
-    _poisson_interval,
-    largest_correlation,
-)
-from netkf.checks.parts.moments import CELLS, compare_shares, correlation_interval
-from netkf.checks.parts.ticks import ClockGroup, _count_in_windows
-from netkf.checks.parts.waiting import censored_ranks, count_ranks, exponential_law
+from netkf.checks.laws import find
 from netkf.checks.statistics import (
-    POWER,
-    detectable_shift_of_student,
-    deviation_interval,
     distance_to_law,
     eigenvalue_interval,
     law_distance,
-    probability_interval,
     quadratic_interval,
+)
+from netkf.core.laws import EXPONENTIAL
+from netkf.laws.intervals import (
+    POWER,
+    correlation_interval,
+    detectable_shift_of_student,
+    deviation_interval,
+    poisson_interval,
+    probability_interval,
     scale_interval,
     student_interval,
 )
+from netkf.laws.ticks import (
+    ClockGroup,
+    correlation_of_columns,
+    count_interval,
+    count_ticks,
+    largest_correlation,
+)
+from netkf.laws.waiting import CELLS, censored_ranks, compare_shares, count_ranks
 from netkf.network.clocks import Poisson, Renewal
 
 LEVEL, TRIALS = 0.01, 300
@@ -58,12 +63,12 @@ def probability(p, trials, size, random):
 
 
 def poisson(mean, size, random):
-    return from_zero(_poisson_interval(random.poisson(mean * (1.0 + size)), mean, LEVEL), 1.0)
+    return from_zero(poisson_interval(random.poisson(mean * (1.0 + size)), mean, LEVEL), 1.0)
 
 
 def renewal(runs, size, random):
     counts = random.normal(40.0 * (1.0 + size), 3.0, runs)
-    found = _count_interval(counts, 40.0, LEVEL, False, 0.0)
+    found = count_interval(counts, 40.0, LEVEL, False, 0.0)
     return found.low > 0.0, 3.0 / 40.0 / runs**0.5 * detectable_shift_of_student(runs, LEVEL)
 
 
@@ -90,7 +95,7 @@ def coincidences(q, size, random):
     lost[:, 1] = np.where(random.random(1600) < size, lost[:, 0], lost[:, 1])
     x = lost - q
     variances = np.full(1600, (q * (1.0 - q)) ** 2)
-    return from_zero(_correlation_of_columns(x[:, 0] * x[:, 1], variances, LEVEL))
+    return from_zero(correlation_of_columns(x[:, 0] * x[:, 1], variances, LEVEL))
 
 
 def law(size, random):
@@ -189,7 +194,9 @@ GAPS = {
 def test_laws_of_gaps_state_the_error_of_the_law_itself(name, cell):
     """Not of what the end of a run leaves of it, which is far smaller."""
     (clock, law, horizon), size = GAPS[name], 60
-    group = ClockGroup(tuple((k, k + 1) for k in range(size)), (clock,) * size, ("",) * size)
+    entities = tuple((k, k + 1) for k in range(size))
+    rates = np.full(size, clock.mean_rate((0, 1)))
+    group = ClockGroup(entities, rates, (clock.gaps,) * size, ("",) * size)
     batches = 1 if horizon > 10.0 else 5
 
     def draw(error, random):
@@ -199,8 +206,8 @@ def test_laws_of_gaps_state_the_error_of_the_law_itself(name, cell):
             times = np.cumsum(gaps, axis=1)
             reached = times < horizon
             clocks = np.broadcast_to(np.arange(size)[:, None], times.shape)[reached]
-            cells += _count_in_windows(group, times[reached], clocks, horizon).cells
-        finding = compare_shares(cells, LEVEL, "gaps")
+            cells += count_ticks(group, times[reached], clocks, horizon).cells
+        finding = find(compare_shares(cells, LEVEL, "gaps"), 0.02)
         return finding.margin[2] < 0.0, finding.detectable
 
     found, accused = shares_found(draw, trials=40)
@@ -210,14 +217,14 @@ def test_laws_of_gaps_state_the_error_of_the_law_itself(name, cell):
 
 def test_laws_of_delays_state_the_error_of_the_law_itself():
     """Of messages of which many are under way when the run ends."""
-    law, horizon = exponential_law(np.array(1.0)), 4.0
+    law, horizon = EXPONENTIAL, 4.0
 
     def draw(error, random):
         sent = random.uniform(0.0, horizon, 4000)
         delays = -np.log1p(-shifted_ranks(error, 5, 4000, random))
         arrived = sent + delays < horizon
         ranks = censored_ranks(law, sent, np.where(arrived, delays, np.inf), horizon)
-        finding = compare_shares(count_ranks(ranks), LEVEL, "delays")
+        finding = find(compare_shares(count_ranks(ranks), LEVEL, "delays"), 0.02)
         return finding.margin[2] < 0.0, finding.detectable
 
     found, accused = shares_found(draw, trials=150)

@@ -228,7 +228,7 @@ class Slightly(Bernoulli):
         return self.delivery
 
 
-@says(CHANNELS, "AllAtOnce.independent: must be False where outcomes of different", delivery=0.8)
+@says(CHANNELS, "AllAtOnce.independent: must be False where outcomes of neighb", delivery=0.8)
 class AllAtOnce(Bernoulli):
     """All links lose the same messages, by their numbers."""
 

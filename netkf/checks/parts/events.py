@@ -1,48 +1,159 @@
-"""Counts of the messages and pairs in the events of one run."""
+"""Counts of the ticks, messages and pairs in the events of one run, and the laws stated of them."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import NamedTuple
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
-from netkf.checks.parts.ticks import count_by_window
+from netkf.core.clock import Entity, generate_ticks
+from netkf.core.laws import EXPONENTIAL
+from netkf.laws.delays import DelayCounts, count_delays, count_fixed
+from netkf.laws.losses import LossCounts, LossLaw, PairCounts
+from netkf.laws.stating import stated_law, stated_part
+from netkf.laws.ticks import ClockGroup, TickCounts, count_by_window, count_ticks
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.network.clocks import LinkClock
+from netkf.network.contacts import Contacts
 from netkf.network.matchings import Matching
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.random_links import has_constant_losses
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
+NO_CLOCKS = ClockGroup((), np.empty(0), (), ())
 
-class LossCounts(NamedTuple):
-    """Counts of the messages of one run over D directions (directed links), from which it is
-    tested how often, and how independently, messages are lost.
 
-    sent, lost : (W, D) messages in each of W equal windows of the run
-    followed   : (D,) losses after which another message was sent
-    repeated   : (D,) pairs of consecutive messages that were both lost
-    both       : (D,) messages lost together with the message of the same number in the opposite
-                 direction
+@lru_cache(maxsize=8)
+def network_clocks(scenario: Scenario) -> ClockGroup:
+    """Return the clocks of the network that are compared with their stated laws, one for each node
+    or link; empty if no messages are sent or no clock decides when.
     """
+    clock = scenario.network.activation
+    if not scenario.filter.algorithm.talks or not isinstance(clock, LinkClock):
+        return NO_CLOCKS
+    entities = tuple(clock.entities(scenario.topology))
+    stated, law, share = stated_part(clock, "activation"), stated_law(clock, "activation"), {}
+    if isinstance(clock, Contacts):
+        # A Poisson clock that ticks in contacts only is one in the time of its contacts; stretched
+        # to the length of a run it has a rate that is smaller by the share of contacts.
+        share = {entity: _contact_time(clock, entity, scenario.horizon) for entity in entities}
+        entities = tuple(entity for entity in entities if share[entity] > 0.0)
+        if stated_law(clock.clock, "activation") is EXPONENTIAL:
+            stated, law = clock.clock, EXPONENTIAL
+    rates = [
+        stated.mean_rate(entity) * share.get(entity, scenario.horizon) / scenario.horizon
+        for entity in entities
+    ]
+    labels = tuple(f"clock {'-'.join(map(str, entity))}" for entity in entities)
+    return ClockGroup(entities, np.array(rates), (law,) * len(entities), labels)
 
-    sent: np.ndarray
-    lost: np.ndarray
-    followed: np.ndarray
-    repeated: np.ndarray
-    both: np.ndarray
+
+def _contact_time(clock: Contacts, entity: Entity, horizon: float) -> float:
+    """Return the seconds that a link is in contact until the ``horizon``."""
+    return float(clock.time_in_contact(entity, np.array([horizon]))[0])
 
 
-class PairCounts(NamedTuple):
-    """Counts of the matchings of one run over L links.
+@lru_cache(maxsize=8)
+def sampling_clocks(scenario: Scenario) -> ClockGroup:
+    """Return the clocks at which sensors sample; empty unless every sampled sensor has one."""
+    entities, rates, laws, labels = [], [], [], []
+    law_of: dict[int, Any] = {}  # clocks of one law share one object
+    for node, placed_sensors in scenario.sampled_sensors.items():
+        for placed_sensor in placed_sensors:
+            clock = getattr(scenario.sensors[placed_sensor.entry], "sampling", None)
+            if clock is None:
+                return NO_CLOCKS
+            entities.append((node, placed_sensor.ordinal))
+            rates.append(stated_part(clock, "sampling").mean_rate(entities[-1]))
+            law = law_of.setdefault(placed_sensor.entry, stated_law(clock, "sampling"))
+            laws.append(law)
+            sensor_label = f"sensor {placed_sensor.ordinal} of " if len(placed_sensors) > 1 else ""
+            labels.append(f"the clock of {sensor_label}node {node}")
+    return ClockGroup(tuple(entities), np.array(rates), tuple(laws), tuple(labels))
 
-    paired   : (L,) slots in which the link was in the matching
-    repeated : (L,) slots in which it was in the matchings of this slot and of the one before
-    slots    : () number of slots with a matching
+
+def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
+    """Return the counts of the ticks of a run by which the clocks of the network are compared with
+    their laws, None without clocks. Of links that tick in contacts only they are counted in the
+    time of contacts, and ``off`` is the largest distance of a tick from a contact of its link.
     """
+    group = network_clocks(scenario)
+    if not group.entities:
+        return None
+    clock: Any = scenario.network.activation
+    rows = run.log[run.log["kind"] == CODES["tick"]]
+    columns = ("node",) if clock.at == "nodes" else ("node", "peer")
+    ids = list(zip(*(rows[name].tolist() for name in columns), strict=True))
+    if clock.at == "links":
+        # Both nodes share the clock of a link, whose entity has the smaller id first.
+        ids = [tuple(sorted(pair)) for pair in ids]
+    index = {entity: k for k, entity in enumerate(group.entities)}
+    owners = np.array([index.get(entity, -1) for entity in ids], dtype=np.int64)
+    if not isinstance(clock, Contacts):
+        return count_ticks(group, rows["t"], owners, scenario.horizon)
+    off, inner, inner_owners = 0.0, [np.empty(0)], [np.empty(0, dtype=np.int64)]
+    for entity in set(ids):
+        off = max(off, clock.distance(entity, rows["t"][[e == entity for e in ids]]))
+    for k, entity in enumerate(group.entities):
+        ticks = rows["t"][owners == k]
+        met = clock.time_in_contact(entity, ticks[clock.in_contact(entity, ticks)])
+        inner.append(met * (scenario.horizon / _contact_time(clock, entity, scenario.horizon)))
+        inner_owners.append(np.full(len(met), k))
+    times, owners = np.concatenate(inner), np.concatenate(inner_owners)
+    return count_ticks(group, times, owners, scenario.horizon)._replace(off=np.array(off))
 
-    paired: np.ndarray
-    repeated: np.ndarray
-    slots: np.ndarray
+
+def samples_of(scenario: Scenario, streams: Streams) -> TickCounts | None:
+    """Return the counts of the samples of a run by which the sampling clocks of sensors are
+    compared with their laws, drawn again from its ``streams``; None without clocks.
+    """
+    group = sampling_clocks(scenario)
+    if not group.entities:
+        return None
+    all_times = scenario.sample_times(streams)
+    times = [all_times[entity] for entity in group.entities]
+    owners = np.repeat(np.arange(len(times)), [len(t) for t in times])
+    return count_ticks(group, np.concatenate(times), owners, scenario.horizon)
+
+
+def count_drawn_ticks(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
+    """Return how often each of E clocks of the network ticks in one ``replica`` of the runs of
+    ``seed``, (E,), drawn from the clocks' streams without simulating anything else.
+    """
+    ticks = draw_ticks(scenario, network_clocks(scenario).entities, seed, replica)
+    return np.array([len(times) for times in ticks])
+
+
+def draw_ticks(
+    scenario: Scenario, entities: Sequence[Entity], seed: int, replica: int
+) -> list[FloatArray]:
+    """Return the times in seconds of the ticks of each of the ``entities`` of the network's clock,
+    drawn again from the streams of one ``replica`` of the runs of ``seed``.
+    """
+    clock: Any = scenario.network.activation
+    streams = Streams(seed, replica)
+    return [
+        generate_ticks(
+            clock,
+            entity,
+            partial(streams.generator, "phase", *entity),
+            streams.generator("clock", *entity),
+            scenario.horizon,
+        )
+        for entity in entities
+    ]
+
+
+def count_drawn_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:
+    """Return how often each of E sensors samples in one ``replica`` of the runs of ``seed``, (E,),
+    drawn from the sensors' streams without simulating anything else.
+    """
+    times = scenario.sample_times(Streams(seed, replica))
+    return np.array([len(times[entity]) for entity in sampling_clocks(scenario).entities])
 
 
 @lru_cache(maxsize=8)
@@ -51,70 +162,75 @@ def direction_indices(scenario: Scenario) -> dict[tuple[int, int], int]:
     return {direction: k for k, direction in enumerate(scenario.topology.directions)}
 
 
-def count_losses(scenario: Scenario, run: Run) -> LossCounts | None:
-    """Return the counts (W, D) of sent and lost messages of a run, in W windows (equal parts) of it
-    and for each of D directions (directed links), and counts of losses that follow or accompany
-    each other; None without links.
+@lru_cache(maxsize=8)
+def loss_law(scenario: Scenario) -> LossLaw:
+    """Return what a scenario states of losses on its directions."""
+    channel, clock = scenario.network.channel, scenario.network.activation
+    loss, links = stated_part(channel.loss, "loss"), scenario.topology.directions
+    delivery = [loss.mean_delivery(link, scenario.table_probability(link)) for link in links]
+    indices, at_once = direction_indices(scenario), getattr(clock, "at", "links") == "links"
+    opposite = np.array([indices.get((j, i), -1) for i, j in links], dtype=np.int64)
+    # Broadcasts of two nodes at different times would both step a chain that they share.
+    one_step = isinstance(clock, Matching) or (
+        isinstance(clock, LinkClock) and (clock.at == "links" or not channel.symmetric)
+    )
+    return LossLaw(
+        lost=1.0 - np.array(delivery),
+        independent=bool(loss.independent) and _redraws_links(scenario),
+        chain=stated_law(channel.loss, "loss") if one_step else None,
+        steady=has_constant_losses(scenario),
+        symmetric=channel.symmetric,
+        shared=bool(at_once and channel.symmetric and (opposite >= 0).any()),
+        opposite=opposite,
+        at_once=at_once and not channel.symmetric,
+        links=links,
+    )
+
+
+def _redraws_links(scenario: Scenario) -> bool:
+    """Return True if every exchange redraws the links, which a filter may keep within a slot."""
+    filter_ = scenario.node_filter
+    if not scenario.slotted:
+        return True
+    phases = range((filter_.schedule or ()).count("exchange"))
+    steps = [(phase, k) for phase in phases for k in range(filter_.exchange_steps(phase))]
+    return all(filter_.redraws_links(*step) for step in steps)
+
+
+def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
+    """Return the counts of sent and lost messages of a run, in windows of it and for each of D
+    directions, and of losses that follow or accompany each other; None without links.
     """
     indices, log = direction_indices(scenario), run.log
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
     if not indices:
         return None
-    size = len(indices)
-    lost_at = in_direction(losses["node"], losses["peer"], indices)
-    sent_at = in_direction(sends["node"], sends["peer"], indices)
-    sent = count_by_window(scenario, sends["t"], sent_at, size)
-    lost = count_by_window(scenario, losses["t"], lost_at, size)
-    number = losses["message"]
+    size, number = len(indices), losses["message"]
+    lost_at = _in_direction(losses["node"], losses["peer"], indices)
+    sent_at = _in_direction(sends["node"], sends["peer"], indices)
+    sent = count_by_window(sends["t"], sent_at, size, scenario.horizon)
+    lost = count_by_window(losses["t"], lost_at, size, scenario.horizon)
     # One integer for each message: the message before it in its direction has that integer less 1,
     # and the gap after the last of each direction keeps directions apart.
     width = int(sends["message"].max(initial=0)) + 2
     keys = lost_at * width + number
     after_loss = np.isin(keys - 1, keys) & (number > 0)
-    opposite = reversed_directions(scenario)[lost_at]
+    opposite = loss_law(scenario).opposite[lost_at]
     both_lost = np.isin(opposite * width + number, keys) & (opposite >= 0)
     followed = number + 1 < sent.sum(axis=0)[lost_at]
-    return LossCounts(
-        sent,
-        lost,
-        followed=np.bincount(lost_at[followed], minlength=size),
-        repeated=np.bincount(lost_at[after_loss], minlength=size),
-        both=np.bincount(lost_at[both_lost], minlength=size),
-    )
+    masks = (followed, after_loss, both_lost)
+    return LossCounts(sent, lost, *(np.bincount(lost_at[m], minlength=size) for m in masks))
 
 
-def in_direction(
+def _in_direction(
     senders: np.ndarray, receivers: np.ndarray, indices: dict[tuple[int, int], int]
-) -> np.ndarray:
-    """Return the index (K,) of the direction of each of K messages from ``senders`` to
-    ``receivers`` (K,), node ids; ``indices`` is by (sender, receiver).
-    """
+) -> IntArray:
+    """Return the index (K,) of the direction of each of K messages, of node ids (K,) each."""
     ids = zip(senders.tolist(), receivers.tolist(), strict=True)
     return np.array([indices[direction] for direction in ids], dtype=np.int64)
 
 
-@lru_cache(maxsize=8)
-def shares_draws(scenario: Scenario) -> np.ndarray:
-    """Return (D,) bool: True for the second of two opposite directions that share all draws.
-
-    Statistics count such pairs once, by the first direction.
-    """
-    clock = scenario.network.activation
-    at_once = getattr(clock, "at", "links") == "links"
-    shared = at_once and scenario.network.channel.symmetric
-    senders = np.array([[i, j] for i, j in direction_indices(scenario)])
-    second = (senders[:, 0] > senders[:, 1]) & (reversed_directions(scenario) >= 0)
-    return np.asarray(second & shared)
-
-
-@lru_cache(maxsize=8)
-def reversed_directions(scenario: Scenario) -> np.ndarray:
-    """Return the index (D,) of the opposite of each direction, -1 without one."""
-    indices = direction_indices(scenario)
-    return np.array([indices.get((j, i), -1) for i, j in indices], dtype=np.int64)
-
-
-def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:
+def pairs_of(scenario: Scenario, run: Run) -> PairCounts | None:
     """Return for each of L links the number (L,) of slots of a run in which it was in the matching
     (the pairs of nodes that exchange in a slot), and in which it was in two matchings in a row;
     None without drawn matchings.
@@ -135,3 +251,60 @@ def count_pairs(scenario: Scenario, run: Run) -> PairCounts | None:
     return PairCounts(
         count, np.bincount(link_of_row[repeated], minlength=len(links)), np.array(float(total))
     )
+
+
+@lru_cache(maxsize=8)
+def stated_delay(scenario: Scenario) -> tuple[float | None, Any]:
+    """Return the constant that the scenario states for its delays, and their law, or None each."""
+    delay = scenario.network.channel.delay
+    return stated_part(delay, "delay").fixed, stated_law(delay, "delay")
+
+
+def delays_of(scenario: Scenario, run: Run) -> DelayCounts | None:
+    """Return counts by which the delays of the messages of a run are compared with their stated
+    law, over D directions; None without links or a stated law.
+
+    Messages that have not arrived when the run ends take longer than that.
+    """
+    (fixed, law), indices = stated_delay(scenario), direction_indices(scenario)
+    rows = run.log[np.isin(run.log["kind"], (CODES["deliver"], CODES["late"]))]
+    if not indices or (fixed is None and law is None):
+        return None
+    if fixed is not None:
+        return count_fixed(rows["age"], fixed, len(indices))
+    sent, directions, ages = _follow_messages(scenario, run, rows)
+    return count_delays(law, sent, ages, directions, len(indices), scenario.horizon)
+
+
+def _follow_messages(
+    scenario: Scenario, run: Run, arrivals: np.ndarray
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return for each of the K messages of a run that are not lost the time (K,) of sending, the
+    index (K,) of its direction, and the seconds (K,) that it takes: inf if it is under way when the
+    run ends. They are in order of direction and number; ``arrivals`` are the rows of the log.
+
+    Where both directions of a link share their draws, one stands for both.
+    """
+    indices, log, law = direction_indices(scenario), run.log, loss_law(scenario)
+    sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
+    width = int(sends["message"].max(initial=0)) + 1
+
+    def keys(rows: np.ndarray, sender: str, receiver: str) -> IntArray:
+        """Return one integer for each message: its direction, and its number in that."""
+        codes: IntArray = _in_direction(rows[sender], rows[receiver], indices) * width
+        return codes + np.asarray(rows["message"], dtype=np.int64)
+
+    sent = keys(sends, "node", "peer")
+    # The receiver of a message comes first in the row of its arrival.
+    arrived = keys(arrivals, "peer", "node")
+    followed = ~np.isin(sent, keys(losses, "node", "peer"))
+    second = np.array([i > j for i, j in law.links]) & (law.opposite >= 0) & law.shared
+    followed &= ~second[sent // width]
+    order = np.argsort(sent[followed], kind="stable")
+    sent, times = sent[followed][order], sends["t"][followed][order]
+    ages = np.full(len(sent), np.inf)
+    position = np.searchsorted(sent, arrived)
+    position[position == len(sent)] = 0
+    known = sent[position] == arrived if len(sent) else np.zeros(len(arrived), dtype=bool)
+    ages[position[known]] = arrivals["age"][known]
+    return times, sent // width, ages

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.checks.parts.moments import NoiseMoments, moments, whitening_matrix
-from netkf.checks.parts.sources import stated_part
+from netkf.laws.noise import MIN_VARIANCE_SHARE, NoiseDraws, noise_draws, whiten
+from netkf.laws.stating import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -69,7 +69,11 @@ def path_law(scenario: Scenario) -> PathLaw | None:
         Phi, W = _discretise(stated.A, stated.B, float(times[1]))
     deviation = float(np.sqrt(np.diagonal(W).max()))
     return PathLaw(
-        times, Phi, whitening_matrix(W), deviation, _sizes(stated, Phi, W, len(times) - 1)
+        times,
+        Phi,
+        whiten(W, MIN_VARIANCE_SHARE).factor,
+        deviation,
+        _sizes(stated, Phi, W, len(times) - 1),
     )
 
 
@@ -98,10 +102,9 @@ def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, F
     return Phi, 0.5 * (W + W.T)
 
 
-def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the sums (:class:`NoiseMoments`) over the plant's noise in the steps of one run's true
-    path, whitened by its stated covariance to d entries; None for plants without noise and for
-    recorded states.
+def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
+    """Return the plant's noise in the steps of one run's true path, whitened by its stated
+    covariance to d entries; None for plants without noise and for recorded states.
     """
     law = path_law(scenario)
     if law is None or not len(law.white):
@@ -110,10 +113,10 @@ def plant_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
     noise = x[1:] - x[:-1] @ law.Phi.T
     # Where the state has outgrown the noise, x(t + gap) - Phi x(t) is mostly rounding.
     accurate = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
-    steps = len(accurate) if accurate.all() else int(np.argmin(accurate))
-    whitened = noise[:steps] @ law.white.T
-    states = _standardise(x[:steps], law.sizes[:steps])
-    return moments(whitened, np.repeat(states[:, :, None], whitened.shape[1], axis=2))
+    usable = np.logical_and.accumulate(accurate)
+    whitened = np.where(usable[:, None], noise @ law.white.T, np.nan)
+    states = _standardise(x[:-1], law.sizes)
+    return noise_draws(whitened, np.repeat(states[:, :, None], whitened.shape[1], axis=2))
 
 
 def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -217,10 +220,9 @@ def reading_labels(scenario: Scenario) -> list[str]:
     ]
 
 
-def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None:
-    """Return the sums (:class:`NoiseMoments`) over the noises of the sensors' first readings in the
-    run of ``streams``, whitened by their stated covariances to d entries; None without drawn
-    sensors.
+def reading_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
+    """Return the noises of the sensors' first readings in the run of ``streams``, whitened by their
+    stated covariances to d entries; None without drawn sensors.
 
     Sensors read states drawn here, of typical size, since their noise must not depend on the state.
     The k-th noises of all sensors form one vector; entries of sensors with fewer readings are nan.
@@ -228,18 +230,17 @@ def reading_moments(scenario: Scenario, streams: Streams) -> NoiseMoments | None
     laws = sensor_laws(scenario)
     if not laws:
         return None
-    columns = [_whitened_noises(scenario, streams, law) for law in laws]
-    length = max(len(z) for z, _ in columns)
-    n = scenario.plant.n
-    z = np.full((length, sum(z.shape[1] for z, _ in columns)), np.nan)
-    state_columns = np.zeros((length, n, z.shape[1]))
+    size = sum(len(law.root) for law in laws)
+    z = np.full((MAX_STEPS, size), np.nan)
+    state_columns = np.zeros((MAX_STEPS, scenario.plant.n, size))
     first_entry = 0
-    for noises, states in columns:
+    for law in laws:
+        noises, states = _whitened_noises(scenario, streams, law)
         entries = slice(first_entry, first_entry + noises.shape[1])
         z[: len(noises), entries] = noises
         state_columns[: len(noises), :, entries] = states[:, :, None]
         first_entry = entries.stop
-    return moments(z, state_columns)
+    return noise_draws(z, state_columns)
 
 
 def _whitened_noises(
@@ -356,4 +357,4 @@ def _increment_noises(
 def whitened_starts(scenario: Scenario, x: FloatArray) -> FloatArray:
     """Return x(0) ``x`` (R, n) of R runs less the stated mean and whitened, (R, d)."""
     plant: Any = scenario.plant
-    return np.asarray((x - plant.start_mean) @ whitening_matrix(plant.start_cov).T)
+    return np.asarray((x - plant.start_mean) @ whiten(plant.start_cov, MIN_VARIANCE_SHARE).factor.T)

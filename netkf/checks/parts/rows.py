@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
+import scipy.special
 
 from netkf.checks.evidence import (
     GAUSSIAN,
@@ -16,128 +17,66 @@ from netkf.checks.evidence import (
     Finding,
     Promise,
 )
-from netkf.checks.parts.moments import (
-    NoiseMoments,
+from netkf.checks.laws import find
+from netkf.checks.parts.network_rows import loss_assumptions, network_promises
+from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts
+from netkf.checks.parts.samples import PartSamples
+from netkf.laws.noise import (
+    NoiseDraws,
     compare_cells,
     compare_correlations,
     compare_means,
     compare_variances,
-    moments,
-    total,
 )
-from netkf.checks.parts.network_rows import loss_assumptions, network_promises
-from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts
-from netkf.checks.parts.samples import PartSamples
-from netkf.checks.parts.sources import is_own_class
-from netkf.linalg.arrays import FloatArray
+from netkf.laws.stating import is_own_class
 from netkf.scenario.scenario import Scenario
 
 STARTS = 10_000
 """States x(0) that are drawn for the tests, since each run has only one."""
 LAW_LEVEL = 0.05
 """Level at which the noise of a user's class is tested for being Gaussian."""
-
-
-def _number_labels(noun: str, count: int) -> list[str]:
-    """Return the labels "noun 0", "noun 1", ... of ``count`` entries."""
-    return [f"{noun} {k}" for k in range(count)]
+VARIANCE_TOLERANCE, MEAN_TOLERANCE, CORRELATION_TOLERANCE = 0.1, 0.1, 0.2
+"""Tolerated relative error of a variance, mean in standard deviations, and correlation."""
 
 
 @lru_cache(maxsize=4)
-def _start_moments(scenario: Scenario, seed: int) -> NoiseMoments:
-    """Return the sums of STARTS states x(0), drawn again from their streams and whitened by the
-    stated mean and covariance, by which rows about the start are tested; cached.
+def _start_draws(scenario: Scenario, seed: int) -> NoiseDraws:
+    """Return STARTS states x(0), drawn again from their streams and whitened, as one run."""
+    z = whitened_starts(scenario, start_states(scenario, seed, STARTS))
+    return NoiseDraws(z[None], np.zeros((1, 2, 0, z.shape[1])))
+
+
+def _draws(samples: PartSamples, group: str) -> tuple[NoiseDraws, list[str], str, bool]:
+    """Return the noises of the start, the plant or the sensors in all runs, labels of the entries,
+    what they are, and whether the noises are Gaussian because their classes are built in.
     """
-    return moments(whitened_starts(scenario, start_states(scenario, seed, STARTS)))
+    scenario = samples.scenario
+    if group == SENSORS:
+        own = any(is_own_class(sensor, "sensor") for sensor in scenario.sensors)
+        return samples.readings, reading_labels(scenario), "readings", not own
+    draws = samples.steps if group == PLANT else _start_draws(scenario, samples.seed)
+    # The entries are eigenvectors of the covariance, not states.
+    labels = [f"direction {k}" for k in range(draws.z.shape[2])]
+    noun = "directions of the noise" if group == PLANT else "directions of x(0)"
+    return draws, labels, noun, not is_own_class(scenario.plant, "plant")
 
 
-def _start_variance(samples: PartSamples, level: float) -> Finding:
-    """Test that x(0) has the stated covariance: whitened by it, states x(0) have variance 1.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    sums = _start_moments(samples.scenario, samples.seed)
-    # The entries of a whitened state are numbered: they are eigenvectors, not states.
-    labels = _number_labels("direction", len(sums.first))
-    gaussian = not is_own_class(samples.scenario.plant, "plant")
-    return compare_variances(sums, labels, level, "directions of x(0)", gaussian)
+def _mean(group: str, samples: PartSamples, level: float) -> Finding:
+    """Compare the means of noises, and their correlations with the states, with 0."""
+    draws, labels, *_ = _draws(samples, group)
+    return find(compare_means(draws.z, labels, level, draws.states), MEAN_TOLERANCE)
 
 
-def _start_mean(samples: PartSamples, level: float) -> Finding:
-    """Test that x(0) has the stated mean: less that and whitened, states x(0) have mean 0.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    sums = _start_moments(samples.scenario, samples.seed)
-    return compare_means(sums, _number_labels("direction", len(sums.first)), level)
+def _variance(group: str, samples: PartSamples, level: float) -> Finding:
+    """Compare the variances of whitened noises with 1."""
+    draws, labels, noun, gaussian = _draws(samples, group)
+    return find(compare_variances(draws.z, labels, level, noun, gaussian), VARIANCE_TOLERANCE)
 
 
-def _step_moments(samples: PartSamples) -> tuple[NoiseMoments, list[str]]:
-    """Return the sums over all runs of the plant's noise, whitened by its stated covariance, and a
-    label for each of its entries.
-    """
-    sums = total(samples.steps)
-    return sums, _number_labels("direction", len(sums.first))
-
-
-def _step_variance(samples: PartSamples, level: float) -> Finding:
-    """Test that the plant's noise has its stated covariance: whitened by it, it has variance 1.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    sums, labels = _step_moments(samples)
-    gaussian = not is_own_class(samples.scenario.plant, "plant")
-    return compare_variances(sums, labels, level, "directions of the noise", gaussian)
-
-
-def _step_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the plant's noise, and its correlations with the states before, with
-    zero.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    return compare_means(*_step_moments(samples), level)
-
-
-def _step_correlation(samples: PartSamples, level: float) -> Finding:
-    """Compare the correlations of the plant's noise, between its entries and in time, with zero.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    return compare_correlations(*_step_moments(samples), level)
-
-
-def _reading_variance(samples: PartSamples, level: float) -> Finding:
-    """Test that noises of the readings have their stated covariances R: whitened by these, they
-    have variance 1.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    labels = reading_labels(samples.scenario)
-    gaussian = not _own_sensors(samples.scenario)
-    return compare_variances(total(samples.readings), labels, level, "readings", gaussian)
-
-
-def _reading_mean(samples: PartSamples, level: float) -> Finding:
-    """Compare the means of the readings' noise, and its correlations with the states read, with
-    zero.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    return compare_means(total(samples.readings), reading_labels(samples.scenario), level)
-
-
-def _reading_correlation(samples: PartSamples, level: float) -> Finding:
-    """Compare the correlations of the readings' noise, between readings and in time, with zero.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
-    return compare_correlations(total(samples.readings), reading_labels(samples.scenario), level)
-
-
-def _own_sensors(scenario: Scenario) -> bool:
-    """Return True if a sensor is of a user's class."""
-    return any(is_own_class(sensor, "sensor") for sensor in scenario.sensors)
+def _correlation(group: str, samples: PartSamples, level: float) -> Finding:
+    """Compare the correlations of noises, between their entries and in time, with 0."""
+    draws, labels, *_ = _draws(samples, group)
+    return find(compare_correlations(draws.z, labels, level), CORRELATION_TOLERANCE)
 
 
 def gaussian_noises(samples: PartSamples) -> Assumption:
@@ -147,50 +86,52 @@ def gaussian_noises(samples: PartSamples) -> Assumption:
     Built-in noises are Gaussian; those of a user's class, which states only a covariance, are
     tested by how they fill cells that have equal probability under the normal law.
     """
-    scenario, tested = samples.scenario, []
-    if is_own_class(scenario.plant, "plant"):
-        if samples.steps is not None:
-            tested.append((total(samples.steps).cells, "the noise of the plant"))
-        if scenario.plant.is_random and np.any(scenario.plant.start_cov):
-            tested.append((_start_moments(scenario, samples.seed).cells, "the law of x(0)"))
-    if _own_sensors(scenario) and samples.readings is not None:
-        tested.append((total(samples.readings).cells, "the noise of the sensors"))
-    rejected = [noun for cells, noun in tested if not _fills_evenly(cells)]
+    plant, groups = samples.scenario.plant, []
+    if samples.steps is not None:
+        groups.append((PLANT, "the noise of the plant"))
+    if plant.is_random and np.any(plant.start_cov):
+        groups.append((START, "the law of x(0)"))
+    if samples.readings is not None:
+        groups.append((SENSORS, "the noise of the sensors"))
+    rejected = [noun for group, noun in groups if not _is_gaussian(samples, group)]
     evidence = f"{' and '.join(rejected)} is not" if rejected else "none is found that is not"
     return Assumption(GAUSSIAN, "the scenario", not rejected, evidence)
 
 
-def _fills_evenly(cells: FloatArray) -> bool:
-    """Return False if noises are found not to be Gaussian, at LAW_LEVEL: ``cells`` (CELLS, d) are
-    the numbers of d whitened entries in cells of equal probability under the normal law.
-    """
-    finding = compare_cells(cells, [""] * cells.shape[1], LAW_LEVEL, "")
-    # Rejected if the upper end of the margin (value, low, high) is below 0.
-    return not finding.margin[2] < 0.0
+def _is_gaussian(samples: PartSamples, group: str) -> bool:
+    """Return False if noises of a user's class are found not to be Gaussian, at LAW_LEVEL."""
+    if group == START and not is_own_class(samples.scenario.plant, "plant"):
+        return True
+    draws, labels, noun, gaussian = _draws(samples, group)
+    if gaussian:
+        return True
+    return compare_cells(scipy.special.ndtr(draws.z), labels, LAW_LEVEL, noun).worst is None
 
 
-def _noise_rows(group: str, *rows: tuple[str, Callable[..., Finding]]) -> tuple[Promise, ...]:
+def _rows(group: str, *rows: tuple[str, Callable[..., Finding]]) -> tuple[Promise, ...]:
     """Return promises of the scenario about one noise, from statements and tests."""
-    return tuple(Promise(text, "the scenario", (), test, group=group) for text, test in rows)
+    return tuple(
+        Promise(text, "the scenario", (), partial(test, group), group=group) for text, test in rows
+    )
 
 
 # A bias comes first: squares about a wrong mean, and products of such, are wrong too.
-START_ROWS = _noise_rows(
+START_ROWS = _rows(
     START,
-    ("the state starts with its mean", _start_mean),
-    ("the state starts with its covariance", _start_variance),
+    ("the state starts with its mean", _mean),
+    ("the state starts with its covariance", _variance),
 )
-PLANT_ROWS = _noise_rows(
+PLANT_ROWS = _rows(
     PLANT,
-    ("the plant follows its equation without a bias", _step_mean),
-    ("the plant's noise has its covariance", _step_variance),
-    ("the plant's noise is white", _step_correlation),
+    ("the plant follows its equation without a bias", _mean),
+    ("the plant's noise has its covariance", _variance),
+    ("the plant's noise is white", _correlation),
 )
-SENSOR_ROWS = _noise_rows(
+SENSOR_ROWS = _rows(
     SENSORS,
-    ("readings have no bias", _reading_mean),
-    ("noises of the sensors have their covariance", _reading_variance),
-    ("noises of the sensors are white and independent of each other", _reading_correlation),
+    ("readings have no bias", _mean),
+    ("noises of the sensors have their covariance", _variance),
+    ("noises of the sensors are white and independent of each other", _correlation),
 )
 
 

@@ -8,16 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.parts.delays import DelayCounts, count_delays
-from netkf.checks.parts.events import (
-    LossCounts,
-    PairCounts,
-    count_losses,
-    count_pairs,
-)
-from netkf.checks.parts.moments import NoiseMoments
-from netkf.checks.parts.noises import plant_moments, reading_moments
-from netkf.checks.parts.ticks import TickCounts, count_samples, count_ticks
+from netkf.checks.parts.events import delays_of, losses_of, pairs_of, samples_of, ticks_of
+from netkf.checks.parts.noises import plant_noises, reading_noises
+from netkf.laws.delays import DelayCounts
+from netkf.laws.losses import LossCounts, PairCounts
+from netkf.laws.noise import NoiseDraws
+from netkf.laws.ticks import TickCounts
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -35,8 +31,8 @@ class PartSummary(NamedTuple):
     ticks: TickCounts | None
     fates: LossCounts | None
     pairs: PairCounts | None
-    steps: NoiseMoments | None
-    readings: NoiseMoments | None
+    steps: NoiseDraws | None
+    readings: NoiseDraws | None
     delays: DelayCounts | None
     sampling: TickCounts | None
 
@@ -45,8 +41,8 @@ PART_TYPES: dict[str, type[Any]] = {
     "ticks": TickCounts,
     "fates": LossCounts,
     "pairs": PairCounts,
-    "steps": NoiseMoments,
-    "readings": NoiseMoments,
+    "steps": NoiseDraws,
+    "readings": NoiseDraws,
     "delays": DelayCounts,
     "sampling": TickCounts,
 }
@@ -60,13 +56,13 @@ def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
     """
     streams = Streams(run.seed, run.replica)
     return PartSummary(
-        ticks=count_ticks(scenario, run),
-        fates=count_losses(scenario, run),
-        pairs=count_pairs(scenario, run),
-        steps=plant_moments(scenario, streams),
-        readings=reading_moments(scenario, streams),
-        delays=count_delays(scenario, run),
-        sampling=count_samples(scenario, streams),
+        ticks=ticks_of(scenario, run),
+        fates=losses_of(scenario, run),
+        pairs=pairs_of(scenario, run),
+        steps=plant_noises(scenario, streams),
+        readings=reading_noises(scenario, streams),
+        delays=delays_of(scenario, run),
+        sampling=samples_of(scenario, streams),
     )
 
 

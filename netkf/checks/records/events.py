@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.parts.ticks import draw_ticks
+from netkf.checks.parts.events import draw_ticks
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import Matching, RecordedSlots

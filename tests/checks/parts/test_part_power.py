@@ -9,27 +9,20 @@ import numpy as np
 import pytest
 
 from netkf.checks.exact import _length_interval
-from netkf.checks.parts.clock_rows import _count_interval, largest_correlation
-from netkf.checks.parts.events import LossCounts, PairCounts, reversed_directions
-from netkf.checks.parts.moments import (
-    CELLS,
-    _between,
-    _in_size,
-    _in_time,
-    compare_cells,
-    correlation_interval,
-    moments,
-)
+from netkf.checks.laws import find
+from netkf.checks.parts.events import loss_law
 from netkf.checks.parts.network_rows import (
     _check_bursts,
     _check_matchings,
     _losses_apart,
-    _mean_correlation,
     pair_probabilities,
 )
 from netkf.checks.parts.samples import PartSamples
-from netkf.checks.parts.ticks import correlate_neighbours
-from netkf.checks.statistics import deviation_interval, probability_interval
+from netkf.laws.intervals import correlation_interval, deviation_interval, probability_interval
+from netkf.laws.losses import PairCounts, count_outcomes, mean_correlation
+from netkf.laws.noise import _between, _in_size, _in_time, compare_cells
+from netkf.laws.ticks import count_interval, largest_correlation
+from netkf.laws.waiting import CELLS, Ranks, correlate_neighbours
 from netkf.scenario.reading import from_table
 from tests.checks.parts.test_parts import SLOTS
 
@@ -50,16 +43,7 @@ def _samples(scenario, fates=None, pairs=None):
 
 
 def _count(scenario, lost):
-    """Count losses (R, W M, D) as `count_losses` does."""
-    runs, _, directions = lost.shape
-    parts = lost.reshape(runs, WINDOWS, MESSAGES, directions)
-    return LossCounts(
-        np.full((runs, WINDOWS, directions), MESSAGES),
-        parts.sum(axis=2),
-        lost[:, :-1].sum(axis=1),
-        (lost[:, 1:] & lost[:, :-1]).sum(axis=1),
-        (lost & lost[..., reversed_directions(scenario)]).sum(axis=1),
-    )
+    return count_outcomes(lost, loss_law(scenario).opposite)
 
 
 def _of(finding):
@@ -133,7 +117,7 @@ def _renewal_clock(folder):
     def draw(size, random):
         gaps = random.gamma(shape, 1.0 / shape / (1.0 + size), (RUNS, 60))
         ticks = (np.cumsum(gaps, axis=1) < mean).sum(axis=1)
-        return _interval(_count_interval(ticks, mean, LEVEL, False, 1.0))
+        return _interval(count_interval(ticks, mean, LEVEL, False, 1.0))
 
     return draw
 
@@ -143,8 +127,8 @@ def _law_of_gaps(folder):
     def draw(size, random):
         shares = np.full(CELLS, (1.0 - 1.0 / CELLS - size) / (CELLS - 1))
         shares[3] = 1.0 / CELLS + size
-        counts = random.multinomial(5000, shares).astype(float)[:, None]
-        return _of(compare_cells(counts, ["all"], LEVEL, "gaps"))
+        u = (random.choice(CELLS, 5000, p=shares) + 0.5) / CELLS
+        return _of(find(compare_cells(u[None, :, None], ["all"], LEVEL, "gaps"), 0.02))
 
     return draw
 
@@ -155,7 +139,7 @@ def _gaps_in_time(folder):
         # Each number is the one before with this probability.
         for k in np.flatnonzero(random.random(len(u)) < size)[1:].tolist():
             u[k] = u[k - 1]
-        sums = correlate_neighbours(u, np.zeros(len(u), dtype=bool))
+        sums = correlate_neighbours(Ranks(u, np.full(len(u), CELLS)), np.zeros(len(u), bool))
         found = correlation_interval(float(sums[0] / sums[1]), float(sums[2]), LEVEL)
         return _interval(deviation_interval(0.0, found))
 
@@ -205,12 +189,12 @@ def test_parts_of_runs_with_few_messages_accuse_nobody(mean):
         # Broadcasts: both links have a message at once.
         sent = np.repeat(random.poisson(mean, (240, 1)), 2, axis=1)
         excess = random.binomial(sent, q) - q * sent
-        found = _mean_correlation(excess, sent * q * (1.0 - q), level)
+        found = mean_correlation(excess, sent * q * (1.0 - q), level)
         accused += not found.low <= 0.0 <= found.high
     # 8 are expected at most; 18 and more have probability 0.002.
     assert accused < 18
     same = np.repeat(excess[:, :1], 2, axis=1)
-    assert _mean_correlation(same, sent * q * (1.0 - q), level).low > 0.0
+    assert mean_correlation(same, sent * q * (1.0 - q), level).low > 0.0
 
 
 def test_correlations_of_noises_are_those_of_the_pairs_that_are_there():
@@ -222,11 +206,12 @@ def test_correlations_of_noises_are_those_of_the_pairs_that_are_there():
         a, b = (one[np.isfinite(a) & np.isfinite(b)] for one in (a, b))
         return (a @ b) / math.sqrt((a @ a) * (b @ b)), len(a)
 
-    found = moments(z)
-    seen = [one[:2] for one in (*_between(found, ["a", "b"]), *_in_time(found, ["a", "b"]))]
+    found = z[None]
+    labels = ["a", "b"]
+    seen = [one[:2] for one in (*_between(found, labels), *_in_time(found, labels))]
     pairs = [(z[:, 1], z[:, 0]), *((z[1:, i], z[:-1, j]) for i in (0, 1) for j in (0, 1))]
     np.testing.assert_allclose(seen, [expected(a, b) for a, b in pairs], rtol=1e-12)
-    lags = [(i, k) for i in (0, 1) for k in (2, 3, 4)]
-    seen = [one[:2] for one in _in_size(found, ["a", "b"])][: len(lags)]
+    lags = [(i, k) for k in (2, 3, 7) for i in (0, 1)]
+    seen = [one[:2] for one in _in_size(found, labels, (2, 3, 7))][: len(lags)]
     assert len(seen) == len(lags)
     np.testing.assert_allclose(seen, [expected(z[k:, i], z[:-k, i]) for i, k in lags], rtol=1e-12)

@@ -6,32 +6,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.special
 import scipy.stats
 
 import netkf
 from netkf.checks.evidence import BROKEN, HOLDS, judge
-from netkf.checks.parts.delays import delay_law
-from netkf.checks.parts.moments import (
-    CELLS,
-    NoiseMoments,
+from netkf.checks.laws import find
+from netkf.checks.parts.noises import start_states
+from netkf.checks.parts.rows import part_promises
+from netkf.checks.parts.samples import stack_parts, summarise_parts
+from netkf.laws.intervals import probability_interval, scale_interval
+from netkf.laws.losses import correlation_of_runs, neighbours_variance
+from netkf.laws.noise import (
     compare_cells,
     compare_correlations,
     compare_means,
     compare_variances,
-    moments,
-    total,
-    whitening_matrix,
+    noise_draws,
+    whiten,
 )
-from netkf.checks.parts.network_rows import (
-    _correlation_of_runs,
-    _neighbours_variance,
-    loss_twice,
-)
-from netkf.checks.parts.noises import start_states
-from netkf.checks.parts.rows import part_promises
-from netkf.checks.parts.samples import stack_parts, summarise_parts
-from netkf.checks.parts.ticks import ClockGroup, _count_in_windows, relative_variance
-from netkf.checks.statistics import probability_interval, scale_interval
+from netkf.laws.ticks import ClockGroup, count_ticks
+from netkf.laws.waiting import CELLS
 from netkf.parts import (
     ConstantDelay,
     ExponentialDelay,
@@ -250,18 +245,18 @@ GAPS = {
 @pytest.mark.parametrize("name", ["gamma", "weibull", "uniform"])
 def test_spreads_of_gaps_are_those_of_scipy(name):
     clock, law = GAPS[name]
-    assert relative_variance(clock) == pytest.approx(law.var() / law.mean() ** 2, rel=1e-12)
+    assert clock.gaps.spread == pytest.approx(law.var() / law.mean() ** 2, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", GAPS)
 def test_gaps_are_uniform_numbers_however_short_the_run(name):
     (clock, law), random = GAPS[name], np.random.default_rng(3)
     cells, products, horizon = np.zeros((CELLS, 2)), np.zeros(3), 2.0
-    group = ClockGroup(((0, 1),), (clock,), ("",))
+    group = ClockGroup(((0, 1),), np.array([clock.mean_rate((0, 1))]), (clock.gaps,), ("",))
     for _ in range(4000):
         ticks = np.cumsum(law.rvs(60, random_state=random))
         ticks = ticks[ticks < horizon]
-        found = _count_in_windows(group, ticks, np.zeros(len(ticks), int), horizon)
+        found = count_ticks(group, ticks, np.zeros(len(ticks), int), horizon)
         cells += found.cells
         products += found.products
     # Short runs do not show how long the longest gaps are: these are one part.
@@ -287,11 +282,12 @@ def test_gaps_are_uniform_numbers_however_short_the_run(name):
 )
 def test_laws_of_delays_are_those_of_scipy(delay, law):
     seconds = np.linspace(0.0, 1.0, 11)
-    found = delay_law(delay, seconds)
     if law is None:
-        assert found is None
+        assert delay.law is None
     else:
-        assert found == pytest.approx(law.cdf(seconds), abs=1e-12)
+        assert delay.law.cdf(seconds) == pytest.approx(law.cdf(seconds), abs=1e-12)
+        assert delay.law.quantile(seconds[1:-1]) == pytest.approx(law.ppf(seconds[1:-1]))
+        assert delay.law.spread == pytest.approx(law.var() / law.mean() ** 2)
 
 
 @pytest.mark.parametrize(("to_bad", "to_good", "good"), [(0.1, 0.3, 1.0), (0.4, 0.2, 0.8)])
@@ -302,54 +298,57 @@ def test_losses_in_a_row_are_those_of_a_simulated_chain(to_bad, to_good, good):
     for k, u in enumerate(random.random(len(bad) - 1).tolist()):
         bad[k + 1] = u >= to_good if bad[k] else u < to_bad
     lost = random.random(len(bad)) >= np.where(bad, 0.1, good)
-    assert loss_twice(chain) == pytest.approx((lost[1:] & lost[:-1]).mean(), abs=0.01)
+    assert chain.chain.lost_twice == pytest.approx((lost[1:] & lost[:-1]).mean(), abs=0.01)
 
 
 def test_whitening_gives_the_identity_and_drops_certain_directions():
     root = np.random.default_rng(1).standard_normal((4, 2))
-    white = whitening_matrix(root @ root.T)
+    white, null = whiten(root @ root.T)
     assert white.shape == (2, 4)
     assert np.allclose(white @ root @ root.T @ white.T, np.eye(2))
+    assert np.allclose(null @ root, 0.0)
 
 
 LABELS = ["a", "b", "c"]
 TESTS = {
-    "variances": lambda found, level: compare_variances(found, LABELS, level, "values"),
-    "means": lambda found, level: compare_means(found, LABELS, level),
-    "correlations": lambda found, level: compare_correlations(found, LABELS, level),
-    "cells": lambda found, level: compare_cells(found.cells, LABELS, level, "values"),
+    "variances": lambda z, level: compare_variances(z, LABELS, level, "values"),
+    "means": lambda z, level: compare_means(z, LABELS, level, with_states(z)),
+    "correlations": lambda z, level: compare_correlations(z, LABELS, level),
+    "cells": lambda z, level: compare_cells(scipy.special.ndtr(z), LABELS, level, "values"),
 }
 
 
+def with_states(z, random=np.random.default_rng(12)):  # noqa: B008
+    # The states of several runs, which may be much alike in one run.
+    states = random.standard_normal((len(z), 1, 2, 3)).repeat(z.shape[1], axis=1)
+    return np.array([noise_draws(*run).states for run in zip(z, states, strict=True)])
+
+
 @pytest.mark.parametrize("name", TESTS)
-def test_moments_keep_their_level(name):
+def test_tests_of_noise_keep_their_level(name):
     random, wrong, level = np.random.default_rng(7), 0, 0.05
-    # Means are compared with the states of several runs, which may be much alike in one run.
-    runs, trials = (10, 500) if name == "means" else (1, 1500)
+    trials = 300
     for _ in range(trials):
-        states = random.standard_normal((runs, 1, 2, 3)).repeat(200 // runs, axis=1)
-        found = [moments(random.standard_normal((200 // runs, 3)), shown) for shown in states]
-        stacked = NoiseMoments(*(np.array(part) for part in zip(*found, strict=True)))
-        wrong += TESTS[name](total(stacked), level).margin[2] < 0.0
+        wrong += TESTS[name](random.standard_normal((10, 20, 3)), level).worst is not None
     low = probability_interval(wrong, trials, 0.001).low
     assert low <= level
 
 
 @pytest.mark.parametrize("name", ["variances", "means", "correlations"])
-def test_moments_find_what_they_say(name):
+def test_tests_of_noise_find_what_they_say(name):
     # An error of the size that a row calls detectable is found with probability 0.9.
     random, count, level = np.random.default_rng(8), 2000, 0.01
-    size = TESTS[name](moments(random.standard_normal((count, 3))), level).detectable
-    found, trials = 0, 300
+    overall = find(TESTS[name](random.standard_normal((1, count, 3)), level), 0.1)
+    size, found, trials = overall.detectable, 0, 300
     for _ in range(trials):
-        z = random.standard_normal((count, 3))
+        z = random.standard_normal((1, count, 3))
         if name == "variances":
             z *= math.sqrt(1.0 + size)
         elif name == "means":
-            z[:, 1] += size
+            z[..., 1] += size
         else:
-            z[:, 2] = size * z[:, 0] + math.sqrt(1.0 - size**2) * z[:, 2]
-        found += TESTS[name](moments(z), level).margin[2] < 0.0
+            z[..., 2] = size * z[..., 0] + math.sqrt(1.0 - size**2) * z[..., 2]
+        found += TESTS[name](z, level).worst is not None
     assert probability_interval(found, trials, 0.001).high >= 0.9
     assert found >= 0.8 * trials
 
@@ -381,15 +380,13 @@ def _follows_the_state(z, states):
     ],
 )
 def test_noises_with_the_right_covariance_that_are_not_white_are_found(change, name, label):
-    random, runs = np.random.default_rng(3), []
-    for _ in range(60):
-        z, states = random.standard_normal((50, 3)), random.standard_normal((50, 2, 3))
-        change(z, states)
-        runs.append(moments(z, states))
-    stacked = NoiseMoments(*(np.array(part) for part in zip(*runs, strict=True)))
-    found = TESTS[name](total(stacked), 1e-3)
-    assert found.margin[2] < 0.0
-    assert label in found.message
+    random = np.random.default_rng(3)
+    z, states = random.standard_normal((150, 50, 3)), random.standard_normal((150, 50, 2, 3))
+    for run in zip(z, states, strict=True):
+        change(*run)
+    seen = np.array([noise_draws(*run).states for run in zip(z, states, strict=True)])
+    test = {**TESTS, "means": lambda z, level: compare_means(z, LABELS, level, seen)}[name]
+    assert label in test(z, 1e-3).worst[1]
 
 
 @pytest.mark.parametrize("steps", [4, 20])
@@ -397,9 +394,8 @@ def test_correlations_within_short_runs_keep_their_level(steps):
     """Neighbours are those of one run: what their ends leave out must not look like correlation."""
     random, wrong, trials, level = np.random.default_rng(9), 0, 250, 0.05
     for _ in range(trials):
-        found = [moments(random.standard_normal((steps, 2))) for _ in range(240 // steps)]
-        stacked = NoiseMoments(*(np.array(part) for part in zip(*found, strict=True)))
-        wrong += compare_correlations(total(stacked), ["a", "b"], level).margin[2] < 0.0
+        z = random.standard_normal((240 // steps, steps, 2))
+        wrong += compare_correlations(z, ["a", "b"], level).worst is not None
     assert probability_interval(wrong, trials, 0.001).low <= level
 
 
@@ -413,11 +409,11 @@ def test_correlations_of_rare_losses_keep_their_level(q):
         lost = random.random((runs, directions, messages)) < q
         both = (lost[..., 1:] & lost[..., :-1]).sum(axis=2)
         count = np.full((runs, directions), messages - 1)
-        found = _correlation_of_runs(
+        found = correlation_of_runs(
             both - count * q**2,
             count,
             probability * (1.0 - probability),
-            _neighbours_variance(probability),
+            neighbours_variance(probability),
             level,
         )
         accused += found.low > 0.0

@@ -1,0 +1,1 @@
+"""Tests of draws against the laws that parts of a scenario state."""

@@ -1,0 +1,292 @@
+"""Noises that should be standard and white, once whitened by the covariance that a part states.
+
+Noises z (R, S, d) are those of R runs, S times and d entries, nan where one is missing. All
+intervals of a comparison hold together at its ``level``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+
+from netkf.laws.intervals import (
+    NO_COMPARISON,
+    Comparison,
+    Interval,
+    correlation_interval,
+    detectable_shift,
+    deviation_interval,
+    scale_interval,
+    student_interval,
+)
+from netkf.laws.losses import MIN_COUNT, MIN_RUNS
+from netkf.laws.waiting import CELLS, MIN_SEEN, cell_interval, cell_label
+from netkf.linalg.arrays import FloatArray, symmetric
+
+MIN_VARIANCE_SHARE = 1e-10
+"""Share of the largest variance below which a direction has no noise."""
+LAGS, PARTS = (2, 3, 4), 4
+"""Lags of the autocorrelation of each entry beside 1, and equal parts of a series in which the
+pooled variance is tested.
+"""
+MIN_COUNT_OF_ANY_LAW = 200
+"""Values from which variances of numbers of an unknown law are tested."""
+
+
+class NoiseDraws(NamedTuple):
+    """Whitened noises of one run; of R runs with a first axis of that length.
+
+    z      : (S, d)
+    states : (2, n, d) number and sum of the products of each entry with the n states to which it is
+             added, in units of their root mean squares
+    """
+
+    z: FloatArray
+    states: FloatArray
+
+
+def noise_draws(z: FloatArray, states: FloatArray) -> NoiseDraws:
+    """Return the draws of one run from its noises ``z`` (S, d) and the ``states`` (S, n, d) to
+    which each is added, 0 where one is not known.
+    """
+    known = (states != 0.0) & np.isfinite(z)[:, None]
+    products = np.where(known, states, 0.0) * np.nan_to_num(z)[:, None]
+    return NoiseDraws(z, np.array([known.sum(axis=0), products.sum(axis=0)]))
+
+
+class Whitening(NamedTuple):
+    """Factors of a covariance S (n, n) of rank r.
+
+    factor     : (r, n), W with W S W' = 1: it turns noise of covariance S into standard white noise
+    null_space : (n - r, n), orthonormal rows: the directions in which S has no noise
+    """
+
+    factor: FloatArray
+    null_space: FloatArray
+
+
+def whiten(S: FloatArray, share: float = 1e-12) -> Whitening:
+    """Return the whitening factors of a covariance ``S`` (n, n), whose directions with less than
+    that ``share`` of the largest variance count as without noise.
+    """
+    values, vectors = np.linalg.eigh(symmetric(S))
+    positive = values > share * max(float(values[-1]), np.finfo(float).tiny)
+    factor = (vectors[:, positive] / np.sqrt(values[positive])).T
+    return Whitening(np.asarray(factor), vectors[:, ~positive].T)
+
+
+def compare_variances(
+    z: FloatArray, labels: Sequence[str], level: float, noun: str, gaussian: bool = True
+) -> Comparison:
+    """Compare the variances of noises with 1: of all entries pooled, all in each part of a run, and
+    one by one, with a third of ``level`` for each.
+
+    Sums of squares of Gaussian numbers are chi-square. Otherwise (``gaussian`` false) the degrees
+    of freedom of the chi-square law are those that match the variance of the sum, from the sample
+    kurtosis. ``labels`` and ``noun`` name the entries.
+    """
+    counts, squares = np.isfinite(z).sum(axis=(0, 1)), np.nan_to_num(z) ** 2
+    min_count = MIN_COUNT if gaussian else MIN_COUNT_OF_ANY_LAW
+    if counts.max(initial=0) < min_count:
+        return NO_COMPARISON
+
+    def distance(square: float, kurtosis: float, count: float, level_part: float) -> Interval:
+        """Return the interval of a variance relative to 1 from the sum of ``count`` squares."""
+        # The relative variance of a sum of squares is (kurtosis - 1) / count, that of chi-square
+        # with f degrees of freedom 2 / f: hence f = 2 count / (kurtosis - 1). A sample kurtosis
+        # below 3 counts as 3, which widens the interval.
+        freedom = count if gaussian else 2.0 * count / max(kurtosis - 1.0, 2.0)
+        return deviation_interval(
+            1.0, scale_interval(freedom * square / count, freedom, level_part)
+        )
+
+    def kurtosis(squares: FloatArray, count: float) -> float:
+        return count * float((squares**2).sum()) / max(float(squares.sum()) ** 2, 1e-300)
+
+    number, pooled = float(counts.sum()), kurtosis(squares, float(counts.sum()))
+    whole = distance(float(squares.sum()), pooled, number, level / 3.0)
+    distances = [(whole, f"all {noun} together")]
+    # Rows behind the last value of all runs belong to no part.
+    length = int(np.flatnonzero(np.isfinite(z).any(axis=(0, 2)))[-1]) + 1
+    for k, part in enumerate(np.array_split(np.arange(length), PARTS)):
+        count = float(np.isfinite(z[:, part]).sum())
+        if count >= min_count:
+            # Each part is too short for a fourth moment: it has that of the whole series.
+            found = distance(float(squares[:, part].sum()), pooled, count, level / (3.0 * PARTS))
+            distances.append((found, f"all {noun} in part {k + 1} of {PARTS} of a run"))
+    for k, label in enumerate(labels):
+        if counts[k] >= MIN_COUNT:
+            count, entry = float(counts[k]), squares[..., k]
+            found = distance(
+                float(entry.sum()), kurtosis(entry, count), count, level / (3.0 * len(labels))
+            )
+            distances.append((found, label))
+    text = f"variances over the stated ones, {counts.sum():,.0f} values,"
+    return Comparison(distances, text, overall=1)
+
+
+def compare_means(
+    z: FloatArray, labels: Sequence[str], level: float, states: FloatArray | None = None
+) -> Comparison:
+    """Compare the means of noises with 0, and their correlations with the ``states`` (R, 2, n, d)
+    to which they are added (:class:`NoiseDraws`), with half of ``level`` each if these are known.
+
+    The mean of ``count`` entries of variance 1 is taken to be normal with variance 1 / count.
+    """
+    counts = np.isfinite(z).sum(axis=(0, 1))
+    if counts.max(initial=0) < MIN_COUNT:
+        return NO_COMPARISON
+    with_states = [] if states is None else _with_states(states, labels, level / 2.0)
+    single, distances = level / ((2.0 if with_states else 1.0) * len(labels)), []
+    for value, count, label in zip(np.nan_to_num(z).sum(axis=(0, 1)), counts, labels, strict=True):
+        if count < MIN_COUNT:
+            continue
+        mean, deviation = float(value / count), 1.0 / math.sqrt(count)
+        reach = deviation * -float(scipy.special.ndtri(single / 2.0))
+        detectable = detectable_shift(deviation, single)
+        interval = Interval(mean, mean - reach, mean + reach, detectable)
+        distances.append((deviation_interval(0.0, interval), label))
+    text = "largest mean in standard deviations"
+    text += ", or correlation with a state," if with_states else ""
+    return Comparison([*distances, *with_states], text)
+
+
+def _with_states(
+    states: FloatArray, labels: Sequence[str], level: float
+) -> list[tuple[Interval, str]]:
+    """Return labelled intervals for the correlations of noises with states.
+
+    States within a run are correlated, so that the independent values are the sums of the products
+    over each run; their mean under the null hypothesis is 0, which makes the sum of their squares
+    an estimate of the variance.
+    """
+    counts, products = states.sum(axis=0)
+    squares, runs = (states[:, 1] ** 2).sum(axis=0), (states[:, 0] > 0.0).sum(axis=0)
+    comparable = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
+    distances = []
+    for j, i in comparable:
+        count, spread = float(counts[j, i]), math.sqrt(squares[j, i])
+        correlation = student_interval(
+            float(products[j, i]) / count, spread / count, int(runs[j, i]), level / len(comparable)
+        )
+        distances.append((deviation_interval(0.0, correlation), f"{labels[i]} and state {j}"))
+    return distances
+
+
+def compare_correlations(
+    z: FloatArray, labels: Sequence[str], level: float, lags: Sequence[int] = LAGS
+) -> Comparison:
+    """Compare noises with white ones: no correlations between entries, with any entry one step
+    before, of an entry with itself ``lags`` steps before, and of the size of an entry with that one
+    step before (which would show a varying variance). All comparisons share the ``level``.
+    """
+    return _compare_found(
+        [*_between(z, labels), *_in_time(z, labels), *_in_size(z, labels, lags)], level
+    )
+
+
+def compare_entries(z: FloatArray, labels: Sequence[str], level: float) -> Comparison:
+    """Compare the correlations between entries of noises at the same time with 0."""
+    return _compare_found(list(_between(z, labels)), level)
+
+
+def compare_with(
+    z: FloatArray, other: FloatArray, labels: Sequence[str], others: Sequence[str], level: float
+) -> Comparison:
+    """Compare the correlations of noises with other numbers (R, S, e) of the same times, which must
+    have mean 0 and are named ``others``, with 0.
+    """
+    value, count = correlate(z, other)
+    names = [(i, j) for i in range(len(labels)) for j in range(len(others))]
+    found = [(value[i, j], count[i, j], f"{labels[i]} and {others[j]}") for i, j in names]
+    return _compare_found(found, level)
+
+
+def _compare_found(found: list[tuple[float, float, str]], level: float) -> Comparison:
+    """Return the comparison with 0 of (correlation, number of pairs, label)."""
+    enough = [entry for entry in found if entry[1] >= MIN_COUNT]
+    distances = [
+        (deviation_interval(0.0, correlation_interval(value, count, level / len(enough))), label)
+        for value, count, label in enough
+    ]
+    return Comparison(distances, "largest correlation") if distances else NO_COMPARISON
+
+
+def compare_cells(u: FloatArray, labels: Sequence[str], level: float, noun: str) -> Comparison:
+    """Compare numbers u (R, S, d), which should be uniform in [0, 1), by how many are in each of
+    CELLS equal parts: of all d columns together, and of each, with half of ``level`` each.
+    """
+    present = np.isfinite(u)
+    # The cell of each number, coded together with its column.
+    index = np.minimum((CELLS * np.nan_to_num(u)).astype(np.int64), CELLS - 1) * u.shape[-1]
+    index += np.arange(u.shape[-1])
+    cells = np.bincount(index[present], minlength=CELLS * u.shape[-1]).reshape(CELLS, -1)
+    counts = cells.sum(axis=0)
+    if counts.sum() < MIN_SEEN:
+        return NO_COMPARISON
+    distances = [
+        (cell_interval(count, counts.sum(), level / (2.0 * CELLS)), f"all, {cell_label(k)}")
+        for k, count in enumerate(cells.sum(axis=1).tolist())
+    ]
+    for column, label in enumerate(labels if len(labels) > 1 else ()):
+        if counts[column] >= MIN_SEEN:
+            for k, count in enumerate(cells[:, column].tolist()):
+                single = level / (2.0 * CELLS * len(labels))
+                found = cell_interval(count, counts[column], single)
+                distances.append((found, f"{label}, {cell_label(k)}"))
+    text = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
+    return Comparison(distances, text, overall=CELLS)
+
+
+def correlate(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the correlations (d, e) of the entries of ``one`` (..., d) and ``other`` (..., e) of
+    mean 0, nan where they are missing, and the numbers of pairs of which they are; 0 without pairs.
+    """
+    pairs = math.prod(one.shape[:-1])
+    a, b = (part.reshape(pairs, part.shape[-1]) for part in (one, other))
+    there, here = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
+    a, b = np.nan_to_num(a), np.nan_to_num(b)
+    # The squares of both factors are summed over the same pairs as the products: with those of
+    # other terms |correlation| could exceed 1.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        value = np.nan_to_num(a.T @ b / np.sqrt(((a**2).T @ here) * (there.T @ b**2)))
+    return np.asarray(value), there.T @ here
+
+
+def _between(z: FloatArray, labels: Sequence[str]) -> Iterator[tuple[float, float, str]]:
+    """Yield correlation, number of terms and label of all pairs of entries at the same time."""
+    value, count = correlate(z, z)
+    for i in range(len(labels)):
+        for j in range(i):
+            yield float(value[i, j]), float(count[i, j]), f"{labels[j]} and {labels[i]}"
+
+
+def _in_time(z: FloatArray, labels: Sequence[str]) -> Iterator[tuple[float, float, str]]:
+    """Yield correlation, number of terms and label of all entries with all one step before."""
+    value, count = correlate(z[:, 1:], z[:, :-1])
+    for i, label in enumerate(labels):
+        for j, earlier in enumerate(labels):
+            yield float(value[i, j]), float(count[i, j]), f"{label} and {earlier} just before"
+
+
+def _in_size(
+    z: FloatArray, labels: Sequence[str], lags: Sequence[int]
+) -> Iterator[tuple[float, float, str]]:
+    """Yield correlation, number of terms and label of each entry with itself ``lags`` steps
+    before, and of the rank of |entry| (its probability under the normal law) with that one before.
+    """
+    for lag in lags:
+        value, count = (np.diagonal(part) for part in correlate(z[:, lag:], z[:, :-lag]))
+        for k, label in enumerate(labels):
+            yield float(value[k]), float(count[k]), f"{label} and itself {lag} before"
+    rank = 2.0 * scipy.special.ndtr(np.abs(z)) - 1.0
+    with np.errstate(invalid="ignore"):
+        rank -= np.nansum(rank, axis=(0, 1)) / np.isfinite(rank).sum(axis=(0, 1))
+    value, count = (np.diagonal(part) for part in correlate(rank[:, 1:], rank[:, :-1]))
+    for k, label in enumerate(labels):
+        if count[k] >= MIN_COUNT_OF_ANY_LAW:
+            yield float(value[k]), float(count[k]), f"the size of {label} and of that just before"

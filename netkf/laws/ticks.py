@@ -1,0 +1,357 @@
+"""Ticks of clocks against the rates and the laws of gaps that the clocks state."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+
+from netkf.core.clock import Entity
+from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw
+from netkf.laws.intervals import (
+    POWER,
+    Comparison,
+    Interval,
+    detectable_shift_of_student,
+    deviation_interval,
+    poisson_interval,
+    scale_interval,
+    student_interval,
+)
+from netkf.laws.waiting import (
+    CELLS,
+    Ranks,
+    censored_ranks,
+    compare_shares,
+    correlate_neighbours,
+    count_ranks,
+    neighbour_correlation,
+)
+from netkf.linalg.arrays import FloatArray
+
+WINDOWS, MAX_WINDOWED = 8, 600
+"""Windows of a run in which ticks and losses are counted, up to so many clocks or directions."""
+FIRST_TICK, SPREAD = 1.0, 2.0
+"""Slack, in ticks of one run, for the transient of a renewal clock that starts with the run; and
+safety factor on the dispersion index of its counts, which replaces c^2 of an unknown gap law.
+"""
+MAX_CLOCKS, MIN_EVENTS = 60, 20
+"""Columns of counts of which all pairs are compared, and events (ticks, losses) in each of them."""
+
+
+class ClockGroup(NamedTuple):
+    """E clocks: the entity (node or link) of each, its stated rate (E,) in ticks per second, nan if
+    unknown, its law (:attr:`Clock.gaps`), one object for clocks of one law, and its label.
+    """
+
+    entities: tuple[Entity, ...]
+    rates: FloatArray
+    gaps: tuple[WaitingLaw | Lattice | None, ...]
+    labels: tuple[str, ...]
+
+    @property
+    def poisson(self) -> bool:
+        """True if all clocks are Poisson processes."""
+        return all(law is EXPONENTIAL for law in self.gaps)
+
+    @property
+    def on_lattice(self) -> bool:
+        """True if the times of all ticks are stated, up to random phases and jitter."""
+        return all(isinstance(law, Lattice) for law in self.gaps)
+
+    @property
+    def spreads(self) -> FloatArray:
+        """The variances (E,) of gaps over squared means, nan if unknown."""
+        known = (getattr(law, "spread", 0.0 if law else math.nan) for law in self.gaps)
+        return np.array(list(known))
+
+
+class TickCounts(NamedTuple):
+    """Counts of the ticks of E clocks in one run; of R runs with a first axis of that length.
+
+    ticks    : (W, E) ticks in each of W equal windows of the run
+    cells    : (CELLS, 2) numbers of ranks of gaps in equal parts of [0, 1), and of those looked at
+    products : (3,) sums over neighbouring gaps (:func:`correlate_neighbours`)
+    off      : () largest distance in seconds of a tick from the times of a deterministic clock
+    """
+
+    ticks: np.ndarray
+    cells: FloatArray
+    products: FloatArray
+    off: FloatArray
+
+
+class TickSeries(NamedTuple):
+    """K ticks, clock by clock and in order of time: times (K,) in seconds, inf for the tick after
+    the last of a clock; number (K,) of each on its clock, from 0; total (K,) ticks of its clock.
+    """
+
+    times: FloatArray
+    number: np.ndarray
+    total: np.ndarray
+
+    @property
+    def before(self) -> FloatArray:
+        """Times (K,) of the tick before on the same clock, 0 before the first."""
+        return np.where(self.number == 0, 0.0, np.concatenate([[0.0], self.times[:-1]]))
+
+
+def count_by_window(
+    times: FloatArray, indices: np.ndarray, size: int, horizon: float
+) -> np.ndarray:
+    """Return how often each of ``size`` indices occurs in each of W equal parts of [0, ``horizon``]
+    (seconds), (W, size), from the ``times`` (K,) and ``indices`` (K,) of K events.
+
+    Counts of different windows are independent, as those of different runs are, so that
+    correlations between clocks can be detected in fewer runs.
+    """
+    windows = WINDOWS if size <= MAX_WINDOWED else 1
+    flat_index = np.minimum((times * (windows / horizon)).astype(np.int64), windows - 1)
+    counts = np.bincount(flat_index * size + indices, minlength=windows * size)
+    return counts.reshape(windows, size)
+
+
+def count_ticks(
+    group: ClockGroup, times: FloatArray, owners: np.ndarray, horizon: float
+) -> TickCounts:
+    """Return the counts by which the clocks of ``group`` are compared with their laws, from the
+    ``times`` (K,) in seconds of the K ticks of a run of ``horizon`` seconds, and the indices
+    ``owners`` (K,) of their clocks in the group.
+    """
+    size = len(group.entities)
+    windows = count_by_window(times, owners, size, horizon)
+    # After its last tick each clock has a gap that the run does not finish.
+    times = np.concatenate([times, np.full(size, np.inf)])
+    owners = np.concatenate([owners, np.arange(size)])
+    order = np.lexsort((times, owners))
+    times, owners = times[order], owners[order]
+    total = np.bincount(owners, minlength=size)
+    number = np.arange(len(times)) - np.concatenate([[0], np.cumsum(total)])[owners]
+    series = TickSeries(times, number, total[owners] - 1)
+    ranks = Ranks(np.full(len(times), np.nan), np.zeros(len(times)))
+    off = 0.0
+    for law in {id(law): law for law in group.gaps}.values():
+        rows = np.array([other is law for other in group.gaps])[owners]
+        ticks, rates = TickSeries(*(column[rows] for column in series)), group.rates[owners[rows]]
+        if isinstance(law, Lattice):
+            ranks.rank[rows], ranks.known[rows] = _lattice_ranks(law, ticks, horizon), CELLS
+            off = max(off, _distance_from_lattice(law, ticks))
+        elif law is not None:
+            begin, gaps = ticks.before * rates, (ticks.times - ticks.before) * rates
+            ranks.rank[rows], ranks.known[rows] = censored_ranks(law, begin, gaps, horizon * rates)
+    products = correlate_neighbours(ranks, number == 0)
+    return TickCounts(windows, count_ranks(ranks), products, np.array(off))
+
+
+def _lattice_ranks(law: Lattice, ticks: TickSeries, horizon: float) -> FloatArray:
+    """Return independent uniform numbers (K,) that K ticks show, nan for ticks that show none.
+
+    With a given phase they are the shares of the jitter. With a random phase, the first tick shows
+    the phase plus jitter, and pairs of neighbouring ticks after it differences of jitter.
+    """
+    uniform, jitter = np.full(len(ticks.times), np.nan), law.jitter
+    # The last tick is left out: jitter could have moved it beyond the end of the run.
+    inner = (ticks.number < ticks.total - 1) & (jitter > 0.0)
+    if not law.random_phase:
+        late = ticks.times[inner] - (law.first + law.period * ticks.number[inner])
+        uniform[inner] = np.clip(late / (jitter or 1.0), 0.0, 1.0)
+        return uniform
+    first = ticks.number == 0
+    if law.period + jitter <= horizon:  # the first tick is never beyond the end
+        uniform[first] = _sum_of_uniforms(ticks.times[first], law.period, jitter)
+    # Ticks 1 and 2, 3 and 4, ...
+    second = np.flatnonzero(inner & ~first & (ticks.number % 2 == 0))
+    if len(second):
+        share = np.clip((ticks.times[second] - ticks.before[second] - law.period) / jitter, -1, 1)
+        uniform[second] = 0.5 + share - 0.5 * share * np.abs(share)
+    return uniform
+
+
+def _sum_of_uniforms(times: FloatArray, period: float, jitter: float) -> FloatArray:
+    """Return P(phase + delay <= ``times``) (K,), uniform up to ``period`` and ``jitter`` or 0."""
+    if jitter == 0.0:
+        return np.clip(times / period, 0.0, 1.0)
+    squares = [np.maximum(times - end, 0.0) ** 2 for end in (0.0, period, jitter, period + jitter)]
+    area = squares[0] - squares[1] - squares[2] + squares[3]
+    return np.asarray(np.clip(area / (2.0 * period * jitter), 0.0, 1.0))
+
+
+def _distance_from_lattice(law: Lattice, ticks: TickSeries) -> float:
+    """Return the largest distance in seconds of one of K ticks from its allowed times: with a
+    random phase, lateness may differ among the ticks of a clock by the jitter.
+    """
+    ticks = TickSeries(*(column[np.isfinite(ticks.times)] for column in ticks))
+    if not len(ticks.times):
+        return 0.0
+    late = ticks.times - (law.first + law.period * ticks.number)
+    if not law.random_phase:
+        return float(max(-late.min(), late.max() - law.jitter, 0.0))
+    starts = np.flatnonzero(ticks.number == 0)
+    spread = np.maximum.reduceat(late, starts) - np.minimum.reduceat(late, starts)
+    early, excess = -late[starts], late[starts] - (law.period + law.jitter)
+    return float(max(spread.max() - law.jitter, early.max(), excess.max(), 0.0))
+
+
+def slack_of_start(group: ClockGroup, counts: np.ndarray) -> FloatArray:
+    """Return the slack (E,) in ticks by which the mean count of each clock in a run of T seconds
+    may differ from rate T although its rate is right.
+
+    A renewal process that starts with the run has a mean number of ticks between rate T - 1 and
+    rate T + c^2 in T seconds, with c the coefficient of variation of its gaps (Lorden 1970). Where
+    the law of the gaps is unknown, c^2 is estimated by the dispersion index (variance over mean) of
+    the ``counts`` (R, E), which tends to c^2 for long runs.
+    """
+    from_counts = SPREAD * counts.var(axis=0, ddof=1) / np.maximum(counts.mean(axis=0), 1e-300)
+    slack = np.where(np.isnan(group.spreads), from_counts, group.spreads)
+    return np.asarray(np.maximum(slack, FIRST_TICK))
+
+
+def rates_of_all(
+    group: ClockGroup, windows: np.ndarray, slack: float, horizon: float, level: float
+) -> list[tuple[Interval, str]]:
+    """Return labelled intervals for the relative error of the total rate of all clocks, in the
+    whole run at ``level`` and, of Poisson clocks, in each of its windows at ``level`` together.
+
+    ``windows`` (R, W, E) are the ticks of R runs of ``horizon`` seconds.
+    """
+    mean, count, total = float(group.rates.sum()) * horizon, windows.shape[1], windows.sum(axis=2)
+    whole = count_interval(total.sum(axis=1), mean, level, group.poisson, slack)
+    parts = [
+        # Poisson counts are right from the start of a run on: no slack for a transient.
+        (
+            count_interval(total[:, k], mean / count, level / count, True, 0.0),
+            f"all clocks in part {k + 1} of {count} of the run",
+        )
+        for k in range(count if group.poisson and count > 1 else 0)
+    ]
+    return [(whole, "all clocks together"), *parts]
+
+
+def rates_of_each(
+    group: ClockGroup, counts: np.ndarray, slack: FloatArray, horizon: float, level: float
+) -> list[Interval]:
+    """Return intervals, at ``level`` together, for the relative errors of the rates of E clocks,
+    from their ``counts`` (R, E) in R runs of ``horizon`` seconds.
+    """
+    expected, single = group.rates * horizon, level / len(group.rates)
+    return [
+        count_interval(counts[:, k], float(mean), single, group.poisson, float(slack[k]))
+        for k, mean in enumerate(expected)
+    ]
+
+
+def smallest_error(ticks: float, level: float) -> float:
+    """Return the relative error of the rate of a Poisson process below which no test at ``level``
+    finds it with probability POWER in so many ``ticks``, by the Cramer-Rao bound 1 / sqrt(ticks).
+    """
+    quantiles = scipy.special.ndtri(1.0 - level) + scipy.special.ndtri(POWER)
+    return float(quantiles) / math.sqrt(ticks)
+
+
+def count_interval(
+    values: np.ndarray, mean: float, level: float, poisson: bool, slack: float
+) -> Interval:
+    """Return an interval for |E(count) / mean - 1|, from the counts ``values`` (R,) of R runs, that
+    misses with probability ``level``.
+
+    Sums of ``poisson`` counts are Poisson and have exact limits. For other clocks Student's
+    interval uses the spread of the counts, and ``slack``, that of the transient at the start of a
+    run in ticks, is subtracted from the distance.
+    """
+    total, runs = float(values.sum()), len(values)
+    expected_total = runs * mean
+    if poisson:
+        return deviation_interval(1.0, poisson_interval(total, expected_total, level))
+    relative_slack = slack / mean
+    # Few integer counts may be all equal: at least the variance of two values with equal odds.
+    spread = math.sqrt(max(float(values.var(ddof=1)), 0.25) * runs)
+    distance = deviation_interval(
+        1.0, student_interval(total / expected_total, spread / expected_total, runs, level)
+    )
+
+    def limits(value: float, factor: float) -> tuple[float, float]:
+        low, high = distance.limits(value, factor)
+        return max(0.0, low - relative_slack), max(0.0, high - relative_slack)
+
+    value, low, high = (max(0.0, end - relative_slack) for end in distance[:3])
+    detectable = distance.detectable + relative_slack
+    return distance._replace(value=value, low=low, high=high, detectable=detectable, again=limits)
+
+
+def compare_gaps(counts: TickCounts, level: float) -> tuple[Comparison, Interval | None]:
+    """Compare the gaps of R runs with their law, and return besides an interval for the
+    correlation of neighbouring ones, None for few; each holds at half of ``level``.
+    """
+    correlation = neighbour_correlation(counts.products, level / 2.0)
+    return compare_shares(counts.cells.sum(axis=0), level / 2.0, "gaps"), correlation
+
+
+def compare_clocks(
+    group: ClockGroup, windows: np.ndarray, horizon: float, level: float
+) -> Comparison:
+    """Compare Poisson clocks with independent ones, from their ticks ``windows`` (R, W, E) in R
+    runs of ``horizon`` seconds: the total count of a window is Poisson, so that its variance equals
+    its mean, and no two clocks have correlated counts; each test gets half of ``level``.
+    """
+    counts = windows.reshape(-1, windows.shape[2])  # (windows of all runs, clocks)
+    mean = float(group.rates.sum()) * horizon / windows.shape[1]
+    values = counts.sum(axis=1) - mean
+    # (x - m)^2 of a Poisson x with mean m has the variance 2 m^2 + m instead of 2 m^2 as for a
+    # normal one: the sum is treated as chi-square with correspondingly fewer degrees of freedom.
+    freedom = len(values) / (1.0 + 0.5 / mean)
+    ratio = scale_interval(freedom * float((values**2).mean()) / mean, freedom, level / 2.0)
+    label = "variance of all ticks at once over that of independent clocks"
+    distances = [(deviation_interval(1.0, ratio), label)]
+    means = counts.mean(axis=0)  # also the variances of Poisson counts
+    pairs = largest_correlation(counts - means, np.broadcast_to(means, counts.shape), level / 2.0)
+    if pairs is not None:
+        correlation, (a, b) = pairs
+        distances.append((correlation, f"correlation of {group.labels[a]} and {group.labels[b]}"))
+    return Comparison(distances, "largest difference")
+
+
+def largest_correlation(
+    values: FloatArray, variances: FloatArray, level: float
+) -> tuple[Interval, tuple[int, int]] | None:
+    """Return an interval for the largest |correlation| of two columns of ``values`` (K, L), such as
+    the counts of two clocks, and the indices of the two.
+
+    Values have mean 0, the expected ``variances`` (K, L), and independent rows. The products of two
+    columns, in units of their expected deviations (those that were seen would be far too small
+    where events are rare), are averaged by Student's interval, with Bonferroni's correction for all
+    pairs. None with fewer than two columns of MIN_EVENTS expected events, or 100 rows. The interval
+    misses the truth with at most the probability ``level``.
+    """
+    frequent = np.flatnonzero(variances[:, :MAX_CLOCKS].sum(axis=0) >= MIN_EVENTS)
+    if len(frequent) < 2 or len(values) < 100:
+        return None
+    x, variance = values[:, frequent], variances[:, frequent]
+    deviation = np.sqrt(variance)
+    correlations = x.T @ x / (deviation.T @ deviation)
+    upper = np.triu_indices(len(frequent), 1)
+    largest = int(np.argmax(np.abs(correlations[upper])))
+    a, b = int(upper[0][largest]), int(upper[1][largest])
+    interval = correlation_of_columns(
+        x[:, a] * x[:, b], variance[:, a] * variance[:, b], level / len(upper[0])
+    )
+    return deviation_interval(0.0, interval), (int(frequent[a]), int(frequent[b]))
+
+
+def correlation_of_columns(products: FloatArray, variances: FloatArray, level: float) -> Interval:
+    """Return Student's interval for a correlation from K ``products`` (K,) of independent values
+    of mean 0, and the ``variances`` (K,) of these products without correlation.
+
+    Rare events that coincide are counted as a Poisson variable: of a correlation r its mean exceeds
+    that without correlation, lambda, by r times ``scale``, and its deviation is that of the sum.
+    """
+    scale, expected = float(np.sqrt(variances).sum()), float(variances.sum())
+    # The effective number of rows, those of small variances counting less.
+    rows = expected**2 / float((variances**2).sum())
+    spread = math.sqrt(max(float(products @ products), expected))
+    interval = student_interval(float(products.sum()) / scale, spread / scale, rows, level)
+    quantile = detectable_shift_of_student(rows, level)
+    root = 0.5 * (quantile + math.sqrt(quantile**2 + 4.0 * expected))
+    detectable = (root**2 - expected) / scale
+    return interval._replace(detectable=detectable if detectable <= 1.0 else math.nan)
