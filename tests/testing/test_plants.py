@@ -130,7 +130,7 @@ def test_false_alarms_are_as_rare_as_stated(seed, monkeypatch):
             checker(part, seed)
         except AssertionError:
             alarms += 1
-    assert alarms <= 2  # of 7: more would be seen once in 250 seeds
+    assert alarms <= 2  # of 7: more happen once in 250 seeds
 
 
 CHECKERS = (
