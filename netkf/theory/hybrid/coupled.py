@@ -124,9 +124,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
             "H(12)"
         )
     if network.channel.delay.fixed is None:
-        return (
-            "not promised: Tanwani's H(12) holds without delays or with fixed ones, not random ones"
-        )
+        return "not promised: Tanwani's H(12) holds for no or fixed delays, and the delay is random"
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
     return _reason_of_samples(scenario) if network.channel.loss.independent else dependent
 
