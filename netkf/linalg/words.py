@@ -1,4 +1,4 @@
-"""The 128-bit product of 64-bit words, which Python and NumPy lack, for kernels."""
+"""The 128-bit product of 64-bit words, which NumPy lacks, for kernels."""
 
 from __future__ import annotations
 

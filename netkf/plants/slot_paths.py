@@ -49,7 +49,7 @@ def draw_normals(
 ) -> None:
     """Fill ``normals`` (>= count, L) with the next ``count`` standard normals of L streams.
 
-    Lane q takes them from row ``first + q * stride`` of the ``states`` (K, >= 4) of K streams if q
+    Lane q takes them from row ``first + q * stride`` of the ``states`` (K, WIDTH) of K streams if q
     < ``runs``, the number of runs left; idle lanes keep their values. Steps these states. ``lanes``
     is a tuple of length L.
     """
@@ -70,7 +70,7 @@ def draw_starts(
     x: FloatArray,
 ) -> None:
     """Write the states x(0) = mean + root z of R runs into ``x`` (B, n, L), B blocks of L runs,
-    where z (q,) are the next standard normals of the stream of each run, ``states`` (R, >= 4).
+    where z (q,) are the next standard normals of the stream of each run, ``states`` (R, WIDTH).
 
     ``mean`` (n,), ``root`` (n, q); ``scratch`` (q, L). ``lanes`` is a tuple of length L.
     """
@@ -153,7 +153,7 @@ def draw_paths(
     present frame, and, with frames, ``absolute``, both (B, S, n, L) for B blocks of L runs; move
     ``path`` behind these slots.
 
-    Each run draws from its own stream, ``states`` (R, >= 4); ``scratch`` (2, max(n, q), L).
+    Each run draws from its own stream, ``states`` (R, WIDTH); ``scratch`` (2, max(n, q), L).
     ``lanes`` is a tuple of length L.
     """
     for b in range(local.shape[0]):
@@ -212,7 +212,7 @@ def draw_readings(
     L), for N filters, and ``H`` (B, S, N, p, n, L) where it is random.
 
     x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
-    components. Run r draws the noise of sensor m from row r M + m of ``states`` (R M, >= 4);
+    components. Run r draws the noise of sensor m from row r M + m of ``states`` (R M, WIDTH);
     ``scratch`` (p, L). ``lanes`` is a tuple of length L.
     """
     count = len(sensors.estimator)

@@ -9,8 +9,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.rng.draws import seed_states
-from netkf.rng.numbers import NormalZiggurat, normal_of, normal_ziggurat
+from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 
 
 class Normals(Protocol):
@@ -32,14 +31,12 @@ class GeneratorNormals:
 
 
 class StreamNormals:
-    """K streams with the seed ``words`` (K, 4) of ``Streams.seed_words``, drawn in compiled code.
-
-    They give the same numbers as numpy generators with these seeds.
+    """The streams with these ``states`` (K, WIDTH), drawn in compiled code: the same numbers as
+    their numpy generators.
     """
 
-    def __init__(self, words: np.ndarray) -> None:
-        self.states = np.empty(words.shape, dtype=np.uint64)
-        seed_states(words, self.states)
+    def __init__(self, states: np.ndarray) -> None:
+        self.states = states
 
     def draw(self, shape: tuple[int, ...]) -> FloatArray:
         """Return the next numbers (K, *shape) of each of the K streams."""
@@ -50,12 +47,9 @@ class StreamNormals:
 
 @kernel
 def fill_normals_of_all(states: np.ndarray, ziggurat: NormalZiggurat, out: FloatArray) -> None:
-    """Write the next M standard normal numbers of stream k of the ``states`` (K, >= 4) of K streams
-    into ``out[k]``, for all k; ``out`` is (K, M). Steps the states.
+    """Write the next M standard normal numbers of stream k of the ``states`` (K, WIDTH) into
+    ``out[k]``, for all k; ``out`` is (K, M).
     """
     for k in range(out.shape[0]):
-        # The state stays in registers during the loop and is stored once.
-        high, low = states[k, 0], states[k, 1]
         for m in range(out.shape[1]):
-            out[k, m], high, low = normal_of(states, k, high, low, ziggurat)
-        states[k, 0], states[k, 1] = high, low
+            out[k, m] = next_normal(states, k, ziggurat)

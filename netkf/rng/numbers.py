@@ -1,9 +1,9 @@
-"""Normal numbers and bounded integers of numpy's ``Generator(PCG64DXSM)``, drawn in kernels.
+"""Normal numbers and bounded integers of numpy's ``Generator(Philox)``, drawn in kernels.
 
-``rng.draws`` has the words, uniforms and exponentials, and explains states. Normals come from the
-ziggurat of Marsaglia and Tsang (2000) with numpy's 256 layers (``ziggurat_normal.npz``), integers
-from Lemire's method (ACM TOMACS 29, 2019) and permutations from masked 32-bit halves of words.
-tests/rng compares all of them with numpy.
+``rng.draws`` has the words, uniforms and exponentials, ``rng.streams`` explains states. Normals
+come from the ziggurat of Marsaglia and Tsang (2000) with numpy's 256 layers
+(``ziggurat_normal.npz``), integers from Lemire's method (ACM TOMACS 29, 2019) and permutations from
+masked 32-bit halves of words. tests/rng compares all of them with numpy.
 """
 
 from __future__ import annotations
@@ -17,28 +17,16 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.rng.draws import (
-    HALF,
-    LAYER,
-    ONE,
-    S8,
-    S32,
-    next_stream_state,
-    next_unit,
-    next_word,
-    scramble,
-)
+from netkf.rng.draws import LAYER, ONE, S8, next_unit, next_word
+from netkf.rng.streams import HALF
 
 _U = np.uint64
-# MANTISSA masks the lower 52 bits of a word; S1 and S9 are shift counts.
-MANTISSA, S1, S9 = _U(0x000FFFFFFFFFFFFF), _U(1), _U(9)
+# MANTISSA masks the lower 52 bits of a word, LOWER its lower half; S1 and S32 are shift counts.
+MANTISSA, LOWER, S1, S32 = _U(0x000FFFFFFFFFFFFF), _U(0xFFFFFFFF), _U(1), _U(32)
 # Where numpy's normal ziggurat begins its tail, and the reciprocal of that.
 TAIL_START = 3.6541528853610087963519472518
 INVERSE_TAIL_START = 0.27366123732975827203338247596
-HAS_HALF, KEPT_HALF = 4, 5
-"""Columns 4 and 5 of a state, after the four of rng.draws: 1 if half of a word is left over from
-the last 32-bit draw, and that half.
-"""
+HAS_HALF = _U(1 << 32)  # added to the half of a word that a state keeps
 
 
 class NormalZiggurat(NamedTuple):
@@ -63,33 +51,9 @@ def normal_ziggurat() -> NormalZiggurat:
         return NormalZiggurat(tables["fi"], tables["wi"], tables["ki"])
 
 
-@kernel(inlined=True)
-def normal_of(
-    states: np.ndarray, k: int, high: Any, low: Any, ziggurat: NormalZiggurat
-) -> tuple[float, Any, Any]:
-    """Return the next standard normal number of stream ``k`` of the ``states`` (K, >= 4) of K
-    streams, and the state after it, for a loop that keeps the state (high, low) in registers;
-    ``states[k]`` is read and written only for the rare numbers outside the fast path.
-    """
-    # As in next_normal: 8 bits choose a layer, one the sign, 52 a point across the layer.
-    word = scramble(high, low)
-    layer = int(word & LAYER)
-    size = (word >> S9) & MANTISSA
-    if size < ziggurat.inside[layer]:
-        x: float = float(size) * ziggurat.width[layer]
-        high, low = next_stream_state(high, low, states[k, 2], states[k, 3])
-        return -x if (word >> S8) & ONE == ONE else x, high, low
-    # The slow path draws the same word again, from the state before it.
-    states[k, 0], states[k, 1] = high, low
-    x = next_normal(states, k, ziggurat)
-    return x, states[k, 0], states[k, 1]
-
-
 @kernel
 def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
-    """Return the next standard normal number of stream ``k`` of the ``states`` (K, >= 4) of K
-    streams (ziggurat), and step its state.
-    """
+    """Return the next standard normal number of stream ``k`` of the ``states`` (K, WIDTH)."""
     while True:
         # 8 bits choose a layer, one the sign, 52 a point across the layer.
         word = next_word(states, k)
@@ -113,7 +77,7 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
 @kernel
 def _tail(states: np.ndarray, k: int, negative: bool) -> float:
     """Return a normal number x with |x| > TAIL_START, ``negative`` or positive, by rejection
-    (Marsaglia 1964), from stream ``k`` of the ``states`` (K, >= 4) of K streams.
+    (Marsaglia 1964), from stream ``k`` of the ``states`` (K, WIDTH).
     """
     # TAIL_START + x, with x exponential of mean 1 / TAIL_START, is accepted with probability
     # exp(-x^2 / 2), by an exponential y of mean 1.
@@ -126,20 +90,21 @@ def _tail(states: np.ndarray, k: int, negative: bool) -> float:
 
 @kernel
 def next_half(states: np.ndarray, k: int) -> Any:
-    """Return the next 32 bits of stream ``k`` of the ``states`` (K, 6) of K streams: the lower half
+    """Return the next 32 bits of stream ``k`` of the ``states`` (K, WIDTH): the lower half
     of a new word, then at the next call its upper half, which the state keeps meanwhile.
     """
-    if states[k, HAS_HALF] == ONE:
-        states[k, HAS_HALF] = _U(0)
-        return states[k, KEPT_HALF]
+    kept = states[k, HALF]
+    if kept >= HAS_HALF:
+        states[k, HALF] = _U(0)
+        return kept & LOWER
     word = next_word(states, k)
-    states[k, HAS_HALF], states[k, KEPT_HALF] = ONE, word >> S32
-    return word & HALF
+    states[k, HALF] = HAS_HALF + (word >> S32)
+    return word & LOWER
 
 
 @kernel
 def next_integer(states: np.ndarray, k: int, count: int) -> Any:
-    """Return the next integer of stream ``k`` of the ``states`` (K, 6) of K streams, uniform on 0
+    """Return the next integer of stream ``k`` of the ``states`` (K, WIDTH), uniform on 0
     .. ``count`` - 1.
 
     ``count`` is at most 2^32 - 1. Lemire's method: of count times 32 random bits the upper half is
@@ -151,9 +116,9 @@ def next_integer(states: np.ndarray, k: int, count: int) -> Any:
     bound = _U(count)
     product = next_half(states, k) * bound
     # The threshold is below ``bound``: the division is rarely needed.
-    if (product & HALF) < bound:
-        threshold = ((HALF - bound) + ONE) % bound
-        while (product & HALF) < threshold:
+    if (product & LOWER) < bound:
+        threshold = ((LOWER - bound) + ONE) % bound
+        while (product & LOWER) < threshold:
             product = next_half(states, k) * bound
     return np.int64(product >> S32)
 
@@ -161,7 +126,7 @@ def next_integer(states: np.ndarray, k: int, count: int) -> Any:
 @kernel
 def shuffle(states: np.ndarray, k: int, order: np.ndarray, count: int) -> None:
     """Write a random permutation of 0 .. count - 1 into ``order`` (>= count,) by Fisher-Yates, from
-    stream ``k`` of the ``states`` (K, 6) of K streams, which it steps.
+    stream ``k`` of the ``states`` (K, WIDTH), which it steps.
 
     It equals ``Generator.permutation(count)``.
     """

@@ -1,22 +1,33 @@
-"""Random streams: one generator for each (purpose, entity), derived by name from the root seed.
+"""Random streams: one for each (purpose, entity), derived by name from the root seed.
 
 A stream depends only on the seed, the replica and its own name. Hence another node, a lost message
 or more draws from one stream never change the numbers of another.
+
+A stream is a range of counters of Philox4x64-10 (Salmon, Moraes, Dror, Shaw, Supercomputing 2011),
+numpy's ``Generator(Philox(seed, counter=[0, a, b, c]))``: the key is the one that numpy makes of
+the seed, ``a`` and ``b`` are the two ids of the entity plus 1 (0: it has fewer), and ``c`` is
+2^32 times the code of the purpose plus the replica. So making a stream costs nothing, and kernels
+hold only its counters (``rng.draws``).
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.random.bit_generator import ISeedSequence
 
-from netkf.rng.seeding import POOL
-from netkf.rng.seeding import seed_words as fill_seed_words
+COUNTER, KEY, BUFFER, USED, HALF = 0, 4, 6, 10, 11
+"""Columns of the state of a stream for kernels: four of the counter, two of the key, the four words
+of the present block, how many of these are used, and half of a word that is left over from the last
+32-bit draw (plus HAS_HALF; 0 without one).
+"""
+WIDTH, BLOCK_WORDS = 12, 4
+WORD, LONG = 1 << 32, 1 << 64
 
 
 @dataclass(frozen=True)
@@ -33,12 +44,8 @@ class Streams:
         """Return the generator of ``purpose`` for ``entity``: non-negative integers, such as a node
         id or the two ends of a link.
         """
-        return np.random.Generator(np.random.PCG64DXSM(self._seed_sequence(purpose, *entity)))
-
-    def _seed_sequence(self, purpose: str, *entity: int) -> Any:
-        """Return numpy's seed sequence of a purpose and an entity."""
-        key = (self.replica, _purpose_code(purpose), *entity)
-        return np.random.SeedSequence(entropy=self.seed, spawn_key=key)
+        key, counter = _key_and_counter(self.seed, self.replica, _purpose_code(purpose), entity)
+        return np.random.Generator(np.random.Philox(_Key(key), counter=counter))
 
     @property
     def runs(self) -> int:
@@ -50,44 +57,11 @@ class Streams:
         """The streams of each run: these."""
         return (self,)
 
-    def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """Return the 64-bit words (K, 4) that seed the generators of K ``entities`` (ids of each)
-        for ``purpose``.
+    def states(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """Return the states (K, WIDTH) at the start, of 64-bit words, of the streams of K
+        ``entities`` (ids of each) for ``purpose``, for kernels.
         """
-        return ReplicaStreams(self.seed, self.replica, 1).seed_words(purpose, entities)
-
-    def generators(
-        self, purpose: str, entities: Sequence[tuple[int, ...]]
-    ) -> list[np.random.Generator]:
-        """Return the generators of K ``entities`` (ids of each) for ``purpose``, in order: those of
-        ``generator(purpose, *entity)``.
-        """
-        return ReplicaStreams(self.seed, self.replica, 1).generators(purpose, entities)
-
-    def with_seeds(self, purposes: Sequence[str], entities: Sequence[tuple[int, ...]]) -> Streams:
-        """Return the same streams, with the seeds of these purposes and entities computed ahead.
-
-        One call for all is faster than numpy, which takes 30 microseconds for each. All entities
-        must have the same length.
-        """
-        seeds: dict[tuple[str, tuple[int, ...]], _Words] = {}
-        if entities and _small_ids(tuple(entities)) is not None:
-            for purpose in purposes:
-                words = self.seed_words(purpose, entities)
-                seeds |= {(purpose, e): _Words(w) for e, w in zip(entities, words, strict=True)}
-        return _Seeded(self.seed, self.replica, seeds)
-
-
-@dataclass(frozen=True)
-class _Seeded(Streams):
-    """Streams with ``seeds`` computed ahead, by purpose and entity."""
-
-    seeds: dict[tuple[str, tuple[int, ...]], _Words] = field(default_factory=dict)
-
-    def _seed_sequence(self, purpose: str, *entity: int) -> Any:
-        """Return the seed that was computed ahead, else numpy's seed sequence."""
-        seed = self.seeds.get((purpose, entity))
-        return super()._seed_sequence(purpose, *entity) if seed is None else seed
+        return ReplicaStreams(self.seed, self.replica, 1).states(purpose, entities)
 
 
 @dataclass(frozen=True)
@@ -111,72 +85,63 @@ class ReplicaStreams:
         """The streams of each run."""
         return tuple(Streams(self.seed, self.replica + k) for k in range(self.count))
 
-    def seed_words(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """Return the 64-bit words (count K, 4) that seed the generators of K entities for
+    def states(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """Return the states (count K, WIDTH) at the start of the streams of K entities for
         ``purpose``, run by run.
         """
-        if not entities:
-            return np.empty((0, 4), dtype=np.uint64)
-        last = self.replica + self.count - 1
-        ids = _small_ids(tuple(entities))
-        # The kernel takes keys of 32-bit words; numpy splits larger numbers into several.
-        if last >= WORD or ids is None:
-            sequences = [
-                s._seed_sequence(purpose, *entity) for s in self.per_replica for entity in entities
-            ]
-            return np.array([sequence.generate_state(4, np.uint64) for sequence in sequences])
-        keys = np.empty((self.count, len(entities), 2 + len(entities[0])), dtype=np.uint32)
-        keys[:, :, 0] = np.arange(self.replica, last + 1, dtype=np.uint32)[:, None]
-        keys[:, :, 1], keys[:, :, 2:] = _purpose_code(purpose), ids
-        words = np.empty((self.count * len(entities), 4), dtype=np.uint64)
-        pool = np.empty(POOL, dtype=np.uint32)
-        fill_seed_words(_entropy_words(self.seed), keys.reshape(len(words), -1), pool, words)
-        return words
-
-    def generators(
-        self, purpose: str, entities: Sequence[tuple[int, ...]]
-    ) -> list[np.random.Generator]:
-        """Return the ``count`` K generators of K entities for ``purpose``, run by run."""
-        seeds: list[Any] = [_Words(words) for words in self.seed_words(purpose, entities)]
-        return [np.random.Generator(np.random.PCG64DXSM(seed)) for seed in seeds]
+        states = np.zeros((self.count, len(entities), WIDTH), dtype=np.uint64)
+        states[:, :, USED] = BLOCK_WORDS
+        code, replicas = _purpose_code(purpose), range(self.replica, self.replica + self.count)
+        ids = _ids_in_counter(tuple(entities)) if entities else None
+        if ids is not None and replicas[-1] < WORD:
+            states[:, :, KEY:BUFFER], states[:, :, 1:3] = _key(self.seed), ids
+            states[:, :, 3] = (code << 32) + np.array(replicas, dtype=np.uint64)[:, None]
+        else:
+            for run, replica in zip(states, replicas, strict=True):
+                for state, entity in zip(run, entities, strict=True):
+                    key, counter = _key_and_counter(self.seed, replica, code, entity)
+                    state[KEY:BUFFER], state[COUNTER:KEY] = key, counter
+        return states.reshape(-1, WIDTH)
 
 
-class _Words(ISeedSequence):
-    """A seed sequence of numpy with four 64-bit ``words`` (4,) that were computed ahead."""
+class _Key(ISeedSequence):
+    """The two 64-bit ``words`` (2,) of a key, in the form in which numpy's Philox takes them."""
 
     def __init__(self, words: np.ndarray) -> None:
         self._words = words
 
     def generate_state(self, n_words: int, dtype: Any = np.uint32) -> np.ndarray:
-        """Return the four words (4,) of uint64; PCG64DXSM asks for no others."""
-        assert (n_words, np.dtype(dtype)) == (4, np.uint64)
+        """Return the two words (2,) of uint64; Philox asks for no others."""
+        assert (n_words, np.dtype(dtype)) == (2, np.uint64)
         return self._words
 
 
+def _key_and_counter(
+    seed: int, replica: int, code: int, entity: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the key (2,) of a stream and its counter (4,) at the start."""
+    if replica < WORD and len(entity) <= 2 and max(entity, default=0) < LONG - 1:
+        ids = [*(id_ + 1 for id_ in entity), 0, 0]
+        counter = [0, ids[0], ids[1], (code << 32) + replica]
+        return _key(seed), np.array(counter, dtype=np.uint64)
+    # No room in the counter: the key is made of the whole name.
+    return _key(seed, (replica, code, *entity)), np.zeros(4, dtype=np.uint64)
+
+
+@lru_cache(maxsize=1024)
+def _key(seed: int, name: tuple[int, ...] = ()) -> np.ndarray:
+    """Return the key (2,) that numpy makes of a seed and the ``name`` of a stream."""
+    words = np.random.SeedSequence(seed, spawn_key=name).generate_state(2, np.uint64)
+    return np.asarray(words)
+
+
 @lru_cache(maxsize=32)
-def _small_ids(entities: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
-    """Return the ids of K entities, m ids each, as 32-bit words (K, m); None if an id needs more
-    bits.
-    """
-    if max(max(entity, default=0) for entity in entities) >= WORD:
+def _ids_in_counter(entities: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
+    """Return words 1 and 2 (K, 2) of the counters of K entities; None if one has no room there."""
+    if any(len(entity) > 2 or max(entity, default=0) >= LONG - 1 for entity in entities):
         return None
-    return np.array(entities, dtype=np.uint32)
-
-
-WORD, MASK = 1 << 32, (1 << 32) - 1
-"""Number of values of a 32-bit word, and the largest."""
-
-
-@cache
-def _entropy_words(seed: int) -> np.ndarray:
-    """Return the 32-bit words (>= POOL,) of a seed, lowest first, padded with zeros to POOL
-    words.
-    """
-    words = [seed & MASK]
-    while seed := seed >> 32:
-        words.append(seed & MASK)
-    words += [0] * (POOL - len(words))
-    return np.array(words, dtype=np.uint32)
+    words = [[id_ + 1 for id_ in entity] + [0] * (2 - len(entity)) for entity in entities]
+    return np.array(words, dtype=np.uint64)
 
 
 @cache

@@ -24,7 +24,6 @@ from netkf.network.channels import (
     ChannelSampler,
     Delay,
     Loss,
-    stream_purposes,
 )
 from netkf.network.channels import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
@@ -283,8 +282,7 @@ def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndar
     """
     lost, channel = np.zeros((CHAINS, LENGTH, len(links)), dtype=bool), Channel(loss=part)
     for chain in range(CHAINS):
-        # All seeds in one call: each alone takes longer than the draws.
-        streams = Streams(seed + 7, chain).with_seeds(stream_purposes(channel), tuple(links))
+        streams = Streams(seed + 7, chain)
         for k, (link, table_probability) in enumerate(links.items()):
             sampler = ChannelSampler(channel, partial(_make_generator, streams, link))
             uniform, bad, _ = sampler.draws(LENGTH)

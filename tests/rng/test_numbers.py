@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from netkf.rng.draws import StreamBatch
 from netkf.rng.normals import fill_normals_of_all
 from netkf.rng.numbers import next_integer, normal_ziggurat, shuffle
 from netkf.rng.streams import Streams
@@ -11,9 +10,7 @@ from netkf.rng.streams import Streams
 
 def both(seed):
     streams = Streams(seed, 3)
-    states = np.zeros((1, 6), dtype=np.uint64)
-    states[:, :4] = StreamBatch(streams, "noise", [(1, 2)]).states
-    return states, streams.generator("noise", 1, 2)
+    return streams.states("noise", [(1, 2)]), streams.generator("noise", 1, 2)
 
 
 def test_normals_with_the_tails_of_the_ziggurat():

@@ -152,8 +152,8 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
     """
     # Built-in classes draw all replicas in one call, with the same numbers as one by one.
     if type(scenario.plant) in (LinearPlant, Diffusion):
-        seed_words = ReplicaStreams(seed, 0, count).seed_words("plant", [()])
-        return scenario.plant.starts(StreamNormals(seed_words))
+        states = ReplicaStreams(seed, 0, count).states("plant", [()])
+        return scenario.plant.starts(StreamNormals(states))
     starts = []
     for replica in range(count):
         random = Streams(seed, replica).generator("plant")

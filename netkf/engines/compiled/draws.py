@@ -19,7 +19,7 @@ from netkf.plants.laws import course_width, grid_time
 from netkf.plants.paths import BLOCK, Block
 from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
-from netkf.rng.numbers import NormalZiggurat, normal_of, normal_ziggurat
+from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
@@ -94,7 +94,7 @@ class Paths:
         # Separate streams for the path, for the states at probes and for those at samples, so that
         # none depends on how many numbers the others take.
         plant, probe, samples = (
-            StreamNormals(streams.seed_words(purpose, [()]))
+            StreamNormals(streams.states(purpose, [()]))
             for purpose in ("plant", "probe", "samples")
         )
         self._paths = scenario.diffusion.paths(
@@ -207,8 +207,7 @@ class Noise:
         noise of ``steps`` steps.
         """
         shared, keys = _sensor_fields(scenario)
-        self._noise = StreamNormals(streams.seed_words("noise", keys))
-        cuts = StreamNormals(streams.seed_words("cut", keys))
+        self._noise = streams.states("noise", keys)
         # Without increment sensors the period is not used; it only must not be None.
         self._period = float(scenario.diffusion.sensing_period or 1.0) if keys else 1.0
         runs, ziggurat = streams.runs, normal_ziggurat()
@@ -219,7 +218,7 @@ class Noise:
             # Rows that a sensor does not have stay 0.
             noise=with_spare((runs * count * steps, 2, most), unset if even else aligned),
             steps=steps,
-            cuts=cuts.states,
+            cuts=streams.states("cut", keys),
             **ziggurat._asdict(),
         )
 
@@ -233,7 +232,7 @@ class Noise:
         normals = sensing.noise.reshape(shape)
         # Standard normals become moments of white noise over one step: variances h and h / 3.
         scales = step_noise(np.ones((2, 1)), self._period)[:, 0]
-        fill_noise(self._noise.states, sensing.rows, normal_ziggurat(), scales, normals)
+        fill_noise(self._noise, sensing.rows, normal_ziggurat(), scales, normals)
 
 
 @kernel
@@ -246,17 +245,14 @@ def fill_noise(
 ) -> None:
     """Draw the noise of increment sensors over C steps, two moments for each row: write normals
     with the standard deviations ``scales`` (2,) of the two moments into ``out`` (K, C, 2, >= p).
-    They are the next numbers of each stream k of the K = R S ``states`` (K, 4) of R runs, which
+    They are the next numbers of each stream k of the K = R S ``states`` (K, WIDTH) of R runs, which
     belongs to sensor k modulo S with ``rows`` (S,) p. Advances ``states``.
     """
     for k in range(len(out)):
         # Streams are numbered run by run, so the sensor is the remainder.
         p = rows[k % len(rows)]
-        high, low = states[k, 0], states[k, 1]
         # Rows beyond p are padding and draw nothing, so that streams do not depend on it.
         for c in range(out.shape[1]):
             for half in range(2):
                 for i in range(p):
-                    normal, high, low = normal_of(states, k, high, low, ziggurat)
-                    out[k, c, half, i] = scales[half] * normal
-        states[k, 0], states[k, 1] = high, low
+                    out[k, c, half, i] = scales[half] * next_normal(states, k, ziggurat)

@@ -12,7 +12,7 @@ from netkf.linalg.lanes import ONE
 from netkf.linalg.small import copy_matrix
 from netkf.plants.paths import fill_course, fill_state_moments
 from netkf.plants.sensors import divide, fill_reading
-from netkf.rng.numbers import NormalZiggurat, normal_of
+from netkf.rng.numbers import NormalZiggurat, next_normal
 
 
 @kernel
@@ -56,11 +56,9 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
     """
     ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
     states, stream = sensing.cuts, run * len(sensing.rows) + s
-    high, low = states[stream, 0], states[stream, 1]
     for half in range(2):
         for i in range(sensing.rows[s]):
-            normals[half, i], high, low = normal_of(states, stream, high, low, ziggurat)
-    states[stream, 0], states[stream, 1] = high, low
+            normals[half, i] = next_normal(states, stream, ziggurat)
 
 
 @kernel(inlined=True)

@@ -26,8 +26,8 @@ from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Poisson
-from netkf.rng.draws import StreamBatch, Ziggurat, exponential_of, next_unit, ziggurat
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.draws import StreamBatch, Ziggurat, next_exponential, next_unit, ziggurat
+from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 TICKS, MIN_TICKS_PER_ENTITY = 1 << 15, 4
@@ -42,8 +42,8 @@ class PoissonClocks(NamedTuple):
 
     next_tick : (E,), time of the next tick, seconds
     rate : (E,), ticks per second
-    tick_streams : (E, 4), states of the random streams of ticks
-    loss_streams : (S, 4), states of the random streams of losses; S = 0: no message is lost
+    tick_streams : (E, WIDTH), states of the random streams of ticks
+    loss_streams : (S, WIDTH), states of the random streams of losses; S = 0: no message is lost
     streams_per_run : number of loss streams of each run
     first, outgoing : entity e of a run sends on the directions ``outgoing[first[e]:first[e + 1]]``
     source : (W,), loss stream of each direction, within a run
@@ -121,7 +121,7 @@ def draw_ticks_of(
     states, first, after = clocks.tick_streams, clocks.first[e], clocks.first[e + 1]
     # Index over all runs. ``high`` and ``low`` are the two words of the stream's state.
     k = run * (len(clocks.first) - 1) + e
-    now, rate, high, low = clocks.next_tick[k], clocks.rate[k], states[k, 0], states[k, 1]
+    now, rate = clocks.next_tick[k], clocks.rate[k]
     m, max_outcomes, complete = counts[0], len(buffer.delay) - (after - first), True
     while now < end:
         # Check the space before a tick is drawn: after an enlargement drawing goes on with this
@@ -133,9 +133,8 @@ def draw_ticks_of(
         buffer.first_outcome[m] = draw_outcomes(clocks, run, first, after, delay, buffer, counts)
         m += 1
         # The next tick is drawn now: it may lie in the next window.
-        gap, high, low = exponential_of(states, k, high, low, exponential)
-        now += gap / rate
-    clocks.next_tick[k], states[k, 0], states[k, 1], counts[0] = now, high, low, m
+        now += next_exponential(states, k, exponential) / rate
+    clocks.next_tick[k], counts[0] = now, m
     return complete
 
 
@@ -332,9 +331,9 @@ class PoissonSchedules:
         senders = senders_of(scenario) if senders is None else senders
         ticks, count = StreamBatch(streams, "clock", senders.entities), len(senders.entities) * runs
         # Without random losses no streams: draw_ticks() then draws no uniform numbers.
-        losses: np.ndarray = np.empty((0, 4), dtype=np.uint64)
+        losses: np.ndarray = np.empty((0, WIDTH), dtype=np.uint64)
         if not scenario.network.channel.loss.deterministic:
-            losses = StreamBatch(streams, "loss", senders.sources).states
+            losses = streams.states("loss", senders.sources)
         rates, probabilities = _rates_and_probabilities(scenario)
         self._clocks = PoissonClocks(
             next_tick=ticks.exponentials(np.arange(count), np.ones(count, dtype=np.int64)),

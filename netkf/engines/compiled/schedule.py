@@ -24,7 +24,6 @@ from netkf.network.channels import (
     delay_depends_on_message,
     delivery_probabilities,
     identical_per_link,
-    stream_purposes,
 )
 from netkf.network.clocks import LinkClock, Poisson
 from netkf.network.graphs import Link
@@ -119,7 +118,11 @@ class TickSource:
             # Entities of several runs follow one another, run by run.
             self._rates = np.tile([clock.mean_rate(entity) for entity in entities], runs)
         elif isinstance(clock, LinkClock):
-            self._random = streams.generators("clock", entities)
+            self._random = [
+                one.generator("clock", *entity)
+                for one in streams.per_replica
+                for entity in entities
+            ]
             self._origins = np.array(
                 [
                     clock.origin(entity, partial(one.generator, "phase", *entity))
@@ -234,10 +237,7 @@ class Outcomes:
         if not self._has_table_law:
             self._samplers = [
                 ChannelSampler(channel, partial(_stream, run_streams, source))
-                for run_streams in (
-                    one.with_seeds(stream_purposes(channel), senders.sources)
-                    for one in streams.per_replica
-                )
+                for run_streams in streams.per_replica
                 for source in senders.sources
             ]
         elif not channel.loss.deterministic:

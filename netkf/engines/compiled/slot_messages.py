@@ -24,7 +24,7 @@ from netkf.linalg.lanes import (
     store_flags,
 )
 from netkf.network.matchings import PROTOCOLS
-from netkf.rng.draws import next_unit, next_unit_of_lane, next_units
+from netkf.rng.draws import next_unit
 from netkf.rng.numbers import next_integer, shuffle
 from netkf.trace.schema import CODES
 
@@ -41,7 +41,7 @@ class Matchings(NamedTuple):
 
     protocol : index in PROTOCOLS, -1: all links exchange
     probability : parameter ``lazy`` or ``p`` of the protocol
-    states : states (R, 6) of the random streams
+    states : states (R, WIDTH) of the random streams
     first, members : (K + 1,) and (M,), list k of links is ``members[first[k]:first[k + 1]]``; for
                      node-wakeup the links of node k in the order of its peers, for uniform-maximal
                      matching k
@@ -64,7 +64,7 @@ class Channels(NamedTuple):
 
     ends : (links, 2), indices of nodes; direction 2 l goes from the first to the second
     delivery : (2, W), delivery probabilities in the good and the bad state of the link
-    loss_streams, state_streams : (B, K, 4, L), random streams of losses and of the chain of
+    loss_streams, state_streams : (B, K, L, WIDTH), random streams of losses and of the chain of
                                   channel states; empty where nothing is drawn
     loss_uniform, state_uniform : (B, K, L), the last uniform numbers drawn from them, -1 at first
     bad : (B, K, L), state of the channel (1: bad), -1 at first
@@ -189,10 +189,10 @@ def draw_link(
             and len(channels.loss_streams) > 0
             and (fresh or uniforms[b, k, 0] < 0.0)
         ):
-            next_units(lanes, channels.loss_streams, b, k, uniforms)
+            next_units(lanes, channels.loss_streams[b, k], uniforms[b, k])
             # The channel state (Gilbert-Elliott) takes one step for each activation.
             if len(channels.state_streams) > 0:
-                next_units(lanes, channels.state_streams, b, k, channels.state_uniform)
+                next_units(lanes, channels.state_streams[b, k], channels.state_uniform[b, k])
                 for q in range(len(lanes)):
                     channels.bad[b, k, q] = next_state(
                         channels.bad[b, k, q],
@@ -217,6 +217,15 @@ def draw_link(
 
 
 @kernel
+def next_units(lanes: Lanes, states: np.ndarray, units: FloatArray) -> None:
+    """Write the next uniform number of each of the streams ``states`` (L, WIDTH) into ``units``
+    (L,). ``lanes`` is a tuple of length L.
+    """
+    for q in range(len(lanes)):
+        units[q] = next_unit(states, q)
+
+
+@kernel
 def draw_link_of_lane(
     channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
 ) -> None:
@@ -234,9 +243,9 @@ def draw_link_of_lane(
             and len(channels.loss_streams) > 0
             and (fresh or channels.loss_uniform[b, k, q] < 0.0)
         ):
-            channels.loss_uniform[b, k, q] = next_unit_of_lane(channels.loss_streams, b, k, q)
+            channels.loss_uniform[b, k, q] = next_unit(channels.loss_streams[b, k], q)
             if len(channels.state_streams) > 0:
-                u = next_unit_of_lane(channels.state_streams, b, k, q)
+                u = next_unit(channels.state_streams[b, k], q)
                 channels.bad[b, k, q] = next_state(
                     channels.bad[b, k, q], u, channels.to_bad, channels.to_good
                 )
@@ -377,8 +386,8 @@ def mark_paired_senders(
 def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> None:
     """Draw a uniform number for each node that is asked for a message (``sent`` is 1), by which
     filters that send at random decide whether to: into ``uniform`` (B, S, E, N, L), in the order of
-    steps, from the streams ``states`` (B, N, 4, L), one for each node and run. Dimensions: B blocks
-    of L runs, S slots of E exchange steps, N nodes.
+    steps, from the streams ``states`` (B, N, L, WIDTH), one for each node and run. Dimensions: B
+    blocks of L runs, S slots of E exchange steps, N nodes.
     """
     for b in range(sent.shape[0]):
         for s in range(sent.shape[1]):
@@ -386,7 +395,7 @@ def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> 
                 for h in range(sent.shape[3]):
                     for q in range(sent.shape[4]):
                         if sent[b, s, e, h, q] == 1:
-                            uniform[b, s, e, h, q] = next_unit_of_lane(states, b, h, q)
+                            uniform[b, s, e, h, q] = next_unit(states[b, h], q)
 
 
 class Stages(NamedTuple):

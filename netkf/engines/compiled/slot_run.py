@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -50,11 +50,10 @@ from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotS
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.network.deliveries import Deliveries
-from netkf.network.graphs import Link
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
-from netkf.rng.draws import StreamBatch
+from netkf.rng.draws import states_in_lanes
 from netkf.rng.numbers import normal_ziggurat
-from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import LONG, Recorder
@@ -146,7 +145,7 @@ class SlotRuns:
         if not plant.is_random:
             self._truth = self._scenario.slot_truth(self._first)
             return
-        self._plant_states = StreamBatch(self._streams, "plant", [()]).states
+        self._plant_states = self._streams.states("plant", [()])
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
         # C-contiguous copies, whatever the plant gives: kernels are compiled for one memory layout.
         mean, F, root, noise = (
@@ -158,7 +157,7 @@ class SlotRuns:
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
-        """Create what readings are drawn from: ``_noise`` (R K, 4), the random streams of the K
+        """Create what readings are drawn from: ``_noise`` (R K, WIDTH), the random streams of the K
         sensors whose readings kernels draw, in R runs; ``_regressors``, for each sensor with a
         random H (regressors), the path of H as a plant of its own and its streams; and
         ``_recorded``, the readings of recorded sensors.
@@ -166,13 +165,13 @@ class SlotRuns:
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.placed_sensor.ordinal) for s in setup.kernel_sensors]
         # One stream for each drawn sensor of each run.
-        self._noise = StreamBatch(streams, "noise", entities).states
+        self._noise = streams.states("noise", entities)
         self._regressors: list[tuple[Path, np.ndarray]] = []
         for s, (A, drive, start) in zip(setup.regressor_sensors, setup.regressors, strict=True):
             x = in_lanes(start, self._blocks)
             # Frame 0: the origin never moves, as regressors do not grow as an unstable plant does.
             path = Path(A, drive, 0, x, np.zeros(x.shape))
-            states = StreamBatch(streams, "regressor", [(s.node, s.placed_sensor.ordinal)]).states
+            states = streams.states("regressor", [(s.node, s.placed_sensor.ordinal)])
             self._regressors.append((path, states))
         scenario, first = self._scenario, self._first
         self._recorded: list[tuple[AssignedSensor, Any]] = [
@@ -182,12 +181,12 @@ class SlotRuns:
     def _begin_messages(self) -> None:
         """Create what messages are drawn from: ``_channels`` (losses) and ``_matchings`` (which
         pairs of nodes exchange) of all runs, with their random streams; and, for filters that draw
-        random numbers to decide whether to send, the streams ``_triggers`` (B, N, 4, L) of N nodes
-        in B blocks of L runs.
+        random numbers to decide whether to send, the streams ``_triggers`` (B, N, L, WIDTH) of N
+        nodes in B blocks of L runs.
         """
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
         # Empty arrays tell the kernels to draw nothing.
-        no_streams = np.zeros((0, 0, 4, LANES), dtype=np.uint64)
+        no_streams = np.zeros((0, 0, LANES, WIDTH), dtype=np.uint64)
         is_drawn = setup.is_drawn and links > 0
         random_loss = is_drawn and not setup.loss.deterministic
         shape = self._blocks, len(setup.entities), LANES
@@ -211,22 +210,17 @@ class SlotRuns:
             streams_per_link=setup.streams_per_link,
         )
         protocol, probability, first, members = setup.matching
-        # Two words more than the state of a generator: for small integers numpy keeps half of a
-        # 64-bit draw for the next call.
-        states = np.zeros((self.runs, 6), dtype=np.uint64)
-        if is_drawn and protocol >= 0:
-            states[:, :4] = StreamBatch(streams, "matching", [()]).states
         if setup.algorithm.randomised:
-            nodes = StreamBatch(streams, "trigger", [(node,) for node in setup.nodes.tolist()])
-            self._triggers = nodes.in_lanes(self.runs)
+            self._triggers = self._in_lanes("trigger", [(node,) for node in setup.nodes.tolist()])
+        states = streams.states("matching", [()])
         order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
         self._matchings = Matchings(protocol, probability, states, first, members, order, busy)
 
-    def _in_lanes(self, purpose: str, entities: list[Link]) -> np.ndarray:
-        """Return the states (B, K, 4, L) of the random streams of K entities in each run. The runs
-        are side by side in B blocks of L lanes.
+    def _in_lanes(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """Return the states (B, K, L, WIDTH) of the random streams of K entities in each run. The
+        runs are side by side in B blocks of L lanes.
         """
-        return StreamBatch(self._streams, purpose, entities).in_lanes(self.runs)
+        return states_in_lanes(self._streams.states(purpose, entities), self.runs)
 
     @property
     def over(self) -> bool:
@@ -538,8 +532,8 @@ class SlotRuns:
     ) -> None:
         """Draw the next S slots of a ``path`` (of the plant, or of random regressors) into
         ``local`` and ``absolute`` (B, S, n, L), the states relative to the moving origin and
-        absolute, from the random streams ``states`` (R, 4). The R runs are side by side in B blocks
-        of L lanes.
+        absolute, from the random streams ``states`` (R, WIDTH). The R runs are side by side in B
+        blocks of L lanes.
         """
         scratch = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
