@@ -289,7 +289,7 @@ def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
 
 
 # Compact, with all functions inlined here: unrolling loops over lanes gains nothing.
-@kernel(compact=True)
+@kernel
 def reduce_runs(
     lanes: Lanes, b: Batch, bounds: np.ndarray, sums: Sums, scratch: ReductionScratch
 ) -> None:
@@ -327,7 +327,7 @@ def reduce_runs(
         divide_averages(b, sums, r)
 
 
-@kernel(compact=True)
+@kernel
 def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
     """Merge the last two of ``depth`` nodes of the binary tree over runs that wait for a neighbour,
     at ``count`` sample times; return depth - 1, the number that waits now.
@@ -339,7 +339,7 @@ def join_nodes(scratch: ReductionScratch, depth: int, count: int) -> int:
     return depth - 1
 
 
-@kernel(compact=True)
+@kernel
 def add_node(
     lanes: Lanes, scratch: ReductionScratch, active: int, count: int, node: int, complete: bool
 ) -> None:
@@ -482,7 +482,7 @@ def reduce_group(
     return complete
 
 
-@kernel(compact=True)
+@kernel
 def mark_missing(
     b: Batch, scratch: ReductionScratch, first: int, active: int, t: int, count: int
 ) -> None:
@@ -569,7 +569,7 @@ def add_total(lanes: Lanes, totals: FloatArray, f: int, a: int, number: Any) -> 
     store(lanes, totals, f, a, load(lanes, totals, f, a) + number)
 
 
-@kernel(compact=True)
+@kernel
 def fill_single_nees(
     b: Batch, sums: Sums, scratch: ReductionScratch, r: int, t: int, f: int, q: int
 ) -> None:
@@ -587,7 +587,7 @@ def fill_single_nees(
     scratch.nees[q] = b.known_nees[r, t, f] if b.has_nees[r] else scratch.single_nees[0]
 
 
-@kernel(compact=True)
+@kernel
 def mark_averaged(
     b: Batch, sums: Sums, scratch: ReductionScratch, first: int, active: int, t: int
 ) -> None:
@@ -620,7 +620,7 @@ def mark_averaged(
         P_used[q] = 1.0 if P_counts else 0.0
 
 
-@kernel(compact=True)
+@kernel
 def divide_averages(b: Batch, sums: Sums, r: int) -> None:
     """Divide ``sums.averages[r]`` (F, 3), sums over the samples of run ``r`` of squared errors,
     traces of P and NEES of F filters, by the numbers of samples that ``mark_averaged`` counted.
@@ -715,7 +715,7 @@ def mark_blurred(
                 sums.rounding_from[r] = b.times[t]
 
 
-@kernel(compact=True)
+@kernel
 def is_blurred(b: Batch, r: int, t: int) -> bool:
     """Return True if rounding blurs sample ``t`` of run ``r`` of the batch ``b``: rounding errors
     of the state exceed a fraction 1 / BLUR of the smallest standard deviation.

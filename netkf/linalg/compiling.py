@@ -7,6 +7,7 @@ on disk, so that the next process starts at once; numba itself is imported with 
 from __future__ import annotations
 
 import atexit
+import gc
 import hashlib
 import os
 import re
@@ -15,8 +16,8 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, cached_property, update_wrapper
 from importlib import import_module
 from pathlib import Path
@@ -26,7 +27,6 @@ from netkf.linalg.code_files import CodeFiles, make_own_folder
 from netkf.linalg.compile_once import SharedCache
 from netkf.linalg.linking import linked_once
 from netkf.linalg.plain import is_plain, plain_kernel
-from netkf.linalg.shortcuts import kernel_compiler, without_collection
 
 ROOT = Path(__file__).parents[1]
 """The folder of netkf."""
@@ -70,7 +70,6 @@ def kernel(
     allocates: bool = False,
     inlined: bool = False,
     fused: bool = False,
-    compact: bool = False,
 ) -> Callable[[Function], Function]: ...
 
 
@@ -80,7 +79,6 @@ def kernel(
     allocates: bool = False,
     inlined: bool = False,
     fused: bool = False,
-    compact: bool = False,
 ) -> Any:
     """Mark a numerical function, written as loops over arrays, that is always run compiled.
 
@@ -90,13 +88,11 @@ def kernel(
     inlined   : its code becomes part of each kernel that calls it, which pays off for functions of
                 up to a few hundred flops
     fused     : a product and a sum may become one instruction (FMA), which rounds once
-    compact   : it is called seldom: its loops are not unrolled or vectorised, which halves the
-                compile time
     """
     # ``@kernel(...)`` with arguments is called without the function.
     if function is None:
-        return lambda loops: _make_kernel(loops, allocates, inlined, fused, compact)
-    return _make_kernel(function, allocates, inlined, fused, compact)
+        return lambda loops: _make_kernel(loops, allocates, inlined, fused)
+    return _make_kernel(function, allocates, inlined, fused)
 
 
 def _numba() -> Any:
@@ -140,13 +136,9 @@ def _configure_numba() -> None:
 class Kernel:
     """A numerical function written as loops. Python and other kernels call it alike."""
 
-    def __init__(
-        self, loops: Callable[..., Any], options: dict[str, Any], compact: bool = False
-    ) -> None:
-        """Wrap the Python function ``loops``; ``options`` are those of numba's njit, and
-        ``compact`` is that of :func:`kernel`.
-        """
-        self._loops, self._options, self._compact = loops, options, compact
+    def __init__(self, loops: Callable[..., Any], options: dict[str, Any]) -> None:
+        """Wrap the Python function ``loops``; ``options`` are those of numba's njit."""
+        self._loops, self._options = loops, options
         update_wrapper(self, loops)
 
     @property
@@ -163,13 +155,6 @@ class Kernel:
         return self._loops.__qualname__
 
     @property
-    def _compiler(self) -> Any:
-        """The numba compiler class of this kernel."""
-        # numba's own lowering tells LLVM more than the lean one, which makes inlined kernels, small
-        # and called most often, up to 1.6 times faster.
-        return kernel_compiler(not self._options.get("forceinline", False), self._compact)
-
-    @property
     def _numba_type_(self) -> Any:
         """The numba type of the function; numba reads this attribute of names in kernels."""
         return self._kernel_dispatcher._numba_type_
@@ -177,7 +162,7 @@ class Kernel:
     @cached_property
     def _kernel_dispatcher(self) -> Any:
         """The numba dispatcher for calls by other kernels; not cached on disk by itself."""
-        dispatcher = _numba().njit(pipeline_class=self._compiler, **self._options)(self._loops)
+        dispatcher = _numba().njit(**self._options)(self._loops)
         _widen_arguments(dispatcher)
         return dispatcher
 
@@ -185,7 +170,7 @@ class Kernel:
     def _python_dispatcher(self) -> Callable[..., Any]:
         """The numba dispatcher for calls by Python; cached on disk with all its callees."""
         numba = _numba()
-        dispatcher: Any = numba.njit(pipeline_class=self._compiler, **self._options)(self._loops)
+        dispatcher: Any = numba.njit(**self._options)(self._loops)
         # Not numba's own cache, which executes what it finds, and whose files are known by the file
         # of the function alone, while callees may change.
         files = CodeFiles(self._loops, _cache_folder(numba.config.CACHE_DIR))
@@ -196,7 +181,7 @@ class Kernel:
 
 
 def _make_kernel(
-    loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool, compact: bool
+    loops: Callable[..., Any], allocates: bool, inlined: bool, fused: bool
 ) -> Callable[..., Any]:
     """Return the Kernel of a function, with numba's options for the arguments of :func:`kernel`."""
     if is_plain():
@@ -207,7 +192,7 @@ def _make_kernel(
         options["forceinline"] = True
     if fused:
         options["fastmath"] = {"contract"}
-    return Kernel(loops, options, compact)
+    return Kernel(loops, options)
 
 
 def _widen_arguments(function: Any) -> None:
@@ -257,7 +242,7 @@ def _use_compile_settings(dispatcher: Any, config: Any) -> None:
         try:
             # One link step for the function and all that it calls, see linking.
             try:
-                with linked_once(), without_collection():
+                with linked_once(), _without_collection():
                     return compile_for(*args, **kwargs)
             except numba_error:
                 # Once more without the replacements, for an error message with the source line. The
@@ -273,6 +258,20 @@ def _use_compile_settings(dispatcher: Any, config: Any) -> None:
             _compile_times.append(time.perf_counter() - started)
 
     dispatcher._compile_for_args = compile_with_settings
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Disable the garbage collector: the compiler makes many objects that live long, and each
+    collection would visit all of them, a tenth of the time.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def seconds_spent() -> float:

@@ -11,7 +11,7 @@ SWEEPS = 30  # at most; convergence takes far fewer
 ROUNDING = 2.0**-54  # relative size of an entry that is too small to change the diagonal
 
 
-@kernel(compact=True)
+@kernel
 def diagonalise(a: FloatArray, vectors: FloatArray) -> None:
     """Leave the eigenvalues of a symmetric ``a`` (n, n) on its diagonal, zeros elsewhere, and write
     its eigenvectors into the columns of ``vectors`` (n, n). Cyclic sweeps (Golub and Van Loan,

@@ -19,8 +19,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import models, register_model
 
 from netkf.linalg import lanes as names
-from netkf.linalg.lean_lowering import entry_pointer
-from netkf.linalg.value_lowering import DATA, I64, SHAPE, STRIDES
+from netkf.linalg.array_layout import DATA, I64, SHAPE, STRIDES, entry_pointer
 
 DOUBLE, BYTE, BIT, I32 = ir.DoubleType(), ir.IntType(8), ir.IntType(1), ir.IntType(32)
 

@@ -15,8 +15,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import lower_builtin, type_callable
 
+from netkf.linalg.array_layout import DATA, I64, array_without_owner
 from netkf.linalg.lanes import ALIGNMENT
-from netkf.linalg.lean_lowering import array_without_owner
 from netkf.linalg.local import (
     local_lanes_matrix,
     local_lanes_vector,
@@ -24,7 +24,6 @@ from netkf.linalg.local import (
     local_vector,
 )
 from netkf.linalg.structs import WORD
-from netkf.linalg.value_lowering import DATA, I64
 
 
 def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> None:

@@ -173,7 +173,7 @@ def fill_blocks(
         store(MANY, out, row, j, total)
 
 
-@kernel(allocates=True, compact=True)
+@kernel(allocates=True)
 def polynomial(series: FloatArray, gap: float) -> FloatArray:
     """Return ``sum_k gap^k series[k]`` (size,) at ``gap`` (seconds), of a table ``series``
     (terms, size + 1) from with_reach(), as a new array.

@@ -29,9 +29,8 @@ from numba.extending import (
 )
 from numba.np.numpy_support import from_dtype
 
-from netkf.linalg.lean_lowering import array_without_owner
+from netkf.linalg.array_layout import DATA, I64, array_without_owner
 from netkf.linalg.structs import WORD, Struct, StructClass, struct_at
-from netkf.linalg.value_lowering import DATA, I64
 
 
 class StructType(types.Type):

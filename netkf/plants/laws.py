@@ -139,7 +139,7 @@ class GridLaws:
         return gain, symmetric_root(symmetric(C_22 - product(gain, C_21.T)))
 
 
-@kernel(allocates=True, compact=True)
+@kernel(allocates=True)
 def fill_impulses(
     out: FloatArray,
     row: int,

@@ -258,7 +258,7 @@ class DiffusionPaths:
             pieces.start[row + 1 : stop] = time
 
 
-@kernel(compact=True)
+@kernel
 def split_pieces(
     rows: IntArray,
     stops: IntArray,
@@ -326,7 +326,7 @@ def split_pieces(
                 set_part(pieces, run, after, length - before, whole, noise)
 
 
-@kernel(compact=True)
+@kernel
 def add_response(
     out: FloatArray,
     values: FloatArray,
@@ -352,7 +352,7 @@ def add_response(
             out[m * n + i] = values[m * n + i] + sign * total
 
 
-@kernel(compact=True)
+@kernel
 def set_part(
     pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     run: int,

@@ -15,7 +15,6 @@ from numba.core.dispatcher import Dispatcher
 
 import netkf
 from netkf.linalg.linking import linked_once
-from netkf.linalg.shortcuts import kernel_compiler, without_collection
 from tests.benchmarks import by_hand, cases, jobs, peers
 
 STANDARD_ERRORS, SHARE = 4.5, 1e-5
@@ -26,15 +25,13 @@ CODE = Path(__file__).parent / "__pycache__" / "slower"
 
 @pytest.fixture
 def slower(monkeypatch):
-    """The same loops, which compile in a quarter of the time: helpers are called where they would
-    be copied, numba leaves out what netkf's kernels do not need, and LLVM works at its first level.
-    These tests ask for results, and not for times.
+    """The same loops, which compile in less time: helpers are called where they would be copied,
+    and LLVM works at its first level. These tests ask for results, and not for times.
     """
     monkeypatch.setattr(config, "OPT", type(config.OPT)(1))
-    compiler = kernel_compiler(True)
     for name, kernel in list(vars(by_hand).items()):
         if isinstance(kernel, Dispatcher):
-            options = {**kernel.targetoptions, "forceinline": False, "pipeline_class": compiler}
+            options = {**kernel.targetoptions, "forceinline": False}
             monkeypatch.setattr(by_hand, name, numba.jit(**options)(kernel.py_func))
     with pytest.MonkeyPatch.context() as patch:  # netkf's own code stays where it is
         patch.setattr(config, "CACHE_DIR", str(CODE))
@@ -88,7 +85,7 @@ def intermittent():
 def test_means_over_runs_agree(make):
     case, runs = make()
     call, results = jobs.prepared(case, 4 * runs)
-    with linked_once(), without_collection():
+    with linked_once():
         call()
     agree(case, runs, results)
 
@@ -97,7 +94,7 @@ def test_means_over_runs_agree(make):
 def test_nodes_that_hear_nothing_have_the_covariances_of_a_local_filter():
     case = cases.load("poisson_ring").replace({"network.channel.loss.delivery": 0.0})
     call, results = jobs.prepared(case, 1)
-    with linked_once(), without_collection():
+    with linked_once():
         call()
     local = netkf.simulate(case.replace({"filter": {"kind": "local", "cov": np.eye(2).tolist()}}))
     size = np.abs(local.P).max(axis=(2, 3), keepdims=True)

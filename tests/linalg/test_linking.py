@@ -1,5 +1,8 @@
 """Inner functions are linked into the outermost one; nothing of numba stays changed."""
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numba
@@ -8,6 +11,7 @@ import pytest
 from numba.core.codegen import CPUCodeLibrary
 
 from netkf.linalg import linking
+from netkf.linalg.compiling import kernel
 from netkf.linalg.linking import linked_once
 
 
@@ -71,3 +75,40 @@ def test_calls_that_take_no_known_type_are_refused_as_ever():
     for _ in range(2):
         with linked_once(), pytest.raises(numba.TypingError):
             refused(np.ones(2))
+
+
+@kernel
+def near_the_end(a, k):
+    return a[-1, -3, 2] + 100 * a[-2, 1, -1] + 10000 * a[k][1][-1]
+
+
+def test_places_that_are_written_as_negative_numbers_count_from_the_end():
+    """Those that are computed never do: kernels do not ask them."""
+    a = np.arange(24).reshape(2, 3, 4)
+    assert near_the_end(a, 1) == a[-1, -3, 2] + 100 * a[-2, 1, -1] + 10000 * a[1][1][-1]
+
+
+CHECKED = """
+import numpy as np
+from netkf.linalg.compiling import kernel
+@kernel(inlined=True)
+def inner(a, k):
+    return a[k]
+@kernel
+def outer(a, k):
+    return inner(a, k)
+for place in (-1, 3):
+    try:
+        outer(np.zeros(3), place)
+    except IndexError:
+        print("refused")
+"""
+
+
+def test_kernels_look_at_bounds_where_numba_is_told_to(tmp_path):
+    given = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    script = tmp_path / "checked.py"
+    script.write_text(CHECKED)
+    command, env = [sys.executable, str(script)], os.environ | given
+    found = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["refused"] * 2
