@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from netkf.linalg.structs import Struct
+from netkf.linalg.structs import Struct, struct_at
 
 Derived = TypeVar("Derived", bound=Struct)
 
@@ -76,8 +76,8 @@ def drop_lane(array: np.ndarray) -> np.ndarray:
     return array[..., 0]
 
 
-def struct_like(struct: Derived, memory: np.ndarray) -> Derived:  # noqa: ARG001
-    """Return, in kernels, the struct of the class of ``struct`` whose block of int64 words is
-    ``memory`` (words,); Python raises TypeError.
+def struct_like(struct: Derived, memory: np.ndarray) -> Derived:
+    """Return the struct of the class of ``struct`` whose block of int64 words is ``memory``
+    (words,).
     """
-    raise TypeError("struct_like is for kernels")
+    return struct_at(memory, type(struct))

@@ -24,6 +24,8 @@ calls often take ``struct.memory``, and begin with ``struct = struct_at(memory, 
 
 from __future__ import annotations
 
+import ctypes
+import math
 from typing import Any, ClassVar, TypeVar, dataclass_transform
 from weakref import WeakValueDictionary
 
@@ -98,6 +100,25 @@ class Struct(metaclass=StructClass):
         _structs[self.address] = self
         for name, value in values.items():
             setattr(self, name, value)
+
+    @classmethod
+    def from_memory(cls, memory: np.ndarray) -> Any:
+        """Return the struct whose block of int64 words is ``memory`` (words,), with views of the
+        arrays that it tells the addresses of; they must be kept elsewhere.
+        """
+        made = object.__new__(cls)
+        made.__dict__.update(memory=memory, address=address_of(memory))
+        for name, kind in cls.struct_kinds.items():
+            words = memory[cls.struct_offsets[name] :]
+            if isinstance(kind, int):
+                made.__dict__[name] = (0,) * kind
+            elif isinstance(kind, tuple):
+                dtype, ndim = kind
+                made.__dict__[name] = with_fields(_array_at(words[0], dtype, words[1 : 1 + ndim]))
+            elif issubclass(kind, Struct):
+                inner = _array_at(words[0], np.dtype(np.int64), [kind.struct_size()])
+                made.__dict__[name] = struct_at(inner, kind)
+        return made
 
     @classmethod
     def struct_size(cls) -> int:
@@ -193,6 +214,13 @@ _structs: WeakValueDictionary[int, Struct] = WeakValueDictionary()
 """All structs by address, for ``struct_at`` in plain Python."""
 
 
+def _array_at(address: int, dtype: np.dtype, shape: Any) -> np.ndarray:
+    """Return the C-contiguous array of this ``shape`` that begins at an address."""
+    size = dtype.itemsize * math.prod(map(int, shape))
+    memory = (ctypes.c_char * size).from_address(int(address))
+    return np.frombuffer(memory, dtype=dtype).reshape(tuple(map(int, shape)))
+
+
 def _rebuilt(cls: type[Derived], n: int | None, values: dict[str, Any]) -> Derived:
     """Return an unpickled struct; ``n`` is the size for a class made by ``of_size``."""
     return (cls if n is None else cls.of_size(n))(**values)
@@ -209,6 +237,5 @@ def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:
     """Return, in kernels, the struct of class ``cls`` whose block of int64 words is ``memory``
     (words,).
     """
-    struct = _structs[address_of(memory)]
-    assert isinstance(struct, cls)
-    return struct
+    known: Any = _structs.get(address_of(memory))
+    return cls.from_memory(memory) if known is None else known

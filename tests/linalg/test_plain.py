@@ -89,13 +89,27 @@ def test_errors_of_plain_kernels_come_through_and_leave_nothing():
     assert plain(np.ones(4)) == math.inf
 
 
-def test_a_struct_is_found_by_its_memory_while_it_lives():
+def test_a_struct_is_found_by_its_memory():
     class Pair(structs.Struct):
         a: np.ndarray
         b: float
 
-    pair = Pair(a=np.ones(2), b=2.0)
+    class Both(structs.Struct):
+        size: structs.Size
+        pair: Pair
+        points: np.ndarray
+
+    pair = Pair(a=np.array([1.0, 2.0]), b=2.0)
     assert structs.struct_at(pair.memory, Pair) is pair
+    points = np.zeros((2, 1), dtype=[("mark", np.int64)])
+    both = Both.of_size(3)(size=(0, 0, 0), pair=pair, points=points)
+    # The words say it all.
+    copy = structs.struct_at(both.memory.copy(), type(both))
+    assert copy is not both
+    copy.pair.a[1] += 1.0
+    copy.points[1, 0].mark = 7
+    assert (pair.a.tolist(), points["mark"].tolist()) == ([1.0, 3.0], [[0], [7]])
+    assert (copy.pair.b, len(copy.size), copy.points.shape) == (2.0, 3, (2, 1))
 
 
 @COMPILED
