@@ -189,11 +189,7 @@ def run_replica(
 
 
 def _error_difference(run: Run, twin: Run) -> float:
-    """Return the largest difference between the errors of a ``run`` with a user's filter class and
-    of its ``twin``, the same true state and messages with the built-in base of that class.
-
-    It is in units of sqrt(tr P) of ``twin``; nan if rounding always exceeds 0.1 TWIN_TOLERANCE.
-    """
+    """Return the largest difference between errors of a ``run`` and of its built-in ``twin``."""
     common = min(len(run.times), len(twin.times))
     size = np.sqrt(np.trace(twin.P[:common], axis1=-2, axis2=-1))[..., None]
     rounding = np.maximum(run.rounding[:common], twin.rounding[:common])[:, None, None]
@@ -212,13 +208,7 @@ def _error_difference(run: Run, twin: Run) -> float:
 
 
 def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
-    """Compare the errors of a user's filter class with those of the built-in filter that it derives
-    from, in the first TWIN_RUNS replicas and those that depart in another row; the differences are
-    in ``results``.
-
-    Serves as the test of the promise SAME_AS_BASE. No interval is estimated, so that ``level`` is
-    not used.
-    """
+    """Compare errors of a user's filter with those of the built-in one it derives from."""
     differences = [result.difference for result in results]
     if np.isnan(differences).all():
         return find_nothing(0.0)
@@ -230,11 +220,7 @@ def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
 
 
 def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:
-    """Count the runs that ended early because they diverged: the test of the promise NONE_DIVERGED,
-    whose margin is minus their share.
-
-    No interval is estimated, so that ``level`` is not used.
-    """
+    """Count the runs that ended early because they diverged."""
     diverged = sum(result.diverged for result in results)
     message = f"{diverged} of {len(results)} runs ended early, so no other promise is looked at"
     margin = -diverged / len(results)
@@ -318,9 +304,7 @@ def judge_replicas(
 def _run_departed(
     scenario: Scenario, results: list[ReplicaResult], rows: list[Evidence], seed: int
 ) -> list[ReplicaResult]:
-    """Return the results with the differences from the built-in base of a user's filter class also
-    for the replicas that broken ``rows`` name, which are run again beside those of the base.
-    """
+    """Return results with differences from the base also where broken rows name a replica."""
     departed = {row.replica for row in rows if row.verdict == BROKEN} - {None}
     if not own_attributes(scenario.filter.algorithm):
         return results
@@ -334,12 +318,7 @@ def _run_departed(
 
 
 def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Evidence]:
-    """Return the row of the verdict that compares a user's filter class with the built-in class
-    that it derives from; an empty list for a built-in filter.
-
-    A class that overrides only weights of links (LINK_WEIGHTS) may differ by design: then nothing
-    is promised.
-    """
+    """Return the row that compares a user's filter class with its built-in base, if any."""
     overridden = own_attributes(scenario.filter.algorithm)
     if not overridden:
         return []
@@ -353,9 +332,7 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
 
 
 def _transposes(scenario: Scenario) -> bool:
-    """Return True if the weights of a user's filter are those of its base with rows and columns
-    exchanged: a mistake, and no design.
-    """
+    """Return True if weights are those of the base with rows and columns exchanged."""
     own, base = (
         chosen.node_filter.pair_weights for chosen in (scenario, with_base_filter(scenario))
     )
@@ -365,9 +342,7 @@ def _transposes(scenario: Scenario) -> bool:
 
 
 def _require_covariances(scenario: Scenario, results: list[ReplicaResult]) -> None:
-    """Raise TheoryError if the results hold no covariance that could be checked, or if runs
-    diverged as those of the built-in filter do (``expected``), which leaves no limits to look at.
-    """
+    """Raise TheoryError if no covariance can be checked, or if runs diverged as expected."""
     summaries = [result.summary for result in results if result.summary is not None]
     diverged = len(results) - len(summaries)
     # A class that diverges where its base does not breaks a promise; a built-in one says nothing.
@@ -442,12 +417,7 @@ def _look_again(
     confidence: float,
     may_continue: bool,
 ) -> Verdict:
-    """Return the verdict on all ``results`` so far, of the replicas of ``seed``, with the decisions
-    of ``earlier`` looks kept. A look is one judgement of all promises on the runs done by then.
-
-    ``may_continue``: further looks are planned, so that this one may spend only its share of the
-    error probability 1 - ``confidence`` (alpha spending).
-    """
+    """Return the verdict on all results so far, with the decisions of earlier looks kept."""
     look, level = (earlier.looks if earlier is not None else 0) + 1, 1.0 - confidence
     # A single look may spend the whole level, unless others are planned.
     level_now = level_of_look(level, look) if may_continue or earlier is not None else level
@@ -463,9 +433,7 @@ def _look_again(
 
 
 def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, runs: int) -> None:
-    """Raise ScenarioError unless runs of ``seed``, up to ``runs`` in all, can be added to an
-    ``earlier`` verdict.
-    """
+    """Raise ScenarioError unless runs can be added to an ``earlier`` verdict."""
     if earlier is None:
         return
     if (earlier.scenario, earlier.seed) != (scenario.name, seed):
@@ -477,9 +445,7 @@ def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, run
 
 
 def _require_laws(scenario: Scenario) -> None:
-    """Raise an error before anything runs if there is nothing to check: no promises, no random
-    input whose distribution could be tested, or a horizon too short for a growth test.
-    """
+    """Raise an error before anything runs if there is nothing to check."""
     find_checks(scenario)
     if not scenario.is_random:
         raise TheoryError(

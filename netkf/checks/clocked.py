@@ -41,11 +41,7 @@ class ClockedSummary(ReplicaSummary):
 
 
 def _mass_conserved(samples: RunSamples, level: float) -> Finding:
-    """Check that exchanges conserve mass: the total push-sum weight of all nodes at the end,
-    messages in flight included, is that at the start, up to rounding.
-
-    No interval is estimated, so that ``level`` is not used.
-    """
+    """Check that exchanges conserve mass."""
     drift, scenario = np.abs(samples.runs.drift), samples.scenario
     message = f"drift of the total weight in {samples.count} runs"
     # Running totals grow with every broadcast, and their rounding remains in their differences.

@@ -60,9 +60,7 @@ class DiffusionSummary(ReplicaSummary):
 
 
 def _without_cooperation(scenario: Scenario) -> Scenario:
-    """Return the scenario with the same filters and no weight for the estimates of others (weight
-    matrix I), sampled at the last time only.
-    """
+    """Return the scenario without weights for others, sampled at the last time only."""
     promised: Any = with_promised_filter(scenario).filter.algorithm
     algorithm = dataclasses.replace(promised, weights=np.eye(len(scenario.nodes)))
     chosen = dataclasses.replace(scenario.filter, algorithm=algorithm)
@@ -70,12 +68,7 @@ def _without_cooperation(scenario: Scenario) -> Scenario:
 
 
 def _sensors_excite(samples: RunSamples, level: float) -> Finding:
-    """Check that the sensors of the network together excite every direction of the state: lambda of
-    paper D (19), the least eigenvalue of the information expected from the next few slots given the
-    regressors so far, must be positive for every past of the regressors.
-
-    No runs are looked at and no interval is estimated, so that ``level`` is not used.
-    """
+    """Check that the sensors of the network together excite every direction of the state."""
     levels = information_level(samples.scenario, PASTS, samples.seed)
     network = levels[levels["node"] == -1].iloc[0]  # the row of all sensors together
     best_sensor = float(levels.loc[levels["node"] != -1, "level"].max())
@@ -90,12 +83,7 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
-    """Compare exact mean-square errors at the end with those of the same runs without cooperation,
-    where each node filters its own readings only.
-
-    The node with the largest error counts in both cases. No interval is estimated, so that
-    ``level`` is not used.
-    """
+    """Compare exact mean-square errors at the end with those without cooperation."""
     Sigma, Sigma_alone = samples.runs.Sigma[:ALONE, -1], samples.runs.alone[:ALONE]
     cooperative = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
     separate = np.trace(Sigma_alone, axis1=-2, axis2=-1).mean(axis=0)
@@ -109,12 +97,7 @@ def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
 
 @error_test
 def _errors_bounded(samples: RunSamples, level: float) -> Finding:
-    """Test that errors stay bounded: compare the growth of the law of e e' at each node, from half
-    of the horizon to its end, with that of Gaussian errors drawn with the exact covariances of the
-    runs that were replayed.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Test that errors stay bounded."""
     e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[: max_replayed(samples.scenario), -2:]
     if np.isnan(e).all():
         return find_nothing(LAW_TOLERANCE)
@@ -135,10 +118,7 @@ def _errors_bounded(samples: RunSamples, level: float) -> Finding:
 
 
 def _draw_squares(Sigma: FloatArray, random: np.random.Generator) -> FloatArray:
-    """Return e e' (DRAWS R, n, n) of Gaussian errors e, DRAWS of them with the variances of each of
-    R covariances ``Sigma`` (R, n, n). Entries of an error are drawn independently, because only
-    the diagonals of e e' are compared.
-    """
+    """Return e e' (DRAWS R, n, n) of Gaussian errors with the variances of ``Sigma`` (R, n, n)."""
     deviations = np.sqrt(np.maximum(np.diagonal(Sigma, axis1=1, axis2=2), 0.0))
     e = random.standard_normal((DRAWS, *deviations.shape)) * deviations
     e = e.reshape(-1, deviations.shape[1])

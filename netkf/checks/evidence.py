@@ -231,11 +231,7 @@ def fold_followers(rows: Sequence[Evidence]) -> list[Evidence]:
 
 
 def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
-    """Return the finding of a test; undecided if theory cannot compute the expected value, or a
-    matrix is so singular that linear algebra fails.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Return the finding of a test; undecided if theory or linear algebra fails."""
     try:
         return promise.test(samples, level)
     except TheoryError as error:
@@ -245,23 +241,13 @@ def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
 
 
 def _is_needed(promise: Promise, row: Assumption) -> bool:
-    """Return True if a promise relies on an assumption: ``promise.needs`` are substrings of its
-    name or source, and tests for Gaussian noises need GAUSSIAN besides.
-    """
+    """Return True if a promise relies on an assumption."""
     needs = (*promise.needs, GAUSSIAN) if promise.test in GAUSSIAN_TESTS else promise.needs
     return any(need in f"{row.assumption} [{row.source}]" for need in needs)
 
 
 def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
-    """Return the row with the verdict that follows from the interval of a finding about ``runs``
-    runs.
-
-    The margin is how far the promise is from being broken. A promise is broken if the whole
-    interval of the margin is below 0, and holds if the interval is above - tolerance. If neither,
-    more runs may decide, and their number is forecast. A promise about a limit that is not reached
-    (``early``) or about errors that rounding hides (``blurred``) is undecided, and so is one whose
-    test gives no number.
-    """
+    """Return the row with the verdict that follows from the interval of a finding."""
     margin, low, high = finding.margin
     verdict, needed, message = _decide(finding, runs)
     off = finding.off
@@ -292,9 +278,7 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
 
 
 def _decide(finding: Finding, runs: int) -> tuple[str, int | None, str]:
-    """Return the verdict on a finding about ``runs`` runs, the number of runs that would decide it
-    (None unless it is undecided and that number is known), and the message.
-    """
+    """Return the verdict on a finding, the runs that would decide it, and the message."""
     (_, low, high), message = finding.margin, finding.message
     if finding.blurred:
         return UNDECIDED, None, message
@@ -316,13 +300,7 @@ def _decide(finding: Finding, runs: int) -> tuple[str, int | None, str]:
 
 
 def _factor_needed(finding: Finding, max_factor: float) -> float:
-    """Return the factor by which the number of runs must grow until an undecided promise is
-    expected to be decided, if it holds; inf if it exceeds ``max_factor``.
-
-    It is decided once the upper limit of the distance from the promise is within the tolerance. The
-    measured distance is taken to be sampling error. Without a forecast the limit shrinks as
-    1 / sqrt(runs); otherwise the factor is found by bisection on a logarithmic scale.
-    """
+    """Return the factor on the runs that is expected to decide a promise; inf if too large."""
     low, tolerance = finding.margin[1], finding.tolerance
     if not tolerance > 0.0:
         return math.inf

@@ -118,11 +118,7 @@ def max_replayed(scenario: Scenario) -> int:
 def _summary_without_replay(
     P: FloatArray, e: FloatArray, nees: FloatArray, size: int
 ) -> ReplicaSummary:
-    """Return a summary of one run without exact covariances: the fields for them are nan.
-
-    At K checked times and N sampled nodes: ``P`` (K, N, n, n), errors ``e`` (K, N, n) and ``nees``
-    (K, N). ``size`` is the number of errors of all nodes at all sample times.
-    """
+    """Return a summary of one run without exact covariances: the fields for them are nan."""
     times, n = len(P), P.shape[-1]
     unknown, pair = np.full(P.shape, np.nan), np.full(2, np.nan)
     return ReplicaSummary(
@@ -143,13 +139,7 @@ def _summary_without_replay(
 def _replayed_summary(
     scenario: Scenario, run: Run, law: ErrorLaw, e: FloatArray, nees: FloatArray
 ) -> ReplicaSummary:
-    """Return the summary of a run with the exact ``law`` of its errors: their mean and covariance,
-    and P by the filter's equations, given the events of the run.
-
-    ``e`` (K, N, n) and ``nees`` (K, N) are those at the K checked times and N sampled nodes; they
-    become nan where the rounding of large states exceeds the exact deviation of the errors. The law
-    is of M estimators: the nodes, or one pooled filter that all nodes share.
-    """
+    """Return the summary of a run with the exact ``law`` of its errors."""
     time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     nodes, times, estimators, n = (
         len(scenario.nodes),
@@ -196,15 +186,7 @@ def _replayed_summary(
 def _pool_times(
     e: FloatArray, covariance: FloatArray, floor: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return two statistics of the errors at all times of a run together, fields of ReplicaSummary.
-
-    ``joint`` (2,) is e' C^-1 e with C their joint covariance, and its degrees of freedom; ``bias``
-    (n, n + 1) is the information matrix and vector of a constant bias of all errors.
-
-    ``e`` (K, M, n) are the errors of M estimators at K times less their mean, ``covariance``
-    (K M n, K M n) is their joint covariance. Directions of variance below ``floor`` are left out,
-    as in :func:`whiten_errors`.
-    """
+    """Return statistics of the errors at all times together, fields of ReplicaSummary."""
     size, n = e[0].size, e.shape[-1]
     # Variances may differ by orders of magnitude between times: each time is scaled to size 1.
     scale = np.repeat(np.sqrt(np.diagonal(covariance).reshape(-1, size).max(axis=1)), size)
@@ -221,15 +203,7 @@ def _pool_times(
 
 
 def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
-    """Return the sum of the NEES of a run and its weights (1 + K M n,), the field ``quadratic`` of
-    ReplicaSummary: the sum is one of squares of independent standard normal numbers times these
-    weights. All are nan if some P is singular.
-
-    The sum is over ``e' P^-1 e`` at all times and estimators, each scaled to the expected value n,
-    so that a moment of a far too small P does not outweigh all others. ``e`` (K, M, n) are errors
-    less their mean and ``P`` (K, M, n, n) covariances of the run; expected values and weights use
-    the exact covariance of the errors and the P that the events should give.
-    """
+    """Return the sum of the NEES of a run and the weights of its squares (1 + K M n,)."""
     if _nearly_singular(P).any() or _nearly_singular(law.P).any():
         return np.full(1 + e.size, np.nan)
     n = e.shape[-1]
@@ -261,18 +235,14 @@ def nees_shares(whitened: FloatArray) -> FloatArray:
 
 
 def _nearly_singular(P: FloatArray) -> np.ndarray:
-    """Return a mask (K, N) of the covariances P (K, N, n, n), at K times and N nodes, that are not
-    finite or whose smallest eigenvalue is at most SINGULAR times the largest.
-    """
+    """Return a mask (K, N) of covariances P (K, N, n, n) that are singular or not finite."""
     finite = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
     values = np.linalg.eigvalsh(np.where(finite[..., None, None], P, 0.0))
     return np.asarray(~(values[..., 0] > SINGULAR * values[..., -1]))
 
 
 def _variance_floor(scenario: Scenario) -> float:
-    """Return the variance below which errors of estimates are rounding: (OPERATIONS EPS)^2 times
-    the sum of tr P(0) and the smallest variance that one reading alone gives.
-    """
+    """Return the variance below which errors of estimates are rounding."""
     information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
     reading_variance = 1.0 / information if information > 0.0 else 0.0
     return (OPERATIONS * EPS) ** 2 * (reading_variance + float(np.trace(scenario.plant.start_cov)))
@@ -411,12 +381,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
 
 
 def _compare_pooled(joint: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference between the squared errors, whitened by their
-    exact covariance and pooled over times, nodes and runs, and their degrees of freedom.
-
-    A row of ``joint`` (R, 2) has both for one run. The interval misses the truth with at most the
-    probability ``level``.
-    """
+    """Return an interval for the relative difference of pooled squares from their freedom."""
     total, freedom = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
     if not freedom > 0.0:
         return Interval(math.nan, 0.0, math.inf)
@@ -470,12 +435,7 @@ def detectable_length(radius: float, n: int) -> float:
 
 
 def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interval:
-    """Return an interval for the length |spread m| of a bias, where ``z`` (k,) is normal with mean
-    m and covariance I and ``spread`` (d, k) turns m into the bias. It excludes 0 if and only if
-    |z|^2 exceeds its chi-square quantile.
-
-    The interval misses the truth with at most the probability ``level``.
-    """
+    """Return an interval for |spread m|, where ``z`` (k,) is normal with mean m, covariance I."""
     reach = gaussian_radius(level, len(z))
     sizes = np.linalg.svd(spread, compute_uv=False)
     smallest = float(sizes[-1]) if len(sizes) == len(z) else 0.0
@@ -540,13 +500,7 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
 
 
 def _pooled_expected_nees(quadratic: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference between the NEES pooled over times, nodes and
-    runs and its expected value.
-
-    ``quadratic`` (R, 1 + S) has for each of R runs the sum of its S scaled squares of standard
-    normal numbers, and their weights. The interval misses the truth with at most the probability
-    ``level``.
-    """
+    """Return an interval for the relative difference of the pooled NEES from its mean."""
     finite = quadratic[np.isfinite(quadratic).all(axis=1)]
     ratio = quadratic_interval(float(finite[:, 0].sum()), finite[:, 1:].ravel(), level)
     return deviation_interval(1.0, ratio) if len(finite) else ratio

@@ -88,9 +88,7 @@ class GossipSummary(ReplicaSummary):
 
 
 def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
-    """Return the summary of a run at K slots and N sampled nodes: exact errors, and P (K, N, n, n)
-    replayed by the Riccati recursion along the nodes that each pair (estimate, covariance) visited.
-    """
+    """Return the summary of a run at K slots and N sampled nodes."""
     slots, exact = list(check_slots(scenario)), vars(summarise_exactly(scenario, run))
     sources = pair_sources(scenario, run, slots[-1])
     counts: dict[str, Any] = {
@@ -126,10 +124,7 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
 
 
 def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
-    """Return the indices i and j, (M,) each, of the M ordered pairs of nodes for which it is
-    counted how often j handed its pair (estimate, covariance) to i: all, or in a large network the
-    ends of links, in both directions.
-    """
+    """Return the indices (M,) of pairs of nodes whose moves are counted: all, or links."""
     if len(sampled_indices(scenario)) == len(scenario.nodes):
         i, j = np.nonzero(~np.eye(len(scenario.nodes), dtype=bool))
         return i, j
@@ -140,10 +135,7 @@ def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
 
 
 def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
-    """Return the number (M,) of slots in which j handed its pair (estimate, covariance) to i, for
-    each of the M (i, j) of :func:`_pairs_to_count`; ``sources`` (slots, N) is the index of the node
-    whose pair each node used in each slot.
-    """
+    """Return the number (M,) of slots in which j handed its pair to i."""
     # The move of a pair from j to i is coded as the number i N + j.
     size = len(scenario.nodes)
     codes, counts = np.unique(np.arange(size) * size + sources, return_counts=True)
@@ -198,13 +190,7 @@ class GossipSamples(RunSamples):
         return self._draw_paths("switched chain", slots, reference_count(self.scenario, laws=1))
 
     def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
-        """Return S = ``count`` simulated switched chains, with their covariances (K, S, n, n) after
-        K increasing numbers of ``slots``; ``purpose`` names the random stream that they are drawn
-        from. A chain starts at a uniformly drawn node, with the P(0) of that node.
-
-        Each chain also runs from a covariance about 1000 times larger through the same nodes
-        (``restarted``), to test whether the law of P still depends on P(0).
-        """
+        """Return covariances (K, S, n, n) of S switched chains after K ``slots``."""
         # Square roots of P(0) (N, n, n), which the recursions work with.
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
@@ -225,11 +211,7 @@ class GossipSamples(RunSamples):
 def _draw_chains(
     matching: FloatArray, slots: int, count: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Return the node indices (count, slots) of ``count`` stationary Markov chains in each slot.
-
-    Their transition matrix is ``matching`` (N, N), the mean matching: the next node is drawn by
-    inversion of the cumulative sums of its rows.
-    """
+    """Return the node indices (count, slots) of ``count`` stationary Markov chains in each slot."""
     cumulative = np.cumsum(matching, axis=1)
     positions = np.empty((count, slots), dtype=int)
     # Abar is doubly stochastic, so the uniform law is stationary.
@@ -242,13 +224,7 @@ def _draw_chains(
 
 
 def _walks_bound(samples: GossipSamples, level: float) -> Finding:
-    """Check that no P of the runs (R, K, N, n, n) exceeds its bound, paper G Lemma 14: the
-    covariance that the last WINDOW readings which updated the node's pair give alone, from an
-    unknown state.
-
-    The bound is of the order of UNKNOWN^2 where these readings do not detect the state. No interval
-    is estimated, so that ``level`` is not used.
-    """
+    """Check that no P of the runs (R, K, N, n, n) exceeds its bound, paper G Lemma 14."""
     P, bound = samples.runs.P, samples.runs.bounds
     size = np.trace(bound, axis1=-2, axis2=-1)
     # A covariance that is not finite exceeds every bound.
@@ -272,12 +248,7 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
 
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
-    """Test the null hypothesis that j hands its pair (estimate, covariance) to i with probability
-    Abar_ij (``samples.matching``), independently in each slot: then the numbers of moves, over all
-    slots of all runs, are binomial.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare how often j hands its pair to i with binomial numbers of Abar_ij."""
     i, j = _pairs_to_count(samples.scenario)
     trials, totals = int(np.sum(samples.runs.slots)), samples.runs.moves.sum(axis=0)
     nodes = samples.scenario.nodes
@@ -291,12 +262,7 @@ def _tokens_move(samples: GossipSamples, level: float) -> Finding:
 
 
 def _random_sensor(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law (probability distribution) of P at a node drawn at random with that of the
-    switched chain (:class:`ChainSamples`), paper G (67).
-
-    The node is drawn anew for each run and slot, so that each run gives one independent value.
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare the law of P at a random node with that of the switched chain, G (67)."""
     random = Streams(samples.seed).generator("random sensor")
     runs, nodes = np.arange(samples.count), len(samples.scenario.nodes)
     picks = random.integers(nodes, size=(len(check_slots(samples.scenario)), samples.count))
@@ -308,12 +274,7 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
 
 
 def _each_sensor(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law of P at each node and checked slot t with that of the switched chains
-    (:class:`ChainSamples`) that took their last reading, in slot t - 1, at this node; the two are
-    equal by paper G (19).
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare the law of P at each node with that of the switched chains there, G (19)."""
     P, positions = samples.reference.P, samples.reference.positions
     pairs = [
         Pair(
@@ -326,14 +287,7 @@ def _each_sensor(samples: GossipSamples, level: float) -> Finding:
 
 
 def _sensors_together(samples: GossipSamples, level: float) -> Finding:
-    """Compare the probability P(tr P_n >= x) at all nodes n with that of the switched chain
-    (:class:`ChainSamples`), at every checked slot and for all x.
-
-    Its mean over the nodes equals that of the chain, paper G (67), which gives paper G (28) and
-    (29) in the limit; hence it exceeds N times that of the chain at no node, paper G (27). Both
-    comparisons use bands around empirical distribution functions (:func:`band_width`). The interval
-    of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare P(tr P_n >= x) of all nodes with that of the switched chain, for all x."""
     traces = np.trace(samples.runs.P, axis1=-2, axis2=-1)
     expected = np.trace(samples.reference.P, axis1=-2, axis2=-1)
     N, band_level = traces.shape[2], level / (2 * traces.shape[1])
@@ -355,22 +309,13 @@ def _sensors_together(samples: GossipSamples, level: float) -> Finding:
 
 
 def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
-    """Return for each of the ``points`` (V,) the share of a sample ``values`` (S,) that is at least
-    as large, an empirical P(value >= point).
-    """
+    """Return for each of ``points`` (V,) the share of ``values`` (S,) at least as large."""
     below = np.searchsorted(np.sort(round_digits(values)), points, "left")
     return np.asarray(1.0 - below / len(values))
 
 
 def _check_tokens(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law at the end of the covariance of each token, the pair (estimate, covariance)
-    that started at one node, with that of the stationary switched chain (:class:`ChainSamples`).
-
-    Chains that start where the token does have the exact law at this time; their distance from the
-    stationary one tells whether the horizon is long enough: if not, the finding is ``early`` and
-    gets a horizon that would do. Its interval misses the truth with at most the probability
-    ``level``.
-    """
+    """Compare the law at the end of the covariance of each token with the stationary one."""
     last, pairs = len(check_slots(samples.scenario)) - 1, []
     chain, origin = samples.reference.P[last], samples.reference.positions[:, 0]
     for i, node in enumerate(samples.nodes):
@@ -383,13 +328,7 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
 
 
 def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law of P at each node at the end with that of simulated switched chains
-    (:class:`ChainSamples`) at this node that started with a covariance about 1000 times larger.
-
-    Only a difference from the chains with the start of the runs breaks the promise; if the two
-    kinds of chains still differ, the finding is ``early`` and gets a horizon that would do. Its
-    interval misses the truth with at most the probability ``level``.
-    """
+    """Compare the law of P at the end with that of chains from a far larger start."""
     P, restarted, positions = samples.reference
     pairs = []
     for i, node in enumerate(samples.nodes):
@@ -402,11 +341,7 @@ def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
 
 
 def _check_bounded(samples: GossipSamples, level: float) -> Finding:
-    """Test that P stays stochastically bounded: compare the growth of its law at each node, from
-    half of the horizon to its end, with that of simulated switched chains at this node.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Test that P stays stochastically bounded."""
     runs, chain, positions = samples.runs.P, samples.reference.P, samples.reference.positions
     half = check_slots(samples.scenario)[-2]
     pairs, expected = [], []
@@ -419,27 +354,19 @@ def _check_bounded(samples: GossipSamples, level: float) -> Finding:
 
 
 def _growth_of(chain: ChainSamples) -> float:
-    """Return the growth (:func:`growth_intervals`) of the law of the chain's covariance between the
-    last two slots of the samples ``chain``, which tends to 0; :func:`with_horizon` looks for the
-    slot at which it is small.
-    """
+    """Return the growth of the law of the chain's covariance between its last two slots."""
     # Only the value of each interval is used, for which the level does not matter.
     intervals = growth_intervals(chain.P[-2], chain.P[-1], level=0.5)
     return max(interval.value for interval in intervals)
 
 
 def _start_memory(chain: ChainSamples) -> float:
-    """Return the distance at the last slot between the laws of the chain's covariance from P(0) and
-    from a start about 1000 times larger, which tends to 0; used as :func:`_growth_of` is.
-    """
+    """Return the distance of the laws from P(0) and from a far larger start at the end."""
     return float(diagonal_distances(chain.P[-1], chain.restarted).max())
 
 
 def _token_memory(chain: ChainSamples) -> float:
-    """Return the largest distance between the law of chains that start at one node and that of all
-    chains, at the last slot; nan if all nodes have fewer than MIN_TOKENS chains. It tends to 0, and
-    is used as :func:`_growth_of` is.
-    """
+    """Return the largest distance of the law of chains from one node to that of all."""
     last, origin = chain.P[-1], chain.positions[:, 0]
     starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
     return max(

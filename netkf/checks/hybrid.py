@@ -78,11 +78,7 @@ class HybridSamples(RunSamples):
 
 
 def _variance_exists(scenario: Scenario) -> Assumption:
-    """Return the assumption that P, which is random since links tick at random, has a variance: a
-    row of the table of assumptions. Without a variance no interval for the mean of P holds.
-
-    It holds if every node detects the state alone, and otherwise if second moments of P decay.
-    """
+    """Return the assumption that P, which is random since links tick at random, has a variance."""
     name, source = "the covariance has a variance", "derived"
     # Nodes whose own readings leave a mode that does not decay unseen: their P may grow for long.
     unobserved = [
@@ -108,13 +104,7 @@ def _variance_exists(scenario: Scenario) -> Assumption:
 
 
 def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
-    """Test that the mean of P over the runs stays below its bound (``samples.bound``, the coupled
-    Riccati equations H (12) of the hybrid paper): at each checked time and node the largest
-    eigenvalue of the mean relative to the bound is at most 1.
-
-    The interval of the finding misses the truth with at most the probability ``level``, of which
-    each time and node has an equal part.
-    """
+    """Test that the mean of P over the runs stays below its bound, H (12)."""
     P, bound = samples.runs.P, samples.bound
     _, times, nodes = P.shape[:3]
     single_level = level / (times * nodes)
@@ -131,11 +121,7 @@ def _mean_below_bound(samples: HybridSamples, level: float) -> Finding:
 
 
 def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval | None:
-    """Return an interval for the largest eigenvalue of E[P] relative to ``bound`` (n, n), less 1,
-    from samples ``P`` (R, n, n); None if the bound is singular.
-
-    The interval misses the truth with at most the probability ``level``.
-    """
+    """Return an interval for the largest eigenvalue of E[P] relative to ``bound``, less 1."""
     values, vectors = np.linalg.eigh(bound)
     if not values[0] > 1e-12 * values[-1]:
         return None
@@ -151,11 +137,7 @@ def _relative_excess(P: FloatArray, bound: FloatArray, level: float) -> Interval
 
 
 def _bound_settles(samples: HybridSamples, level: float) -> Finding:
-    """Check that the bound on the mean of P, the coupled Riccati equations H (12) of the hybrid
-    paper, reaches its steady state: compute it at 10, 100, ... horizons until it is close.
-
-    No runs are looked at and no interval is estimated, so that ``level`` is not used.
-    """
+    """Check that the bound on the mean of P, H (12), reaches its steady state."""
     promised = with_promised_filter(samples.scenario)
     steady_bound, distance, factor = steady_covariance_bound(promised), np.inf, 1.0
     while distance > STEADY_TOLERANCE and factor < MAX_TIME:
@@ -171,12 +153,7 @@ def _bound_settles(samples: HybridSamples, level: float) -> Finding:
 
 
 def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
-    """Check that the steady bound on the mean of P approaches its limit S for ever faster links at
-    least as fast as one over their rate (H Theorem 3 of the hybrid paper).
-
-    The exponent is computed from two scenarios, whose rates differ by a factor 10. No runs are
-    looked at and no interval is estimated, so that ``level`` is not used.
-    """
+    """Check that the steady bound approaches S as one over the rate of links, H Theorem 3."""
     promised = with_promised_filter(samples.scenario)
     # Links so fast that the distance is already in its power law.
     S, first = limit_covariance(promised), _mixing_factor(promised)
@@ -204,11 +181,7 @@ def _bound_approaches_limit(samples: HybridSamples, level: float) -> Finding:
 
 
 def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
-    """Check H Remark 1 of the hybrid paper: the bound on the mean of P, H (12), whose gains vary
-    with time, is at most the one for the constant gains of its steady state, at all checked times.
-
-    No runs are looked at and no interval is estimated, so that ``level`` is not used.
-    """
+    """Check H Remark 1 of the hybrid paper."""
     promised, times = (
         with_promised_filter(samples.scenario),
         np.array(check_times(samples.scenario)),
@@ -227,12 +200,7 @@ def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
 
 
 def _mixing_factor(scenario: Scenario) -> float:
-    """Return a factor on the rates of links, 1 or more, with which exchanges make the estimates of
-    all nodes agree 100 times faster than the filters themselves change.
-
-    The speed (1/s) of a filter is bounded by |A| + |S| |H' V^-1 H|, with S the limit of P for fast
-    links.
-    """
+    """Return a factor on the rates with which estimates agree 100 times faster than they change."""
     S, slowest = limit_covariance(scenario), _slowest_mixing(coupling(scenario))
     models = {id(model): model for model in scenario.models}.values()  # nodes share them
     speeds = [
@@ -244,12 +212,7 @@ def _mixing_factor(scenario: Scenario) -> float:
 
 
 def _slowest_mixing(mixing: scipy.sparse.csr_array) -> float:
-    """Return the rate (1/s) at which differences between nodes decay under exchanges alone: the
-    second smallest real part of the eigenvalues of the Laplacian of ``mixing`` (N, N).
-
-    ``mixing[i, j]`` is the rate at which i hears j times the weight that i gives to j. Raises
-    TheoryError if the iteration for large networks fails.
-    """
+    """Return the rate (1/s) at which differences between nodes decay under exchanges alone."""
     leaving = np.asarray(mixing.sum(axis=1)).reshape(-1)
     laplacian = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - mixing)
     if laplacian.shape[0] <= MAX_DENSE:
@@ -266,9 +229,7 @@ def _slowest_mixing(mixing: scipy.sparse.csr_array) -> float:
 
 @lru_cache(maxsize=8)
 def _with_faster_links(scenario: Scenario, factor: float) -> Scenario:
-    """Return the scenario with all rates of links multiplied by ``factor``; cached, because its
-    tables take time. Raises TheoryError if the clocks have no rate.
-    """
+    """Return the scenario with all rates of links multiplied by ``factor``."""
     clock = scenario.network.activation
     if not isinstance(clock, (Poisson, Renewal)) or clock.rate is None:
         raise TheoryError("the clocks have no rate to raise")
@@ -391,9 +352,7 @@ class HybridChecks(PaperChecks):
 
 
 def _settling_rows(scenario: Scenario) -> list[Assumption]:
-    """Return the assumption that the bound on the mean of P, paper H (12), has a steady state, as a
-    list of one row of the table of assumptions; empty if that cannot be decided.
-    """
+    """Return the assumption that the bound has a steady state; none if it is not decided."""
     try:
         settles = has_steady_state(scenario)
     except TheoryError:
@@ -413,9 +372,7 @@ def _require_known_steadiness(scenario: Scenario) -> None:
 
 
 def _require_constant_gains(scenario: Scenario) -> None:
-    """Raise TheoryError if there is no bound with constant gains other than paper H (12), the bound
-    on the mean of P, itself.
-    """
+    """Raise TheoryError if there is no bound with constant gains beside H (12)."""
     if not scenario.filter.algorithm.talks:
         raise TheoryError("without messages the gains are those of Kalman-Bucy filters")
     if has_steady_state(scenario):
@@ -423,9 +380,7 @@ def _require_constant_gains(scenario: Scenario) -> None:
 
 
 def _require_limit(scenario: Scenario) -> None:
-    """Raise TheoryError if the steady bound on the mean of P has no limit S for ever faster links,
-    or it cannot be computed for links fast enough.
-    """
+    """Raise TheoryError if the steady bound has no limit S that can be computed."""
     if len(scenario.nodes) == 1 or scenario.network.channel.delay.fixed != 0.0:
         raise TheoryError("S is the limit for links that take no time")
     faster = _with_faster_links(scenario, 10.0 * _mixing_factor(scenario))

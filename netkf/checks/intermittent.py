@@ -100,19 +100,14 @@ class IntermittentSummary(ReplicaSummary):
 
 
 def _heard_directions(scenario: Scenario) -> list[Direction]:
-    """Return (sender, receiver) of all D directed links that can carry readings: those from nodes
-    with sensors.
-    """
+    """Return (sender, receiver) of all D directed links that can carry readings."""
     senders = sensing_neighbours(scenario)
     return [(sender, node) for node in scenario.nodes for sender in senders[node]]
 
 
 @lru_cache(maxsize=8)
 def _least_roots(scenario: Scenario) -> FloatArray:
-    """Return for each of W sampled nodes the Cholesky root (n, n) of P*, the steady covariance with
-    all readings that can reach the node and so the least point of the support of the law of P; nan
-    if it does not exist. Cached, because every replica of a scenario needs it.
-    """
+    """Return for each sampled node the Cholesky root (n, n) of P*, nan without one."""
     # Without losses all slots are alike: one slot has the readings of each node.
     arrivals, n = all_arrivals(scenario, slots=1), scenario.plant.n
     F, Q = scenario.slot_belief
@@ -129,13 +124,7 @@ def _least_roots(scenario: Scenario) -> FloatArray:
 
 
 def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
-    """Return the summary of a run at K slots and N sampled nodes: exact errors, and P (K, N, n, n)
-    replayed, that is computed by the Riccati recursion from the readings that arrived in the run.
-
-    P is replayed from P(0) to all checked slots. To the last slot only it is also replayed from 0
-    and from a very large start, which should converge, and from P* (the steady covariance with all
-    readings), which stays in the support of the invariant law.
-    """
+    """Return the summary of a run at K slots and N sampled nodes."""
     slots, exact = list(check_slots(scenario)), vars(summarise_exactly(scenario, run))
     last, counts = (
         slots[-1:],
@@ -167,18 +156,14 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
 
 
 def _roots_above(*roots: FloatArray) -> FloatArray:
-    """Return roots (W, n, n) of a start covariance far above all of the given ones: FAR_START^2
-    times their sum, plus I. The arguments are roots of covariances too, (W, n, n) each.
-    """
+    """Return roots (W, n, n) of a start covariance far above all of the given ones."""
     total = sum(root @ np.swapaxes(root, -1, -2) for root in roots)
     above = FAR_START**2 * total + np.eye(roots[0].shape[-1])
     return np.asarray(np.linalg.cholesky(above), dtype=np.float64)
 
 
 def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.ndarray:
-    """Return how many readings were sent (``kind`` "send") or delivered ("deliver") over each of
-    the D directed links of :func:`_heard_directions` in the first ``slots`` slots of a run.
-    """
+    """Return how many readings have events of a ``kind`` on each direction in the first slots."""
     # In the log a message is sent by the node of its row, but delivered to it.
     sender, receiver = ("node", "peer") if kind == "send" else ("peer", "node")
     rows = run.log[run.log["kind"] == CODES[kind]]
@@ -188,13 +173,7 @@ def _count_messages(scenario: Scenario, run: Run, kind: str, slots: int) -> np.n
 
 
 def _path_averages(table: ModeTable, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
-    """Return for each of K filters the average of ``1 / (1 + tr P)`` over the second half of the
-    slots, an average over time that is compared with one over runs.
-
-    A row of ``sequences`` (K, slots) has the mode (index in ``table`` of a set of readings) that
-    updates one filter in each slot; ``roots`` (K, n, n) are those of the start covariances. The
-    averaged function is bounded, so that its mean exists for every law of P.
-    """
+    """Return for each of K filters the average of ``1 / (1 + tr P)`` over half of the slots."""
     first, averages = sequences.shape[1] // 2, []
     for all_slots in trace_paths(roots, sequences, *table):
         path = all_slots[first:]  # (slots, n, n) roots S with P = S S', so tr P is their square sum
@@ -239,12 +218,7 @@ class IntermittentSamples(RunSamples):
     def _draw_arrivals(
         self, purpose: str, slots: list[int], samples: int, paths: int
     ) -> ArrivalSamples:
-        """Return S = ``samples`` simulated covariances of each of N sampled nodes, (N, K, S, n, n)
-        after each of K increasing numbers of ``slots``, and averages (N, S') over the slots for the
-        first S' = ``paths``.
-
-        ``purpose`` names the random stream from which it is drawn which readings arrive.
-        """
+        """Return simulated covariances (N, K, S, n, n) and averages (N, S')."""
         sampled = sampled_indices(self.scenario).tolist()
         per_node = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
         return ArrivalSamples(*(np.array(values) for values in zip(*per_node, strict=True)))
@@ -252,12 +226,7 @@ class IntermittentSamples(RunSamples):
     def _draw_node(
         self, purpose: str, k: int, slots: list[int], samples: int, paths: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the fields of ArrivalSamples for the k-th node of the scenario: covariances
-        (K, S, n, n), those from a larger start (S, n, n), and averages over the slots (S',).
-
-        They are those of S = ``samples`` simulated filters after each of K numbers of ``slots``,
-        and averages for the first S' = ``paths``; ``purpose`` names their random stream.
-        """
+        """Return the fields of ArrivalSamples for the k-th node of the scenario."""
         scenario = self.scenario
         node = scenario.nodes[k]
         senders = sensing_neighbours(scenario)[node]
@@ -292,9 +261,7 @@ class IntermittentSamples(RunSamples):
 
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
-    """Return the probability that a reading sent over a directed link (sender, receiver) arrives
-    within its slot; raises TheoryError if losses or delays give no such probability.
-    """
+    """Return the probability that a reading on a direction arrives within its slot."""
     channel = scenario.network.channel
     if not channel.loss.independent:
         raise TheoryError("losses come in bursts or recorded")
@@ -306,11 +273,7 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
 
 
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:
-    """Check that no P of the runs (R, K, N, n, n) is below the covariance of a filter without any
-    losses from the same start, which converges to P*, the least point of the support of the law.
-
-    No interval is estimated, so that ``level`` is not used.
-    """
+    """Check that no P is below that of a filter without losses from the same start."""
     slots = list(check_slots(samples.scenario))
     table, sequences, _ = all_arrivals(samples.scenario, slots[-1])
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
@@ -329,14 +292,7 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _in_support(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare P at the end with the point of the support of its invariant law to which the readings
-    of the run lead from P*, the steady covariance with all readings.
-
-    Both lie between the covariances from a very large start and from 0, and may differ by the
-    spread of these two, which vanishes once P has become independent of its start. If no spread has
-    vanished yet, the horizon that would do is extrapolated from the rate at which the median spread
-    decays. No interval is estimated, so that ``level`` is not used.
-    """
+    """Compare P at the end with the point of its support that the readings lead to."""
     P, point, spread = samples.runs.P[:, -1], samples.runs.in_support, samples.runs.spread
     finite = np.isfinite(point).all(axis=(0, -1, -2))  # nodes for which P* exists
     size = np.trace(point, axis1=-2, axis2=-1)[:, finite]
@@ -371,11 +327,7 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Test the null hypothesis that readings arrive independently with the stated probability, R
-    (12): then the number that arrived over each directed link, in all runs, is binomial.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare the numbers of readings that arrive with binomial ones, R (12)."""
     pairs = _heard_directions(samples.scenario)  # (sender, receiver) of each directed link
     sent, arrived = samples.runs.sent.sum(axis=0), samples.runs.arrived.sum(axis=0)
     intervals = []
@@ -388,12 +340,7 @@ def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding
 
 
 def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law (probability distribution) of P at each node and checked slot with that of
-    simulated covariances (``samples.reference``) whose readings arrive independently, with the
-    stated probabilities.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare the law of P at each node and slot with that of simulated arrivals."""
     pairs = [
         Pair(f"slot {slot}, node {node}", samples.runs.P[:, k, i], samples.reference.P[i, k])
         for k, slot in enumerate(check_slots(samples.scenario))
@@ -403,12 +350,7 @@ def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
-    """Test that P stays stochastically bounded: compare the growth of its law at each node, from
-    half of the horizon to its end, with that of simulated covariances whose readings arrive
-    independently, with the stated probabilities.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Test that P stays stochastically bounded."""
     runs, reference_P = samples.runs.P, samples.reference.P
     pairs = [
         Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]) for i, node in enumerate(samples.nodes)
@@ -419,13 +361,7 @@ def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _check_initial_condition(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law of P at the end with that of simulated covariances from a start about a
-    thousand times larger.
-
-    Only a difference from simulated covariances with the start of the runs breaks the promise; if
-    the two kinds of simulated ones still differ, the finding is ``early`` and gets a horizon that
-    would do. Its interval misses the truth with at most the probability ``level``.
-    """
+    """Compare the law of P at the end with that from a far larger start."""
     P, restarted = samples.reference.P, samples.reference.restarted
     pairs = [
         Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
@@ -436,29 +372,19 @@ def _check_initial_condition(samples: IntermittentSamples, level: float) -> Find
 
 
 def _growth_of(reference: ArrivalSamples) -> float:
-    """Return the largest excess of P(later P > GROWTH x) over P(earlier P > x), over all x and
-    nodes, between the last two numbers of slots in ``reference``. It tends to 0;
-    :func:`with_horizon` looks for the slot at which it is small.
-    """
+    """Return the largest growth of the law of P between the last two numbers of slots."""
     # Only the value of each interval is used, for which the level does not matter.
     return max(g.value for P in reference.P for g in growth_intervals(P[-2], P[-1], level=0.5))
 
 
 def _memory_of(reference: ArrivalSamples) -> float:
-    """Return the largest distance over the nodes, at the last slot, between the laws of covariances
-    from P(0) and from a start about 1000 times larger. It tends to 0, and is used as
-    :func:`_growth_of` is.
-    """
+    """Return the largest distance at the end of the laws from P(0) and a far larger start."""
     pairs = zip(reference.P, reference.restarted, strict=True)
     return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare averages of 1 / (1 + tr P) over the slots of one run with those of simulated
-    covariances whose readings arrive independently, by their distributions over the runs.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare averages over the slots of one run with those of simulated arrivals."""
     averages, expected = samples.runs.averages, samples.reference.averages
     intervals = [
         (
@@ -476,13 +402,7 @@ def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _outage_factors(scenario: Scenario) -> dict[int, float]:
-    """Return, by id of each sampled node without a sensor, the factor (1 - g) alpha^2 by which
-    slots without any reading multiply E[P], with g the probability that a reading arrives in a slot
-    and alpha the spectral radius of F.
-
-    E[P] diverges if it is 1 or more, paper R (29), (31). Nodes with losses or delays for which g is
-    unknown are left out.
-    """
+    """Return, by node without a sensor, the factor (1 - g) alpha^2 of slots without readings."""
     factors, neighbours = {}, sensing_neighbours(scenario)
     alpha = growth_factor(scenario.slot_belief[0])
     for node in sampled_nodes(scenario):
@@ -499,12 +419,7 @@ def _outage_factors(scenario: Scenario) -> dict[int, float]:
 
 
 def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
-    """Check that E[P] diverges: compute a lower bound on it, at the horizon and at twice the
-    horizon, for the node whose slots without readings multiply it by the largest factor
-    (:func:`_outage_factors`), and check that it grows.
-
-    No interval is estimated, so that ``level`` is not used.
-    """
+    """Check that a lower bound on E[P] grows as the largest factor of outages says."""
     scenario, factors = samples.scenario, _outage_factors(samples.scenario)
     node = max(factors, key=lambda k: factors[k])
     F, Q = scenario.slot_belief
@@ -529,10 +444,7 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
-    """Return the exact invariant law of P, by index among the sampled nodes, for the nodes that
-    have no sensor and one neighbour with a sensor, if the plant is scalar; other nodes are left
-    out, and those for which the law has no closed form.
-    """
+    """Return the exact invariant laws of a scalar P, by index of the sampled node."""
     laws, neighbours = {}, sensing_neighbours(scenario)
     if not fixed_readings(scenario).holds:
         return {}
@@ -551,15 +463,7 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
 
 
 def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Test the null hypothesis that P at the end falls between the holes of its support (intervals
-    that a scalar P never enters) with the exact probabilities.
-
-    After an outage of k slots (the last k without a reading), of probability g (1 - g)^k with g
-    that of an arrival, P lies between the k-th and the next hole, paper R Proposition 24. The exact
-    law at the last slot gives the probabilities also when the start still matters. Counts of a cell
-    are binomial; Pearson's p-value is added to the message. The interval of the finding misses the
-    truth with at most the probability ``level``.
-    """
+    """Compare how often P falls between the holes of its support with exact probabilities."""
     laws, intervals, tests = _scalar_laws(samples.scenario), [], []
     single_level = level / (len(laws) * (CELLS + 1))
     for k, law in laws.items():
@@ -582,21 +486,14 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
 def _law_at_end(
     samples: IntermittentSamples, k: int, law: ScalarLaw
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the exact distribution function of P at the k-th sampled node in the last slot, from
-    its start P(0) on: a function from points (K,) to probabilities (K,).
-
-    ``law`` is the invariant law of the scalar system of that node, which P approaches.
-    """
+    """Return the exact distribution function of P at the k-th node in the last slot."""
     node = int(sampled_indices(samples.scenario)[k])
     start = float(samples.first_covariances[node, 0, 0])
     return partial(law.cdf_after, slots=check_slots(samples.scenario)[-1], start=start)
 
 
 def _outage_edges(law: ScalarLaw) -> FloatArray:
-    """Return points (CELLS,) that separate the values of a scalar P by the length of the outage
-    (slots without a reading) before them: the k-th is the middle of the interval that P never
-    enters above its values after outages of k slots.
-    """
+    """Return points (CELLS,) that separate a scalar P by the length of the last outage."""
     edge = np.array(0.5 * sum(law.hole))
     edges = []
     # A slot without a reading maps each such interval (hole) to the next.
@@ -607,11 +504,7 @@ def _outage_edges(law: ScalarLaw) -> FloatArray:
 
 
 def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the empirical distribution of P at the end with its exact distribution function at
-    that time, for the nodes of a scalar scenario for which this is known.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
-    """
+    """Compare the distribution of a scalar P at the end with its exact law."""
     laws = _scalar_laws(samples.scenario)
     intervals = []
     for k, law in laws.items():

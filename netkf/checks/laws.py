@@ -128,9 +128,7 @@ def pool(
 
 
 def _rounding_of(P: FloatArray, start: float) -> float:
-    """Return the size of rounding errors in entries of S covariances ``P`` (S, n, n) that were
-    computed from covariances with traces up to ``start``.
-    """
+    """Return the rounding errors in entries of ``P`` (S, n, n), from traces up to ``start``."""
     return OPERATIONS * EPS * max(start, float(np.median(np.trace(P, axis1=-2, axis2=-1))))
 
 

@@ -83,10 +83,7 @@ def _make_title(rows: list[Evidence], claim: str) -> str:
 
 
 def _draw_row(axes: Any, height: int, row: Evidence) -> None:
-    """Draw the row of one promise at height ``height``: the interval of its distance from the
-    promise in units of what is tolerated, the measured distance, and the distance that the test
-    would have detected.
-    """
+    """Draw the row of one promise at height ``height``."""
     # The interval low, high of a row is of the margin, which is minus the distance.
     mark, unit = MARKS.get(row.verdict, OTHER), row.tolerance
     low, high = max(0.0, -row.high) / unit, min(max(0.0, -row.low) / unit, 2.0 * FURTHEST)

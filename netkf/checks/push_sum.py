@@ -129,11 +129,7 @@ class PushSumSamples(RunSamples):
 
 
 def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
-    """Check that exchanges conserve mass: the totals over all nodes of the push-sum weight (1) and
-    of the push-sum number (N) at the end of the runs are those of the start, up to rounding.
-
-    No interval is estimated, so that ``level`` is not used.
-    """
+    """Check that exchanges conserve mass."""
     drift = np.abs(samples.runs.drift)
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
     # Size of the compared values, of the terms whose rounding errors they inherit, and relative
@@ -149,13 +145,7 @@ def _count_exchanges(samples: PushSumSamples) -> float:
 
 
 def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
-    """Compare P of every node at the end with its limit P_inf (n, n), the steady covariance of the
-    Kalman filter that gets all readings.
-
-    The finding is ``early`` (undecided) if P computed by the filter's equations from the links of
-    these runs (``runs.replayed``) is as far from P_inf: then the horizon is too short. No interval
-    is estimated, so that ``level`` is not used.
-    """
+    """Compare P of every node at the end with that of the filter with all readings."""
     limit = push_sum_limits(with_promised_filter(samples.scenario)).P
     was_replayed = ~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])
     P, replayed = samples.runs.P[was_replayed, -1], samples.runs.replayed[was_replayed, -1]
@@ -173,12 +163,7 @@ def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
-    """Return the factor on the horizon at which P is within STEADY_TOLERANCE of its ``limit``
-    (n, n), as advice for a verdict that is undecided because the horizon is too short.
-
-    It is extrapolated from the decay of the distance of the replayed P from half of the horizon to
-    its end; nan if the distance does not decay.
-    """
+    """Return the factor on the horizon at which P is near its ``limit`` (n, n)."""
     P = samples.runs.replayed[~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])]
     half, last = (float(relative_difference(P[:, k], limit).max()) for k in (-2, -1))
     if not 0.0 < last < half < math.inf:
@@ -189,12 +174,7 @@ def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
 
 @error_test
 def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
-    """Test the null hypothesis that errors at the end have mean 0, in all directions at once.
-
-    Under it the mean of R' errors, each whitened by its exact covariance, is normal with covariance
-    I / R' at every node. The interval of the finding misses the truth with at most the probability
-    ``level``.
-    """
+    """Test the null hypothesis that errors at the end have mean 0, in all directions at once."""
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", BIAS_TOLERANCE)
     if not np.isfinite(samples.standardised).all():
@@ -216,15 +196,7 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
 @error_test
 @gaussian_test
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
-    """Test the null hypothesis that mean-square errors at the end are the exact steady ones.
-
-    Given which links of a run were up, |W e|^2 (the squared error in units of the steady
-    covariance, ``samples.ratios``) is a quadratic form of normal numbers; summed over the runs it
-    gives an interval for the factor on its expected value. The promise is broken only if mean
-    squares differ from those expected for the links of these runs; the upper limit is for their
-    distance from the steady ones. The interval of the finding misses the truth with at most the
-    probability ``level``.
-    """
+    """Test the null hypothesis that mean-square errors at the end are the exact steady ones."""
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", SQUARE_TOLERANCE)
     squares, weights = samples.ratios
@@ -253,11 +225,7 @@ def _mean_square(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
-    """Check that gamma, the number of averaging steps in a slot, of the bound of paper P Theorem 6
-    (which is to keep mean-square errors bounded) is at least the exact minimum for that.
-
-    No runs are looked at and no interval is estimated, so that ``level`` is not used.
-    """
+    """Check that gamma of P Theorem 6 is at least the exact minimum."""
     scenario = with_promised_filter(samples.scenario)
     gamma, needed = minimum_gamma(scenario, "mean-square"), exact_minimum_gamma(scenario)
     margin = float(gamma - needed)
@@ -266,13 +234,7 @@ def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _many_steps(samples: PushSumSamples, level: float) -> Finding:
-    """Check that with ever more averaging steps in a slot (gamma) the steady error covariances
-    (N, n, n), and the covariance of the noise that averaging leaves (P Lemma 4), come to their
-    limits: compute them for gamma = 1, 2, 4, ..., below MAX_STEPS, until they agree to
-    STEADY_TOLERANCE.
-
-    No runs are looked at and no interval is estimated, so that ``level`` is not used.
-    """
+    """Check that steady covariances and the noise of averaging come to their limits."""
     scenario = with_promised_filter(samples.scenario)
     limits, gamma, distance = large_gamma_limits(scenario), 1, np.inf
     noise_scale = float(np.abs(limits.noise).max())
@@ -301,9 +263,7 @@ def _many_steps(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _relative_distance(P: FloatArray, limit: FloatArray) -> float:
-    """Return the largest entry of |P - limit| over the largest entry of |limit|, for the
-    covariances ``P`` (N, n, n) of N nodes and one ``limit`` (n, n).
-    """
+    """Return the largest entry of |P - limit| over that of |limit|, of ``P`` (N, n, n)."""
     return float(np.abs(P - limit).max() / np.abs(limit).max())
 
 
@@ -449,10 +409,7 @@ class PushSumChecks(PaperChecks):
 
 
 def _every_slot(scenario: Scenario) -> Assumption:
-    """Return the assumption that every node averages its push-sum masses with its neighbours and
-    computes its gain from them in every slot (steps 2 and 3 of the push-sum paper), on which the
-    exact covariances rely: a row of the table of assumptions.
-    """
+    """Return the assumption that every node averages and gains in every slot."""
     algorithm: Any = with_promised_filter(scenario).filter.algorithm
     holds = algorithm.stop == "never" and not algorithm.asymptotic
     evidence = "exchanged for ever" if holds else "gains are frozen or taken from the limit"

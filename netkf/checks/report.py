@@ -49,9 +49,7 @@ def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: boo
 
 
 def _computed_lines(rows: list[Evidence]) -> list[str]:
-    """Return one line on ``rows`` that are computed without any run, which therefore cannot break
-    them; no line without such rows.
-    """
+    """Return one line on ``rows`` that are computed without any run, if there are any."""
     if not rows:
         return []
     listed = "; ".join(f"{row.promise} [{row.source}]: {row.verdict}" for row in rows)
@@ -60,9 +58,7 @@ def _computed_lines(rows: list[Evidence]) -> list[str]:
 
 
 def _summary_lines(verdict: Verdict) -> list[str]:
-    """Return the lines below the table: the numbers of rows by verdict, and the runs that would
-    decide the undecided ones.
-    """
+    """Return the lines below the table."""
     counts = Counter(row.verdict for row in verdict.rows)
     counted_verdicts = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
     looks = f" at all of {verdict.looks} looks" if verdict.looks > 1 else ""
@@ -78,9 +74,7 @@ def _summary_lines(verdict: Verdict) -> list[str]:
 
 
 def _broken_again(broken: list[Evidence], command: str) -> list[str]:
-    """Return lines that repeat the broken promises in short, each with the command that replays a
-    run that shows it: ``command`` followed by the number of that run.
-    """
+    """Return lines with the broken promises and the ``command`` that replays each."""
     lines = []
     for row in broken:
         values = f": seen {row.seen:.4g}, expected {row.expected:.4g}"
@@ -91,9 +85,7 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
 
 
 def _describe_row(row: Evidence) -> str:
-    """Return the text below a promise: the runs that would decide it, its measured deviation, and
-    the evidence; or the assumptions that fail, if it was not tested.
-    """
+    """Return the text below a promise."""
     if row.verdict == NOT_PROMISED:
         return row.assumptions
     parts = [f"needs about {row.needed:,} runs"] if row.needed is not None else []
@@ -108,9 +100,7 @@ def _describe_row(row: Evidence) -> str:
 
 
 def _summarise_row(row: Evidence) -> str:
-    """Return what a row says in short: the runs that would decide it, its measured deviation and
-    the smallest one that is detectable; its evidence or reason if it has no interval.
-    """
+    """Return what a row says in short."""
     if row.verdict == NOT_PROMISED or not row.low < row.high:
         return _describe_row(row)
     needed = f"needs about {row.needed:,} runs; " if row.needed is not None else ""

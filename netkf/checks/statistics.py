@@ -25,7 +25,6 @@ def affine(interval: Interval, scale: float, shift: float) -> Interval:
     """Return the interval of ``scale`` times a quantity plus ``shift``; the scale is positive."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another value and ``factor`` times the samples."""
         low, high = interval.limits((value - shift) / scale, factor)
         return scale * low + shift, scale * high + shift
 
@@ -79,10 +78,7 @@ def law_excess(
 
 
 def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatArray:
-    """Return the differences (V,) of the empirical distribution functions of two samples ``first``
-    (S,) and ``second`` (S',), at the V distinct values of both, as comparisons of distributions
-    need them; values closer than ``rounding``, or equal to DIGITS digits, are one.
-    """
+    """Return the differences (V,) of two empirical distribution functions at V values."""
     a, b = np.sort(first), np.sort(second)
     points = np.sort(np.concatenate([a, b]))
     # Neighbours that differ by rounding only are one value, represented by the largest of them.
@@ -94,18 +90,12 @@ def _ecdf_gaps(first: FloatArray, second: FloatArray, rounding: float) -> FloatA
 
 
 def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -> Interval:
-    """Return the interval of the largest of the ``gaps`` (V,) between two empirical distribution
-    functions of ``a`` and ``b`` samples, from a Dvoretzky-Kiefer-Wolfowitz band around each.
-
-    ``grow``: further runs add to the second sample too, not to the first only. The interval misses
-    the truth with at most the probability ``level``.
-    """
+    """Return the interval of the largest of ``gaps`` (V,), with a band around each sample."""
     value = max(0.0, float(gaps.max()))
     widths = band_width(a, level / 2.0), band_width(b, level / 2.0)
     width = sum(widths)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another distance and ``factor`` times the samples."""
         first, second = widths[0] / math.sqrt(factor), widths[1]
         reach = first + (second / math.sqrt(factor) if grow else second)
         return value - reach, value + reach
@@ -147,7 +137,6 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another distance and ``factor`` times the samples."""
         reach = width / math.sqrt(factor)
         return value - reach, value + reach
 
@@ -184,9 +173,7 @@ def quadratic_interval(total: float, weights: FloatArray, level: float) -> Inter
 
 
 def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
-    """Return the quantile that a sum of squares of independent standard normal numbers with
-    ``weights`` (K,) exceeds (``upper``), or stays below, with probability ``tail``.
-    """
+    """Return the quantile of a weighted sum of squares that has so much in its ``tail``."""
     # The saddle point of a value x solves K'(s) = sum w / (1 - 2 s w) = x, with K the cumulant
     # generating function. K' increases up to its pole, so that bisection over s finds the quantile.
     pole = 0.5 / float(weights.max())
@@ -208,13 +195,7 @@ def _quadratic_quantile(weights: FloatArray, tail: float, upper: bool) -> float:
 
 
 def _log_tail(weights: FloatArray, s: float) -> float:
-    """Return log P(sum > K'(s)) for s > 0, log P(sum < K'(s)) for s < 0 (Lugannani and Rice 1980),
-    for the sum of squares of standard normal numbers with ``weights`` (K,).
-
-    With r = sqrt(2 (s K'(s) - K(s))) and u = |s| sqrt(K''(s)) the probability is 1 - N(r) + n(r)
-    (1/u - 1/r), N and n the normal distribution and density; near s = 0, where 1/u - 1/r cancels,
-    1/2.
-    """
+    """Return the log of the tail of the sum at the saddle point s (Lugannani and Rice 1980)."""
     shrunk = 1.0 - 2.0 * s * weights
     value, curvature = float((weights / shrunk).sum()), float((2.0 * (weights / shrunk) ** 2).sum())
     cumulant = -0.5 * float(np.log(shrunk).sum())

@@ -60,9 +60,7 @@ def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: st
 
 
 def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str) -> None:
-    """Write scenario, results, table, text and JSON of a verdict into a directory, the JSON last:
-    it has digests of the others, and a directory without it holds no verdict.
-    """
+    """Write the files of a verdict, the JSON with their digests last."""
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
     results = io.BytesIO()
@@ -91,9 +89,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
 
 
 def _require_same(path: Path, columns: dict[str, Any], scenario: Scenario) -> None:
-    """Raise ScenarioError unless the results that are read back from the file ``path``, to which
-    runs may be added later, are those that were written.
-    """
+    """Raise ScenarioError unless the results read back are those that were written."""
     again = _result_columns(tuple(_read_results(path, scenario)))
     for name in sorted(columns.keys() | again.keys()):
         one, other = (np.asarray(part.get(name, ())) for part in (columns, again))
@@ -164,9 +160,7 @@ def _infinite_numbers(verdict: Verdict) -> list[tuple[int, str, bool]]:
 
 
 def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
-    """Return the rows (one for each promise) of the JSON ``document`` of a verdict, in which nan
-    and infinite numbers were stored as null and listed apart.
-    """
+    """Return the rows of the JSON of a verdict, with nan and infinite numbers restored."""
     rows = [dict(row) for row in document["rows"]]
     for row in rows:
         row |= {name: np.nan for name in NUMBERS if row[name] is None}
@@ -176,12 +170,7 @@ def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
 
 
 def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
-    """Return the results of all replicas as arrays, by name, for a file without pickles.
-
-    "difference", "expected" and "diverged" have a first axis over all replicas; "summary.NAME" and
-    "PART.NAME", the fields of their summaries, one over those that did not diverge. "audit.NAME"
-    have one over all replicas again.
-    """
+    """Return the results of all replicas as arrays, by name, for a file without pickles."""
     columns = {
         "difference": np.array([result.difference for result in results]),
         "expected": np.array([result.expected for result in results]),
@@ -203,9 +192,7 @@ def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]
 
 
 def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
-    """Return the results of the replicas in the file ``path``, in order: the inverse of
-    :func:`_result_columns`. The class of a summary follows from the scenario's filter.
-    """
+    """Return the results of the replicas in the file ``path``, in order."""
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
     audits = {name: columns.pop(name) for name in list(columns) if name.startswith("audit.")}

@@ -122,7 +122,6 @@ def student_interval(value: float, deviation: float, count: float, level: float)
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another mean and ``factor`` times the samples."""
         quantile = -float(scipy.special.stdtrit(factor * count - 1.0, level / 2.0))
         reach = deviation / math.sqrt(factor) * quantile
         return value - reach, value + reach
@@ -139,7 +138,6 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
     low = high = detectable = math.nan
 
     def limits(share: float, factor: float) -> tuple[float, float]:
-        """Return the Clopper-Pearson limits for another share and ``factor`` times the trials."""
         hits = min(max(share, 0.0), 1.0) * trials * factor
         missed = trials * factor - hits
         low = float(scipy.special.betaincinv(hits, missed + 1, level / 2)) if hits else 0.0
@@ -154,10 +152,7 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
 
 
 def _binomial_shift(p: float, trials: int, level: float) -> float:
-    """Return the error of a probability ``p`` that an exact two-sided binomial test at ``level``
-    detects with probability POWER, in ``trials``; the larger one of both directions, of those in
-    which an error can be so large that it is detected.
-    """
+    """Return the error of ``p`` that a binomial test finds with probability POWER."""
     # Of the rarer outcome: q rises where p > 1/2 falls.
     up = _binomial_rise(p, trials, level), _binomial_rise(1.0 - p, trials, level)
     possible = [shift for shift in up if math.isfinite(shift)]
@@ -165,9 +160,7 @@ def _binomial_shift(p: float, trials: int, level: float) -> float:
 
 
 def _binomial_rise(p: float, trials: int, level: float) -> float:
-    """Return by how much a probability must exceed ``p`` for its test to be significant with
-    probability POWER; nan if no number of successes is significant.
-    """
+    """Return by how much a probability must exceed ``p`` to be found; nan if it never is."""
     # The least number of successes that has at most the probability level / 2: by bisection.
     low, high = 0, trials + 1
     while high - low > 1:
@@ -186,7 +179,6 @@ def with_drawn(interval: Interval, sample_factor: Callable[[float], float]) -> I
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for ``factor`` times the runs, as :meth:`Interval.limits` asks."""
         actual = sample_factor(factor)
         # The caller has divided the value by sqrt(factor); it shrinks by sqrt(actual) only.
         return interval.limits(value * math.sqrt(factor / actual), actual)
@@ -206,7 +198,6 @@ def deviation_interval(expected: float, interval: Interval) -> Interval:
     side = math.copysign(1.0, interval.value - expected)
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return 0 and the largest distance for another value and ``factor`` times the samples."""
         ends = interval.limits(expected + side * value, factor)
         return 0.0, max(abs(end - expected) for end in ends)
 
@@ -229,15 +220,11 @@ def scale_interval(total: float, freedom: float, level: float) -> Interval:
     """
 
     def quantiles(freedom: float) -> tuple[float, float]:
-        """Return the quantiles of chi-square with ``freedom`` degrees, exceeded with probabilities
-        level / 2 and 1 - level / 2.
-        """
         tails = 1.0 - level / 2.0, level / 2.0
         upper, lower = (2.0 * float(scipy.special.gammaincinv(freedom / 2.0, p)) for p in tails)
         return upper, lower
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another variance and ``factor`` times the samples."""
         total_freedom = factor * freedom
         upper, lower = quantiles(total_freedom)
         return value * total_freedom / upper, value * total_freedom / lower
@@ -260,7 +247,6 @@ def correlation_interval(value: float, count: float, level: float) -> Interval:
     reach = -spread * float(scipy.special.ndtri(level / 2.0))
 
     def limits(value: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another correlation and ``factor`` times the samples."""
         centre = math.atanh(min(max(value, -1.0 + 1e-12), 1.0 - 1e-12))
         wide = reach / math.sqrt(factor)
         return math.tanh(centre - wide), math.tanh(centre + wide)
@@ -277,7 +263,6 @@ def poisson_interval(total: float, mean: float, level: float) -> Interval:
     """
 
     def limits(ratio: float, factor: float) -> tuple[float, float]:
-        """Return the limits for another ratio and ``factor`` times the runs."""
         count, expected = ratio * mean * factor, mean * factor
         low = float(scipy.special.gammaincinv(count, level / 2.0)) if count else 0.0
         high = float(scipy.special.gammaincinv(count + 1.0, 1.0 - level / 2.0))
@@ -288,10 +273,7 @@ def poisson_interval(total: float, mean: float, level: float) -> Interval:
 
 
 def _poisson_shift(mean: float, level: float) -> float:
-    """Return the relative error of the ``mean`` of a Poisson variable that Garwood's test at
-    ``level`` detects with probability POWER in one observation: the larger one of both directions,
-    of those in which an error can be so large that it is detected.
-    """
+    """Return the relative error of a ``mean`` that Garwood's test finds with probability POWER."""
     # The least count that has at most the probability level / 2, and the largest such one.
     many = math.ceil(scipy.special.pdtrik(1.0 - 0.5 * level, mean)) + 1
     few = math.floor(scipy.special.pdtrik(0.5 * level, mean)) - 1

@@ -143,15 +143,7 @@ def direction_label(link: tuple[int, int]) -> str:
 def _loss_interval(
     law: LossLaw, sent: np.ndarray, lost: np.ndarray, directions: np.ndarray, level: float
 ) -> Interval:
-    """Return an interval for the distance between the lost and the stated share of messages.
-
-    ``sent`` and ``lost`` (R, D) are counts of R runs; only ``directions`` (indices) count.
-    Independent losses of one direction have the exact limits of Clopper and Pearson. Otherwise the
-    R runs are the independent values: losses of a run less their expected number have mean 0, and
-    Student's interval applies. Where losses (or deliveries) occur in fewer than MIN_EVENTS runs,
-    their sample variance is unreliable: limits are then those of independent messages if
-    independence is stated, else those of :func:`share_of_bounded_runs`.
-    """
+    """Return an interval for the distance between the lost and the stated share of messages."""
     q, sent, lost = law.lost[directions], sent[:, directions], lost[:, directions]
     total, losses, runs = float(sent.sum()), lost.sum(axis=1), len(sent)
     excess = (lost - sent * q).sum(axis=1)
@@ -304,9 +296,7 @@ def correlation_of_runs(
 
 
 def _links_apart(law: LossLaw, counts: LossCounts, level: float) -> list[tuple[Interval, str]]:
-    """Return labelled intervals for the largest and the mean correlation of the numbers of losses
-    of two links, from their counts in the windows of all runs.
-    """
+    """Return intervals for the largest and the mean correlation of losses of two links."""
     # One direction of a link stands for both, which may share their draws.
     direction_of_link: dict[tuple[int, int], int] = {}
     for k, (i, j) in enumerate(law.links):

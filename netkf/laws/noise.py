@@ -158,12 +158,7 @@ def compare_means(
 def _with_states(
     states: FloatArray, labels: Sequence[str], level: float
 ) -> list[tuple[Interval, str]]:
-    """Return labelled intervals for the correlations of noises with states.
-
-    States within a run are correlated, so that the independent values are the sums of the products
-    over each run; their mean under the null hypothesis is 0, which makes the sum of their squares
-    an estimate of the variance.
-    """
+    """Return labelled intervals for the correlations of noises with states."""
     counts, products = states.sum(axis=0)
     squares, runs = (states[:, 1] ** 2).sum(axis=0), (states[:, 0] > 0.0).sum(axis=0)
     comparable = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
@@ -276,9 +271,7 @@ def _in_time(z: FloatArray, labels: Sequence[str]) -> Iterator[tuple[float, floa
 def _in_size(
     z: FloatArray, labels: Sequence[str], lags: Sequence[int]
 ) -> Iterator[tuple[float, float, str]]:
-    """Yield correlation, number of terms and label of each entry with itself ``lags`` steps
-    before, and of the rank of |entry| (its probability under the normal law) with that one before.
-    """
+    """Yield the same of each entry with itself before, and of its size with that before."""
     for lag in lags:
         value, count = (np.diagonal(part) for part in correlate(z[:, lag:], z[:, :-lag]))
         for k, label in enumerate(labels):

@@ -146,11 +146,7 @@ def count_ticks(
 
 
 def _lattice_ranks(law: Lattice, ticks: TickSeries, horizon: float) -> FloatArray:
-    """Return independent uniform numbers (K,) that K ticks show, nan for ticks that show none.
-
-    With a given phase they are the shares of the jitter. With a random phase, the first tick shows
-    the phase plus jitter, and pairs of neighbouring ticks after it differences of jitter.
-    """
+    """Return independent uniform numbers (K,) that K ticks show, nan for ticks that show none."""
     uniform, jitter = np.full(len(ticks.times), np.nan), law.jitter
     # The last tick is left out: jitter could have moved it beyond the end of the run.
     inner = (ticks.number < ticks.total - 1) & (jitter > 0.0)
@@ -179,9 +175,7 @@ def _sum_of_uniforms(times: FloatArray, period: float, jitter: float) -> FloatAr
 
 
 def _distance_from_lattice(law: Lattice, ticks: TickSeries) -> float:
-    """Return the largest distance in seconds of one of K ticks from its allowed times: with a
-    random phase, lateness may differ among the ticks of a clock by the jitter.
-    """
+    """Return the largest distance in seconds of one of K ticks from its allowed times."""
     ticks = TickSeries(*(column[np.isfinite(ticks.times)] for column in ticks))
     if not len(ticks.times):
         return 0.0

@@ -114,11 +114,7 @@ def table_entries(topology: Topology) -> dict[Link, float]:
 
 
 def _check_pure(watched: WatchedPart, links: dict[Link, float]) -> None:
-    """Check that delivery probabilities do not depend on earlier calls.
-
-    ``links`` are directed links with their entries in the graph's table. The same calls are made
-    in one order and in the reverse order.
-    """
+    """Check that delivery probabilities do not depend on earlier calls."""
     calls = [
         (link, message, bad, table_probability)
         for link, table_probability in links.items()
@@ -141,11 +137,7 @@ def _check_pure(watched: WatchedPart, links: dict[Link, float]) -> None:
 
 
 def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    """Check that links with equal entries in the graph's table have equal delivery probabilities.
-
-    Links may differ if the class that defines ``delivery_probability``, or one derived from it,
-    defines ``mean_delivery`` too.
-    """
+    """Check that links with equal entries in the table have equal probabilities."""
     part = watched.part
     ancestors = type(part).__mro__
     mean_owner, probability_owner = (
@@ -171,11 +163,7 @@ def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> Non
 def _check_delivery_probabilities(
     watched: WatchedPart, link: Link, table_probability: float
 ) -> None:
-    """Check that the delivery probabilities of a link are from 0 to 1, in both states of the
-    channel, and 0 or 1 if the loss is deterministic; the mean may be nan.
-
-    ``table_probability`` is the entry of the graph's table for the link.
-    """
+    """Check that the delivery probabilities of a link are from 0 to 1 in both states."""
     part, where = watched.part, f"{watched.name}.delivery_probability"
     for bad in (False, True):
         for message in (0, 1, 2, 1000):
@@ -200,9 +188,7 @@ def _check_delivery_probabilities(
 
 
 def _check_channel_state(watched: WatchedPart) -> None:
-    """Check ``next_state``: the state is True or False, each call makes the same draws (none if the
-    loss is not ``stateful``), and equal generators give equal states.
-    """
+    """Check that ``next_state`` is a bool, and that each call makes the same draws."""
     part, where = watched.part, f"{watched.name}.next_state"
     histories: list[list[Any]] = []
     for _ in range(2):
@@ -238,9 +224,7 @@ def _check_channel_state(watched: WatchedPart) -> None:
 
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
-    """Check simulated outcomes on all directed ``links``, with their entries in the graph's table,
-    against ``mean_delivery``, ``independent`` and the chain that the class states.
-    """
+    """Check simulated outcomes against ``mean_delivery``, ``independent`` and the stated chain."""
     part, where = watched.part, f"{watched.name}.mean_delivery"
     stated = np.array([part.mean_delivery(link, p) for link, p in links.items()])
     if np.isnan(stated).all() and not part.independent:
@@ -277,9 +261,7 @@ def _loss_law(part: Loss, links: tuple[Link, ...], lost: FloatArray) -> LossLaw:
 
 
 def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndarray:
-    """Return the mask (CHAINS, LENGTH, L) of the messages over L directed links that the engine
-    would lose; each link has random streams of its own.
-    """
+    """Return the mask (CHAINS, LENGTH, L) of messages that the engine would lose."""
     lost, channel = np.zeros((CHAINS, LENGTH, len(links)), dtype=bool), Channel(loss=part)
     for chain in range(CHAINS):
         streams = Streams(seed + 7, chain)
@@ -315,11 +297,7 @@ def _check_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
 
 
 def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    """Check delays against the law of the built-in class from which a class derives, unless it
-    defines ``longest`` itself.
-
-    A constant delay is compared on every link, others by DELAYS messages over all links in turn.
-    """
+    """Check delays against the law that the class states or inherits."""
     stated, part = stated_part(watched.part, "delay"), watched.part
     where = f"{watched.name}.message_delay"
     rule = f"delays must have the law of {type(stated).__name__}, from which it derives"
@@ -350,9 +328,7 @@ def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
 
 
 def _check_draws(watched: WatchedPart) -> None:
-    """Check that delays are drawn from the given generator and that neighbouring ones are
-    independent.
-    """
+    """Check that delays come from the given generator, and are independent."""
     where = f"{watched.name}.draw"
     with guard_user_code(where):
         random, other_random = (Streams(6, k).generator("delay") for k in range(2))
@@ -375,9 +351,7 @@ def _check_draws(watched: WatchedPart) -> None:
 
 
 def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    """Check ``message_delay`` on every link: from 0 to ``longest`` seconds or nan, equal to
-    ``fixed`` unless that is None, and independent of earlier calls.
-    """
+    """Check ``message_delay`` on every link."""
     part, where, longest = watched.part, f"{watched.name}.message_delay", watched.part.longest
     drawn_delay = part.fixed or 0.0
     calls = [(link, message) for link in links for message in MESSAGES]
@@ -400,9 +374,7 @@ def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None
 
 
 def _draw_delays(watched: WatchedPart) -> list[float]:
-    """Return DRAWS delays in seconds from a generator with a fixed seed; check each of them, and
-    that each takes the same calls of the generator.
-    """
+    """Return DRAWS delays in seconds from a generator with a fixed seed."""
     fixed, where, random = watched.part.fixed, f"{watched.name}.draw", RecordingGenerator(6)
     first_calls, rule = None, "must be a finite number of at least 0 seconds"
     delays: list[float] = []

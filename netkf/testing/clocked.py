@@ -56,9 +56,7 @@ class ClockTrial(Trial):
         clock: str | None,
         increments: bool,
     ) -> None:
-        """Start a trial of the ``system``: sensors give ``increments`` or samples, nodes transmit
-        by the kind of ``clock``, and ``shift`` (n,), if any, moves the truth on the way.
-        """
+        """Start a trial of the ``system``."""
         self._clock, self._increments = clock, increments
         # The drift per second in continuous time; a :class:`System` states slots of one second.
         self._A = system.M - np.eye(len(system.M))
@@ -104,9 +102,7 @@ class ClockTrial(Trial):
             self.record_end()
 
     def _check_composition(self, node: int) -> None:
-        """Check for ``node`` that a prediction over two gaps in turn equals that over their sum,
-        and that ``max_measurement_interval`` is positive.
-        """
+        """Check that a prediction over two gaps in turn equals that over their sum."""
         watched, state = self.watched, self.states[node]
         for first, second in GAPS:
             in_one_step = watched.call("predict", state, first + second)
@@ -126,9 +122,7 @@ class ClockTrial(Trial):
     def _compare_predictions(
         self, name: str, one_step: FloatArray, two_steps: FloatArray, first: float, second: float
     ) -> None:
-        """Check that the predictions of xhat (n,) or P (n, n), called ``name``, in one step of
-        ``first + second`` seconds and in two steps, are equal up to rounding.
-        """
+        """Check that predictions in one step and in two are equal up to rounding."""
         difference = float(np.abs(one_step - two_steps).max())
         size = max(float(np.abs(one_step).max()), float(np.abs(two_steps).max()), 1e-300)
         demand(
@@ -141,9 +135,7 @@ class ClockTrial(Trial):
         )
 
     def _pass_time(self, shift: bool) -> None:
-        """Predict all nodes over a random gap, with the readings of their sensors; with ``shift``
-        the truth is shifted at its end, before samples.
-        """
+        """Predict all nodes over a random gap, with the readings of their sensors."""
         max_gap = MAX_SAMPLE_GAP
         if self._increments:
             max_gap = min(MAX_INCREMENT_GAP, *(model.interval for model in self.models))
@@ -164,10 +156,7 @@ class ClockTrial(Trial):
                     self.step(node, "update", self.sample(node, self._time))
 
     def _moments(self, start: FloatArray, gap: float) -> FloatArray:
-        """Return the two moments (2 p,) of increments dy over ``gap`` seconds, as sensors give
-        them, the integrals of dy and of z dy with z from -1 to 1 over the gap: noise, plus the
-        effect of a truth that is shifted by ``start`` (n,) at the beginning.
-        """
+        """Return the two moments (2 p,) of increments of a truth that is shifted."""
         noise = self.random.normal(size=2 * len(self.system.H)) * np.sqrt(gap)
         # Integrals of H e^{A s} start over s, weighted with the Legendre polynomials 1 and z.
         effect = np.zeros((2, len(self.system.H)))
@@ -189,11 +178,7 @@ class ClockTrial(Trial):
             self._in_flight[k] = message._replace(payload=payload)
 
     def _exchange(self, k: int, reliable: bool) -> None:
-        """Let two nodes transmit in round ``k`` and all nodes absorb the messages that arrive.
-
-        Unless ``reliable``, every third message is lost and some arrive in the next round. Checks
-        that sums are conserved if no message is lost or in flight.
-        """
+        """Let two nodes transmit in round ``k`` and all nodes absorb the messages that arrive."""
         is_conserved = reliable and not self._in_flight
         before = self.conserved_sums() if is_conserved else {}
         payloads = [
@@ -214,11 +199,7 @@ class ClockTrial(Trial):
             self.check_conserved(before, "none")
 
     def _choose_transmissions(self, k: int) -> list[tuple[int, tuple[int, ...]]]:
-        """Return the senders of round ``k``, each with its receivers.
-
-        With a clock for each link both of its ends send, with one for each direction one of them;
-        otherwise two nodes broadcast to all others.
-        """
+        """Return the senders of round ``k``, each with its receivers."""
         a, b = sorted({k % len(self.nodes), (k + 1) % len(self.nodes)})
         if self._clock == "links":
             return [(a, (b,)), (b, (a,))]

@@ -93,9 +93,7 @@ def check_clock_object(part: Any, link: Link | None, seed: int) -> None:
 
 
 def _all_entities(part: Any) -> tuple[Entity, ...]:
-    """Return the entities (links, directions or nodes) of a complete graph of 4 nodes that have a
-    clock, at most MAX_ENTITIES; at least the link (0, 1).
-    """
+    """Return the entities of a complete graph of 4 nodes with a rate, or the link (0, 1)."""
     topology = Complete(nodes=4).build(seed=0)
     entities = tuple(part.entities(topology))[:MAX_ENTITIES]
     try:
@@ -108,10 +106,7 @@ def _all_entities(part: Any) -> tuple[Entity, ...]:
 
 
 def _check_entity(watched: WatchedPart, entity: Entity) -> None:
-    """Check that the ticks of the clock of one ``entity`` (a link, direction or node, by ids)
-    increase, are the same from equal generators, and do not depend on how many are asked for at
-    once.
-    """
+    """Check that the ticks of one entity increase, and do not depend on the size of blocks."""
     _check_origin(watched, entity)
     in_one_block = _read_ticks(watched, entity, BLOCKS[0])
     _check_increasing(watched, in_one_block)
@@ -136,9 +131,7 @@ def _check_entity(watched: WatchedPart, entity: Entity) -> None:
 
 
 def _check_interleaved(watched: WatchedPart, entities: tuple[Entity, ...]) -> None:
-    """Check that the ticks of the clocks of some ``entities`` (links, directions or nodes, by ids)
-    stay the same when the others tick in between.
-    """
+    """Check that ticks of entities stay the same when the others tick in between."""
     part, where = watched.part, f"{watched.name}.ticks"
     with guard_user_code(where):
         alone = [list(_iterate_ticks(part, entity, k)) for k, entity in enumerate(entities)]
@@ -161,9 +154,7 @@ def _check_interleaved(watched: WatchedPart, entities: tuple[Entity, ...]) -> No
 
 
 def _iterate_ticks(part: Any, entity: Entity, stream: int) -> Iterator[float]:
-    """Yield the first INTERLEAVED_TICKS ticks of an entity in seconds, one call each, drawn from
-    the random streams numbered ``stream``.
-    """
+    """Yield the first INTERLEAVED_TICKS ticks of an entity, one call each."""
     random = RecordingGenerator(11, stream)
     position = ClockPosition(float(part.origin(entity, lambda: RecordingGenerator(12, stream))))
     for _ in range(INTERLEAVED_TICKS):
@@ -176,9 +167,7 @@ def _iterate_ticks(part: Any, entity: Entity, stream: int) -> Iterator[float]:
 
 
 def _check_origin(watched: WatchedPart, entity: Entity) -> None:
-    """Check that the origin (the phase of the clock) is a finite number, and the same from equal
-    generators.
-    """
+    """Check that the origin is a finite number, and the same from equal generators."""
     first, second = (
         watched.call("origin", entity, lambda: RecordingGenerator(8), repeatable=False)
         for _ in range(2)
@@ -190,11 +179,7 @@ def _check_origin(watched: WatchedPart, entity: Entity) -> None:
 
 
 def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -> FloatArray:
-    """Return the ticks (K,) of the clock of an ``entity`` (a link, direction or node) in seconds,
-    asked for in ``blocks`` of these sizes, from a generator with a fixed seed.
-
-    Each block must be a float64 vector of at most its size, and empty after the clock stopped.
-    """
+    """Return the ticks (K,) of an entity, asked for in ``blocks``, from one fixed seed."""
     random = RecordingGenerator(9)
     origin = watched.part.origin(entity, lambda: RecordingGenerator(10))
     where, now, has_stopped = f"{watched.name}.ticks", 0.0, False
@@ -241,9 +226,7 @@ def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
 
 
 def _first_difference(one: FloatArray, other: FloatArray) -> int:
-    """Return the first index at which two arrays of times, ``one`` (K,) and ``other`` (K',),
-    differ; the length of the shorter one if it agrees with the longer.
-    """
+    """Return the first index at which two arrays of times differ."""
     shorter = min(len(one), len(other))
     unequal = np.flatnonzero(one[:shorter] != other[:shorter])
     return int(unequal[0]) if unequal.size else shorter
@@ -286,9 +269,7 @@ def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -
 def _draw_ticks(
     part: Any, entity: Entity, seed: int, run: int, stream: int, horizon: float
 ) -> FloatArray:
-    """Return the ticks (K,) of an ``entity`` in a ``run`` of ``seed``, from generators numbered
-    ``stream``.
-    """
+    """Return the ticks (K,) of an entity in a run, from generators numbered ``stream``."""
     streams = Streams(seed, run)
     random = streams.generator("testing", stream)
     return generate_ticks(part, entity, lambda: streams.generator("phase", stream), random, horizon)
@@ -324,9 +305,7 @@ def _check_generators_used(
 def _check_rates(
     watched: WatchedPart, group: ClockGroup, counts: TickCounts, unknown: np.ndarray, horizon: float
 ) -> None:
-    """Check the rates of all clocks together and of each; those of ``unknown`` rate (E,) with the
-    median of all.
-    """
+    """Check the rates of all clocks together and of each."""
     where, rule = f"{watched.name}.mean_rate", "must be the mean ticks per second in the long run"
     ticks, distances = counts.ticks.sum(axis=1), []
     slack = slack_of_start(group, ticks)
@@ -348,9 +327,7 @@ def _check_gaps(
     times: list[list[FloatArray]],
     horizon: float,
 ) -> None:
-    """Check gaps against their stated law, and neighbouring ones for independence; of a lattice
-    the times of ticks, the jitter and the phases.
-    """
+    """Check gaps against their stated law, and neighbouring ones for independence."""
     law, part, where = group.gaps[0], watched.part, f"{watched.name}.ticks"
     parent = f"{type(stated_part(part, 'activation')).__name__}, from which it derives"
     rule, remedy = f"gaps must have the law of {parent}", STATE_IT

@@ -64,9 +64,7 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
 
 
 def _check_class_variables(watched: WatchedPart) -> None:
-    """Check the types and values of the class variables by which a user's filter states what it
-    does, such as ``clocks``; ``watched`` is the filter.
-    """
+    """Check types and values of the class variables that state what a filter does."""
     part, name = watched.part, watched.name
     for flag in FLAGS:
         value = getattr(part, flag)
@@ -84,10 +82,7 @@ def _check_class_variables(watched: WatchedPart) -> None:
 
 
 def _check_schedule(watched: WatchedPart) -> None:
-    """Check the schedule of a user's filter in slots: the names and order of the phases of a slot
-    ("predict", "sense", "exchange"), the number of steps of each exchange, and that in its first
-    step it is drawn anew which links are up.
-    """
+    """Check the schedule of a user's filter in slots."""
     schedule, where = watched.part.schedule, f"{watched.name}.schedule"
     are_phases = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
     text = ", ".join(f'"{phase}"' for phase in PHASES)
@@ -110,9 +105,7 @@ def _check_schedule(watched: WatchedPart) -> None:
 
 
 def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
-    """Check that ``predicts`` is True if the schedule has "predict" after "sense", and False if
-    before.
-    """
+    """Check that ``predicts`` says if the schedule predicts after it senses."""
     if not {"predict", "sense"} <= set(schedule):
         return
     predicts = schedule.index("sense") < schedule.index("predict")
@@ -126,9 +119,7 @@ def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
 
 
 def _check_weights(watched: WatchedPart) -> None:
-    """Check the weights of messages: the matrix ``pair_weights``, or ``weight`` for all pairs of
-    degrees up to MAX_DEGREE, which are from 0 to 1 and sum to at most 1 at a node.
-    """
+    """Check the weights of messages."""
     part, where = watched.part, f"{watched.name}.weight"
     largest_degree = watched.call("largest_degree")
     demand(
@@ -157,11 +148,7 @@ def _check_weights(watched: WatchedPart) -> None:
 
 
 def _check_pair_weights(watched: WatchedPart, weights: FloatArray) -> None:
-    """Check that a matrix of ``weights`` (N, N) is square, not negative, and that its columns sum
-    to at most 1.
-
-    Entry (l, i) is the weight that node i gives to what node l sends.
-    """
+    """Check that ``weights`` (N, N) are not negative, and that columns sum to at most 1."""
     where = f"{watched.name}.pair_weights"
     is_square = weights.ndim == 2 and weights.shape[0] == weights.shape[1]
     demand(is_square, where, "must be a square matrix", str(weights.shape))

@@ -101,11 +101,7 @@ def _check_recorded(part: RecordedSlots, name: str) -> None:
 
 
 def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: int) -> None:
-    """Check the matchings (pairs of nodes that exchange in a slot) that a user's class draws on one
-    graph with ``seed``: form, repeatability, frequencies, independence of slots.
-
-    ``copy`` is the object after pickling, which must draw the same.
-    """
+    """Check the matchings of one graph: form, repeatability, frequencies, independence."""
     part, where = watched.part, f"{watched.name}.draw"
     first = watched.call("draw", topology, _make_generator(seed, 0), repeatable=False)
     demand(isinstance(first, list), where, "must return a list of pairs", first)
@@ -135,11 +131,7 @@ def _make_generator(seed: int, run: int) -> np.random.Generator:
 def _draw_matchings(
     part: Any, topology: Topology, where: str, random: np.random.Generator, slots: int
 ) -> np.ndarray:
-    """Draw the matchings of ``slots`` slots and return a mask (slots, L) of the paired links.
-
-    Checks that the pairs are links and that no node is in two pairs; messages blame the method
-    ``where``.
-    """
+    """Draw the matchings of ``slots`` slots and return a mask (slots, L) of the paired links."""
     index = {link: k for k, link in enumerate(topology.links)}
     is_paired = np.zeros((slots, len(index)), dtype=bool)
     # Indices of the links of each matching: most are drawn many times, and checked once.
@@ -158,18 +150,14 @@ def _draw_matchings(
 
 
 def _demand_matching(where: str, pairs: list[Link], slot: int) -> None:
-    """Raise AssertionError, which blames the method ``where``, if a node is in two of the ``pairs``
-    of a slot.
-    """
+    """Raise AssertionError if a node is in two of the ``pairs`` of a slot."""
     nodes = [node for pair in pairs for node in pair]
     if len(set(nodes)) < len(nodes):
         fail(where, "must have every node in one pair at most", f"{list(pairs)} in slot {slot}")
 
 
 def _stated_mean(watched: WatchedPart, topology: Topology) -> FloatArray | None:
-    """Return the probabilities (L,) that ``mean`` of the class states for the links; None if it
-    raises ScenarioError. Checks the form of the mean matching (N, N).
-    """
+    """Return the probabilities (L,) that ``mean`` of the class states for the links."""
     where, size = f"{watched.name}.mean", len(topology.nodes)
     try:
         mean = watched.part.mean(topology)
@@ -193,11 +181,7 @@ def _stated_mean(watched: WatchedPart, topology: Topology) -> FloatArray | None:
 def _check_frequencies(
     watched: WatchedPart, topology: Topology, is_paired: np.ndarray, mean: FloatArray | None
 ) -> None:
-    """Check how often links are paired, ``is_paired`` (slots, L), against the stated ``mean`` (L,),
-    and that slots up to MAX_LAG apart are independent.
-
-    Without a mean, all links of a symmetric graph must be paired equally often.
-    """
+    """Check ``is_paired`` (slots, L) against ``mean`` (L,), and slots for independence."""
     where, links, runs = f"{watched.name}.draw", topology.links, len(is_paired) // RUN
     graph = f"on {len(topology.nodes)} nodes and {len(links)} links"
     rule = "must pair links as often as mean says"

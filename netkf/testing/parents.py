@@ -80,9 +80,7 @@ def _with_weights(watched: WatchedPart, weights: FloatArray) -> WatchedPart:
 
 
 def _forbid_transposed(name: str, child: WatchedPart, parent: WatchedPart) -> None:
-    """Raise AssertionError if a filter has the numbers of its ``parent`` with the rows and columns
-    of the matrix of weights exchanged, which is a mistake also where it differs by design.
-    """
+    """Refuse weights that are those of the parent with rows and columns exchanged."""
     weights = getattr(parent.part, "weights", None)
     if not isinstance(weights, np.ndarray) or np.array_equal(weights, weights.T):
         return
@@ -120,10 +118,7 @@ def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | 
 
 
 def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield pairs of trials of a user's filter and of the built-in one that it derives from, with
-    the same systems, readings and messages, each with the unit of its time, "slot" or "round". A
-    trial is a short run of the filter at a few connected nodes.
-    """
+    """Yield pairs of equal trials of a filter and of its parent, with the unit of their time."""
     parts = child.part, parent.part
     slots = None
     if all(part.schedule is not None for part in parts):
@@ -149,12 +144,7 @@ def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Tria
 def _clock_trial_pairs(
     child: WatchedPart, parent: WatchedPart, system: System, clock: str | None
 ) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield pairs of trials (short runs at a few nodes) of a user's filter and of the built-in one
-    that it derives from in continuous time, with samples and, if both filters take them, with
-    increments; each with "round", the name of a trial's unit of time.
-
-    ``clock`` is the kind of clock by which nodes transmit, None if filters send no messages.
-    """
+    """Yield such pairs in continuous time, with samples and with increments."""
     # The clock "readings" ticks when a node has taken a sample.
     needs_samples = child.part.needs_samples or parent.part.needs_samples or clock == "readings"
     for increments in (False,) if needs_samples else (False, True):

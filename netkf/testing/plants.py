@@ -102,9 +102,7 @@ def check_plant_object(part: Any, seed: int) -> None:
 
 
 def _check_form(part: Any, name: str) -> None:
-    """Check the shapes of the matrices of a plant, and that ``start_cov`` is a covariance; ``name``
-    is the class in messages.
-    """
+    """Check the shapes of the matrices of a plant, and that ``start_cov`` is a covariance."""
     n = part.n
     matrix = part.F if isinstance(part, LinearPlant) else getattr(part, "A", np.zeros((n, n)))
     fits = isinstance(n, int) and matrix.shape == (n, n)
@@ -119,9 +117,7 @@ def _check_form(part: Any, name: str) -> None:
 
 
 def _move_start(part: Any) -> tuple[Any, FloatArray] | None:
-    """Return a copy of the plant with another mean of x(0), and the difference (n,) of the means;
-    None if its class has no parameter for the mean.
-    """
+    """Return the plant with another mean of x(0), and the difference (n,); or None."""
     mean = part.start_mean + 3.0 * (1.0 + np.sqrt(np.diag(part.start_cov)))
     try:
         moved = dataclasses.replace(part, mean=mean)
@@ -137,9 +133,7 @@ def _make_generator(seed: int, run: int, purpose: str = "plant") -> np.random.Ge
 
 
 def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> None:
-    """Check that two paths (K, n) from equal streams are equal; messages blame the method
-    ``where``, and ``when`` says in them how the ``other`` path was drawn.
-    """
+    """Check that two paths (K, n) from equal streams are equal."""
     difference = scaled_difference(one, other)
     demand(
         difference <= ROUNDING,
@@ -153,11 +147,7 @@ def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> N
 def _demand_moved(
     where: str, x: FloatArray, moved: FloatArray, Phi: FloatArray, offset: FloatArray, law: str
 ) -> None:
-    """Check that a path from a start moved by ``offset`` (n,), ``moved`` (K, n), differs from the
-    path ``x`` (K, n) by the transition matrices ``Phi`` (K, n, n) times the offset.
-
-    In messages ``where`` is the method to blame and ``law`` the name of these matrices.
-    """
+    """Check that ``moved`` (K, n) is ``x`` plus ``Phi`` (K, n, n) times ``offset`` (n,)."""
     expected = Phi @ offset
     error = np.abs(moved - x - expected)
     worst = int(error.max(axis=1).argmax())
@@ -177,11 +167,7 @@ def _check_starts(
     start: Callable[[np.random.Generator], FloatArray],
     is_inherited: bool,
 ) -> None:
-    """Check mean (n,) and covariance (n, n) of x(0) (n,), which ``start`` draws from a generator.
-
-    ``where`` is the method that messages blame, ``seed`` that of the generators. ``is_inherited``
-    says that the class does not override the method behind ``start``.
-    """
+    """Check mean and covariance of x(0), which ``start`` draws from a generator."""
     whitening = whiten(part.start_cov)
     count = STARTS if len(whitening.factor) else FEW_STARTS
     with guard_user_code(where):
@@ -216,11 +202,7 @@ def _draw_starts(
     is_inherited: bool,
     count: int,
 ) -> Sequence[FloatArray]:
-    """Return ``count`` draws of x(0) (n,), with generators of ``seed``.
-
-    They are drawn all at once if the class overrides neither ``start`` (``is_inherited``) nor
-    ``starts`` and both give the same first values.
-    """
+    """Return ``count`` draws of x(0) (n,), with generators of ``seed``."""
     random = _make_generator(seed, 0)
     first = [start(random) for _ in range(min(count, FEW_STARTS))]
     if is_inherited and type(part).starts is Plant.starts:
@@ -235,12 +217,7 @@ def _draw_starts(
 def _check_noise(
     noise: FloatArray, S: FloatArray, states: FloatArray, labels: NoiseLabels, rule: str
 ) -> None:
-    """Check the noise of a user's plant: ``noise`` (R, K, q) of K steps of R runs, with the
-    ``states`` (R, K, n) before each.
-
-    It must be white with the covariance S (q, q), and independent of the states. ``rule`` is the
-    message if it is not 0 in the directions in which S has no noise.
-    """
+    """Check the noise of a user's plant."""
     whitening = whiten(S)
     size = 1.0 + float(np.abs(states).max())
     error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size
@@ -260,12 +237,7 @@ def _check_noise(
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
-    """Check a user's plant in slots: repeatable paths, also if states are kept relative to a moving
-    origin (in frames), the law of x(0) and that of the noise.
-
-    ``copy`` is the plant after pickling, ``name`` the class in messages, ``seed`` that of the
-    random generators.
-    """
+    """Check a user's plant in slots."""
     where = f"{name}.truth"
 
     def draw_path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
@@ -307,12 +279,7 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
 
 
 def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any) -> None:
-    """Check the ``truth`` of a run with moving frames against its ``path`` (K, n) without them.
-
-    A frame is a part of a run in which states are kept as differences from an origin, so that large
-    states lose no digits. Absolute states must be those of the path, and local states the same less
-    the origin of the frame, which moves by F and is the state where the frame begins.
-    """
+    """Check the ``truth`` of a run with moving frames against its ``path`` (K, n) without them."""
     frame = truth.frame_slots
     origin = np.zeros(part.n)
     for slot, x in enumerate(path):
@@ -360,13 +327,7 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
 
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:
-    """Check a user's plant in continuous time: x(0), paths at sample times (of sensors) and probe
-    times (at which the state is only looked at), and paths on the sensing grid, the regular times
-    at which continuous sensors read.
-
-    ``copy`` is the plant after pickling, ``name`` the class in messages, ``seed`` that of the
-    random generators.
-    """
+    """Check a user's plant in continuous time."""
     speed, growth = float(np.abs(eigenvalues(part.A)).max()), growth_rate(part.A)
     time_constant = 1.0 / speed if speed > 0.0 else 1.0
     max_seconds = MAX_LOG_GROWTH / growth if growth > 0.0 else math.inf
@@ -381,14 +342,7 @@ def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> 
 def _check_sampled(
     part: Diffusion, copy: Diffusion, where: str, seed: int, scale: tuple[float, float]
 ) -> None:
-    """Check paths at sample and probe times: repeatable, the same without probes, and with noise of
-    the stated law.
-
-    part, copy : the plant, and the same after pickling
-    where      : method that messages blame, such as ``MyPlant.sampled_truth``
-    seed       : that of the random generators
-    scale      : time constant of the plant, and the longest run without loss of digits, in seconds
-    """
+    """Check paths at sample and probe times."""
     time_constant, max_seconds = scale
     times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
     # At least eight times, two for each gap, however fast the plant grows.
@@ -400,9 +354,6 @@ def _check_sampled(
     def draw_path(
         plant: Any, at: FloatArray, run: int = 0, probes: FloatArray = probe_times
     ) -> FloatArray:
-        """Return the states (1 + K, n) of a ``run`` at time 0 and at K times ``at`` (K,) in
-        seconds, if the state is probed at the times ``probes``.
-        """
         randoms = [_make_generator(seed, run, purpose) for purpose in ("plant", "probe")]
         truth = call_user_function(
             where, plant.sampled_truth, *randoms, sample_times, probes, horizon
@@ -438,23 +389,13 @@ def _check_sampled(
 
 
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
-    """Check the first ``steps`` steps of a plant's paths on the sensing grid, the times at which
-    continuous sensors read: they are the same for several runs at once and for one, with steps cut
-    in between and without, and have noise of the stated law.
-
-    ``name`` is the class in messages, ``seed`` that of the random generators.
-    """
+    """Check paths on the sensing grid: alone or not, cut or not, and the law of their noise."""
     where, period = f"{name}.paths", float(part.sensing_period or 0.0)
     blocks = -(-steps // BLOCK)
     probe_times = period * np.array([1.3, 4.0, 5.5, 5.7])
     sample_times = period * np.array([2.5, 5.6])
 
     def draw_paths(runs: Sequence[int], cut: bool = False) -> Any:
-        """Return what the plant's ``paths`` gives for the first ``blocks`` blocks of BLOCK steps of
-        the grid, for R ``runs`` (their numbers): one piece for each step, but with ``cut`` steps
-        are divided at the probe and sample times. Its fields ``x_start`` and ``x_end`` (R, pieces,
-        n) are the states at both ends of each piece.
-        """
         plant_normals, probe_normals, sample_normals = (
             GeneratorNormals([_make_generator(seed, run, purpose) for run in runs])
             for purpose in ("plant", "probe", "samples")
@@ -499,14 +440,7 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
 def _check_one_path(
     part: Diffusion, where: str, cut: Any, times: tuple[FloatArray, FloatArray], seed: int
 ) -> None:
-    """Check that the plant's method ``path``, which draws one run, gives the states of ``cut``, the
-    block that its ``paths`` drew for the same run (number 1) with the same ``seed``.
-
-    where : method that messages blame
-    cut   : block of the run, whose K'' pieces end at the times ``end`` (K'',) in the states
-            ``x_end`` (1, K'', n)
-    times : its probe and sample times (K,) and (K',) in seconds
-    """
+    """Check that ``path`` of one run gives the states of ``cut``, drawn by ``paths``."""
     plant_random, probe_random, sample_random = (
         _make_generator(seed, 1, purpose) for purpose in ("plant", "probe", "samples")
     )

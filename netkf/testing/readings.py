@@ -150,9 +150,7 @@ class IncrementReader:
     def _read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
     ) -> IncrementPieces:
-        """Return the increments that ``node`` reads over ``steps`` steps at the constant state
-        ``x`` (n,), ``cut`` or not, as :meth:`read_pieces` but without its guard of the user's code.
-        """
+        """Return the pieces as :meth:`read_pieces`, without its guard."""
         plant = Diffusion(
             mean=x, A=np.zeros((self.n, self.n)), B=np.zeros((self.n, 1)), sensing_period=STEP
         )

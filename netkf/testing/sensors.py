@@ -121,21 +121,14 @@ def check_sensor_object(part: Any, seed: int) -> None:
 
 
 def _make_states(seed: int, count: int, n: int, run: int = 0) -> FloatArray:
-    """Return random states (count, n) at which sensors are read, others for each ``run`` of
-    ``seed``.
-    """
+    """Return random states (count, n) at which sensors are read, others for each run."""
     return 3.0 * Streams(seed, run).generator("testing").normal(size=(count, n))
 
 
 def _check_same_readings(
     reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    """Check that readings depend only on their random streams, numbers and states: they stay the
-    same if others are read in between, if some are left out or taken together, and for ``copy``,
-    which reads the sensor after pickling. A path gives the readings of one node in one run.
-
-    ``nodes`` are ids of nodes with the sensor; ``seed`` is that of states and streams.
-    """
+    """Check that readings depend only on their random streams, numbers and states."""
     node, streams, x = nodes[0], Streams(seed), _make_states(seed, SHORT_LENGTH, reader.n)
     numbers = list(range(SHORT_LENGTH))
     series = reader.read_several(reader.make_path(streams, node), numbers, x)
@@ -169,9 +162,7 @@ def _check_same_readings(
 def _demand_equal(
     reader: SensorReader, one: ReadingSeries, other: ReadingSeries, when: str
 ) -> None:
-    """Check that two series of readings are equal; ``when`` says in messages how the second one was
-    taken.
-    """
+    """Check that two series of readings are equal."""
     for name, a, b in zip(("readings", "matrices H"), one, other, strict=True):
         difference = scaled_difference(a, b)
         demand(
@@ -194,10 +185,7 @@ def _select(series: ReadingSeries, ks: list[int]) -> ReadingSeries:
 
 
 def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
-    """Check that another state changes a reading of ``node`` by H times the difference, and does
-    not change H, which is that of the sensor unless it is ``varying``; states are drawn with
-    ``seed``.
-    """
+    """Check that another state changes a reading by H times the difference."""
     streams, numbers = Streams(seed), list(range(LENGTH))
     x, other_x = (_make_states(seed, LENGTH, reader.n, run) for run in (0, 1))
     series = reader.read_several(reader.make_path(streams, node), numbers, x)
@@ -225,11 +213,7 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
 
 
 def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None:
-    """Check that the noise of readings is white with the stated R, for all ``nodes`` together and
-    for each; that it is uncorrelated between nodes; and that it does not depend on a varying H.
-
-    Runs are simulated with ``seed``.
-    """
+    """Check that noise is white with the stated R, independent of nodes and a varying H."""
     labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     runs = max(2, READINGS // (LENGTH * len(nodes)))
     factor = whiten(reader.sensor.R).factor
@@ -254,12 +238,7 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
 
 
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
-    """Check the two moments of the increments dy (integrals over a time) that ``node`` (its id)
-    reads: those over pieces of steps add up to those of the steps, equal streams give equal ones,
-    another state changes them by H times its integral, and their noise is white.
-
-    ``seed`` is that of states and streams.
-    """
+    """Check that increments add up, are repeatable, move by H x, and have white noise."""
     x, other_x = _make_states(seed, 2, reader.n)
     streams = Streams(seed)
     cut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
@@ -296,9 +275,7 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
 
 
 def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
-    """Check that the noise of increments of ``node`` (its id) at the constant state ``x`` (n,) is
-    white with the stated R (p, p), in RUNS runs of STEPS steps with ``seed``.
-    """
+    """Check that the noise of increments at the state ``x`` (n,) is white with R."""
     factor = whiten(reader.sensor.R).factor
     whitened = []
     for run in range(RUNS):
@@ -316,11 +293,7 @@ def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, se
 def _check_regressors(
     sensor: RegressorSensor, reader: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    """Check that H is C s, with s[k+1] = A s[k] + B xi and s[0] = ``start``: mean and covariance of
-    H in each slot, independence of the noise of readings and of two of the ``nodes`` (ids).
-
-    ``seed`` is that of the streams.
-    """
+    """Check that H is C s, with s[k+1] = A s[k] + B xi and s[0] = ``start``."""
     slots, x = range(REGRESSOR_SLOTS), np.zeros((REGRESSOR_SLOTS, reader.n))
     pair = nodes[:2]
     H = np.empty((len(pair), REGRESSOR_RUNS, REGRESSOR_SLOTS, reader.n))
@@ -357,9 +330,7 @@ def _check_regressors(
 
 
 def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: NoiseLabels) -> None:
-    """Check the noise s[k+1] - A s[k] of H = C s, from ``H`` (runs, slots, n), if s (m,) follows
-    from H: C (n, m) has full column rank.
-    """
+    """Check the noise s[k+1] - A s[k] of H = C s, from ``H`` (runs, slots, n)."""
     m = len(sensor.A)
     if len(sensor.C) < m or np.linalg.cond(sensor.C) > 1e6:
         return
@@ -371,11 +342,7 @@ def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: Noise
 
 
 def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the sample times of a sensor at ``nodes`` (ids): inside the run, increasing, the same
-    from equal streams, independent of the length of the run, and as many as the clock states.
-
-    ``name`` is the class in messages, ``seed`` that of the streams.
-    """
+    """Check the sample times of a sensor at ``nodes`` (ids)."""
     where, horizon = f"{name}.sample_times", 30.0
     rate = sensor.sampling.mean_rate((nodes[0], 0)) if isinstance(sensor.sampling, Clock) else 1.0
     if rate > 0.0:
@@ -399,11 +366,7 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
 
 
 def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the number of samples of many runs against the mean rate of the clock, if it has one.
-
-    ``nodes`` are ids, runs have the seeds ``seed`` + 1, + 2, ..., and messages blame the method
-    ``where``.
-    """
+    """Check the number of samples of many runs against the rate of the clock."""
     rate = sensor.sampling.mean_rate((nodes[0], 0))
     if not rate > 0.0:
         return
@@ -422,9 +385,7 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
 
 
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
-    """Return the sample times (K,), in seconds, of the sensor at ``node`` (its id) in a run of
-    ``horizon`` seconds with ``seed``; the method ``where`` must return them as a float64 vector.
-    """
+    """Return the sample times (K,) at ``node`` in a run of ``horizon`` seconds."""
     streams = Streams(seed)
 
     def generator(purpose: str) -> np.random.Generator:
@@ -438,11 +399,7 @@ def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -
 
 
 def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
-    """Check that ``h`` and ``jacobian`` depend on the state and the node alone, have shapes that
-    fit R, and that the Jacobian has the derivatives of ``h``.
-
-    ``name`` is the class in messages, ``seed`` that of the states tried.
-    """
+    """Check ``h`` and ``jacobian``: a function of state and node, shapes, and derivatives."""
     positions = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
     sensor = sensor.located(positions)
     p, n = len(sensor.R), _find_state_size(sensor, name)
@@ -468,9 +425,7 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
 
 
 def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
-    """Return the smallest number of states, up to MAX_STATES, that ``h`` and ``jacobian`` accept;
-    raises AssertionError, which names the class by ``name``, if there is none.
-    """
+    """Return the smallest number of states, up to MAX_STATES, that the sensor accepts."""
     failure = ""
     for n in range(1, MAX_STATES + 1):
         try:
@@ -483,18 +438,14 @@ def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
 
 
 def _accepts_state_size(sensor: NonlinearSensor, n: int) -> bool:
-    """Return True if ``h`` and ``jacobian`` of a sensor accept states of n components; they may
-    raise what they like for others.
-    """
+    """Return True if ``h`` and ``jacobian`` of a sensor accept states of n components."""
     sensor.check_state(n)
     sensor.h(np.ones(n), sensor.nodes[0])
     return np.shape(sensor.jacobian(np.ones(n), sensor.nodes[0]))[-1:] == (n,)
 
 
 def _derivative_error(sensor: NonlinearSensor, node: int, x: FloatArray, J: FloatArray) -> float:
-    """Return the largest absolute difference of a Jacobian ``J`` (p, n) at the state ``x`` (n,)
-    from central differences of ``h``.
-    """
+    """Return the largest error of ``J`` (p, n) at ``x`` (n,), by differences of ``h``."""
     numerical = np.empty_like(J)
     for k, step in enumerate(np.eye(len(x)) * DERIVATIVE_STEP):
         ahead, behind = (np.asarray(sensor.h(x + sign * step, node)) for sign in (1.0, -1.0))

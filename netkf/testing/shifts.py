@@ -51,9 +51,7 @@ def check_shift(watched: WatchedPart, trials: Sequence[Trial]) -> None:
 
 
 def _compare_trials(watched: WatchedPart, trial: Trial, shifted: Trial) -> None:
-    """Check that the estimates of a ``trial`` (a short run of the user's filter at a few nodes)
-    equal those of the same trial with a shifted truth, from which the shift is subtracted already.
-    """
+    """Check that estimates are those with a shifted truth, less the shift."""
     # The shift itself adds an estimate of each node.
     others = [estimate for estimate in shifted.estimates if estimate.after != "shift"]
     for one, other in zip(trial.estimates, others, strict=True):
@@ -82,7 +80,5 @@ def estimate_differences(
 
 
 def _largest_difference(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest absolute difference of two arrays of one shape, such as xhat (n,) or P
-    (n, n).
-    """
+    """Return the largest absolute difference of two arrays of one shape."""
     return float(np.abs(one - other).max())

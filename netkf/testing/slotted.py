@@ -61,12 +61,7 @@ class SlotTrial(Trial):
                 self._advance(kind, slot)
 
     def _advance(self, kind: str, slot: int) -> None:
-        """Run the phase ``kind``, "predict" or "sense", of a ``slot``, and move the shift of the
-        truth with it.
-
-        Without a phase "predict", ``update`` also predicts: before the reading is used, or after it
-        if the filter ``predicts``.
-        """
+        """Run the phase ``kind`` of a slot, and move the shift of the truth with it."""
         part = self.part
         update_predicts = kind == "sense" and "predict" not in part.schedule
         if kind == "predict" or (update_predicts and not part.predicts):
@@ -82,9 +77,7 @@ class SlotTrial(Trial):
             self.step(node, "update", reading)
 
     def _exchange(self, exchange: Exchange, lost: bool) -> None:
-        """Run one step of an exchange of messages at all nodes, with all messages ``lost`` or none,
-        and check that the sums over the nodes that the filter calls ``conserved`` do not change.
-        """
+        """Run a step of an exchange at all nodes; ``conserved`` sums must be kept."""
         before = self.conserved_sums()
         payloads = {node: self.emit(node, exchange) for node in self._talking_nodes(exchange.slot)}
         for node, senders in enumerate(self._choose_senders(exchange.slot)):
@@ -98,18 +91,14 @@ class SlotTrial(Trial):
         self.check_conserved(before, "all" if lost else "none")
 
     def _choose_senders(self, slot: int) -> list[list[int]]:
-        """Return the senders whose messages each node receives: all others, or, if messages are
-        pairwise, its partner in this slot.
-        """
+        """Return the senders whose messages each node receives."""
         if not self.part.pairwise:
             return [[k for k in self.nodes if k != node] for node in self.nodes]
         pair = self._talking_nodes(slot)
         return [[k for k in pair if k != node] if node in pair else [] for node in self.nodes]
 
     def _talking_nodes(self, slot: int) -> list[int]:
-        """Return the nodes that send: all of them, or, if messages are pairwise, the pair of this
-        slot.
-        """
+        """Return the nodes that send: all, or the pair of this slot."""
         count = len(self.nodes)
         if not self.part.pairwise:
             return list(self.nodes)

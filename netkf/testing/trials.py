@@ -45,11 +45,7 @@ class Trial(ABC):
     def __init__(
         self, watched: WatchedPart, system: System, shift: FloatArray | None = None
     ) -> None:
-        """Start the user's filter, ``watched.part``, at each of 2 or 3 connected nodes; all but
-        node 1 have the sensor of the ``system`` (n states).
-
-        ``shift`` (n,), if any, moves the truth during the run.
-        """
+        """Start the user's filter, ``watched.part``, at each of 2 or 3 connected nodes."""
         self.watched, self.part, self.system = watched, watched.part, system
         self.random = Streams(0).generator("testing")
         self.estimates: list[CheckedEstimate] = []
@@ -79,10 +75,7 @@ class Trial(ABC):
         """
 
     def _start(self, node: int, models: Sequence[Any]) -> Any:
-        """Return the state that the filter's ``init`` makes for a node at time 0, from its model
-        and what it is told of the network; ``models`` are those of all nodes. Its estimate is
-        checked and recorded.
-        """
+        """Return the state that ``init`` makes for a node at time 0."""
         degree = len(self.nodes) - 1
         own_weight = max(0.0, 1.0 - float(self.weights[:, node].sum()))
         information = np.stack([model.information for model in models])
@@ -190,11 +183,7 @@ class Trial(ABC):
 
 
 def _make_network(part: Any) -> tuple[range, FloatArray]:
-    """Return the nodes and weights (N, N) of a complete graph for a filter.
-
-    N is the size of ``pair_weights`` if the filter has them, else 3, or 2 if its weights allow only
-    one link at a node. Entry [l, i] is the weight that node i gives to messages of node l.
-    """
+    """Return the nodes and weights (N, N) of a complete graph for a filter."""
     weights = part.pair_weights
     if weights is None:
         count = 3 if part.largest_degree() >= 2.0 else 2

@@ -100,11 +100,7 @@ def collect_leaves(value: Any) -> Leaves:
 def _add_leaves(
     members: Iterable[tuple[str, Any]], path: str, ancestors: set[int], leaves: Leaves
 ) -> None:
-    """Add copies of the numbers, texts and arrays (leaves) in the ``members`` (name, value) of the
-    value at ``path`` to ``leaves``, by their paths.
-
-    ``ancestors`` are the ids of the values that contain the members, so that cycles end.
-    """
+    """Add copies of the leaves of ``members``; ``ancestors`` are ids that end cycles."""
     # Most members are leaves: a call for each of them would take a third of a check.
     for name, member in members:
         if type(member) in _PLAIN:
@@ -122,9 +118,7 @@ def _add_leaves(
 
 
 def _list_members(value: Any) -> Iterable[tuple[str, Any]]:
-    """Return the members of a value, each with the text that it adds to a path: items of
-    collections, fields of tuples and dataclasses, else attributes.
-    """
+    """Return the members of a value, each with the text that it adds to a path."""
     fields = getattr(value, "_fields", None)
     if fields is not None:
         return [(f".{name}", getattr(value, name)) for name in fields]
@@ -193,11 +187,7 @@ def _python_generator() -> Any:
 
 @cache
 def _python_state_address() -> int | None:
-    """Return the address of the state of Python's global generator in memory: its position, then
-    624 words.
-
-    None if this interpreter lays out the object otherwise: the memory must agree with ``getstate``.
-    """
+    """Return the address of the state of Python's global generator in memory."""
     header, size = object.__basicsize__, random.Random.__basicsize__
     if sys.implementation.name != "cpython" or size < header + MERSENNE_BYTES:
         return None
@@ -282,11 +272,7 @@ class WatchedPart:
         return {path.strip("[]'"): leaf for path, leaf in collect_leaves(attributes).items()}
 
     def _call_method(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
-        """Call a method with these ``arguments`` and return the result.
-
-        Raises AssertionError, which blames ``where``, if the method fails or uses a global
-        generator.
-        """
+        """Call a method with these ``arguments`` and return the result."""
         before = global_generator_states()
         try:
             result = getattr(self.part, method)(*arguments)

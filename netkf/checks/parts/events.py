@@ -279,12 +279,7 @@ def delays_of(scenario: Scenario, run: Run) -> DelayCounts | None:
 def _follow_messages(
     scenario: Scenario, run: Run, arrivals: np.ndarray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Return for each of the K messages of a run that are not lost the time (K,) of sending, the
-    index (K,) of its direction, and the seconds (K,) that it takes: inf if it is under way when the
-    run ends. They are in order of direction and number; ``arrivals`` are the rows of the log.
-
-    Where both directions of a link share their draws, one stands for both.
-    """
+    """Return times of sending, directions and ages (K,) of messages that are not lost."""
     indices, log, law = direction_indices(scenario), run.log, loss_law(scenario)
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
     width = int(sends["message"].max(initial=0)) + 1

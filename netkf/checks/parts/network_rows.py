@@ -126,9 +126,7 @@ def _drawn_counts(draw: Draw, scenario: Scenario, seed: int, first: int, count: 
 
 
 def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
-    """Return the number of further replicas, beside ``runs`` simulated runs, in which only the
-    clocks are drawn, so that a rate that is off by WANTED_RATE would be detected.
-    """
+    """Return the number of replicas of clocks alone that reveal an error WANTED_RATE."""
     ticks = group.rates * horizon
     further = min(
         math.ceil(ENOUGH_TICKS / ticks.min() - runs),
@@ -140,9 +138,7 @@ def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
 
 
 def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
-    """Compare rates: of all ticks, of Poisson clocks in each window of the run, and of each clock,
-    in further replicas too; each of the three gets a third of the level.
-    """
+    """Compare the rates of all ticks, of each window and of each clock, at equal levels."""
     scenario, group = samples.scenario, clocks.group(samples.scenario)
     windows, horizon = getattr(samples, clocks.field).ticks, scenario.horizon
     counts, runs = windows.sum(axis=1), len(windows)
@@ -207,9 +203,7 @@ def _clocks_apart(clocks: Clocks, samples: PartSamples, level: float) -> Finding
 
 
 def _clock_promises(clocks: Clocks, samples: PartSamples) -> list[Promise]:
-    """Return the promises about clocks if the runs have ticks of them, and their rates are stated;
-    which tests apply depends on whether they are Poisson, on lattices, or of another known law.
-    """
+    """Return the promises about clocks, which depend on the kind of their law."""
     counts, group = getattr(samples, clocks.field), clocks.group(samples.scenario)
     # Rows (statement, test, whether it is exact, that is uses none of the level).
     rows: list[tuple[str, Callable[..., Finding], bool]] = []

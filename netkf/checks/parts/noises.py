@@ -78,10 +78,7 @@ def path_law(scenario: Scenario) -> PathLaw | None:
 
 
 def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray:
-    """Return the root mean squares (steps, n) of the states before each of ``steps`` steps
-    ``x+ = Phi x + w``, with Phi (n, n) and the covariance W (n, n) of w, from the start of
-    ``plant`` on: the units of states when their correlation with the noise is tested.
-    """
+    """Return the root mean squares (steps, n) of the states before each of ``steps`` steps."""
     mean, covariance, sizes = plant.start_mean, plant.start_cov, []
     for _ in range(steps):
         sizes.append(np.sqrt(np.diagonal(covariance) + mean**2))
@@ -90,10 +87,7 @@ def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray
 
 
 def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A gap)`` (n, n) and the covariance ``int_0^gap e^{A s} B B' e^{A' s} ds`` (n, n)
-    of the noise over a ``gap`` in seconds (Van Loan 1978), for A (n, n) and B (n, m): the law of a
-    step of the true path, by a formula that shares no code with the plant that is tested.
-    """
+    """Return ``exp(A gap)`` and the covariance (n, n) of the noise (Van Loan 1978)."""
     n = len(A)
     blocks = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]])
     exponential = scipy.linalg.expm(blocks * gap)
@@ -120,16 +114,12 @@ def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
 
 
 def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return S states ``x`` (S, n) in units of their root mean squares ``sizes`` (S, n); 0 where
-    these are 0.
-    """
+    """Return S states ``x`` (S, n) in units of their root mean squares ``sizes`` (S, n)."""
     return np.divide(x, sizes, out=np.zeros_like(x), where=sizes > 0.0)
 
 
 def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
-    """Return the true states (S + 1, n) of the run of ``streams`` at ``law.times``, drawn again
-    from its stream.
-    """
+    """Return the true states (S + 1, n) of a run at ``law.times``, drawn again."""
     if scenario.slotted:
         truth = scenario.slot_plant.truth(streams.generator("plant"))
         return np.array([truth.absolute(slot) for slot in range(len(law.times))])
@@ -246,9 +236,7 @@ def reading_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
 def _whitened_noises(
     scenario: Scenario, streams: Streams, law: SensorLaw
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the whitened noises (S, p) of a sensor's first readings in one run, and the states
-    (S, n) that it read, in units of their root mean squares.
-    """
+    """Return whitened noises (S, p) of a sensor's first readings, and scaled states (S, n)."""
     random = streams.generator("check readings", law.node, law.placed_sensor.ordinal)
     if scenario.slotted:
         count = min(MAX_STEPS, int(scenario.horizon / scenario.slot_plant.period))
@@ -278,34 +266,26 @@ def _whitened_noises(
 
 
 def _reading_of(path: Any, k: int, x: FloatArray) -> FloatArray:
-    """Return reading number ``k`` (p,) of a sensor that is not linear where the state is x (n,);
-    samples in continuous time come with a function that linearises them.
-    """
+    """Return reading number ``k`` (p,) of a sensor that is not linear where the state is x (n,)."""
     reading = path.reading(k, x)
     return np.asarray(reading[0] if isinstance(reading, tuple) else reading)
 
 
 def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
-    """Return ``count`` Gaussian states (count, n) for sensors to read, of the size that the plant's
-    states have: with the mean of x(0) and the covariance of :func:`_typical_covariance`.
-    """
+    """Return ``count`` Gaussian states (count, n) of the size that the plant's states have."""
     root = square_root(_typical_covariance(scenario))
     plant: Any = scenario.plant
     return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
 
 
 def _typical_covariance(scenario: Scenario) -> FloatArray:
-    """Return the covariance (n, n) of x(0) plus that of the plant's noise in ten slots, or ten
-    seconds in continuous time.
-    """
+    """Return the covariance (n, n) of x(0) and of the noise of ten slots or seconds."""
     plant: Any = scenario.plant
     return np.asarray(plant.start_cov + 10.0 * np.asarray(plant.Q))
 
 
 def _state_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
-    """Return the root mean squares (S, n) of S states ``x`` (S, n) as :func:`_typical_states` draws
-    them; all rows are equal.
-    """
+    """Return the root mean squares (S, n) of states that :func:`_typical_states` draws."""
     sizes = np.sqrt(np.diagonal(_typical_covariance(scenario)) + scenario.plant.start_mean**2)
     return np.asarray(np.broadcast_to(sizes, x.shape))
 
@@ -326,14 +306,7 @@ class _Grid(NamedTuple):
 def _increment_noises(
     scenario: Scenario, streams: Streams, law: SensorLaw, random: np.random.Generator
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield whitened noises (2, p) of the increments dy of a continuous sensor, and the two states
-    (2, n) they were added to, drawn from ``random``.
-
-    Every other step is cut in two, as the event of a link would cut it; the sensor then draws the
-    two parts conditionally on their sum (a bridge). For each piece of a step the sensor gives two
-    moments of dy over the piece, whose noises have variances R length and R length / 3, with the
-    length in seconds.
-    """
+    """Yield whitened noises (2, p) of a continuous sensor's increments, and states (2, n)."""
     sensor: Any = scenario.sensors[law.placed_sensor.entry]
     node, ordinal = law.node, law.placed_sensor.ordinal
     path = sensor.path(*(streams.generator(p, node, ordinal) for p in ("noise", "cut")))

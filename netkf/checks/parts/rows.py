@@ -47,9 +47,7 @@ def _start_draws(scenario: Scenario, seed: int) -> NoiseDraws:
 
 
 def _draws(samples: PartSamples, group: str) -> tuple[NoiseDraws, list[str], str, bool]:
-    """Return the noises of the start, the plant or the sensors in all runs, labels of the entries,
-    what they are, and whether the noises are Gaussian because their classes are built in.
-    """
+    """Return the noises of a group, their labels and noun, and if they are Gaussian."""
     scenario = samples.scenario
     if group == SENSORS:
         own = any(is_own_class(sensor, "sensor") for sensor in scenario.sensors)

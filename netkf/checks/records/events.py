@@ -80,9 +80,7 @@ def _first(wrong: np.ndarray) -> int | None:
 
 
 def _ordered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault if times decrease, or events of one instant are not in the order of their
-    kinds and entities.
-    """
+    """Yield a fault if times decrease, or events of one instant are not in order."""
     if (row := _first(~np.isfinite(log["t"]) | (log["t"] < 0.0))) is not None:
         yield f"{_describe(log, row)} has no time of the run"
     if (row := _first(np.diff(log["t"]) < 0.0)) is not None:
@@ -108,9 +106,7 @@ def _ordered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _ordered_steps(log: Any) -> Iterator[str]:
-    """Yield a fault if a step of an exchange in slots has events out of their order: the round (or
-    the ticks), then messages, then absorptions.
-    """
+    """Yield a fault if a step of an exchange in slots has events out of their order."""
     # A message that takes time may arrive in a later exchange, where it is late.
     rows = np.flatnonzero((log["phase"] >= 0) & (log["kind"] != LATE))
     steps = np.cumsum(log["kind"][rows] == ROUND)
@@ -130,9 +126,7 @@ def _keys(log: Any, senders: np.ndarray, receivers: np.ndarray) -> IntArray:
 
 
 def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless the messages of each directed link, and the transmissions of each node,
-    are numbered from 0 in the order in which they are sent.
-    """
+    """Yield a fault unless messages and transmissions are numbered from 0 in order."""
     links = set(scenario.topology.directions)
     for kind in (SEND, TRANSMIT):
         rows = np.flatnonzero(log["kind"] == kind)
@@ -151,9 +145,7 @@ def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each message is lost at once, or arrives once, in a row after it is sent
-    and as long after it as its age says; none may be under way longer than its delay can be.
-    """
+    """Yield a fault unless each message is lost at once, or arrives once when its age says."""
     send_rows = np.flatnonzero(log["kind"] == SEND)
     sends = log[send_rows]
     ends = np.flatnonzero(np.isin(log["kind"], (DELIVER, LOST, LATE)))
@@ -198,9 +190,7 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each node that messages reach at one instant (in slots: in one step of
-    an exchange) absorbs them once, or swaps with each sender.
-    """
+    """Yield a fault unless each node that messages reach at one instant (in slots."""
     kinds = log["kind"]
     if scenario.slotted and isinstance(scenario.network.activation, Matching):
         swaps, arrivals = (np.flatnonzero(kinds == kind) for kind in (SWAP, DELIVER))
@@ -243,9 +233,7 @@ def _compare_times(
 
 
 def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless nodes sense on the grid of their increments and at the times of their
-    samples, drawn again from the streams of the run.
-    """
+    """Yield a fault unless nodes sense on their grid and at samples drawn again."""
     if run.status != "complete":
         return
     sampled = scenario.sample_times(Streams(run.seed, run.replica))
@@ -263,9 +251,7 @@ def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless clocks tick at the times drawn again from their streams, those of one
-    instant in the order of clocks.
-    """
+    """Yield a fault unless clocks tick at the times drawn again, in order of clocks."""
     clock = scenario.network.activation
     silent = not scenario.node_filter.talks or run.status != "complete"
     if silent or not isinstance(clock, LinkClock) or isinstance(clock, OnReadings):
@@ -291,9 +277,7 @@ def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _caused(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each message under clocks follows the tick or the transmission of its
-    sender, and each of these sends to all receivers.
-    """
+    """Yield a fault unless each message follows its cause, which sends to all receivers."""
     kinds = log["kind"]
     clock: Any = scenario.network.activation
     by_link = getattr(clock, "at", "links") in ("links", "directions")
@@ -333,9 +317,7 @@ def _slots(scenario: Scenario) -> int:
 
 
 def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each node with sensors senses once in every slot (filters that do not
-    predict begin in slot 1).
-    """
+    """Yield a fault unless each node with sensors senses once in every slot."""
     if run.status != "complete" or "sense" not in (scenario.node_filter.schedule or ()):
         return
     first = 0 if scenario.node_filter.predicts else 1
@@ -349,9 +331,7 @@ def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless all nodes send once on each link in every step of an exchange, and both
-    ends of each drawn pair do.
-    """
+    """Yield a fault unless all nodes, or drawn pairs, send in every step."""
     algorithm, activation = scenario.node_filter, scenario.network.activation
     if run.status != "complete" or not algorithm.talks or algorithm.decides_in_slots():
         return

@@ -50,9 +50,7 @@ def files_fault(scenario: Scenario, run: Run, engine: Engine) -> str:
 
 
 def _directory_fault(run: Run, scenario: Scenario, directory: Path) -> str:
-    """Return a fault of the files of ``run`` in a directory; raises DamagedError if they cannot be
-    read.
-    """
+    """Return a fault of the files of ``run`` in a directory."""
     manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
     stored = read_run(directory, scenario, manifest)
     return _tables_fault(run, stored) or _summary_fault(run, stored)
@@ -138,9 +136,7 @@ def _summary_fault(run: Run, stored: StoredRun) -> str:
 
 
 def _transmissions(run: Run) -> dict[int, int]:
-    """Return the number of transmissions of each node: its broadcasts, or else its messages, those
-    of one step of an exchange in slots together.
-    """
+    """Return the number of transmissions of each node."""
     rows = run.log[np.isin(run.log["kind"], (CODES["send"], CODES["transmit"], CODES["round"]))]
     sends = rows["kind"] == CODES["send"]
     broadcasts = rows["node"][rows["kind"] == CODES["transmit"]]
@@ -154,10 +150,7 @@ def _transmissions(run: Run) -> dict[int, int]:
 
 
 def _averages_fault(run: Run, summary: dict[str, Any], rows: dict[int, Any]) -> str:
-    """Return a fault of the averages over time: the RMS error, the mean trace of P and, where P is
-    well conditioned, the mean NEES, of each node and of all. Errors are averaged over the samples
-    before rounding blurs them.
-    """
+    """Return a fault of the averages over time."""
     after = run.times > 0.0
     after = after if after.any() else np.ones(len(run.times), dtype=bool)
     blurred_from = summary.get("rounding_from")

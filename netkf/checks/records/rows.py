@@ -76,9 +76,7 @@ def audit_record(scenario: Scenario, run: Run, seed: int, replica: int) -> Audit
 
 
 def _audit_twin(scenario: Scenario, run: Run, audit: Audit, engine: Engine) -> Audit:
-    """Return the ``audit`` of a run with that of a shorter one added, which has samples at time 0
-    and at the instants of events, and is done on both engines and into files.
-    """
+    """Return the ``audit`` with that of a shorter run on both engines and in files."""
     short = with_start(scenario, _short_horizon(scenario, len(run.log)), run.log)
     again = simulate(short, run.seed, run.replica, engine)
     twin = ONE_ENGINE
@@ -99,9 +97,7 @@ def _audit_twin(scenario: Scenario, run: Run, audit: Audit, engine: Engine) -> A
 
 
 def _short_horizon(scenario: Scenario, events: int) -> float:
-    """Return a horizon in seconds of which a run has about TWIN_EVENTS events, that of the scenario
-    if it has no more ``events``; in slots a whole number of them.
-    """
+    """Return a horizon in seconds of which a run has about TWIN_EVENTS events."""
     horizon = scenario.horizon * min(1.0, TWIN_EVENTS / max(events, 1))
     if not scenario.slotted or horizon == scenario.horizon:
         return horizon

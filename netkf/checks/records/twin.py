@@ -39,9 +39,7 @@ def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
 
 
 def _gaps(scenario: Scenario, run: Run, twin: Run) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Return the names of compared values, the differences (T, N) of two runs, and the differences
-    (T, N) that rounding explains.
-    """
+    """Return names of values, the differences (T, N) of two runs, and what rounding explains."""
     starts = np.array([scenario.initial_estimate(node)[1] for node in scenario.nodes])
     information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
     given = np.asarray(np.isfinite(twin.P).all(axis=(2, 3)))
