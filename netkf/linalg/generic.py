@@ -15,7 +15,7 @@ in compiled code when that is compiled::
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, update_wrapper
+from functools import update_wrapper
 from typing import Any, TypeVar
 
 import numpy as np
@@ -55,13 +55,6 @@ class Generic:
     def __reduce__(self) -> str:
         """Return the name in its module, which pickle stores."""
         return self.__qualname__  # type: ignore[attr-defined, no-any-return]
-
-    @cached_property
-    def _numba_type_(self) -> Any:
-        """The numba type of the function, which numba reads of names in kernels."""
-        from netkf.linalg.generic_types import GenericType
-
-        return GenericType(self)
 
 
 def generic(function: Callable[..., Any]) -> Generic:

@@ -15,14 +15,15 @@ from numba.extending import (
     overload,
     register_model,
     type_callable,
+    typeof_impl,
 )
 from numba.np.arrayobj import populate_array
 
-from netkf.linalg.generic import drop_lane, struct_like
+from netkf.linalg.generic import Generic, drop_lane, struct_like
 from netkf.linalg.struct_types import StructType, class_of
 
 
-class GenericType(types.Callable, types.Opaque):  # type: ignore[misc]
+class GenericType(types.Callable, types.Opaque):
     """A function whose kernel is chosen by the type of the first argument of a call."""
 
     def __init__(self, function: Any) -> None:
@@ -47,6 +48,12 @@ class GenericType(types.Callable, types.Opaque):  # type: ignore[misc]
 
 
 register_model(GenericType)(models.OpaqueModel)
+
+
+@typeof_impl.register(Generic)
+def type_of(value: Generic, _: Any) -> GenericType:
+    """Return the numba type of a function whose name is in a kernel."""
+    return GenericType(value)
 
 
 @type_callable(drop_lane)

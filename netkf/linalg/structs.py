@@ -217,7 +217,7 @@ _structs: WeakValueDictionary[int, Struct] = WeakValueDictionary()
 def _array_at(address: int, dtype: np.dtype, shape: Any) -> np.ndarray:
     """Return the C-contiguous array of this ``shape`` that begins at an address."""
     size = dtype.itemsize * math.prod(map(int, shape))
-    memory = (ctypes.c_char * size).from_address(int(address))
+    memory: Any = (ctypes.c_char * size).from_address(int(address))
     return np.frombuffer(memory, dtype=dtype).reshape(tuple(map(int, shape)))
 
 
@@ -238,4 +238,5 @@ def struct_at(memory: np.ndarray, cls: type[Derived]) -> Derived:
     (words,).
     """
     known: Any = _structs.get(address_of(memory))
-    return cls.from_memory(memory) if known is None else known
+    found: Derived = cls.from_memory(memory) if known is None else known
+    return found
