@@ -24,6 +24,7 @@ from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeI
 from netkf.algorithms.kernels.constant_gains import correct_by_innovation, correct_by_moments
 from netkf.algorithms.kernels.neighbours import combine_convex_roots, copy_pairs
 from netkf.algorithms.kernels.root_update import combine_roots
+from netkf.algorithms.kernels.run import usable
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
     SlotLinks,
@@ -37,7 +38,7 @@ from netkf.algorithms.kernels.slots import (
     rebase,
     store_sample_of_slot,
 )
-from netkf.algorithms.models import FlowModel, SlotModel, first_root, usable
+from netkf.algorithms.models import FlowModel, SlotModel, first_root
 from netkf.algorithms.pairs import weighted_pairs
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError

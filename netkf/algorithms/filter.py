@@ -364,7 +364,7 @@ class Filter(Component):
         the time of sending.
         """
         if self.kernels is not None:
-            return single.shift_payload(self, payload, offset)
+            return single.shift_payload(payload, offset)
         return payload._replace(xhat=payload.xhat + offset)
 
     def accepts(self, payload: Any, age: float) -> bool:
@@ -380,6 +380,8 @@ class Filter(Component):
         scale 1 / trace(P G), G = H' R^-1 H, after a first guess or after a reset by a neighbour
         that knew less.
         """
+        if self.kernels is not None:
+            return single.interval(state)
         return float(state.model.max_interval(state.root))
 
     def steps(self, phase: int) -> int:

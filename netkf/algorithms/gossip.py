@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from netkf.algorithms.filter import Filter
-from netkf.algorithms.kernels.run import copy_estimate
+from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
 from netkf.linalg.compiling import kernel
@@ -22,10 +22,9 @@ def swap(record: Any, h: int, run: Any) -> None:
     """Replace the estimate of node ``h`` by the one that arrives; of several, the last sender's."""
     payload = record.payload
     for k in range(run.count):
-        arrived = load_flags(run.lanes, run.arrived, k)
-        copy_estimate(
-            run, record.xhat, record.root, h, payload.xhat, payload.root, run.message[k], arrived
-        )
+        m, arrived = run.message[k], load_flags(run.lanes, run.arrived, k)
+        carry(run.model, run, payload.xhat, payload.root, m, run.age[k])
+        copy_estimate(run, record.xhat, record.root, h, payload.xhat, payload.root, m, arrived)
 
 
 @built_in("gossip")

@@ -125,7 +125,7 @@ class Kcf(Filter):
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
-    kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift)
+    kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, sends_readings=True)
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return predictions of nodes, (xbar, root) in messages, and the settings."""

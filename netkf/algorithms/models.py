@@ -19,15 +19,11 @@ import scipy.linalg
 from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
+from netkf.algorithms.kernels.run import usable
 from netkf.algorithms.kernels.slots import predict_root_alone
 from netkf.algorithms.modes import RateGroups, rate_groups
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
-from netkf.linalg.compiling import kernel
 
-MAX_RELATIVE_GAIN = 1.0
-"""Largest integral of trace(P G), G = H' R^-1 H, over the increments that are used in one update,
-see ``usable``.
-"""
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
 
@@ -219,28 +215,6 @@ class SlotModel:
         ``Filter.max_measurement_interval``.
         """
         return math.inf
-
-
-@kernel
-def usable(rate: float) -> float:
-    """Return the longest interval (seconds) of increments for one update, for ``rate = trace(P G)``
-    in 1/s with ``G = H' R^-1 H``: P changes on the time scale 1 / rate, see
-    ``Filter.max_measurement_interval``.
-    """
-    return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
-
-
-@kernel
-def interval_end(now: float, time: float, length: float) -> float:
-    """Return the end, in seconds, of a measurement interval that begins at ``now`` and lasts
-    ``length`` seconds, but ends at ``time`` at the latest.
-
-    Engines cut the time to the next event, ``time``, into such intervals, see
-    ``Filter.max_measurement_interval``. One too short to change the clock would repeat for ever; it
-    ends at ``time`` instead.
-    """
-    end = now + length
-    return end if now < end < time else time
 
 
 def first_root(cov: FloatArray) -> FloatArray:

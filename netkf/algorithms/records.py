@@ -47,8 +47,12 @@ class Kernels:
 
     predict, update, absorb, shift : ``verb(record, h, run)`` for node h
     emit : ``emit(record, h, m, run)`` writes payload number m of node h
-    positions : fields of the payload that move with the origin
+    shift_payload : ``shift_payload(record, m, run)``, of payload m
+    interval : ``interval(record, h, run)``, the seconds of increments that ``update`` may use at
+               once from this state on
     decides : ``emit`` may write 0 into ``run.sends``
+    sends_readings : a message brings the sender's reading of that instant, ``run.heard``
+    counts_sends : ``emit`` changes the record, so that it is called even if no message arrives
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
     under_clocks : the verbs under clocks, where they are others than in slots
@@ -59,8 +63,11 @@ class Kernels:
     emit: Any = standard.emit
     absorb: Any = standard.absorb
     shift: Any = standard.shift
-    positions: tuple[str, ...] = ("xhat",)
+    shift_payload: Any = standard.shift_payload
+    interval: Any = standard.interval
     decides: bool = False
+    sends_readings: bool = False
+    counts_sends: bool = False
     unrolled: bool = True
     under_clocks: Kernels | None = None
 
@@ -125,6 +132,14 @@ class Records:
     arrays: dict[str, np.ndarray]
     links: tuple[str, ...] = ()
 
+    def copied(self) -> Any:
+        """Return the struct of the first block with its own copies of the arrays of nodes and
+        links.
+        """
+        struct, cls = self.struct, type(self.struct)
+        fields = {name: getattr(struct, name) for name in cls.struct_fields}
+        return cls(**fields | {name: array[0].copy() for name, array in self.arrays.items()})
+
     @property
     def memories(self) -> np.ndarray:
         """(B, words) int64: the struct of each block, for ``struct_like``."""
@@ -171,6 +186,16 @@ def make_records(
     values |= make_arrays(record.scratch, (), lanes)
     values |= record.settings
     return Records(record_class(f"{name}Record", values)(**values), arrays, tuple(per_link))
+
+
+def resized(payload: Any, messages: int) -> Any:
+    """Return a payload struct with room for so many messages, those of ``payload`` among them."""
+    fields = {}
+    for name in type(payload).struct_fields:
+        old = getattr(payload, name)
+        fields[name] = np.zeros((messages, *old.shape[1:]), dtype=old.dtype)
+        fields[name][: len(old)] = old
+    return type(payload)(**fields)
 
 
 def record_owner(cls: type) -> type:

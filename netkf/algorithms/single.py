@@ -6,6 +6,7 @@ that it may change, so that states are values as those of filters in plain Pytho
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,8 +37,8 @@ class Payload:
     that the sender had taken at that instant, or None.
     """
 
-    def __init__(self, fields: dict[str, np.ndarray], reading: Any) -> None:
-        self.fields, self.reading = fields, reading
+    def __init__(self, fields: dict[str, np.ndarray], reading: Any, sender: NodeState) -> None:
+        self.fields, self.reading, self.sender = fields, reading, sender
 
     def __getattr__(self, name: str) -> Any:
         """Return a field without its axes of messages and lanes."""
@@ -55,7 +56,7 @@ class Payload:
     def _replace(self, **fields: Any) -> Payload:
         """Return a payload with other values of some fields, as of a NamedTuple."""
         arrays = {name: np.asarray(value)[None, ..., None] for name, value in fields.items()}
-        return Payload({**self.fields, **arrays}, self.reading)
+        return Payload({**self.fields, **arrays}, self.reading, self.sender)
 
 
 class NodeState:
@@ -282,7 +283,7 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     if not run.sends[0]:
         return new, None
     fields = {name: getattr(payload, name) for name in type(payload).struct_fields}
-    return new, Payload(fields, new.reading)
+    return new, Payload(fields, new.reading, new)
 
 
 def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeState:
@@ -303,6 +304,13 @@ def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeStat
     return new
 
 
+def interval(state: NodeState) -> float:
+    """Return the seconds of increments that ``update`` may use at once; inf in slots."""
+    if not state.run.clocked:
+        return math.inf
+    return float(state.kernels.interval(state.record, 0, state.run.struct))
+
+
 def shift(state: NodeState, offset: FloatArray) -> NodeState:
     """Return the state after the origin of coordinates moved by ``-offset`` (n,)."""
     new, run = state.copied(), state.run.struct
@@ -311,12 +319,19 @@ def shift(state: NodeState, offset: FloatArray) -> NodeState:
     return new
 
 
-def shift_payload(filtering: Any, payload: Payload, offset: FloatArray) -> Payload:
+def shift_payload(payload: Payload, offset: FloatArray) -> Payload:
     """Return a payload under way after the origin moved by ``-offset`` (n,) at its sending."""
-    moved = {name: payload.fields[name].copy() for name in filtering.kernels.positions}
-    for array in moved.values():
-        array[0, ..., 0] += offset
-    return Payload({**payload.fields, **moved}, payload.reading)
+    new = payload.sender.copied()
+    record, run = new.record, new.run.struct
+    run.offset[:, 0] = offset
+    fields = {name: array.copy() for name, array in payload.fields.items()}
+    record.payload = type(record.payload)(**fields)
+    new.kernels.shift_payload(record, 0, run)
+    reading = payload.reading
+    if reading is not None:
+        y, H = reading
+        reading = y + H @ offset, H
+    return Payload(fields, reading, payload.sender)
 
 
 def _field(payload: Any, name: str) -> np.ndarray:

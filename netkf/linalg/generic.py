@@ -69,6 +69,22 @@ def drop_lane(array: np.ndarray) -> np.ndarray:
     return array[..., 0]
 
 
+def copy_row(struct: Struct, k: int, m: int) -> None:
+    """Copy entry ``m`` of each array of a struct to entry ``k``."""
+    for name in struct.struct_fields:
+        array = getattr(struct, name)
+        if isinstance(array, np.ndarray):
+            array[k] = array[m]
+
+
+def copy_arrays(target: Derived, source: Derived) -> None:
+    """Copy all arrays of a struct into those of another one of its class and shapes."""
+    for name in target.struct_fields:
+        array, given = getattr(target, name), getattr(source, name)
+        if isinstance(array, np.ndarray) and array is not given:
+            array[...] = given
+
+
 def struct_like(struct: Derived, memory: np.ndarray) -> Derived:
     """Return the struct of the class of ``struct`` whose block of int64 words is ``memory``
     (words,).

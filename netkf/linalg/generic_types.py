@@ -19,8 +19,8 @@ from numba.extending import (
 )
 from numba.np.arrayobj import populate_array
 
-from netkf.linalg.generic import Generic, drop_lane, struct_like
-from netkf.linalg.struct_types import StructType, class_of
+from netkf.linalg.generic import Generic, copy_arrays, copy_row, drop_lane, struct_like
+from netkf.linalg.struct_types import StructType, class_of, load_field
 
 
 class GenericType(types.Callable, types.Opaque):
@@ -91,3 +91,56 @@ def _struct_like(_: Any, struct: StructType, memory: Any) -> Any:
 @overload(struct_like, inline="always")
 def _overload_struct_like(struct, memory):  # noqa: ANN001, ANN202, ARG001
     return lambda struct, memory: _struct_like(struct, memory)  # noqa: PLW0108
+
+
+def _arrays_of(context: Any, builder: Any, struct: StructType, address: Any) -> Any:
+    """Yield each array of a struct: its address, its length, and the bytes of an entry."""
+    for name, _, kind in struct.fields:
+        if isinstance(kind, types.Array):
+            value = load_field(context, builder, struct, address, name)
+            array = context.make_array(kind)(context, builder, value)
+            first_stride = cgutils.unpack_tuple(builder, array.strides)[0]
+            length = cgutils.unpack_tuple(builder, array.shape)[0]
+            yield builder.bitcast(array.data, cgutils.voidptr_t), length, first_stride
+
+
+@intrinsic
+def _copy_row(_: Any, struct: StructType, k: Any, m: Any) -> Any:
+    """Type and emit the copy of entry m to entry k of all arrays."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        to, source = (
+            context.cast(builder, arg, kind, types.intp)
+            for arg, kind in zip(args[1:], sig.args[1:], strict=True)
+        )
+        for data, _, stride in _arrays_of(context, builder, sig.args[0], args[0]):
+            target = builder.gep(data, [builder.mul(to, stride)])
+            origin = builder.gep(data, [builder.mul(source, stride)])
+            cgutils.raw_memcpy(builder, target, origin, stride, 1)
+        return context.get_dummy_value()
+
+    return types.none(struct, k, m), emit
+
+
+@overload(copy_row, inline="always")
+def _overload_copy_row(struct, k, m):  # noqa: ANN001, ANN202, ARG001
+    return lambda struct, k, m: _copy_row(struct, k, m)  # noqa: PLW0108
+
+
+@intrinsic
+def _copy_arrays(_: Any, target: StructType, source: StructType) -> Any:
+    """Type and emit the copy of all arrays."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        targets = _arrays_of(context, builder, sig.args[0], args[0])
+        sources = _arrays_of(context, builder, sig.args[1], args[1])
+        for (data, length, stride), (origin, _, _) in zip(targets, sources, strict=True):
+            cgutils.raw_memcpy(builder, data, origin, builder.mul(length, stride), 1)
+        return context.get_dummy_value()
+
+    return types.none(target, source), emit
+
+
+@overload(copy_arrays, inline="always")
+def _overload_copy_arrays(target, source):  # noqa: ANN001, ANN202, ARG001
+    return lambda target, source: _copy_arrays(target, source)  # noqa: PLW0108

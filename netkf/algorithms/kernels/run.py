@@ -17,6 +17,7 @@ call, so that one text of a filter serves slots and clocks, one run or L of them
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -33,13 +34,17 @@ from netkf.algorithms.kernels.root_flow import (
     FlowScratch,
     FlowTable,
     gain_root,
+    information_rate,
     propagate_root,
 )
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane, generic
-from netkf.linalg.lanes import Lanes, aligned, load, store
+from netkf.linalg.lanes import ONE, Lanes, aligned, load, store
 from netkf.linalg.structs import Size, Struct, sized
+
+MAX_RELATIVE_GAIN = 1.0
+"""Largest integral of trace(P G), G = H' R^-1 H, over the increments that one update uses."""
 
 
 class SlotTables(Struct):
@@ -267,9 +272,10 @@ def _update_under_clocks(
         use_reading(run, x, root, k, run.reading, True)
         return
     m, gains = model.models[h], model.gains
+    moments, estimates = model.moments[: gains.moments[m]], drop_lane(x)
     gain_root(
-        run.size, model.moments, gains.series[m], gains.reach[m], 0, drop_lane(root), drop_lane(x),
-        k, run.gap, model.values,
+        run.size, moments, gains.series[m], gains.reach[m], 0, drop_lane(root), estimates, k,
+        run.gap, model.values,
     )  # fmt: skip
 
 
@@ -341,3 +347,37 @@ def absorb(record: Any, h: int, run: Any) -> None:
 def shift(record: Any, h: int, run: Any) -> None:
     """Move the estimate of node ``h`` with the origin."""
     shift_vector(run, record.xhat, h)
+
+
+@kernel
+def shift_payload(record: Any, m: int, run: Any) -> None:
+    """Move the estimate in payload ``m`` with the origin."""
+    shift_vector(run, record.payload.xhat, m)
+
+
+@kernel
+def interval(record: Any, h: int, run: Any) -> float:
+    """Return the longest interval (seconds) of increments for one update: P changes on the time
+    scale 1 / trace(P G), G = H' R^-1 H.
+    """
+    table = run.model.table
+    m = run.model.models[h]
+    return usable(information_rate(ONE, run.size, table.whitened_H[m], record.root[h]))
+
+
+@kernel
+def usable(rate: float) -> float:
+    """Return the longest interval (seconds) of increments for one update, for a ``rate`` of
+    information in 1/s.
+    """
+    return MAX_RELATIVE_GAIN / rate if rate > 0.0 else math.inf
+
+
+@kernel
+def interval_end(now: float, time: float, length: float) -> float:
+    """Return the end, in seconds, of a measurement interval that begins at ``now`` and lasts
+    ``length`` seconds, but ends at ``time`` at the latest; one too short to change the clock would
+    repeat for ever, and ends at ``time`` instead.
+    """
+    end = now + length
+    return end if now < end < time else time

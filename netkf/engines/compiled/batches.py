@@ -127,6 +127,8 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
         group = together(len(start.nodes), runs)
         state = workspace.begin(draws, traced=False, buffer=buffer, together=group)
         simulate_together(state, workspace.visits(group), arrays, group)
+    elif workspace.clocked is not None:
+        workspace.clocked.simulate(workspace.begin(draws, traced=False, buffer=buffer), arrays)
     else:
         simulate_batch(workspace.begin(draws, traced=False, buffer=buffer), arrays)
     return RunBatch(

@@ -17,6 +17,7 @@ from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.agenda import advance_alone, is_immediate
 from netkf.engines.compiled.batch_loop import run_alone
+from netkf.engines.compiled.clock_filters import ClockFilters
 from netkf.engines.compiled.combination_state import combination_state_of
 from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path
 from netkf.engines.compiled.event_loop import (
@@ -200,6 +201,9 @@ class Workspace:
         self._start, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
         # A copy, since directed links count the messages of a run.
         self._records = entities, directions.copy()
+        # By receiver and sender: the order in which filters add up messages.
+        order = np.lexsort((directions["sender"], directions["receiver"]))
+        self._incoming = np.argsort(order, kind="stable")
         self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
         size, n = self._start.xhat.shape
         self._pool = empty_pool(FIRST_MESSAGES, n)
@@ -215,6 +219,12 @@ class Workspace:
         # Code compiled for each n makes filters that combine estimates 1.5 times faster. It does
         # not help filters of sums and of readings: these share one event loop for all n.
         self._unrolled = scenario.node_filter.combination not in SPECIAL
+        kernels = scenario.node_filter.kernels
+        self.clocked: ClockFilters | None = None
+        if kernels is not None and not is_immediate(scenario):
+            kernels = kernels.of(True)
+            self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)
+            self._unrolled = kernels.unrolled
 
     @property
     def filters(self) -> Filters:
@@ -253,8 +263,13 @@ class Workspace:
             self._scratch = instants, *arrays
         _, scratch, flow_arrays, update_arrays = self._scratch
         nodes, n = start.xhat.shape
-        xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
-        xhat[:], root[:] = np.tile(start.xhat, (together, 1)), np.tile(start.root, (together, 1, 1))
+        if self.clocked is not None:
+            self.clocked.begin(instants)
+            xhat, root = self.clocked.estimates
+        else:
+            xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
+            xhat[:] = np.tile(start.xhat, (together, 1))
+            root[:] = np.tile(start.root, (together, 1, 1))
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
             nodes=start.nodes.copy(),
@@ -266,6 +281,7 @@ class Workspace:
             entities=entities,
             outgoing=self._senders.outgoing,
             directions=directions,
+            incoming=self._incoming,
             pool=pool,
             pool_x=self._pool[1],
             pool_root=self._pool[2],
@@ -301,6 +317,7 @@ class Workspace:
         return {
             "combination_kind": COMBINATIONS.index(algorithm.combination),
             "clock_kind": CLOCKS.index(self._senders.at),
+            "newest_only": algorithm.newest_only,
             "keep_own": getattr(algorithm, "on_loss", "") == "keep-own",
             "most_messages": max_messages,
             "free_count": len(self._pool[0]),
@@ -363,6 +380,10 @@ class FlowRun:
         recorder.exact_errors = scenario.exact_errors
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
         self._visits = workspace.visits() if is_immediate(scenario) else None
+        self._clocked = workspace.clocked
+        if self._clocked is not None:
+            self._totals = self._history = self._combination = None
+            return
         self._totals = _make_totals(scenario, self._state)
         self._history = _make_history(scenario, self._state)
         self._combination = combination_state_of(scenario, self._state)
@@ -395,6 +416,8 @@ class FlowRun:
         its request (WANT_... or DONE): visits in SIMD lanes, the loop of batches, which needs no
         extra state, or the loop with extra state.
         """
+        if self._clocked is not None:
+            return self._clocked.advance(self._state)
         if self._visits is not None:
             return advance_alone(self._state, self._visits)
         if self._scenario.node_filter.combination not in SPECIAL:
@@ -435,6 +458,10 @@ class FlowRun:
         # The history of each node gets one entry: the beginning of the frame.
         if self._history is not None and self._history.free[1] < len(state.nodes):
             add_past(self._history, len(state.nodes))
+        if self._clocked is not None:
+            self._clocked.shift(self._scenario, state, offset)
+            state.frame_at = k + 1
+            return
         move_origin(
             self._scenario, state, self._totals, self._history, self._combination, k, offset
         )
@@ -445,6 +472,8 @@ class FlowRun:
         an entry for each of them.
         """
         add_messages(self._state, self._state.most_messages)
+        if self._clocked is not None:
+            self._clocked.grow(len(self._state.pool))
         # ``offered`` has a row for each message: the total that it carries.
         if self._totals is not None:
             grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))

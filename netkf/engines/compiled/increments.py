@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from netkf.algorithms.kernels.root_flow import gain_root, information_rate, propagate_root
-from netkf.algorithms.models import interval_end, usable
+from netkf.algorithms.kernels.run import interval_end, usable
 from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.state import PathBlock, Sensing, Simulation
 from netkf.linalg.arrays import FloatArray

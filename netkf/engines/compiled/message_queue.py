@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.engines.compiled.state import READINGS, Simulation
+from netkf.engines.compiled.state import Simulation
 from netkf.linalg.compiling import kernel
 
 
@@ -84,7 +84,7 @@ def put(state: Simulation, h: int, message: int) -> None:
     ``inbox``, ``last`` and ``next``; a message that is replaced becomes free.
     """
     nodes, directions, pool = state.nodes, state.directions, state.pool
-    newest_only = state.combination_kind != READINGS
+    newest_only = state.newest_only == 1
     node, peer = nodes[h], directions[pool[message].direction].sender
     previous, position = -1, node.inbox
     # Inboxes are linked lists with a pointer to the last message. Mostly messages come in the order

@@ -249,6 +249,8 @@ class Simulation(Struct):
                               that they carry
     first_free, free_count : first free message of the pool, and number of free ones
     most_messages : largest number of messages that one event may send
+    incoming : (W,), number of each directed link among all links sorted by receiver and sender
+    newest_only : 1 if of several messages of one sender at one instant the newest counts
     heap, in_flight, order : heap (C,) of messages under way, number of these, and of all that were
                              ever put there
     waiting, receivers : nodes (N,) with messages in their inbox, and number of these
@@ -289,6 +291,7 @@ class Simulation(Struct):
     entities: np.ndarray
     outgoing: IntArray
     directions: np.ndarray
+    incoming: IntArray
     pool: np.ndarray
     pool_x: FloatArray
     pool_root: FloatArray
@@ -309,6 +312,7 @@ class Simulation(Struct):
     combination_kind: int
     clock_kind: int
     keep_own: int
+    newest_only: int
     traced: int
     run: int
     first_run: int

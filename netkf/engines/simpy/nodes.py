@@ -8,7 +8,7 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
-from netkf.algorithms.models import interval_end
+from netkf.algorithms.kernels.run import interval_end
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray, block_diagonal

@@ -1,0 +1,152 @@
+"""Filters under clocks as records: what the composed event loop needs, made once for each run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.kernels.root_flow import flow_scratch
+from netkf.algorithms.kernels.run import ClockRun, ClockTables, scratch_of, size_of
+from netkf.algorithms.records import Kernels, make_records, resized
+from netkf.engines.compiled.batch_loop import BatchArrays
+from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
+from netkf.engines.compiled.state import Filters, Instants, Simulation, add_messages
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.generic import copy_arrays
+from netkf.linalg.lanes import ONE
+from netkf.scenario.scenario import Scenario
+
+
+class ClockFilters:
+    """N filters of one run whose verbs are kernels, with room for C ``messages``."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        kernels: Kernels,
+        start: Filters,
+        messages: int,
+    ) -> None:
+        self.kernels, self._loop = kernels, clock_loop(kernels)
+        self._p = 1
+        pooled = scenario.node_filter.pooled
+        infos = scenario.node_infos[:1] if pooled else scenario.node_infos
+        models = (scenario.pooled_model,) if pooled else scenario.models
+        links = _links_by_receiver(scenario)
+        starts = list(zip(start.xhat, start.root, strict=True))
+        count = len(links["sender"])
+        self.records = make_records(
+            scenario.node_filter, starts, infos, models, links=count, messages=messages
+        )
+        self.record, self.start = self.records.struct, self.records.copied()
+        n, size = start.xhat.shape[1], size_of(start.xhat.shape[1], kernels.unrolled)
+        cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
+        self.run = cls(
+            size=size,
+            lanes=ONE,
+            model=ClockTables(
+                table=start.table,
+                models=np.ascontiguousarray(start.nodes["model"]),
+                gains=start.gains,
+                moments=np.zeros(max(1, int(start.gains.moments.max()))),
+                increments=0,
+                scratch=flow_scratch(start.table, kernels.unrolled),
+                values=np.zeros(max(1, start.gains.series.shape[2])),
+            ),
+            **links,
+            **self._inbox(messages, n),
+            sends=np.ones(1, dtype=np.uint8),
+            uniform=np.zeros(1),
+            reading=0,
+            first_y=0,
+            first_H=0,
+            count=0,
+            slot=-1,
+            phase=-1,
+            step=-1,
+            gap=0.0,
+            **scratch_of(n, 1),
+        )
+
+    def begin(self, instants: Instants) -> None:
+        """Go back to time 0, for a run whose sensors take samples at these ``instants``."""
+        copy_arrays(self.record, self.start)
+        # Rows of the reading of each sample, then the largest sum over one instant.
+        rows = np.concatenate([instants.rows, [0]])[instants.sensor]
+        totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
+        p = int(np.diff(totals).max(initial=0))
+        if p > self._p:
+            self._p = p
+            self.grow(len(self.run.message))
+
+    @property
+    def estimates(self) -> tuple[FloatArray, FloatArray]:
+        """Estimates (N, n) and roots (N, n, n): views of those of the record."""
+        arrays = self.records.arrays
+        return arrays["xhat"][0, ..., 0], arrays["root"][0, ..., 0]
+
+    def _inbox(self, messages: int, n: int) -> dict[str, np.ndarray]:
+        """Return an inbox for so many messages, and room for their readings and the own one."""
+        readings = 1 + messages if self.kernels.sends_readings else 1
+        return {
+            "y": np.zeros((readings, self._p, 1)),
+            "H": np.zeros((readings, self._p, n, 1)),
+            "rows": np.zeros(readings, dtype=np.int64),
+            "matrix": np.arange(readings),
+            "message": np.zeros(messages, dtype=np.int64),
+            "link": np.zeros(messages, dtype=np.int64),
+            "message_weight": np.zeros(messages),
+            "age": np.zeros(messages),
+            "heard": np.full(messages, -1),
+            "arrived": np.ones((messages, 1), dtype=np.uint8),
+        }
+
+    def advance(self, state: Simulation) -> int:
+        """Run the event loop until it needs something from Python; return its request."""
+        return int(self._loop(state, self.record, self.run))
+
+    def simulate(self, state: Simulation, batch: BatchArrays) -> None:
+        """Simulate all runs of a batch up to the horizon, as ``batch_loop.simulate_batch``."""
+        simulate, run, resumed = batch_loop(self.kernels), 0, False
+        while run < len(batch.lengths):
+            arguments = self.record, self.start, self.run, batch.memory, run, resumed
+            run = int(simulate(state, *arguments))
+            # A run stops only if the pool of messages is too small.
+            if run < len(batch.lengths):
+                add_messages(state, state.most_messages)
+                self.grow(len(state.pool))
+                resumed = True
+
+    def grow(self, messages: int) -> None:
+        """Make room for so many messages; those that are there stay."""
+        messages = max(messages, len(self.run.message))
+        self.record.payload = resized(self.record.payload, messages)
+        for name, array in self._inbox(messages, len(self.run.size)).items():
+            setattr(self.run, name, array)
+
+    def shift(self, scenario: Scenario, state: Simulation, offset: FloatArray) -> None:
+        """Move all nodes and messages under way by ``offset`` (n,): the origin of coordinates has
+        moved by its negative.
+        """
+        run, now = self.run, float(state.frames[state.frame_at])
+        run.offset[:, 0] = offset
+        shift_loop(self.kernels)(self.record, run)
+        for m in state.heap[: state.in_flight].tolist():
+            # A payload refers to the time of sending: predict the offset back to it.
+            run.offset[:, 0] = scenario.move_back(offset, now - state.pool["sent"][m])
+            self.kernels.shift_payload(self.record, m, run)
+
+
+def _links_by_receiver(scenario: Scenario) -> dict[str, Any]:
+    """Return the directed links sorted by receiver and sender, as fields of a run."""
+    index = scenario.topology.index
+    directions = scenario.topology.directions if scenario.node_filter.talks else ()
+    ends = sorted((index[receiver], index[sender]) for sender, receiver in directions)
+    receivers = np.array([receiver for receiver, _ in ends], dtype=np.int64)
+    nodes = scenario.nodes
+    return {
+        "first": np.searchsorted(receivers, np.arange(len(nodes) + 1)).astype(np.int64),
+        "sender": np.array([sender for _, sender in ends], dtype=np.int64),
+        "weight": np.array([scenario.weight(nodes[r], nodes[s]) for r, s in ends], dtype=float),
+    }
