@@ -19,6 +19,7 @@ from netkf.algorithms.kernels.run import (
     ClockTables,
     SingleSlotRun,
     SlotTables,
+    clock_tables_class,
     scratch_of,
     size_of,
 )
@@ -211,7 +212,7 @@ def clock_tables(model: FlowModel, unrolled: bool) -> ClockTables:
     """Return the model of one node under clocks as kernels take it."""
     table = stack_tables([model.flow, model.unobserved_flow])
     gains = _gains_of(model)
-    return ClockTables(
+    return clock_tables_class(len(model.A), unrolled)(
         table=table,
         models=np.zeros(1, dtype=np.int64),
         gains=gains,

@@ -137,6 +137,11 @@ class ClockTables(Struct):
     values: FloatArray
 
 
+def clock_tables_class(n: int, unrolled: bool) -> Any:
+    """Return the class of ClockTables whose scratch knows n, if kernels are compiled for it."""
+    return ClockTables.of_size(n) if unrolled else ClockTables
+
+
 class ClockRun(Struct):
     """The surroundings of H nodes of one run under clocks: a SlotRun with ClockTables, in which
     ``slot``, ``phase`` and ``step`` are -1.

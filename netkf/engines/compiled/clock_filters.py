@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.root_flow import flow_scratch
-from netkf.algorithms.kernels.run import ClockRun, ClockTables, scratch_of, size_of
+from netkf.algorithms.kernels.run import ClockRun, clock_tables_class, scratch_of, size_of
 from netkf.algorithms.records import Kernels, make_records, resized
 from netkf.engines.compiled.batch_loop import BatchArrays
 from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
@@ -45,7 +45,7 @@ class ClockFilters:
         self.run = cls(
             size=size,
             lanes=ONE,
-            model=ClockTables(
+            model=clock_tables_class(n, kernels.unrolled)(
                 table=start.table,
                 models=np.ascontiguousarray(start.nodes["model"]),
                 gains=start.gains,

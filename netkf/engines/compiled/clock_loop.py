@@ -70,6 +70,18 @@ def clock_loop(kernels: Kernels) -> Any:
     counts_sends = kernels.counts_sends
 
     @kernel
+    def predict_participants(
+        state: Simulation, record: Any, run: ClockRun, event: int, now: float
+    ) -> None:
+        """Predict the nodes that take part in an event to ``now`` (seconds)."""
+        # The sender of a message that is lost needs no prediction, unless it reads increments.
+        lost = event == ON_TICK and not counts_sends and is_lost(state)
+        for k in range(count_participants(state, event)):
+            h = participant(state, event, k)
+            if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
+                predict_node(state, record, run, h, now)
+
+    @kernel
     def loop(state: Simulation, record: Any, run: ClockRun) -> int:
         """Simulate the run ``state`` until the loop needs something from Python."""
         while True:
@@ -80,12 +92,7 @@ def clock_loop(kernels: Kernels) -> Any:
             if request != GO_ON:
                 return request
             seek_piece(state, now)
-            # The sender of a message that is lost needs no prediction, unless it reads increments.
-            lost = event == ON_TICK and not counts_sends and is_lost(state)
-            for k in range(count_participants(state, event)):
-                h = participant(state, event, k)
-                if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
-                    predict_node(state, record, run, h, now)
+            predict_participants(state, record, run, event, now)
             if event == ON_TICK:
                 on_tick(state, record, run, now)
                 # Absorptions come next, unless there are other events at this instant.
