@@ -36,7 +36,7 @@ from netkf.algorithms.kernels.slots import (
 )
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.registry import built_in
-from netkf.core.fields import field, one_of, positive
+from netkf.core.fields import field, of_time, one_of, positive
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
@@ -129,12 +129,12 @@ class Intermittent(Filter):
     late    under clocks, readings that took time: "exact": the result is that of the filter that
             had all arrived readings in the order of their times, by going back to before the late
             one; "drop": they are not used
-    window  seconds that a late reading may be old; older ones are late for good. By default the
-            longest time a message may take
+    window  seconds that a late reading may be old, at most; older ones are late for good. By
+            default the longest time a message may take
     """
 
     late: str = field(one_of("exact", "drop"), default="exact")
-    window: float | None = field(positive, default=None)
+    window: float | None = field(of_time(positive), default=None)
 
     paper: ClassVar[str] = "intermittent"
     combination: ClassVar[str] = "readings"

@@ -43,8 +43,8 @@ def check_times(scenario: Scenario) -> list[float]:
     an eighth, a quarter, half and all of the horizon.
     """
     if scenario.slotted:
-        return [round(scenario.slot_plant.period * slot, 12) for slot in check_slots(scenario)]
-    return [scenario.horizon * share for share in HORIZON_SHARES]
+        return [scenario.slot_plant.slot_time(slot) for slot in check_slots(scenario)]
+    return [scenario.time_grid.instant(scenario.horizon * share) for share in HORIZON_SHARES]
 
 
 def errors_at_once(scenario: Scenario) -> int:
@@ -64,8 +64,8 @@ def probe_times(scenario: Scenario) -> list[float]:
     count = min(MAX_POOLED, POOLED_ERRORS // errors_at_once(scenario))
     even = np.linspace(0.0, checked[-1], max(count, 0) + 1)[1:].tolist()
     if scenario.slotted:
-        period = scenario.slot_plant.period
-        even = [round(period * max(1, round(time / period)), 12) for time in even]
+        plant = scenario.slot_plant
+        even = [plant.slot_time(max(1, round(time / plant.period))) for time in even]
     # The further times are thinned evenly: with the checked ones there are ``count``.
     others = sorted(set(even) - set(checked))
     spare = min(max(count - len(checked), 0), len(others))

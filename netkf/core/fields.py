@@ -19,6 +19,7 @@ import numpy as np
 
 from netkf.core.contracts import hold_to_contract, is_netkf_class
 from netkf.core.errors import ScenarioError
+from netkf.core.instants import as_written
 from netkf.core.printable import MAX_NAME
 from netkf.core.stamps import TimeBase
 from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
@@ -37,6 +38,7 @@ class Rule:
     remedy       text that tells the user how to correct a value that breaks the rule
     schema       JSON Schema that accepts every value of a file that obeys the rule; empty: any
     of_nodes     whether texts in the value are names of nodes, for which scenarios put their ids
+    of_time      whether numbers in the value are times or durations, which instants are made of
     """
 
     requirement: str
@@ -44,6 +46,7 @@ class Rule:
     remedy: str = ""
     schema: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
     of_nodes: bool = False
+    of_time: bool = False
 
     def __call__(self, key: str, value: object) -> Any:
         """Return the converted value; raises ScenarioError at ``key`` if it breaks the rule."""
@@ -214,8 +217,22 @@ def _convert_seconds(value: Any) -> float:
     return result
 
 
+def of_time(rule: Rule) -> Rule:
+    """Return the rule for a value that obeys ``rule``, in which numbers are times in seconds: one
+    that is a rational number up to rounding, such as 0.1 + 0.2 or 5 * (1 / 60), becomes the float64
+    nearest to it (``core.instants``).
+    """
+
+    def convert(value: Any) -> Any:
+        """Return the value by the rule, a number as it is meant."""
+        result = rule.convert(value)
+        return as_written(result) if isinstance(result, float) else result
+
+    return dataclasses.replace(rule, convert=convert, of_time=True)
+
+
 _DURATION = {"type": "number", "minimum": MIN_SECONDS, "maximum": MAX_SECONDS}
-seconds = Rule(positive.requirement, _convert_seconds, positive.remedy, _DURATION)
+seconds = of_time(Rule(positive.requirement, _convert_seconds, positive.remedy, _DURATION))
 probability = number(low=0.0, high=1.0)
 
 

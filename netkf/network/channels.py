@@ -17,6 +17,7 @@ from netkf.core.fields import (
     field,
     instance_of,
     number,
+    of_time,
     positive,
     probability,
 )
@@ -303,7 +304,7 @@ class NoDelay(Delay):
 class ConstantDelay(Delay):
     """A delay of ``seconds`` for every message."""
 
-    seconds: float = field(number(low=0.0))
+    seconds: float = field(of_time(number(low=0.0)))
 
     def draw(self, random: np.random.Generator) -> float:
         """Return ``seconds``."""

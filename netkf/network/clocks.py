@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,11 +22,13 @@ from netkf.core.fields import (
     list_of,
     node_id,
     number,
+    of_time,
     one_of,
     positive,
     source_file,
     tuple_of,
 )
+from netkf.core.instants import OnGrid
 from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw, gamma_law, uniform_law, weibull_law
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Topology, demand_links, demand_nodes
@@ -36,7 +38,7 @@ AT = ("links", "directions", "nodes")
 
 
 @dataclass(frozen=True, eq=False)
-class LinkClock(Clock):
+class LinkClock(Clock, OnGrid):
     """The contract of a clock that activates the network, see Clock.
 
     ``at`` selects the entities that have a clock each. "links": both ends exchange; an entity is
@@ -218,7 +220,7 @@ class Renewal(LinkClock):
     """
 
     distribution: str = field(one_of(*PARAMETERS))
-    mean: float | None = field(positive, default=None)
+    mean: float | None = field(of_time(positive), default=None)
     rate: float | None = field(_rate, default=None)
     scale: float | None = field(positive, default=None)
     shape: float | None = field(number(low=0.1, high=1e6), default=None)
@@ -308,17 +310,10 @@ class Renewal(LinkClock):
             assert self.high is not None
             gaps = self.low + (self.high - self.low) * random.random(count)
         else:
-            # Tick number 0 is at one gap after time 0, as nothing is sent at time 0.
-            return _lattice(0.0, self._mean, index + 1, count)
+            # Tick number 0 is at one gap after time 0, as nothing is sent at time 0. From its
+            # number and not from the tick before: rounding does not add up.
+            return self._mean * np.arange(index + 1, index + 1 + count)
         return _accumulate(now, gaps)
-
-
-def _lattice(phase: float, period: float, first: int, count: int) -> FloatArray:
-    """Return the ticks (count,) ``first`` to ``first + count - 1`` of a periodic clock, tick k at
-    ``phase + k period``, all in seconds.
-    """
-    # Rounded so that lattices whose periods are multiples of each other meet exactly.
-    return np.round(phase + period * np.arange(first, first + count), 12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,9 +323,10 @@ class Periodic(LinkClock):
     ``phase`` is a time in [0, period) or "random", one draw a link; nothing ticks at time 0.
     """
 
-    period: float = field(number(low=MIN_GAP))
+    period: float = field(of_time(number(low=MIN_GAP)))
     phase: float | str = field(
-        either(number(low=0.0), one_of("random"), lambda value: isinstance(value, str)), default=0.0
+        of_time(either(number(low=0.0), one_of("random"), lambda value: isinstance(value, str))),
+        default=0.0,
     )
     jitter: float = field(number(low=0.0), default=0.0)
 
@@ -376,7 +372,8 @@ class Periodic(LinkClock):
         Engines call it for one block of ticks after another.
         """
         # With phase 0 the lattice point at time 0 is no tick.
-        times = _lattice(origin, self.period, index + (origin == 0.0), count)
+        first = index + (origin == 0.0)
+        times = origin + self.period * np.arange(first, first + count)
         return times + self.jitter * random.random(count) if self.jitter > 0.0 else times
 
 
@@ -388,6 +385,8 @@ class RecordedClock(LinkClock):
     """
 
     path: SourceFile = field(source_file)
+
+    grid_values: ClassVar[tuple[str, ...]] = ("_instants",)
 
     def __post_init__(self) -> None:
         """Check the fields and read the table; raises ScenarioError for a mistake in either."""
@@ -425,7 +424,8 @@ class RecordedClock(LinkClock):
         for entity, t in self.row_keys:
             if t > 0.0:
                 times.setdefault(entity, []).append(t)
-        return {entity: np.unique(values) for entity, values in times.items()}
+        snap = self.time_grid.snap
+        return {entity: np.unique(snap(np.array(t))) for entity, t in times.items()}
 
     @property
     def rows(self) -> FloatArray:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -39,6 +40,8 @@ class Contacts(LinkClock):
 
     path: SourceFile = field(source_file)
     clock: LinkClock = field(instance_of(*INNER))
+
+    grid_values: ClassVar[tuple[str, ...]] = ("_intervals",)
 
     def __post_init__(self) -> None:
         """Check the fields and read the table; raises ScenarioError for a mistake in either."""
@@ -90,7 +93,8 @@ class Contacts(LinkClock):
             else:
                 begins.append(begin)
                 ends.append(end)
-        return {pair: (np.array(b), np.array(e)) for pair, (b, e) in intervals.items()}
+        snap = self.time_grid.snap
+        return {pair: (snap(np.array(b)), snap(np.array(e))) for pair, (b, e) in intervals.items()}
 
     @cached_property
     def overlapping(self) -> int:
@@ -113,6 +117,7 @@ class Contacts(LinkClock):
     def in_contact(self, entity: Entity, times: FloatArray) -> np.ndarray:
         """Return flags (K,): whether a link is in contact at ``times`` (K,) in seconds."""
         begins, ends = self._intervals.get(entity, (np.empty(0), np.empty(0)))
+        times = self.time_grid.snap(times)
         last = np.searchsorted(begins, times, side="right") - 1
         inside = np.zeros(len(times), dtype=bool)
         begun = last >= 0

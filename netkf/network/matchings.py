@@ -21,6 +21,7 @@ from netkf.core.fields import (
     SourceFile,
     field,
     number,
+    of_time,
     one_of,
     positive,
     source_file,
@@ -35,12 +36,12 @@ MAX_EDGES = 20  # beyond it the recursions over sets of edges take too long
 class SlotActivation(Component):
     """The contract of activation in slots, which selects the links of each exchange.
 
-    ``phase`` is the length of one exchange in seconds, shared evenly among its steps; the inbox of
-    a step closes when its time is over. By default half of the period is shared evenly among the
-    exchanges of a slot.
+    ``phase`` is the length of one exchange in seconds, which its steps share: each lasts phase /
+    steps. The inbox of a step closes at its end; what arrives just then is in time. By default half
+    of the period is shared evenly among the exchanges of a slot.
     """
 
-    phase: float | None = field(positive, default=None)
+    phase: float | None = field(of_time(positive), default=None)
 
     @abstractmethod
     def check(self, topology: Topology) -> None:

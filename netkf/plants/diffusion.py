@@ -13,10 +13,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
-from netkf.core.fields import field, matrix, positive, square
+from netkf.core.fields import field, matrix, of_time, positive, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import eigenvalues
 from netkf.plants.laws import GridLaws
@@ -39,7 +40,9 @@ class Diffusion(Plant):
 
     A: FloatArray = field(square)
     B: FloatArray = field(matrix)
-    sensing_period: float | None = field(positive, default=None)
+    sensing_period: float | None = field(of_time(positive), default=None)
+
+    grid_values: ClassVar[tuple[str, ...]] = ("laws",)
 
     @property
     def n(self) -> int:
@@ -55,7 +58,7 @@ class Diffusion(Plant):
     def laws(self) -> GridLaws:
         """The laws of the steps of the sensing grid, shared by all paths of this plant."""
         assert self.sensing_period is not None
-        return GridLaws(self.A, self.B, self.sensing_period)
+        return GridLaws(self.A, self.B, self.sensing_period, self.time_grid)
 
     @property
     def longest_period(self) -> float:
@@ -137,7 +140,7 @@ class Diffusion(Plant):
         of their frame. Used if all sensors take samples, so that nothing needs the grid.
         """
         # Drawn at the frame times also without frames: then the path is the same.
-        marks = multiples(frame_period(self.A), horizon)
+        marks = multiples(frame_period(self.A), horizon, self.time_grid)
         start = self.start(random)
         times = TruthTimes(samples, probes, marks)
         return SampledTruth(self.moves, start, random, probing, times, frames)

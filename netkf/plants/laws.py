@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from netkf.core.instants import STANDARD, TimeGrid
 from netkf.linalg.arrays import FloatArray, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES
@@ -33,16 +34,9 @@ DEPENDENT = 1e-9  # a remainder below this share of the row's norm is rounding
 _NODES, _WEIGHTS = gauss_legendre(20)  # on [0, 1]
 
 
-def grid_time(period: float, k: int) -> float:
-    """Return the time k * period in seconds, rounded so that grids whose periods are multiples of
-    each other have equal times.
-    """
-    return float(round(k * period, 12))
-
-
 class GridLaws:
     """The laws of all paths of ``dx = A x dt + B dw`` on the sensing grid of one ``period`` (s);
-    ``A`` (n, n), ``B`` (n, m).
+    ``A`` (n, n), ``B`` (n, m). Its points are instants of ``time_grid``.
 
     to_end, to_moments  power series in the gap of the response to the state at the start of a
                         step, of its end (terms, n n + 1) and moments (terms, 2 n n + 1); the last
@@ -56,11 +50,13 @@ class GridLaws:
     Laws of states inside a step are computed on demand and cached.
     """
 
-    def __init__(self, A: FloatArray, B: FloatArray, period: float) -> None:
+    def __init__(
+        self, A: FloatArray, B: FloatArray, period: float, time_grid: TimeGrid = STANDARD
+    ) -> None:
         """Compute the laws of one step of ``period`` seconds of ``dx = A x dt + B dw``, with ``A``
         (n, n) and ``B`` (n, m).
         """
-        self.n, self.period = len(A), period
+        self.n, self.period, self.time_grid = len(A), period, time_grid
         self.A, self.B = A, B
         self.to_end, self.to_moments = _response_series(A, period)
         self.course_table = course_table(self.to_end, self.n, period)
@@ -75,7 +71,7 @@ class GridLaws:
         """
         times = self._grids.get((first, count))
         if times is None:
-            times = np.array([grid_time(self.period, first + k) for k in range(count)])
+            times = self.time_grid.snap(self.period * np.arange(first, first + count))
             if len(self._grids) < MAX_GRIDS:
                 self._grids[first, count] = times
         return times
@@ -112,7 +108,7 @@ class GridLaws:
         The result is the gain of the conditional mean and a square root of the conditional
         covariance, both (3 n, 3 n).
         """
-        key = round(length, 12), round(before, 12)
+        key = self.time_grid.instant(length), self.time_grid.instant(before)
         law = self._conditional_laws.get(key)
         if law is None:
             if len(self._conditional_laws) >= MAX_LAWS:

@@ -43,20 +43,19 @@ class LinearPlant(Plant):
         return len(self.F)
 
     def slot_time(self, k: int) -> float:
-        """Return the start of slot k in seconds, rounded so that grids whose periods are multiples
-        of each other have equal times.
-        """
-        return float(round(k * self.period, 12))
+        """Return the start of slot k in seconds, on the grid of the scenario."""
+        return self.time_grid.instant(k * self.period)
 
     def slots_of(self, times: FloatArray) -> np.ndarray:
-        """Return the slots (K,) that contain each of K ``times`` (K,), in seconds; a time that is
-        below the start of a slot by rounding belongs to that slot.
-        """
-        return np.asarray(np.floor(times / self.period + 1e-9).astype(int))
+        """Return the slots (K,) that contain each of K ``times`` (K,), in seconds."""
+        snap, period = self.time_grid.snap, self.period
+        # The nearest slot, or the one before if that one begins later.
+        nearest = np.rint(np.asarray(times) / period)
+        return np.asarray((nearest - (snap(nearest * period) > snap(times))).astype(int))
 
     def over(self, slot: int, horizon: float) -> bool:
-        """Return True if ``slot`` begins at or after the horizon (seconds), up to rounding."""
-        return self.slot_time(slot) >= horizon - 1e-9 * self.period
+        """Return True if ``slot`` begins at or after the horizon (seconds)."""
+        return self.slot_time(slot) >= self.time_grid.instant(horizon)
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
         """Return the true states of one run, drawn from ``random``; with ``frames`` those of an

@@ -33,7 +33,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, ONE, Lanes, load, spread, store
 from netkf.linalg.portable import apply
 from netkf.linalg.structs import Size
-from netkf.plants.laws import GridLaws, grid_time
+from netkf.plants.laws import GridLaws
 from netkf.plants.transitions import Transitions
 from netkf.rng.normals import Normals
 
@@ -137,7 +137,7 @@ class DiffusionPaths:
         if steps is None:
             return np.empty(0)
         count = int(horizon / (steps * period)) + 2
-        times = np.array([grid_time(period, steps * k) for k in range(1, count)])
+        times = self.laws.time_grid.snap(period * (steps * np.arange(1, count)))
         return np.asarray(times[times < horizon])
 
     def following(self, blocks: int = 1, most: int | None = None) -> Block:
@@ -213,10 +213,10 @@ class DiffusionPaths:
         for k in range(int(turn.max()) + 1):
             cuts = np.flatnonzero(turn == k)
             # The conditional law depends only on the length and on the position of the cut: cuts
-            # with the same law are drawn together. Values that differ by rounding count as equal.
-            starts = pieces.start[rows[cuts]]
-            lengths = np.round(pieces.end[rows[cuts]] - starts, 12).tolist()
-            positions = np.round(times[cuts] - starts, 12).tolist()
+            # with the same law are drawn together.
+            starts, snap = pieces.start[rows[cuts]], self.laws.time_grid.snap
+            lengths = snap(pieces.end[rows[cuts]] - starts).tolist()
+            positions = snap(times[cuts] - starts).tolist()
             groups = defaultdict[tuple[float, float], list[int]](list)
             for cut, length, position in zip(cuts.tolist(), lengths, positions, strict=True):
                 groups[length, position].append(cut)
@@ -477,7 +477,7 @@ class DiffusionPath:
 
     def grid(self, k: int) -> float:
         """Return the time (seconds) of the k-th point of the sensing grid."""
-        return grid_time(self.period, k)
+        return self.laws.time_grid.instant(k * self.period)
 
     def _at(self, time: float) -> PathStep:
         """Return the piece that contains ``time`` in seconds (start < time <= end), in the sensing

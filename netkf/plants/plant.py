@@ -10,13 +10,14 @@ from typing import ClassVar
 import numpy as np
 
 from netkf.core.fields import Component, covariance, field, vector
+from netkf.core.instants import OnGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root, product
 from netkf.rng.normals import Normals
 
 
 @dataclass(frozen=True, eq=False)
-class Plant(Component):
+class Plant(Component, OnGrid):
     """The contract of a plant, whose x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n).
 
     Both are zero by default.

@@ -19,6 +19,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
+from netkf.core.instants import TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
 from netkf.plants.transitions import Transitions
@@ -51,11 +52,13 @@ class ContinuousTruth(Protocol):
         """
 
 
-def multiples(period: float | None, horizon: float) -> FloatArray:
-    """Return the multiples (K,) of ``period`` in (0, horizon), seconds; empty without a period."""
+def multiples(period: float | None, horizon: float, grid: TimeGrid) -> FloatArray:
+    """Return the multiples (K,) of ``period`` in (0, horizon), seconds, on the ``grid``; empty
+    without a period.
+    """
     if period is None or period >= horizon:
         return np.empty(0)
-    times = period * np.arange(1, int(horizon / period) + 2)
+    times = grid.snap(period * np.arange(1, int(horizon / period) + 2))
     return np.asarray(times[times < horizon])
 
 

@@ -28,6 +28,7 @@ from netkf.scenario.records import check_records
 from netkf.scenario.registry import explain_time_mismatch, kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
 from netkf.scenario.shapes import require_shape
+from netkf.scenario.time_grid import check_grid
 
 MAX_SAMPLES = 10_000_000  # state samples of one run
 MAX_ENTRIES = 100_000_000
@@ -58,6 +59,7 @@ def check_scenario(scenario: DerivedScenario) -> None:
         _check_slots(scenario)
     elif uses_grid(scenario):
         _check_sensing_period(scenario)
+    check_grid(scenario)
     if not scenario.slotted:
         _check_speed(scenario)
     scenario.node_filter.check_scenario(scenario)

@@ -150,6 +150,7 @@ class DerivedScenario(ScenarioModel):
         if not isinstance(plant, Diffusion):
             raise TheoryError("this is about scenarios in continuous time, and this one has slots")
         plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
+        plant = plant.on_grid(self.time_grid)
         if plant.sensing_period is not None or not uses_grid(self):
             return plant
         # Nodes with the same sensors are counted and not listed, and G = H' R^-1 H of all nodes is
@@ -163,7 +164,7 @@ class DerivedScenario(ScenarioModel):
         total_information = sum(weighted, 0.0 * plant.A)
         max_period = longest_interval_for(plant.A, plant.Q, total_information)
         period = default_sensing_period(plant, informations, max_period)
-        return dataclasses.replace(plant, sensing_period=period)
+        return dataclasses.replace(plant, sensing_period=period).on_grid(self.time_grid)
 
     def _true_information(self, entries: tuple[int, ...]) -> FloatArray:
         """Return the true ``H' R^-1 H`` (n, n) of a node with these ``[[sensors]]`` entries."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -28,7 +29,8 @@ from netkf.core.fields import (
     text,
     vector,
 )
-from netkf.linalg.arrays import FloatArray
+from netkf.core.instants import OnGrid, TimeGrid
+from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graph_files import graph_rule
@@ -40,6 +42,7 @@ from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.names import bind_names
 from netkf.scenario.stamps import Time, restamp
+from netkf.scenario.time_grid import choose_grid, snap_limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +164,35 @@ class ScenarioModel(Component):
                 object.__setattr__(self, name, bind_names(value, names))
             except ScenarioError as error:
                 raise error.under(name) from None
+        self._put_on_grid()
+
+    def _put_on_grid(self) -> None:
+        """Take horizon and probe times from the grid, and give it to the parts that need it."""
+        grid = self.time_grid
+        network, filtering = self.network, self.filter
+        if isinstance(network.activation, OnGrid):
+            activation = network.activation.on_grid(grid)
+            if activation is not network.activation:
+                network = dataclasses.replace(network, activation=activation)
+        algorithm = snap_limits(filtering.algorithm, grid)
+        if algorithm is not filtering.algorithm:
+            filtering = dataclasses.replace(filtering, algorithm=algorithm)
+        probe = self.probe
+        if isinstance(probe, np.ndarray) and not np.array_equal(grid.snap(probe), probe):
+            probe = readonly_array(grid.snap(probe))
+        for name, value in (
+            ("horizon", grid.instant(self.horizon)),
+            ("probe", probe),
+            ("plant", self.plant.on_grid(grid)),
+            ("network", network),
+            ("filter", filtering),
+        ):
+            object.__setattr__(self, name, value)
+
+    @cached_property
+    def time_grid(self) -> TimeGrid:
+        """The grid that every instant of a run lies on."""
+        return choose_grid(self)
 
     @property
     def is_linear(self) -> bool:
@@ -193,10 +225,9 @@ class ScenarioModel(Component):
         """(T,) times of the state samples in seconds."""
         if isinstance(self.probe, np.ndarray):
             return self.probe
-        count = int(np.floor(self.horizon / self.probe * (1.0 + 1e-12)))
-        # Rounded, so that 3 x 0.1 is 0.3: at most 12 decimals, or 12 digits of a period below 1 s.
-        decimals = 12 - min(0, int(np.floor(np.log10(self.probe))))
-        return np.minimum(np.round(self.probe * np.arange(count + 1), decimals), self.horizon)
+        count = int(np.rint(self.horizon / self.probe))
+        times = self.time_grid.snap(self.probe * np.arange(count + 1))
+        return np.asarray(times[times <= self.horizon])
 
     @property
     def slotted(self) -> bool:

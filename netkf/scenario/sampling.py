@@ -36,6 +36,9 @@ def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, i
             times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
         except ScenarioError as error:
             raise error.under(f"sensors[{placed_sensor.entry}]") from None
+        times = scenario.time_grid.before(scenario.horizon, times)
+        if isinstance(getattr(sensor, "sampling", None), RecordedSampling):
+            times = np.unique(times)  # rows of one instant are one sample
         times_of_sensors[node, placed_sensor.ordinal] = times
     return times_of_sensors
 

@@ -14,6 +14,7 @@ from netkf.scenario.records import record_notes
 from netkf.scenario.sampling import sampling_notes
 from netkf.scenario.stamps import stamp_notes
 from netkf.scenario.tables import change_keys
+from netkf.scenario.time_grid import grid_notes
 from netkf.scenario.usage import repeat_notes
 
 
@@ -47,7 +48,7 @@ class Scenario(DerivedScenario):
         file it was read from may not exist where the pickle is loaded.
         """
         names = {field.name for field in dataclasses.fields(self)}
-        names |= {"_folder", "_trust", "topology"}
+        names |= {"_folder", "_trust", "topology", "time_grid"}
         return {name: value for name, value in self.__dict__.items() if name in names}
 
     def __repr__(self) -> str:
@@ -80,4 +81,5 @@ class Scenario(DerivedScenario):
             *record_notes(self),
             *sampling_notes(self),
             *stamp_notes(self),
+            *grid_notes(self),
         )

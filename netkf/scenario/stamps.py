@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
@@ -12,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import MAX_SECONDS, Component, Rule, SourceFile, field, one_of
+from netkf.core.fields import MAX_SECONDS, Component, Rule, SourceFile, field, one_of, positive
+from netkf.core.instants import COARSEST, FINEST
 from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import RecordedClock
@@ -55,6 +57,23 @@ _origin = Rule(
 )
 
 
+def _convert_resolution(value: Any) -> float:
+    """Return a resolution, a power of ten within the limits of grids."""
+    seconds: float = positive.convert(value)
+    exponent = round(math.log10(seconds))
+    if seconds != float(f"1e{exponent}") or not FINEST <= exponent <= COARSEST:
+        raise ValueError
+    return seconds
+
+
+_resolution = Rule(
+    "must be a power of ten of at most 1 second",
+    _convert_resolution,
+    "write 1e-6, say, or leave it out",
+    {"type": "number", "exclusiveMinimum": 0, "maximum": 1},
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Time(Component):
     """What the stamps of recorded tables mean, those in columns t, from and until.
@@ -62,10 +81,13 @@ class Time(Component):
     origin  the stamp of simulated 0: seconds, or an ISO 8601 time (UTC where it names no zone);
             stamps of all tables count from it. Default 0, which ISO 8601 stamps take for 1970
     unit    unit of stamps that are numbers: "s", "ms", "us" or "ns"
+    resolution  every instant is a whole multiple of it, a power of ten in seconds; by default the
+                finest that leaves 1e15 of them to the horizon
     """
 
     origin: int | float | str | None = field(_origin, default=None)
     unit: str = field(one_of(*UNITS), default="s")
+    resolution: float | None = field(_resolution, default=None)
 
     @property
     def stamps(self) -> TimeBase:

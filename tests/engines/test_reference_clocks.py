@@ -139,7 +139,7 @@ class Reference:
                 self.rows.append(("lost", t, sender, receiver, number))
                 return
             seconds = 0.0
-        arrival = t + seconds
+        arrival = round(t + seconds, 9)
         if arrival < self.case["horizon"]:
             if arrival > t:
                 heapq.heappush(self.times, arrival)
@@ -409,7 +409,7 @@ def moments(random, horizon, share, lattice):
     if not lattice:
         moved = random.random(len(chosen)) < 0.5
         chosen = chosen - moved * random.random(len(chosen)) * STEP * 0.99
-    return [float(t) for t in chosen]
+    return [round(float(t), 9) for t in chosen]
 
 
 def graph(random, ids, directed):
@@ -472,7 +472,7 @@ def records(random, directions, lattice, column):
             else:
                 value = float(STEP * random.integers(0, scale + 1))
                 if not lattice and random.random() < 0.5:
-                    value = float(random.random() * STEP * scale)
+                    value = round(float(random.random() * STEP * scale), 9)
                 if random.random() < 0.03:
                     value = 1e3
             rows.append([i, j, message, value])
@@ -482,14 +482,14 @@ def records(random, directions, lattice, column):
 def slow(case, factor):
     """All gaps grow."""
     case["horizon"] *= factor
-    case["probe"] = [t * factor for t in case["probe"]]
+    case["probe"] = [round(t * factor, 9) for t in case["probe"]]
     for sensor in case["sensors"]:
         for row in sensor["rows"]:
-            row[0] *= factor
+            row[0] = round(row[0] * factor, 9)
     for row in case["ticks"] or ():
-        row[0] *= factor
+        row[0] = round(row[0] * factor, 9)
     for row in case["delay"]["rows"] if case["delay"] else ():
-        row[3] *= factor
+        row[3] = round(row[3] * factor, 9)
     if "window" in case["filter"]:
         case["filter"]["window"] *= factor
 

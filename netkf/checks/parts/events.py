@@ -135,17 +135,18 @@ def draw_ticks(
     drawn again from the streams of one ``replica`` of the runs of ``seed``.
     """
     clock: Any = scenario.network.activation
-    streams = Streams(seed, replica)
-    return [
+    streams, horizon = Streams(seed, replica), scenario.horizon
+    ticks = (
         generate_ticks(
             clock,
             entity,
             partial(streams.generator, "phase", *entity),
             streams.generator("clock", *entity),
-            scenario.horizon,
+            horizon,
         )
         for entity in entities
-    ]
+    )
+    return [scenario.time_grid.before(horizon, times) for times in ticks]
 
 
 def count_drawn_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarray:

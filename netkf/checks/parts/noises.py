@@ -65,7 +65,8 @@ def path_law(scenario: Scenario) -> PathLaw | None:
         times = stated.period * np.arange(slots + 1)
         Phi, W = np.asarray(stated.F), np.asarray(stated.Q)
     else:
-        times = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
+        even = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
+        times = scenario.time_grid.snap(even)
         Phi, W = _discretise(stated.A, stated.B, float(times[1]))
     deviation = float(np.sqrt(np.diagonal(W).max()))
     return PathLaw(

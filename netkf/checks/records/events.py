@@ -172,11 +172,10 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     if (k := _first(ends < send_rows[order[place]])) is not None:
         yield f"{_describe(log, int(ends[k]))} comes before message {last['message'][k]} is sent"
     age = np.where(is_lost, 0.0, last["age"])
-    if (
-        k := _first(~(last["t"] - sent["t"] == age) | (last["phase"] != sent["phase"]))
-    ) is not None:
+    taken = scenario.time_grid.snap(last["t"] - sent["t"])
+    if (k := _first(~(taken == age) | (last["phase"] != sent["phase"]))) is not None:
         yield (
-            f"{_describe(log, int(ends[k]))} is {last['t'][k] - sent['t'][k]:.9g} s after its "
+            f"{_describe(log, int(ends[k]))} is {taken[k]:.9g} s after its "
             f"message was sent in phase {sent['phase'][k]}, not {age[k]:.9g} s"
         )
     waiting = sends["t"][~np.isin(every, keys)]

@@ -15,7 +15,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import aligned, unset, with_spare
 from netkf.linalg.portable import cholesky
 from netkf.plants.diffusion import NO_TIMES
-from netkf.plants.laws import course_width, grid_time
+from netkf.plants.laws import course_width
 from netkf.plants.paths import BLOCK, Block
 from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
@@ -47,8 +47,7 @@ def steps_to_the_end(scenario: Scenario) -> int:
     assert period is not None
     # A first guess from below; the loop counts the rest.
     steps = max(1, int(scenario.horizon / period) - 1)
-    # Compare grid times bit for bit, as the engine does.
-    while grid_time(period, steps) < scenario.horizon:
+    while scenario.time_grid.instant(steps * period) < scenario.horizon:
         steps += 1
     return steps
 

@@ -20,6 +20,7 @@ from netkf.algorithms.kernels.root_update import (
     end_intersection,
     scale_root,
 )
+from netkf.core.instants import snapped
 from netkf.engines.compiled.combination_state import (
     CombinationState,
     add_consensus,
@@ -440,8 +441,10 @@ def send(
     if not delay >= 0.0:
         record_event(state, now, LOST, sender_id, receiver_id, number)
         return
+    delay = snapped(delay, state.per_second)
+    arrival = snapped(now + delay, state.per_second)
     # The horizon is half open: a message that arrives after it leaves no event.
-    if delay > 0.0 and not now + delay < state.horizon:
+    if delay > 0.0 and not arrival < state.horizon:
         return
     m = take(state)
     message = pool[m]
@@ -464,7 +467,7 @@ def send(
         arrive(state, m, now)
         return
     # ``order`` breaks ties between messages of one link that arrive at the same time.
-    message.arrival, message.order = now + delay, state.order
+    message.arrival, message.order = arrival, state.order
     state.order += 1
     push(pool, state.heap, state.in_flight, m)
     state.in_flight += 1
@@ -530,7 +533,7 @@ def arrive(state: Simulation, m: int, now: float) -> None:
     message = state.pool[m]
     direction = state.directions[message.direction]
     sender_id, receiver_id = state.nodes[direction.sender].id, state.nodes[direction.receiver].id
-    age = now - message.sent
+    age = snapped(now - message.sent, state.per_second)
     # ``not <=`` also rejects an age that is nan.
     if not age <= state.age_limit:
         record_event_with_age(state, now, LATE, receiver_id, sender_id, message.number, age)
@@ -565,6 +568,7 @@ def on_absorb(
     m = node.inbox
     while m != -1:
         oldest, m = max(oldest, now - pool[m].sent), pool[m].next
+    oldest = snapped(oldest, state.per_second)
     if totals is not None:
         hear(state, totals, h, now)
     elif history is not None:

@@ -326,6 +326,7 @@ class Workspace:
             # node.
             "most_rows": 2 + 3 * max_messages + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
+            "per_second": self._scenario.time_grid.per_second,
             "age_limit": getattr(algorithm, "max_age", math.inf),
             "inbox_time": 0.0,
         }

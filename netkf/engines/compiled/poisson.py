@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.core.instants import snapped
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.schedule import (
     LOST,
@@ -40,7 +41,7 @@ MAX_WINDOW_TICKS.
 class PoissonClocks(NamedTuple):
     """The Poisson clocks of R runs, E entities in all, and the loss model of their messages.
 
-    next_tick : (E,), time of the next tick, seconds
+    next_tick : (E,), time of the next tick, seconds, not on the grid yet
     rate : (E,), ticks per second
     tick_streams : (E, WIDTH), states of the random streams of ticks
     loss_streams : (S, WIDTH), states of the random streams of losses; S = 0: no message is lost
@@ -49,6 +50,7 @@ class PoissonClocks(NamedTuple):
     source : (W,), loss stream of each direction, within a run
     delivery_probability : (W,), of the messages of each direction
     bits : whether outcomes are stored as arrival bits, see TickBuffer
+    per_second : ticks of the time grid in a second (core.instants)
     """
 
     next_tick: FloatArray
@@ -61,6 +63,7 @@ class PoissonClocks(NamedTuple):
     source: np.ndarray
     delivery_probability: FloatArray
     bits: bool
+    per_second: float
 
 
 class TickBuffer(NamedTuple):
@@ -123,17 +126,19 @@ def draw_ticks_of(
     k = run * (len(clocks.first) - 1) + e
     now, rate = clocks.next_tick[k], clocks.rate[k]
     m, max_outcomes, complete = counts[0], len(buffer.delay) - (after - first), True
-    while now < end:
+    instant = snapped(now, clocks.per_second)
+    while instant < end:
         # Check the space before a tick is drawn: after an enlargement drawing goes on with this
         # tick.
         if m == len(buffer.t) or counts[1] > max_outcomes:
             complete = False
             break
-        buffer.t[m], buffer.entity[m] = now, e
+        buffer.t[m], buffer.entity[m] = instant, e
         buffer.first_outcome[m] = draw_outcomes(clocks, run, first, after, delay, buffer, counts)
         m += 1
         # The next tick is drawn now: it may lie in the next window.
         now += next_exponential(states, k, exponential) / rate
+        instant = snapped(now, clocks.per_second)
     clocks.next_tick[k], counts[0] = now, m
     return complete
 
@@ -346,6 +351,7 @@ class PoissonSchedules:
             source=senders.source,
             delivery_probability=probabilities,
             bits=bits,
+            per_second=scenario.time_grid.per_second,
         )
         # The first tick of each entity, unit exponentials over its rate.
         self._clocks.next_tick[:] /= self._clocks.rate
@@ -355,6 +361,7 @@ class PoissonSchedules:
         self._max_sends = int(np.diff(senders.first).max())
         self._delay = float(scenario.network.channel.delay.fixed or 0.0)
         self._horizon, self._length = scenario.horizon, math.inf
+        self._instant = scenario.time_grid.instant
         if self._rate > 0.0:
             entities = len(senders.entities)
             # A window of some thousand ticks, more of them where there are many links.
@@ -365,7 +372,7 @@ class PoissonSchedules:
 
     def following(self) -> Window:
         """Return the next window of the ticks of one run; the last one ends at infinity."""
-        begin, end = self._end, self._end + self._length
+        begin, end = self._end, self._instant(self._end + self._length)
         # The last window has no end, so that the loop asks for no other.
         if not begin < end < self._horizon:
             end = math.inf

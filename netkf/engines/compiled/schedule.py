@@ -108,6 +108,7 @@ class TickSource:
         )
         assert isinstance(clock, LinkClock) or not entities
         self._clock, self._entities, self._horizon = clock, entities * runs, scenario.horizon
+        self._snap = scenario.time_grid.snap
         count = len(self._entities)
         self.last, self.drawn = np.zeros(count), np.zeros(count, dtype=np.int64)
         # Poisson clocks are drawn for all entities at once; others one by one in Python.
@@ -146,14 +147,16 @@ class TickSource:
             times = np.full((len(indices), max(sizes.max(), 1)), np.inf)
             for row, t in zip(times, blocks, strict=True):
                 row[: len(t)] = t
-        # The horizon is half open.
-        before_horizon = times < self._horizon
+        # Clocks go on from their own times, and the ticks are the instants nearest to them. The
+        # horizon is half open.
+        instants = self._snap(times)
+        before_horizon = instants < self._horizon
         numbers = before_horizon.sum(axis=1)
         self.drawn[indices] += sizes
         # An entity has ended if some of its ticks lie beyond the horizon.
         ended = (sizes == 0) | (numbers < sizes)
         self.last[indices] = np.where(ended, np.inf, times[np.arange(len(indices)), sizes - 1])
-        return times[before_horizon], numbers
+        return instants[before_horizon], numbers
 
     def _exponential(self, indices: np.ndarray, counts: np.ndarray) -> FloatArray:
         """Return the times (M, max(counts)) in seconds of the next ``counts`` (M,) ticks of the
@@ -418,7 +421,7 @@ class Schedule:
         senders = senders_of(scenario) if senders is None else senders
         self._draws = draws = EntityDraws(scenario, streams, senders)
         window_ticks = min(max(TICKS_PER_ENTITY * draws.count, MIN_WINDOW_TICKS), MAX_WINDOW_TICKS)
-        self._horizon, self._end = scenario.horizon, 0.0
+        self._horizon, self._end, self._grid = scenario.horizon, 0.0, scenario.time_grid
         self._waiting = draws.more(np.arange(draws.count)) if draws.count else NO_TICKS
         # The rate of the first blocks decides the length of all windows.
         self._length = window_ticks / draws.rate if draws.rate > 0.0 else math.inf
@@ -427,7 +430,7 @@ class Schedule:
         """Return the next window, all ticks of the run in the next interval of time in the order of
         (time, entity); the last one ends at infinity.
         """
-        end, draws = self._end + self._length, self._draws
+        end, draws = self._grid.instant(self._end + self._length), self._draws
         # The last window has no end, so that the loop asks for no other.
         if not self._end < end < self._horizon:
             end = math.inf

@@ -98,6 +98,7 @@ class SlotEvents:
         of one run; no slot has been made yet.
         """
         self._scenario, self._setup, self._algorithm = scenario, setup, scenario.node_filter
+        self._instant = scenario.time_grid.instant
         self._random = streams.generator("matching")
         self._directions = [
             DirectionDraws(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
@@ -225,7 +226,8 @@ class SlotEvents:
         start = now = self._scenario.slot_plant.slot_time(slot)
         for step, phase, end in zip(*(c.tolist() for c in setup.stages[:3]), strict=True):
             if step >= 0:
-                exchange_step = Step(slot, step, phase, repeats[phase], now, start + end)
+                until = self._instant(start + end)
+                exchange_step = Step(slot, step, phase, repeats[phase], now, until)
                 now, repeats[phase] = exchange_step.end, repeats[phase] + 1
                 yield exchange_step
 
@@ -332,6 +334,7 @@ class SlotEvents:
             )
             if draw[0] < probability:
                 delay = checked_delay(channel.delay, direction.ends, number, draw[2])
+                delay = self._instant(delay)
         if math.isnan(delay):
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:
@@ -339,11 +342,11 @@ class SlotEvents:
             # The inbox holds one message of each sender, the last to arrive.
             self._inbox.setdefault(receiver, {})[sender] = (number, 0.0)
         # A message that would arrive after the end leaves no event.
-        elif now + delay < self._scenario.end_time:
+        elif (arrival := self._instant(now + delay)) < self._scenario.end_time:
             self._order += 1
             # Order in the heap: time, directed link, order of sending.
             entry = (
-                now + delay,
+                arrival,
                 direction.index,
                 self._order,
                 direction,
@@ -361,12 +364,13 @@ class SlotEvents:
         while self._in_flight and self._in_flight[0][0] <= until:
             now, _, _, direction, number, sent, phase, exchange = heapq.heappop(self._in_flight)
             (sender, receiver), in_time = direction.ends, exchange == self._open
+            age = self._instant(now - sent)
             # After the horizon nothing is recorded; the last exchange may still be finished.
             if now < self._scenario.horizon:
                 kind = DELIVER if in_time else LATE
-                self._append_row((now, kind, receiver, sender, number, phase, now - sent))
+                self._append_row((now, kind, receiver, sender, number, phase, age))
             if in_time:
-                self._inbox.setdefault(receiver, {})[sender] = (number, now - sent)
+                self._inbox.setdefault(receiver, {})[sender] = (number, age)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
         """End an exchange step: set ``up`` (W,) to 1 for those of the W directed links whose

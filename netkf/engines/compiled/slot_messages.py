@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.core.instants import snapped
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
@@ -405,12 +406,14 @@ class Stages(NamedTuple):
     phase : (K,), number of the exchange that the step belongs to, -1 where sensors are read
     end : (K,), seconds after the slot begins
     stopping : step in which nodes may permanently freeze their network estimate, -1: none
+    per_second : ticks of the time grid in a second (core.instants)
     """
 
     step: np.ndarray
     phase: np.ndarray
     end: FloatArray
     stopping: int
+    per_second: float
 
 
 class SlotTimes(NamedTuple):
@@ -587,7 +590,7 @@ def _slot_rows(
         elif times.exchanged[s]:
             row = _write_sends(channels, traced, messages, rows, stage, pairwise, row)
             # Absorptions happen at the end of the step, when its inboxes close.
-            now = times.start[s] + stages.end[k]
+            now = snapped(times.start[s] + stages.end[k], stages.per_second)
             closing = SlotStage(stage.slot, s, stage.step, stage.phase, now)
             row = _write_step_end(traced, messages, rows, closing, pairwise, stages.stopping, row)
     return row

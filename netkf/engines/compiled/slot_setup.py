@@ -141,6 +141,7 @@ class SlotSetup:
             np.array(phases, dtype=np.int64),
             np.array(ends, dtype=np.float64),
             last_step.get(algorithm.slot_stopping(), -1),
+            scenario.time_grid.per_second,
         )
         self.fresh = np.array(fresh, dtype=bool)
         self.phases = [phase for step, phase, _ in stages if step >= 0]

@@ -267,7 +267,7 @@ class Simulation(Struct):
     frames, frame_at : times (F,) at which frames begin
     probes, probe_at : times (T,) of samples
     run, first_run : number of the present run, and of the first one
-    horizon : seconds
+    horizon, per_second : seconds, and ticks of the time grid in a second (core.instants)
 
     Results
 
@@ -336,6 +336,7 @@ class Simulation(Struct):
     absorbing: int
     samples: int
     horizon: float
+    per_second: float
     age_limit: float
     inbox_time: float
 

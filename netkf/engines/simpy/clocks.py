@@ -73,7 +73,7 @@ def _tick_process(
     horizon, and call ``activate``, which lets its nodes send, with its time in seconds: a SimPy
     process. ``tick_order`` is the index of the entity, which orders simultaneous ticks.
     """
-    clock = scenario.network.activation
+    clock, instant = scenario.network.activation, scenario.time_grid.instant
     assert isinstance(clock, LinkClock)
     # A stream of its own: the ticks of one entity never depend on those of another.
     random = streams.generator("clock", *entity)
@@ -83,12 +83,14 @@ def _tick_process(
     while True:
         # Ticks are drawn in blocks; their times do not depend on the length of a block.
         times = next_ticks(clock, entity, ClockPosition(origin, index, now), random, count).tolist()
+        # The clock goes on from its own times, and the ticks are the instants nearest to them.
         for now in times:
+            time = instant(now)
             # Half open: a tick at the horizon does not happen.
-            if now >= scenario.horizon:
+            if time >= scenario.horizon:
                 return
-            yield timeline.at(now, Rank.TICK, tick_order)
-            activate(now)
+            yield timeline.at(time, Rank.TICK, tick_order)
+            activate(time)
         # An empty block: the clock has no more ticks.
         if not times:
             return

@@ -59,7 +59,7 @@ class SlotSchedule:
         and the number of steps of each of its exchanges.
         """
         self._algorithm, self._plant = scenario.node_filter, scenario.slot_plant
-        self.horizon = scenario.horizon
+        self.horizon, self._instant = scenario.horizon, scenario.time_grid.instant
         phases = self._algorithm.schedule or ()
         # Steps of each exchange; none if the filter does not talk.
         self._exchanges = [
@@ -117,12 +117,12 @@ class SlotSchedule:
         number = (slot - algorithm.first_slot) * sum(self._exchanges)
         for kind in algorithm.schedule or ():
             if kind == "exchange":
-                # Steps share the phase equally. Their ends are computed from the start of the slot,
-                # so that rounding does not add up.
+                # Steps share the phase equally; their ends are counted from the start of the slot.
                 steps = self._exchanges[phase]
                 for step in range(steps if talks else 0):
                     yield Stage("send", now, rank, phase, step, number)
-                    now = start + (phase + (step + 1) / steps) * self._length
+                    share = phase + (step + 1) / steps
+                    now = self._instant(start + share * self._length)
                     # Absorption has the next rank: a step may take no time, and then only ranks
                     # order it.
                     yield Stage("absorb", now, rank + 1, phase, step, number)

@@ -71,6 +71,7 @@ class Transmitter:
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
         self._horizon, self._until = scenario.horizon, scenario.end_time
+        self._instant = scenario.time_grid.instant
         # Payloads under way, by link and number, because a move of the origin shifts them.
         self._under_way: dict[tuple[Link, int], Envelope] = {}
 
@@ -109,8 +110,10 @@ class Transmitter:
         # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
         # nan: the message is lost.
-        delay = transit_time(
-            self._channel, direction.link, number, outcome, direction.table_probability
+        delay = self._instant(
+            transit_time(
+                self._channel, direction.link, number, outcome, direction.table_probability
+            )
         )
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
@@ -120,11 +123,11 @@ class Transmitter:
         if delay == 0.0:
             self._arrive(direction, phase, envelope, None)
         # A message that would arrive after the end is neither delivered nor lost.
-        elif now + delay < self._until:
+        elif (arrival := self._instant(now + delay)) < self._until:
             # Delivery takes the envelope from this dictionary, since it may be shifted meanwhile.
             self._under_way[direction.link, number] = envelope
             callback = partial(self._arrive, direction, phase, envelope)
-            self._timeline.call_at(now + delay, Rank.DELIVER, direction.entity, callback)
+            self._timeline.call_at(arrival, Rank.DELIVER, direction.entity, callback)
 
     def _arrive(
         self, direction: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
@@ -138,7 +141,7 @@ class Transmitter:
         if arrival is not None:
             # The stored envelope may have been shifted since it was sent.
             envelope = self._under_way.pop((direction.link, envelope.number))
-            envelope = envelope._replace(age=now - envelope.sent)
+            envelope = envelope._replace(age=self._instant(now - envelope.sent))
         arrives_in_time = direction.receiver.in_time(envelope)
         # After the horizon the last slot is finished for its sample, without recording events.
         if now < self._horizon or envelope.sent == now:

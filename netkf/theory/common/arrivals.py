@@ -22,7 +22,7 @@ def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
     """
     index, size, period = scenario.topology.index, len(scenario.nodes), scenario.slot_plant.period
     rows = run.log[run.log["kind"] == CODES["deliver"]]
-    sent, length = rows["t"] - rows["age"], scenario.phase_length
+    sent, length = scenario.time_grid.snap(rows["t"] - rows["age"]), scenario.phase_length
     slot = scenario.slot_plant.slots_of(sent)
     # A message belongs to the step in which it was sent.
     since = sent - slot * period - rows["phase"] * length
@@ -45,7 +45,7 @@ def require_traced_exchanges(scenario: Scenario, run: Run) -> None:
     that begins there are not in the trace.
     """
     plant = scenario.slot_plant
-    slots = np.round(run.times / plant.period).astype(int).tolist()
+    slots = plant.slots_of(run.times).tolist()
     if slots and plant.over(slots[-1], scenario.horizon):
         message = "the exchanges of the slot at the horizon are not in the trace: sample before it"
         raise TheoryError(message)

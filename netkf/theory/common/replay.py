@@ -199,7 +199,7 @@ def _replay_slots(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterat
     observe = slot_observations(scenario, run)
     arrivals = _exchanged_messages(scenario, run) if rule.takes_messages else {}
     processed = 0
-    for until in np.round(run.times / plant.period).astype(int).tolist():
+    for until in plant.slots_of(run.times).tolist():
         while processed < until:
             slot = processed if scenario.node_filter.predicts else processed + 1
             _replay_slot(rule, prediction, phases, slot, observe(slot), arrivals)

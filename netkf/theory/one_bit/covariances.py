@@ -47,7 +47,7 @@ def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
     sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
     used = _used_bits(scenario, run)
     P, covariances, slot = [np.asarray(scenario.initial_estimate(node)[1]) for node in nodes], [], 0
-    for until in np.round(run.times / plant.period).astype(int).tolist():
+    for until in plant.slots_of(run.times).tolist():
         while slot < until:
             slot += 1
             P = [lyapunov_step(one, F, Q) for one in P]

@@ -1,0 +1,219 @@
+"""The time grid of a scenario, chosen from its horizon and the times in its fields."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import Component
+from netkf.core.instants import COARSEST, FINEST, MAX_TICKS, TimeGrid, as_fraction
+from netkf.linalg.spectra import eigenvalues
+from netkf.network.clocks import Poisson
+from netkf.network.matchings import SlotActivation
+from netkf.plants.diffusion import Diffusion
+
+MAX_REFINE = 10_000  # ticks in a resolution; more would leave too few decimals
+LISTED = 64  # of a list of probe times, how many are looked at
+FAR = 1e3  # a tick is far below a time of so many ticks
+
+
+class TimeConstant(NamedTuple):
+    """A time in the fields of a scenario: its key path, seconds, and the rational number that it
+    stands for, None if it is not known.
+    """
+
+    key: str
+    seconds: float
+    exact: Fraction | None
+
+
+def choose_grid(scenario: Any) -> TimeGrid:
+    """Return the grid of instants of a scenario: the finest power of ten that leaves MAX_TICKS to
+    the horizon, or ``[time] resolution``, divided where times of the scenario are no decimal
+    numbers, so that sums of them are whole numbers of ticks.
+    """
+    automatic, given = _choose_automatically(scenario), scenario.time.resolution
+    return automatic if given is None else TimeGrid(given, automatic.refine)
+
+
+def _choose_automatically(scenario: Any) -> TimeGrid:
+    """Return the grid without ``[time] resolution``."""
+    refine, horizon = 1, Fraction(scenario.horizon)
+    for constant in _time_constants(scenario):
+        finer = math.lcm(refine, _odd_part(constant))
+        # Of many odd denominators the first ones count; the others leave a note.
+        if finer <= min(MAX_REFINE, MAX_TICKS / horizon):
+            refine = finer
+    for exponent in range(FINEST, COARSEST + 1):
+        ticks = 10**-exponent * refine
+        if horizon * ticks <= MAX_TICKS and int(float(ticks)) == ticks:
+            return TimeGrid(float(f"1e{exponent}"), refine)
+    return TimeGrid(10.0**COARSEST)
+
+
+def _odd_part(constant: TimeConstant) -> int:
+    """Return the part of the denominator of a time that no power of ten is divisible by."""
+    part = 1 if constant.exact is None else constant.exact.denominator
+    for prime in (2, 5):
+        while part % prime == 0:
+            part //= prime
+    return part
+
+
+def _time_constants(scenario: Any) -> Iterator[TimeConstant]:
+    """Yield the times that instants of a scenario are made of."""
+    yield _constant("horizon", scenario.horizon)
+    probe = scenario.probe
+    listed = probe[:LISTED].tolist() if isinstance(probe, np.ndarray) else [probe]
+    yield from (_constant("probe", time) for time in listed)
+    network = scenario.network
+    for key, part in (
+        ("plant", scenario.plant),
+        *((f"sensors[{k}]", sensor) for k, sensor in enumerate(scenario.sensors)),
+        ("network.activation", network.activation),
+        ("network.channel.delay", network.channel.delay),
+        ("filter", scenario.filter.algorithm),
+    ):
+        yield from _times_of(key, part)
+    if network.channel.delay.fixed is not None:
+        yield _constant("network.channel.delay", network.channel.delay.fixed)
+    yield from _step_lengths(scenario)
+
+
+def _constant(key: str, seconds: float) -> TimeConstant:
+    """Return a time in the fields of a scenario."""
+    return TimeConstant(key, seconds, as_fraction(seconds) if math.isfinite(seconds) else None)
+
+
+def _times_of(key: str, part: Any) -> Iterator[TimeConstant]:
+    """Yield the times in the fields of a component and of the components inside it."""
+    if not isinstance(part, Component):
+        return
+    for field in dataclasses.fields(part):
+        value, rule = getattr(part, field.name), field.metadata.get("rule")
+        if isinstance(value, Component):
+            yield from _times_of(f"{key}.{field.name}", value)
+        elif isinstance(value, float) and rule is not None and rule.of_time:
+            yield _constant(f"{key}.{field.name}", value)
+    gaps = getattr(part, "gaps", None)
+    if isinstance(gaps, Lattice):
+        yield _constant(key, gaps.period)
+
+
+def _step_lengths(scenario: Any) -> Iterator[TimeConstant]:
+    """Yield the length of a step of each exchange of a slot."""
+    activation, node_filter = scenario.network.activation, scenario.node_filter
+    if not (scenario.slotted and isinstance(activation, SlotActivation) and node_filter.talks):
+        return
+    length = scenario.phase_length
+    exact = as_fraction(length)
+    for phase in range((node_filter.schedule or ()).count("exchange")):
+        steps = node_filter.exchange_steps(phase)
+        if steps:
+            share = None if exact is None else exact / steps
+            yield TimeConstant("network.activation.phase", length / steps, share)
+
+
+def snap_limits(algorithm: Any, grid: TimeGrid) -> Any:
+    """Return a filter whose times, which ages are compared with, are on the ``grid``."""
+    if not isinstance(algorithm, Component):
+        return algorithm
+    times = {
+        field.name: getattr(algorithm, field.name)
+        for field in dataclasses.fields(algorithm)
+        if field.init and field.metadata.get("rule") and field.metadata["rule"].of_time
+    }
+    changed = {
+        name: grid.instant(value)
+        for name, value in times.items()
+        if isinstance(value, float) and 0.0 < grid.instant(value) != value
+    }
+    return dataclasses.replace(algorithm, **changed) if changed else algorithm
+
+
+def check_grid(scenario: Any) -> None:
+    """Raise ScenarioError if the instants of a scenario have no grid: ``[time] resolution`` does
+    not fit the horizon or a time, or a time is too short to be seen at the horizon.
+    """
+    grid, given = scenario.time_grid, scenario.time.resolution
+    least = _choose_automatically(scenario).resolution
+    if given is not None and given < least:
+        raise ScenarioError(
+            "time.resolution",
+            f"must leave at most {MAX_TICKS:g} ticks to the horizon {scenario.horizon:.15g}",
+            given,
+            f"give at least {least:g}, or leave it out",
+        )
+    is_coarse = given is not None and given > least
+    for key, seconds, exact in _time_constants(scenario):
+        is_held = _is_held(grid, seconds, exact)
+        if seconds > 0.0 and (seconds < grid.resolution / grid.refine or _is_off(grid, seconds)):
+            why = f"the resolution {given:g} of [time]"
+            if not is_coarse:
+                why = f"{least:g} s, the resolution of time up to the horizon {scenario.horizon:g}"
+            raise ScenarioError(
+                key, f"must be far above {why}", seconds, "lengthen it or shorten the horizon"
+            )
+        if is_coarse and not is_held:
+            remedy = f"give a finer resolution, at least {least:g}, or leave it out"
+            rule = f"must be a multiple of the resolution {given:g} of [time]"
+            raise ScenarioError(key, rule, seconds, remedy)
+
+
+def _is_held(grid: TimeGrid, seconds: float, exact: Fraction | None) -> bool:
+    """Return True if a time is a whole number of ticks, up to rounding where it is not known."""
+    if exact is not None:
+        return grid.holds(exact)
+    return abs(grid.instant(seconds) - seconds) <= 1e-15 * seconds
+
+
+def _is_off(grid: TimeGrid, seconds: float) -> bool:
+    """Return True if the nearest whole number of ticks is far from a time."""
+    return abs(grid.instant(seconds) - seconds) * FAR > seconds
+
+
+def grid_notes(scenario: Any) -> tuple[str, ...]:
+    """Return lines on times that are rounded, and on a resolution that is not far below the
+    shortest gap of a clock, delay or window, or the shortest time constant of the plant.
+    """
+    grid, notes = scenario.time_grid, []
+    tick = 1.0 / grid.per_second
+    rounded = [
+        constant
+        for constant in _time_constants(scenario)
+        if constant.exact is not None and not grid.holds(constant.exact)
+    ]
+    if rounded:
+        key, seconds, _ = rounded[0]
+        more = f", and {len(rounded) - 1} more" if len(rounded) > 1 else ""
+        notes.append(
+            f"time: {key} = {seconds!r} is no whole number of ticks of {tick:g} s{more}: instants "
+            "that are sums of it may be a tick apart"
+        )
+    key, shortest = min(_short_times(scenario), key=lambda pair: pair[1])
+    if shortest < FAR * tick:
+        notes.append(
+            f"time: instants are whole multiples of {tick:g} s, which is not far below {key} "
+            f"{shortest:.3g} s: it is rounded"
+        )
+    return tuple(notes)
+
+
+def _short_times(scenario: Any) -> Iterator[tuple[str, float]]:
+    """Yield the times of a scenario, also mean gaps of clocks and time constants, by name."""
+    yield from ((key, value) for key, value, _ in _time_constants(scenario) if value > 0.0)
+    clocks = [getattr(sensor, "sampling", None) for sensor in scenario.sensors]
+    for clock in (scenario.network.activation, *clocks):
+        if isinstance(clock, Poisson):
+            rates = [rate for rate in (clock.rate, *(e[-1] for e in clock.rates)) if rate]
+            yield "the mean gap of a clock,", 1.0 / max(rates, default=1e-15)
+    if isinstance(scenario.plant, Diffusion):
+        fastest = float(np.abs(eigenvalues(scenario.plant.A)).max())
+        if fastest > 0.0:
+            yield "the shortest time constant of the plant,", 1.0 / fastest
