@@ -21,7 +21,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -32,6 +32,8 @@ MAX_TICKS = 1e15
 """Largest number of ticks up to the horizon, see above."""
 FINEST, COARSEST = -22, 0
 """Exponents of ten of the resolutions: float64 holds 10^22, and a tick is at most a second."""
+MAX_REFINE = 10_000
+"""Ticks in a resolution; more would leave too few decimals."""
 MAX_DENOMINATOR = 100_000
 """Of rational numbers that are recognised by their value."""
 SHORT = 15  # significant digits of decimal numbers that are taken as they are written
@@ -60,6 +62,11 @@ class TimeGrid:
     def per_second(self) -> float:
         """Ticks in a second, an integer."""
         return float(10 ** -round(math.log10(self.resolution)) * self.refine)
+
+    def as_table(self) -> dict[str, Any]:
+        """Return the keys of ``[time]`` that say the grid: ``refine`` only where it is not 1."""
+        more = {} if self.refine == 1 else {"refine": self.refine}
+        return {"resolution": self.resolution, **more}
 
     def snap(self, times: FloatArray) -> FloatArray:
         """Return ``times`` (any shape), seconds, in canonical form."""

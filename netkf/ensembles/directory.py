@@ -211,6 +211,7 @@ class _DirectoryWriter:
             engine=plan.engine,
             runs=plan.runs,
             node_names=scenario.topology.names,
+            time_grid=scenario.time_grid,
         )
         self._known: list[int] = []
         self._done = self.simulated = 0

@@ -14,6 +14,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer
+from netkf.core.instants import TimeGrid
 from netkf.engines.base import Engine, Progress, silent
 from netkf.linalg import compiling
 from netkf.network.recorded import RecordedDelay, RecordedLoss
@@ -228,6 +229,7 @@ def _create_output(
         replica=replica,
         engine=engine,
         node_names=scenario.topology.names,
+        time_grid=scenario.time_grid,
     )
     # Written first, so that the directory of a process that is killed says "interrupted".
     manifest.write("interrupted", {})
@@ -288,8 +290,8 @@ def _event_totals(recorder: Recorder) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """The manifest.json of a directory of ``runs`` runs, numbered from ``replica`` on, of a network
-    whose nodes have ``node_names``: ids by name.
+    """The manifest.json of a directory of ``runs`` runs, numbered from ``replica`` on, with their
+    instants on ``time_grid``, of a network whose nodes have ``node_names``: ids by name.
     """
 
     directory: Path
@@ -297,6 +299,7 @@ class Manifest:
     seed: int
     replica: int
     engine: str
+    time_grid: TimeGrid
     runs: int = 1
     node_names: Mapping[str, int] = field(default_factory=dict)
 
@@ -322,6 +325,7 @@ class Manifest:
             "runs": {"wanted": self.runs, "done": int(completed_runs)},
             "engine": self.engine,
             "status": status,
+            "time": self.time_grid.as_table(),
             **({"node_names": dict(self.node_names)} if self.node_names else {}),
             **totals,
         }

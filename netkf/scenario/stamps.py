@@ -13,8 +13,17 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import MAX_SECONDS, Component, Rule, SourceFile, field, one_of, positive
-from netkf.core.instants import COARSEST, FINEST
+from netkf.core.fields import (
+    MAX_SECONDS,
+    Component,
+    Rule,
+    SourceFile,
+    field,
+    integer,
+    one_of,
+    positive,
+)
+from netkf.core.instants import COARSEST, FINEST, MAX_REFINE
 from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import RecordedClock
@@ -82,12 +91,15 @@ class Time(Component):
             stamps of all tables count from it. Default 0, which ISO 8601 stamps take for 1970
     unit    unit of stamps that are numbers: "s", "ms", "us" or "ns"
     resolution  every instant is a whole multiple of it, a power of ten in seconds; by default the
-                finest that leaves 1e15 of them to the horizon
+                finest that leaves at most 1e15 of them to the horizon
+    refine  into how many ticks the resolution is divided, so that times which are no decimal
+            numbers, such as 1/12, are whole numbers of ticks; by default as many as these need
     """
 
     origin: int | float | str | None = field(_origin, default=None)
     unit: str = field(one_of(*UNITS), default="s")
     resolution: float | None = field(_resolution, default=None)
+    refine: int | None = field(integer(low=1, high=MAX_REFINE), default=None)
 
     @property
     def stamps(self) -> TimeBase:

@@ -12,13 +12,12 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
-from netkf.core.instants import COARSEST, FINEST, MAX_TICKS, TimeGrid, as_fraction
+from netkf.core.instants import COARSEST, FINEST, MAX_REFINE, MAX_TICKS, TimeGrid, as_fraction
 from netkf.linalg.spectra import eigenvalues
 from netkf.network.clocks import Poisson
 from netkf.network.matchings import SlotActivation
 from netkf.plants.diffusion import Diffusion
 
-MAX_REFINE = 10_000  # ticks in a resolution; more would leave too few decimals
 LISTED = 64  # of a list of probe times, how many are looked at
 FAR = 1e3  # a tick is far below a time of so many ticks
 
@@ -44,8 +43,8 @@ def choose_grid(scenario: Any) -> TimeGrid:
 
 def _choose_automatically(scenario: Any) -> TimeGrid:
     """Return the grid without ``[time] resolution``."""
-    refine, horizon = 1, Fraction(scenario.horizon)
-    for constant in _time_constants(scenario):
+    refine, horizon = scenario.time.refine or 1, Fraction(scenario.horizon)
+    for constant in () if scenario.time.refine else _time_constants(scenario):
         finer = math.lcm(refine, _odd_part(constant))
         # Of many odd denominators the first ones count; the others leave a note.
         if finer <= min(MAX_REFINE, MAX_TICKS / horizon):

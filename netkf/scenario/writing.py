@@ -89,7 +89,9 @@ def _scenario_table(
     """
     table = _field_values(scenario, style)
     table.pop("time", None)
-    if time := _field_values(scenario.time, style):
+    # A run's own copy says its grid.
+    grid = scenario.time_grid.as_table() if style.with_defaults else {}
+    if time := {**_field_values(scenario.time, style), **grid}:
         table["time"] = time
     table["plant"] = _kind_table("plant", plant, style)
     table["sensors"] = [_sensor_table(sensor, style) for sensor in scenario.sensors]

@@ -1,0 +1,191 @@
+"""A scenario in another unit of time is the same scenario: seconds, milliseconds, tenths, twelfths,
+minutes. Its times are whole numbers of a unit, so that many instants meet: samples, ticks, arrivals
+after whole periods, windows and steps that end when a message arrives, probes.
+"""
+
+import math
+import pathlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import netkf
+from netkf.scenario.reading import from_table
+
+UNITS = {
+    "ms": 1e-3,
+    "0.1 s": 0.1,
+    "1/12 s": 1 / 12,
+    "1/60 s": 1 / 60,
+    "1/600 s": 0.1 / 60,
+    "s": 1.0,
+}
+NODES = 4
+
+
+def clocked(unit, filter_, activation, sampling, delay, window=None, rates=False):
+    """A scenario under clocks whose times are those of the arguments, times ``unit`` seconds."""
+    times = {"period", "phase", "seconds"}
+
+    def seconds(table):
+        scaled = {name: unit * table[name] for name in times & set(table)}
+        return {**table, **scaled, **({"rate": table["rate"] / unit} if "rate" in table else {})}
+
+    options = dict(filter_)
+    if window is not None:
+        options["window"] = window * unit
+    plant = {
+        "kind": "diffusion",
+        "A": [[-0.02 / unit, 0.1 / unit], [-0.1 / unit, -0.02 / unit]],
+        "B": [[0.0], [0.5 / math.sqrt(unit)]],
+        "cov": [[1.0, 0.2], [0.2, 2.0]],
+    }
+    sensors = [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.04]], "sampling": seconds(sampling)},
+        {"nodes": [2], "H": [[0.0, 1.0]], "R": [[0.5]], "sampling": seconds(sampling)},
+    ]
+    if sampling["kind"] == "continuous":
+        plant["sensing_period"] = sampling["period"] * unit
+        for sensor in sensors:
+            sensor["sampling"] = "continuous"
+            sensor["R"] = [[50.0 * sensor["R"][0][0] * unit]]
+    return made(unit, plant, sensors, seconds(activation), seconds(delay), options)
+
+
+def slotted(unit, filter_, steps, activation, delay):
+    """A scenario in slots of 12 units with exchanges of ``steps`` steps, one unit each."""
+    plant = {
+        "kind": "linear",
+        "F": [[1.0, 0.3], [-0.3, 0.9]],
+        "Q": [[0.1, 0.0], [0.0, 0.4]],
+        "period": 12 * unit,
+        "cov": [[1.0, 0.2], [0.2, 2.0]],
+    }
+    sensors = [{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.04]]}]
+    activation = {**activation, "phase": steps * unit}
+    delay = {"kind": "constant", "seconds": delay * unit}
+    return made(unit, plant, sensors, activation, delay, filter_)
+
+
+def made(unit, plant, sensors, activation, delay, filter_):
+    tables = {
+        "format": 1,
+        "name": "units",
+        "horizon": 60 * unit,
+        "probe": (12 if plant["kind"] == "linear" else 2) * unit,
+        "plant": plant,
+        "sensors": sensors,
+        "network": {
+            "graph": {"kind": "path", "nodes": NODES},
+            "activation": activation,
+            "channel": {"loss": {"kind": "bernoulli", "delivery": 0.8}, "delay": delay},
+        },
+        "filter": filter_,
+    }
+    return from_table(tables, pathlib.Path())
+
+
+def compare(run, other, unit):
+    """Both runs have the same events, at the same multiples of their unit, and the same P."""
+    assert len(run.log) == len(other.log)
+    for name in ("kind", "node", "peer", "message", "phase"):
+        np.testing.assert_array_equal(run.log[name], other.log[name])
+    for name in ("t", "age"):
+        np.testing.assert_allclose(other.log[name] / unit, run.log[name], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(other.P, run.P, rtol=1e-9, atol=1e-12)
+    if (run.log["t"] % 1.0 == 0.0).all():  # every instant of the lattice is the number one writes
+        assert (run.log["t"] == np.rint(run.log["t"])).all()
+        np.testing.assert_array_equal(other.log["t"], np.rint(run.log["t"]) / round(1 / unit))
+
+
+CLOCKED = [
+    ({"kind": "diffusion"}, "nodes"),
+    ({"kind": "diffusion"}, "directions"),
+    ({"kind": "hybrid", "epsilon": 0.2}, "links"),
+    ({"kind": "covariance-intersection", "epsilon": 0.2}, "directions"),
+    ({"kind": "intermittent"}, "readings"),
+]
+SLOTTED = [
+    ({"kind": "hcmci"}, {"kind": "broadcast"}),
+    ({"kind": "icf"}, {"kind": "broadcast"}),
+    ({"kind": "gossip"}, {"kind": "matching", "protocol": "uniform-maximal"}),
+]
+PERIODS = st.sampled_from([1, 2, 3, 4, 6])
+
+
+@st.composite
+def clocked_cases(draw):
+    """Arguments of ``clocked`` but the unit."""
+    filter_, at = draw(st.sampled_from(CLOCKED))
+    period = draw(PERIODS)
+    sampling = {"kind": "periodic", "period": draw(PERIODS)}
+    activation = {"kind": "periodic", "at": at, "period": period}
+    activation["phase"] = draw(st.integers(0, period - 1))
+    if at == "readings":
+        activation = {"kind": "readings"}
+    elif draw(st.booleans()) and draw(st.booleans()):
+        activation = {"kind": "poisson", "at": at, "rate": 0.5}
+    if filter_["kind"] == "hybrid" and draw(st.booleans()):
+        sampling["kind"] = "continuous"
+    delay = draw(st.integers(0, 6))
+    window = delay if at == "readings" and delay else None
+    return filter_, activation, sampling, {"kind": "constant", "seconds": delay}, window
+
+
+@given(clocked_cases(), st.sampled_from(list(UNITS)))
+@settings(max_examples=25, deadline=None)
+def test_clocks_in_every_unit(case, name):
+    unit = UNITS[name]
+    run, other = (netkf.simulate(clocked(u, *case), engine="simpy") for u in (1.0, unit))
+    compare(run, other, unit)
+
+
+@given(st.sampled_from(SLOTTED), st.integers(1, 5), st.integers(0, 2), st.sampled_from(list(UNITS)))
+@settings(max_examples=15, deadline=None)
+def test_slots_in_every_unit(case, steps, delay, name):
+    filter_, activation = case
+    several = filter_["kind"] != "gossip"
+    options = {**filter_, "steps": steps} if several else filter_
+    unit = UNITS[name]
+    runs = [
+        netkf.simulate(
+            slotted(u, options, steps if several else 1, activation, delay), engine="simpy"
+        )
+        for u in (1.0, unit)
+    ]
+    compare(*runs, unit)
+    # What takes a step is in time, and what takes two is late.
+    ages = runs[1].events.groupby("kind")["age"].max()
+    assert ages.get("deliver", 0.0) <= unit
+    assert delay < 2 or "deliver" not in ages
+
+
+@pytest.mark.parametrize("unit", [1 / 12, 0.1])
+@pytest.mark.parametrize("k", range(len(CLOCKED)))
+def test_engines_agree_under_clocks(k, unit):
+    filter_, at = CLOCKED[k]
+    activation = {"kind": "periodic", "at": at, "period": 4, "phase": 1}
+    if at == "readings":
+        activation = {"kind": "readings"}
+    sampling = {"kind": "periodic", "period": 3}
+    window = 6 if at == "readings" else None
+    delay = {"kind": "constant", "seconds": 6}
+    scenario = clocked(unit, filter_, activation, sampling, delay, window)
+    agree(scenario)
+
+
+@pytest.mark.parametrize("k", range(len(SLOTTED)))
+def test_engines_agree_in_slots(k):
+    filter_, activation = SLOTTED[k]
+    steps = 1 if filter_["kind"] == "gossip" else 3
+    options = filter_ if steps == 1 else {**filter_, "steps": steps}
+    agree(slotted(1 / 12, options, steps, activation, 1))
+
+
+def agree(scenario):
+    simpy, compiled = (netkf.simulate(scenario, engine=e) for e in ("simpy", "compiled"))
+    assert simpy.fingerprint == compiled.fingerprint
+    assert simpy.log.tobytes() == compiled.log.tobytes()
+    np.testing.assert_allclose(compiled.P, simpy.P, rtol=1e-10, atol=1e-12)
