@@ -151,18 +151,21 @@ def check_grid(scenario: Any) -> None:
         )
     is_coarse = given is not None and given > least
     for key, seconds, exact in _time_constants(scenario):
-        is_held = _is_held(grid, seconds, exact)
-        if seconds > 0.0 and (seconds < grid.resolution / grid.refine or _is_off(grid, seconds)):
-            why = f"the resolution {given:g} of [time]"
-            if not is_coarse:
-                why = f"{least:g} s, the resolution of time up to the horizon {scenario.horizon:g}"
+        if is_coarse and not _is_held(grid, seconds, exact):
             raise ScenarioError(
-                key, f"must be far above {why}", seconds, "lengthen it or shorten the horizon"
+                key,
+                f"must be a multiple of the resolution {given:g} of [time]",
+                seconds,
+                f"give a finer resolution, at least {least:g}, or leave it out",
             )
-        if is_coarse and not is_held:
-            remedy = f"give a finer resolution, at least {least:g}, or leave it out"
-            rule = f"must be a multiple of the resolution {given:g} of [time]"
-            raise ScenarioError(key, rule, seconds, remedy)
+        if seconds > 0.0 and _is_off(grid, seconds):
+            raise ScenarioError(
+                key,
+                f"must be far above {grid.resolution:g} s, the finest resolution of time that "
+                f"leaves {MAX_TICKS:g} ticks to the horizon {scenario.horizon:.15g}",
+                seconds,
+                "lengthen it or shorten the horizon",
+            )
 
 
 def _is_held(grid: TimeGrid, seconds: float, exact: Fraction | None) -> bool:
