@@ -44,7 +44,10 @@ def choose_grid(scenario: Any) -> TimeGrid:
 def _choose_automatically(scenario: Any) -> TimeGrid:
     """Return the grid without ``[time] resolution``."""
     refine, horizon = scenario.time.refine or 1, Fraction(scenario.horizon)
-    for constant in () if scenario.time.refine else _time_constants(scenario):
+    # Not of probes, which no instant depends on, nor of the horizon: what is recorded, and for how
+    # long, must not change a run.
+    constants = (c for c in _time_constants(scenario) if c.key not in ("horizon", "probe"))
+    for constant in () if scenario.time.refine else constants:
         finer = math.lcm(refine, _odd_part(constant))
         # Of many odd denominators the first ones count; the others leave a note.
         if finer <= min(MAX_REFINE, MAX_TICKS / horizon):
@@ -189,7 +192,9 @@ def grid_notes(scenario: Any) -> tuple[str, ...]:
     rounded = [
         constant
         for constant in _time_constants(scenario)
-        if constant.exact is not None and not grid.holds(constant.exact)
+        if constant.key not in ("horizon", "probe")
+        and constant.exact is not None
+        and not grid.holds(constant.exact)
     ]
     if rounded:
         key, seconds, _ = rounded[0]

@@ -50,7 +50,11 @@ def path(tmp_path):
         ({"horizon": 1000.0}, TimeGrid(1e-12)),
         ({"horizon": 1000.1}, TimeGrid(1e-11)),
         ({"network.activation.period": 1 / 12}, TimeGrid(1e-13, 3)),
-        ({"network.activation.period": 1 / 7, "probe": 1 / 3}, TimeGrid(1e-12, 21)),
+        (
+            {"network.activation.period": 1 / 7, "sensors.0.sampling.period": 1 / 3},
+            TimeGrid(1e-12, 21),
+        ),
+        ({"probe": 1 / 3}, TimeGrid(1e-13)),
         ({"network.channel.delay.seconds": 1 / 600}, TimeGrid(1e-13, 3)),
         ({"sensors.0.sampling.period": 1 / 3}, TimeGrid(1e-13, 3)),
         ({"sensors.0.sampling.period": 0.1 + 0.2}, TimeGrid(1e-13)),
@@ -128,6 +132,10 @@ def test_notes_of_a_coarse_grid(path):
 
 def test_times_of_samples_end_at_the_horizon(path):
     scenario = netkf.load(path).replace({"horizon": 100 * (1 / 12), "probe": 1 / 3})
+    assert len(scenario.times) == 26
+    assert scenario.times[-1] == scenario.horizon
+    np.testing.assert_allclose(scenario.times, np.arange(26) / 3, atol=1e-13)
+    scenario = scenario.replace({SAMPLING: 1 / 12})
     assert scenario.horizon == 25 / 3
     np.testing.assert_array_equal(scenario.times, [k / 3 for k in range(26)])
 
