@@ -13,6 +13,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
 from netkf.core.instants import COARSEST, FINEST, MAX_REFINE, MAX_TICKS, TimeGrid, as_fraction
+from netkf.core.laws import Lattice
 from netkf.linalg.spectra import eigenvalues
 from netkf.network.clocks import Poisson
 from netkf.network.matchings import SlotActivation
