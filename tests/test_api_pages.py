@@ -12,7 +12,7 @@ import netkf
 from tests.documents import DOCS
 
 API = DOCS / "api"
-MODULES = ("netkf", "netkf.parts", "netkf.testing", "netkf.theory")
+MODULES = ("netkf", "netkf.parts", "netkf.testing", "netkf.theory", "netkf.kernels")
 DIRECTIVE = re.compile(r"^\.\. auto(?:class|function|exception):: (\S+)$", re.MULTILINE)
 ELSEWHERE = {
     "netkf.parts.Scenario",

@@ -5,6 +5,7 @@ import re
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.linalg
 
@@ -60,6 +61,45 @@ def test_the_scenarios_of_the_page_run_in_both_kinds_of_time(folder):
         run = netkf.simulate(netkf.load(folder / name), engine="simpy")
         assert run.status == "complete"
         assert np.abs(run.error).max() < 10.0
+
+
+@pytest.mark.parametrize("name", ["kcf_slots.toml", "kcf_clocks.toml"])
+def test_the_kernels_are_the_methods(folder, name):
+    """A custom filter whose verbs are kernels runs in both engines, as the one in plain Python."""
+    plain = netkf.load(folder / name)
+    text = (folder / name).read_text().replace("kcf:Kcf", "kcf_kernels:Kcf")
+    (folder / "kernels.toml").write_text(text)
+    kernels = netkf.load(folder / "kernels.toml")
+    expected = netkf.simulate(plain, engine="auto")
+    assert "simpy" in expected.engine
+    for engine in ("simpy", "compiled"):
+        run = netkf.simulate(kernels, engine=engine)
+        assert run.engine == engine
+        pd.testing.assert_frame_equal(run.events, expected.events)
+        np.testing.assert_allclose(run.xhat, expected.xhat, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(run.P, expected.P, rtol=0, atol=1e-10)
+    assert netkf.simulate(kernels).engine == "compiled"
+
+
+def test_a_class_that_changes_nothing_is_compiled_and_one_that_changes_a_method_is_not(folder):
+    (folder / "derived.py").write_text(
+        "from netkf.parts import Kcf\n\n\nclass Same(Kcf):\n    pass\n\n\n"
+        "class Deaf(Kcf):\n    def absorb(self, state, messages, exchange):\n"
+        "        return state\n"
+    )
+    text = (folder / "kcf_slots.toml").read_text()
+    runs = {}
+    for name in ("derived:Same", "derived:Deaf", "kcf", "local"):
+        (folder / "s.toml").write_text(
+            text.replace("kcf:Kcf", name).replace(
+                "epsilon = 0.2", "" if name == "local" else "epsilon = 0.2"
+            )
+        )
+        runs[name] = netkf.simulate(netkf.load(folder / "s.toml"))
+    assert runs["derived:Same"].engine == "compiled"
+    assert runs["derived:Deaf"].engine == "simpy"
+    np.testing.assert_array_equal(runs["derived:Same"].P, runs["kcf"].P)
+    np.testing.assert_allclose(runs["derived:Deaf"].P, runs["local"].P, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS, ids=["nodes", "directions", "readings"])

@@ -531,3 +531,17 @@ def commutes(algorithm: Filter) -> bool:
 
     # A class that redefines a step without ``shift`` may no longer commute.
     return owner("shift") <= min(owner(name) for name in STEPS)
+
+
+def compiled_kernels(algorithm: Filter, clocked: bool) -> Kernels | None:
+    """Return the kernels of a filter under clocks or in slots; None if it has none, or if its class
+    defines one of STEPS in Python after them, so that they do not say what it does.
+    """
+    kernels = algorithm.kernels
+    if kernels is None:
+        return None
+    order = type(algorithm).__mro__
+    first = next((k for k, cls in enumerate(order) if "kernels" in vars(cls)), len(order))
+    if any(name in vars(cls) for cls in order[:first] for name in STEPS):
+        return None
+    return kernels.of(clocked)

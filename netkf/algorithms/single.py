@@ -220,6 +220,8 @@ def clock_tables(model: FlowModel, unrolled: bool) -> ClockTables:
         increments=0,
         scratch=flow_scratch(table, unrolled),
         values=np.zeros(max(1, gains.series.shape[2])),
+        mean=np.zeros((1, len(model.A))),
+        mean_root=np.zeros((1, len(model.A), len(model.A))),
     )
 
 

@@ -10,7 +10,8 @@ call, so that one text of a filter serves slots and clocks, one run or L of them
 ``predict_estimate``               predict an estimate by ``run.gap`` seconds (slots: one slot)
 ``update_estimate``                update an estimate with the node's own reading
 ``use_reading``                    update an estimate with any reading
-``predict_copy``, ``carry``        predict an estimate of another node, a message to now
+``predict_copy``                   predict an estimate of another node
+``carry``, ``carry_mean``          predict what a message brings to now
 ``load_flags(lanes, arrived, k)``  the runs in which message k of the inbox has arrived
 =================================  ============================================================
 """
@@ -125,7 +126,8 @@ class ClockTables(Struct):
     models : (H,), index of each node's model
     gains, moments, increments : for nodes that read increments: the tables of their gains, the
         moments (2 p,) of the reading of ``update``, and 1 where that is one of increments
-    scratch, values : scratch of predictions, and of gains
+    scratch, values, mean, mean_root : scratch of predictions, of gains, and of means (1, n) and
+        (1, n, n)
     """
 
     table: FlowTable
@@ -135,6 +137,8 @@ class ClockTables(Struct):
     increments: int
     scratch: FlowScratch
     values: FloatArray
+    mean: FloatArray
+    mean_root: FloatArray
 
 
 def clock_tables_class(n: int, unrolled: bool) -> Any:
@@ -189,6 +193,13 @@ def carry(model: Any, run: Any, x: FloatArray, root: FloatArray, m: int, age: fl
 
 
 @generic
+def carry_mean(model: Any, run: Any, x: FloatArray, m: int, age: float) -> None:
+    """Predict the mean ``x[m]`` of ``x`` (K, n, L), of a message ``age`` seconds old, to now; in
+    slots it stays.
+    """
+
+
+@generic
 def update_estimate(model: Any, run: Any, x: FloatArray, root: FloatArray, k: int, h: int) -> None:
     """Update estimate ``k`` with the reading of node ``h``, ``run.reading``, or its increments."""
 
@@ -221,6 +232,28 @@ def _carry_in_slot(
     model: SlotTables, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
 ) -> None:
     pass
+
+
+@carry_mean.register(SlotTables)
+@kernel(inlined=True)
+def _carry_mean_in_slot(model: SlotTables, run: Any, x: FloatArray, m: int, age: float) -> None:
+    pass
+
+
+@carry_mean.register(ClockTables)
+@kernel
+def _carry_mean_over_age(model: ClockTables, _run: Any, x: FloatArray, m: int, age: float) -> None:
+    if not age > 0.0:
+        return
+    n, last = x.shape[1], len(model.table.unit) - 1
+    for i in range(n):
+        model.mean[0, i] = x[m, i, 0]
+        for j in range(i + 1):
+            # A root of zero: the mean does not depend on it.
+            model.mean_root[0, i, j] = 0.0
+    propagate_root(model.table, last, model.mean_root, model.mean, 0, age, model.scratch)
+    for i in range(n):
+        x[m, i, 0] = model.mean[0, i]
 
 
 @update_estimate.register(SlotTables)

@@ -53,6 +53,8 @@ class ClockFilters:
                 increments=0,
                 scratch=flow_scratch(start.table, kernels.unrolled),
                 values=np.zeros(max(1, start.gains.series.shape[2])),
+                mean=np.zeros((1, n)),
+                mean_root=np.zeros((1, n, n)),
             ),
             **links,
             **self._inbox(messages, n),

@@ -10,12 +10,14 @@ from functools import partial
 
 import numpy as np
 
+from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.registry import built_in_filters
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.agenda import is_immediate, simulate_agenda
 from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.engines.compiled.batches import flow_batches, quick_runs
+from netkf.engines.compiled.clock_loop import clock_loop
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.slot_loop import slot_loop
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
@@ -47,6 +49,18 @@ BUILT_IN_PARTS = (
 )
 
 
+def _has_code(scenario: Scenario) -> bool:
+    """Return True if there are kernels for the filter of a scenario."""
+    node_filter = scenario.node_filter
+    if compiled_kernels(node_filter, not scenario.slotted) is not None:
+        return True
+    if type(scenario.filter.algorithm) not in built_in_filters().values():
+        return False
+    if scenario.slotted:
+        return node_filter.slot_kernel is not None
+    return node_filter.combination in COMBINATIONS
+
+
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
     """Runs all built-in plants, sensors and filters; clocks and channels may be a user's own, since
@@ -62,23 +76,18 @@ class CompiledEngine(Engine):
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
         parts: list[tuple[str, Component]] = [("plant", scenario.plant)]
         parts += [("sensor", sensor) for sensor in scenario.sensors]
-        parts += [("filter", scenario.filter.algorithm)]
-        compiled = {*BUILT_IN_PARTS, *built_in_filters().values()}
         for family, part in parts:
             # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
-            if type(part) not in compiled:
+            if type(part) not in BUILT_IN_PARTS:
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
-        node_filter = scenario.node_filter
-        if not (
-            (node_filter.kernels or node_filter.slot_kernel)
-            if scenario.slotted
-            else node_filter.combination in COMBINATIONS
-        ):
-            time = "in slots" if scenario.slotted else "under clocks"
+        if not _has_code(scenario):
             name = name_of("filter", scenario.filter.algorithm)
-            return f'engine "compiled" has no code for the filter {name!r} {time}; {remedy}'
+            return (
+                f'engine "compiled" has no code for the filter {name!r}, whose methods are plain '
+                f"Python; {remedy}, or write them as kernels (netkf.kernels)"
+            )
         return None
 
     def announce(self, scenario: Scenario) -> None:
@@ -86,10 +95,14 @@ class CompiledEngine(Engine):
         if is_plain():
             announce_plain()
             return
+        node_filter = scenario.node_filter
+        kernels = compiled_kernels(node_filter, not scenario.slotted)
         # Slots and continuous time are compiled separately.
-        if scenario.slotted:
-            kernels = scenario.node_filter.kernels
-            compiling.announce(slot_loop(kernels) if kernels else scenario.node_filter.slot_kernel)
+        if kernels is not None and not (not scenario.slotted and is_immediate(scenario)):
+            loop = slot_loop(kernels) if scenario.slotted else clock_loop(kernels)
+            compiling.announce(loop)
+        elif scenario.slotted:
+            compiling.announce(node_filter.slot_kernel)
         else:
             compiling.announce(simulate_agenda if is_immediate(scenario) else simulate_runs)
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.kernels.slots import (
     ARRIVING,
     SENDING,
@@ -118,7 +119,7 @@ class SlotRuns:
             root_Q=setup.root_Q,
             rows=setup.rows,
         )
-        kernels = setup.algorithm.kernels
+        kernels = compiled_kernels(setup.algorithm, clocked=False)
         self._filters = SlotFilters(setup, kernels, blocks) if kernels is not None else None
         if self._filters is None:
             self._scratch = slot_scratch(setup.estimators, setup.n, setup.algorithm.unrolled)
