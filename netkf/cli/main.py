@@ -130,10 +130,7 @@ def _print_traceback(error: Exception) -> str:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line, with one subparser for each of COMMANDS.
-
-    A parsed namespace has the function of its command as ``run``.
-    """
+    """Return the parser of the command line, with one subparser for each of COMMANDS."""
     from importlib import import_module
 
     import netkf

@@ -60,9 +60,7 @@ class Command:
     takes_scenario: bool = True
 
     def add_to(self, commands: Any) -> None:
-        """Add the parser of the command to the subparsers ``commands``; parsed namespaces have the
-        function ``run``.
-        """
+        """Add the parser of the command to ``commands``; namespaces have its function ``run``."""
         parser = commands.add_parser(self.name, help=self.help, description=self.help)
         if self.takes_scenario:
             _add_scenario(parser)
@@ -84,9 +82,7 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def add_trust(parser: argparse.ArgumentParser, folder: str) -> None:
-    """Add ``--trust``; ``folder`` names, in its help, the folder from which modules are imported
-    besides the current one and installed packages.
-    """
+    """Add ``--trust``; ``folder`` names the folder from which modules are imported."""
     parser.add_argument(
         "--trust",
         action="store_true",
@@ -128,9 +124,7 @@ def parse_seed(text: str) -> int:
 
 
 def parse_replica(text: str) -> int:
-    """Return the value of ``--replica``; raises ArgumentTypeError unless it is an integer from 0
-    on.
-    """
+    """Return the value of ``--replica``; raises ArgumentTypeError."""
     if not text.isdecimal() or len(text) > 12:
         rule = "must be an integer of at least 0"
         raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
@@ -147,9 +141,7 @@ def parse_count(text: str) -> int:
 
 
 def parse_workers(text: str) -> int:
-    """Return the value of ``--workers``; raises ArgumentTypeError unless it is a positive integer
-    of at most WORKERS_PER_CORE per core, or 64.
-    """
+    """Return the value of ``--workers``; raises ArgumentTypeError."""
     return _parse_positive(text, max(64, WORKERS_PER_CORE * (os.cpu_count() or 1)))
 
 

@@ -221,9 +221,7 @@ def safe_streams() -> Iterator[None]:
 
 
 def discard_output(stream: Any = None) -> None:
-    """Redirect a stream, by default standard output, to the null device: what is left in its buffer
-    would fail again when the process ends.
-    """
+    """Send what is left in a stream's buffer to the null device, where it cannot fail."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
 

@@ -44,9 +44,7 @@ class ProgressLine:
             print(f"netkf: {text}", file=sys.stderr, flush=True)
 
     def make_time_update(self, horizon: float) -> Callable[[float], None]:
-        """Return a callback of an engine: a function of the simulated time (s) that shows its
-        percentage of ``horizon`` (s) on the line.
-        """
+        """Return a function of the simulated time (s) that shows its share of ``horizon``."""
         last_percent = -1
 
         def update(seconds: float) -> None:

@@ -36,10 +36,7 @@ WHITE_SHARE = 0.1
 
 
 def nees_figure(data: FigureData) -> Picture:
-    """Draw NEES over time with the interval that contains it if P is exact.
-
-    Raises UnavailableError without samples, ground truth or covariances.
-    """
+    """Draw NEES over time with its interval if P is exact; raises UnavailableError."""
     data.require_samples()
     data.require_truth()
     data.require_covariance()
@@ -68,9 +65,7 @@ def _nees_headline(inside: float, mean: float, n: int) -> str:
 
 
 def require_innovations(data: FigureData) -> Innovations:
-    """Return the innovations of a run, for which it is replayed; raises UnavailableError, with the
-    reason for the reader of the figure, if there are none.
-    """
+    """Return the innovations of a run, by a replay; raises UnavailableError."""
     if data.run is None:
         raise UnavailableError(
             "Only single runs have innovations: draw netkf.open(DIR).replica(0)."
@@ -84,11 +79,7 @@ def require_innovations(data: FigureData) -> Innovations:
 
 
 def nis_figure(data: FigureData) -> Picture:
-    """Draw the NIS (squared innovations in units of their covariances) of the readings over time,
-    with the interval of its means if P is exact.
-
-    Raises UnavailableError if there are no innovations.
-    """
+    """Draw the NIS of the readings over time, with its interval; raises UnavailableError."""
     innovations = require_innovations(data)
     figure = new_figure(7.4, 4.2)
     share, mean = draw_nis(figure.add_subplot(), innovations)

@@ -82,10 +82,7 @@ class FigureData:
 
     @cached_property
     def innovations(self) -> Innovations:
-        """The innovations of the run, which is replayed once for all figures.
-
-        Raises NetkfError if they cannot be computed.
-        """
+        """The innovations of the run, replayed once for all figures; raises NetkfError."""
         assert self.run is not None
         return compute_innovations(self.run)
 
@@ -170,9 +167,7 @@ class FigureData:
         return ""
 
     def title(self, headline: str) -> str:
-        """Return the title of a figure: the ``headline``, a sentence on what the figure shows,
-        after a word if the run ended early.
-        """
+        """Return the ``headline`` of a figure, after a word if the run ended early."""
         prefixes = {"diverged": "Diverged: ", "interrupted": "Interrupted: ", "failed": "Failed: "}
         if self.status == "diverged" and self.runs > 1:
             return headline  # some runs diverged: the caption says how many
@@ -218,9 +213,7 @@ def _reduce_run(run: Run) -> FigureData:
 
 
 def reduce_completed_run(scenario: Scenario, completed: CompletedRun) -> FigureData:
-    """Return the data to draw of a run that was just simulated and written to a directory, for its
-    picture run.png.
-    """
+    """Return the data to draw of a run that was just written, for its run.png."""
     status = "diverged" if completed.samples.diverged else completed.status
     return reduce_samples(
         scenario,

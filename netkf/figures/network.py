@@ -22,9 +22,7 @@ MAX_ASPECT = 2.2
 
 
 def network_figure(data: FigureData) -> Picture:
-    """Draw the network once for each known quantity of the nodes (errors, messages and bytes sent),
-    which their colours show.
-    """
+    """Draw the network once for each known quantity of the nodes, which their colours show."""
     positions = get_positions(data.scenario.topology)
     quantities = _colour_quantities(data)
     aspect = _network_aspect(positions)
@@ -47,9 +45,7 @@ def network_figure(data: FigureData) -> Picture:
 
 
 def error_label(data: FigureData) -> tuple[str, str]:
-    """Return the key of the node averages that measures the errors, and a label with its unit;
-    without ground truth that of trace P.
-    """
+    """Return the key and the label of the nodes' errors, or of trace P without ground truth."""
     if data.shows_errors:
         return "rms_error", "RMS error, units of the state"
     return "mean_trace", "mean trace P, squared units of the state"

@@ -77,9 +77,7 @@ def draw_nodes(axes: Any, data: FigureData, values: FloatArray, se: FloatArray |
 
 
 def root_interval(root: FloatArray, se: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the limits (T,) of the 95% intervals of values ``root`` (T,) whose squares have the
-    standard errors ``se`` (T,).
-    """
+    """Return the 95% limits (T,) of ``root`` (T,), whose squares have errors ``se`` (T,)."""
     low, high = (np.maximum(root**2 + s * NORMAL_QUANTILE * se, 0.0) for s in (-1.0, 1.0))
     return np.sqrt(low), np.sqrt(high)
 
@@ -120,9 +118,7 @@ def _draw_estimates(axes: Any, data: FigureData) -> None:
 
 
 def draw_covariances(axes: Any, data: FigureData) -> None:
-    """Draw the roots of the traces of P over time, with the bound and the limits that theory gives,
-    or a message if the filter gives no covariance.
-    """
+    """Draw the roots of the traces of P over time, with bound and limits, or a message."""
     if not np.isfinite(data.trace).any():
         draw_message(axes, f"{NO_COVARIANCE}: trace P is unavailable")
         return
@@ -136,9 +132,7 @@ def draw_covariances(axes: Any, data: FigureData) -> None:
 
 
 def draw_promises(axes: Any, times: FloatArray, promised: PromisedTraces) -> None:
-    """Draw what theory gives to compare trace P with, as square roots: the bound over ``times``
-    (T,), its limit, and the trace of a centralised filter.
-    """
+    """Draw the roots of the bound over ``times`` (T,), its limit, and the central trace."""
     if promised.bound is not None:
         _draw_bound(axes, times, np.sqrt(promised.bound))
     limits: tuple[tuple[float, str, Any], ...] = (

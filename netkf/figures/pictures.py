@@ -12,20 +12,14 @@ from netkf.scenario.scenario import Scenario
 
 
 def run_picture(scenario: Scenario, completed: CompletedRun) -> None:
-    """Write ``run.png`` to the directory of a run: its overview.
-
-    Raises WriteError if the file cannot be written.
-    """
+    """Write the overview of a run as ``run.png``; raises WriteError."""
     with style_context():
         figure = overview(reduce_completed_run(scenario, completed))
     write_figure(figure, completed.directory / "run.png")
 
 
 def ensemble_picture(scenario: Scenario, finished: FinishedEnsemble) -> None:
-    """Write ``run.png`` to the directory of an ensemble: the overview of its means with intervals.
-
-    Raises WriteError if the file cannot be written.
-    """
+    """Write the overview of an ensemble as ``run.png``; raises WriteError."""
     with style_context():
         figure = overview(reduce_ensemble(scenario, finished.ensemble, finished.promised))
     write_figure(figure, finished.directory / "run.png")

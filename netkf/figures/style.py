@@ -103,9 +103,7 @@ def style_context() -> Iterator[None]:
 
 
 def new_figure(width: float = 7.4, height: float = 4.4) -> Picture:
-    """Return an empty figure, ``width`` x ``height`` inches, with matplotlib's constrained
-    layout.
-    """
+    """Return an empty figure of ``width`` x ``height`` inches, with constrained layout."""
     figure = Picture(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -158,10 +156,7 @@ def text_width(text: str, size: float, weight: str = "normal") -> float:
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all, in the format of the suffix, one of ``names.FORMATS``.
-
-    Raises WriteError if the file cannot be written.
-    """
+    """Write a figure, whole or not at all, in the format of its suffix; raises WriteError."""
     file_format = path.suffix.removeprefix(".").lower() or "png"
     # Without dates, the same figure always has the same bytes.
     undated: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
@@ -171,9 +166,7 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def draw_legend(axes: Any, columns: int | None = None) -> None:
-    """Draw the legend of all labelled series above the axes, where it covers none of them, in as
-    many columns as fit unless ``columns`` is given.
-    """
+    """Draw the legend above the axes, in ``columns`` or as many columns as fit."""
     handles, labels = axes.get_legend_handles_labels()
     if not labels:
         return
@@ -216,9 +209,7 @@ def draw_message(axes: Any, message: str) -> None:
 
 
 def message_figure(headline: str, message: str, caption: Sequence[str]) -> Picture:
-    """Return a figure that shows only a message, such as the reason why there are no data, with the
-    title ``headline`` and the sentences of the ``caption``.
-    """
+    """Return a figure that shows only a message, with a ``headline`` and a ``caption``."""
     figure = new_figure(7.4, 2.2)
     draw_message(figure.add_subplot(), message)
     finish_figure(figure, headline, caption)

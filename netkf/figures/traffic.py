@@ -63,9 +63,7 @@ class AgeSawtooth(NamedTuple):
     low: FloatArray
 
     def mean(self, edges: FloatArray) -> FloatArray:
-        """Return the averages (B,) of the age of information, in seconds, over B bins of time
-        between ``edges`` (B + 1,) in seconds, which begin at time 0.
-        """
+        """Return the mean ages (B,) in bins between ``edges`` (B + 1,), in seconds."""
         length = self.stop - self.start
         # The integral of the age up to each segment, then up to each edge within its segment.
         at_start = np.concatenate([[0.0], np.cumsum(length * (self.low + 0.5 * length))])
@@ -75,9 +73,7 @@ class AgeSawtooth(NamedTuple):
         return np.asarray(np.diff(integral) / np.diff(edges))
 
     def largest(self, edges: FloatArray) -> FloatArray:
-        """Return the largest age of information (B,), in seconds, in each of B bins of time between
-        ``edges`` (B + 1,) in seconds.
-        """
+        """Return the largest ages (B,) in bins between ``edges`` (B + 1,), in seconds."""
         # The age is largest at the end of the bin, or of a segment within it.
         last = np.searchsorted(self.start, edges[1:], side="left") - 1
         largest = self.low[last] + edges[1:] - self.start[last]
@@ -208,9 +204,7 @@ class DirectedMessages(NamedTuple):
 
 
 def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
-    """Return the messages of each direction (from one node to another) that have an outcome,
-    ordered by sender and receiver, from the EVENT rows ``log`` (E,) of a run.
-    """
+    """Return the messages with an outcome of each direction, from EVENT rows ``log``."""
     arrivals = log[log["kind"] == CODES["deliver"]]
     losses = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
     # The node of an arrival, late ones included, is the receiver; that of a loss is the sender.
@@ -301,9 +295,7 @@ def _readable_end(directions: list[DirectedMessages], end: float) -> float:
 
 
 def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
-    """Return Wilson's interval of a delivery probability, at the level CONFIDENCE, from the numbers
-    of ``delivered`` messages and of all, ``total``.
-    """
+    """Return Wilson's interval of a delivery probability, at the level CONFIDENCE."""
     interval = binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
     return float(interval.low), float(interval.high)
 

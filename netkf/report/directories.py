@@ -66,9 +66,7 @@ class ReportSource:
 
     @property
     def kind(self) -> str:
-        """The kind of results in the directory: run, ensemble, sweep, filters (a comparison of
-        them) or verdict (of ``netkf check``).
-        """
+        """The kind of results: run, ensemble, sweep, filters or verdict."""
         if self.sweep is not None:
             return "sweep"
         if self.filters is not None:

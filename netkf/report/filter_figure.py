@@ -19,10 +19,7 @@ MAX_RATIO = 10.0
 
 
 def filters_figure(comparison: StoredComparison) -> str:
-    """Return an SVG figure with the RMS error of each filter and a bar of two standard errors.
-
-    It is empty if no filter has a finite error.
-    """
+    """Return the RMS errors of filters with two standard errors as SVG; empty if none is finite."""
     rows = [
         row
         for row in comparison.rows

@@ -54,9 +54,7 @@ def read_innovations(source: ReportSource) -> Innovations | str | None:
 
 
 def node_means(readings: Innovations) -> NodeMeans:
-    """Return the mean over time of each node's NIS (squared innovation in units of its covariance,
-    per scalar reading), (M,) for M nodes with readings, with limits (M,) that hold if P is exact.
-    """
+    """Return mean NIS per scalar reading (M,) of M nodes, with limits (M,) if P is exact."""
     finite = np.isfinite(readings.nis)
     nodes, columns = np.unique(readings.nodes[finite], return_inverse=True)
     # Numbers of scalar readings, the degrees of freedom, and sums of NIS of each node.

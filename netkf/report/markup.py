@@ -55,9 +55,7 @@ def table_box(
 
 
 def section(element_id: str, title: str, body: str) -> str:
-    """Return a section with the heading ``title``; ``body`` is HTML, ``element_id`` the id to link
-    to.
-    """
+    """Return a section with the heading ``title``; ``body`` is HTML."""
     return (
         f'<section id="{element_id}" aria-labelledby="{element_id}-title">'
         f'<h2 id="{element_id}-title">{text(title)}</h2>{body}</section>'
@@ -65,10 +63,7 @@ def section(element_id: str, title: str, body: str) -> str:
 
 
 def script_json(value: Any) -> str:
-    """Return JSON that a script element can hold: ``</script>`` and comments are escaped.
-
-    Raises ValueError if a number is not finite.
-    """
+    """Return JSON that a script element can hold; raises ValueError for numbers not finite."""
     document = json.dumps(value, separators=(",", ":"), allow_nan=False)
     for character in "<>&\u2028\u2029":
         document = document.replace(character, f"\\u{ord(character):04x}")
@@ -76,8 +71,6 @@ def script_json(value: Any) -> str:
 
 
 def content_hash(source: str) -> str:
-    """Return the SHA-256 source expression of an inline script or style in a content security
-    policy.
-    """
+    """Return the SHA-256 source expression of an inline script or style."""
     digest = hashlib.sha256(source.encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"

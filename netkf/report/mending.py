@@ -60,9 +60,7 @@ def _why_command(source: ReportSource, worst: WorstSample) -> str:
 
 
 def describe_mending(explanation: Explanation) -> str:
-    """Return a sentence on how much smaller trace P and the error of the worst sample would be had
-    no message been missing, as replays of the run show.
-    """
+    """Return a sentence on the worst sample had no message been missing, by replays."""
     # The first replay is the run as it was, the last one has no message missing.
     actual, best = explanation.what_ifs[0], explanation.what_ifs[-1]
     same_trace = math.isnan(actual.trace) or math.isclose(
@@ -114,9 +112,7 @@ def central_sample(source: ReportSource) -> CentralSample | None:
 
 
 def describe_central(source: ReportSource, explanation: Explanation, central: CentralSample) -> str:
-    """Return sentences that compare the worst sample, with no message missing, with the centralised
-    filter: their difference is the price of the network.
-    """
+    """Return sentences on the price of the network: the worst sample beside the central one."""
     best = explanation.what_ifs[-1]
     numbers = [f"trace P {format_number(central.trace)}"] if math.isfinite(central.trace) else []
     numbers += [f"error {format_number(central.error)}"] if math.isfinite(central.error) else []
@@ -158,9 +154,7 @@ def _describe_smallest_set(explanation: Explanation) -> str:
 
 
 def mending_section(source: ReportSource, explanation: Explanation | str) -> str:
-    """Return the explanation of the worst sample as HTML: sentences, and a table of its replays; or
-    a paragraph with the reason why there is none.
-    """
+    """Return the replays of the worst sample as HTML, or the reason why there are none."""
     if isinstance(explanation, str) or source.worst is None:
         return paragraph(f"The worst sample is not explained here: {explanation}", "note")
     rows = [

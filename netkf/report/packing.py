@@ -23,20 +23,14 @@ class Packer:
         self._columns: list[bytes] = []
 
     def add(self, values: Any, dtype: str) -> dict[str, Any]:
-        """Append an array of a type (a key of TYPES); return its index, type and shape as JSON
-        values, from which the page reads it.
-        """
+        """Append an array of a type of TYPES; return its index, type and shape for the page."""
         column = np.ascontiguousarray(values, dtype=TYPES[dtype])
-        self._columns.append(_transpose_bytes(column))
+        # The first byte of all numbers, then the second, and so on: these compress better.
+        octets = np.frombuffer(column.tobytes(), dtype=np.uint8)
+        self._columns.append(octets.reshape(column.size, column.itemsize).T.tobytes())
         return {"part": len(self._columns) - 1, "type": dtype, "shape": list(column.shape)}
 
     def text(self) -> tuple[str, list[int]]:
         """Return all columns as base64 text, and the number of uncompressed bytes of each one."""
         compressed = gzip.compress(b"".join(self._columns), compresslevel=9, mtime=0)
         return base64.b64encode(compressed).decode("ascii"), list(map(len, self._columns))
-
-
-def _transpose_bytes(column: np.ndarray) -> bytes:
-    """Return the first byte of all numbers, then the second, and so on."""
-    octets = np.frombuffer(column.tobytes(), dtype=np.uint8)
-    return octets.reshape(column.size, column.itemsize).T.tobytes()

@@ -37,9 +37,7 @@ INTERVAL_WIDTH = 2.0
 
 
 def verdict_table(source: ReportSource) -> str:
-    """Return the results of ``netkf check``, which tests on many runs what theory promises, as a
-    table: one row for each promise, broken ones first.
-    """
+    """Return the verdict of ``netkf check`` as a table of promises, broken ones first."""
     verdict = source.verdict or {}
     rank = {verdict: k for k, verdict in enumerate(VERDICT_ORDER)}
     rows = sorted(verdict.get("rows", []), key=lambda row: rank.get(row["verdict"], len(rank)))
@@ -63,9 +61,7 @@ def verdict_table(source: ReportSource) -> str:
 
 
 def summary_section(source: ReportSource) -> str:
-    """Return the table of averages over time that ``netkf run`` prints for each node, with notes on
-    messages and bounds, as HTML.
-    """
+    """Return the averages of each node, with notes on messages and bounds, as HTML."""
     summary = source.summary
     if not summary:
         return paragraph("There is no summary: the runs ended before it was written")
@@ -124,9 +120,7 @@ def _explain_limit(label: str) -> str:
 
 
 def comparison_section(comparison: Comparison) -> str:
-    """Return a table of the differences of the runs in two directories, A and B, below a sentence
-    that counts the certain ones (whose intervals exclude 0), as HTML.
-    """
+    """Return the differences of two directories, A and B, as HTML."""
     rows = []
     for quantity, node, (first, second) in comparison.rows:  # node -1: all nodes
         label = quantity if node < 0 else f"{quantity} of node {node}"
@@ -161,9 +155,7 @@ def _difference_cells(entry: Entry) -> list[str]:
 
 
 def filters_table(comparison: StoredComparison) -> str:
-    """Return a table of the filters that were run on the same draws, with their differences from
-    the first one, as HTML.
-    """
+    """Return the filters, with their differences from the first one, as HTML."""
     header = ["filter"]
     for name in ("RMS error", "worst instant", "NEES / n"):
         header += [name, f"difference from {comparison.first}", "certain?"]
@@ -201,9 +193,7 @@ def _quantity_cells(quantity: Quantity) -> list[str]:
 
 
 def sweep_table(source: ReportSource) -> str:
-    """Return a table of the first MAX_ROWS points of a sweep, each with its values of the varied
-    keys, as HTML.
-    """
+    """Return the first MAX_ROWS points of a sweep as HTML."""
     assert source.sweep is not None
     points = source.sweep.table
     if not len(points):
@@ -290,9 +280,7 @@ def _matrix_traces(matrices: FloatArray) -> FloatArray:
 
 
 def averages(source: ReportSource) -> list[dict[str, Any]] | None:
-    """Return the averages of each node and their standard errors, by the names in summary.json;
-    None without a summary.
-    """
+    """Return averages of each node by the names in summary.json; None without a summary."""
     if not source.summary:
         return None
     names = ["node", *COLUMNS, *(f"{name}_se" for name in COLUMNS)]

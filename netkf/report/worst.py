@@ -124,10 +124,7 @@ class WorstSamples(NamedTuple):
 
 
 def find_worst_samples(run: StoredRun, summary: Mapping[str, Any]) -> WorstSamples | None:
-    """Return the worst samples of a run overall and after the start-up; None if all are nan.
-
-    ``summary`` is the contents of summary.json.
-    """
+    """Return the worst samples of a run overall and after the start-up; None if all are nan."""
     worst = find_worst_sample(run, summary)
     if worst is None:
         return None

@@ -102,9 +102,7 @@ class RunDirectory:
         return int(self.manifest["runs"]["done"] or 1)
 
     def value(self, quantity: str, node: int) -> tuple[float | None, float | None]:
-        """Return the value and the standard error of a ``quantity`` at ``node`` (an id, -1 for all
-        nodes together), None if it has none.
-        """
+        """Return a ``quantity`` at ``node`` (-1: all) and its standard error, or None."""
         if quantity in MESSAGES:
             table, errors = self.summary["messages"], self.summary.get("messages_se", {})
             return table.get(quantity), errors.get(quantity)

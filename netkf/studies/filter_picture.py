@@ -27,9 +27,7 @@ PANELS = (
 
 
 def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
-    """Write ``filters.png``: errors, consistency and traffic of the filters that ran, side by
-    side; bars are two standard errors.
-    """
+    """Write ``filters.png``: errors, consistency and traffic of the filters that ran."""
     rows = [row for row in completed.comparison.rows if row.ran]
     with style_context():
         figure = new_figure(9.6, 1.7 + 0.34 * len(rows))

@@ -38,9 +38,7 @@ class FilterValues(NamedTuple):
 
 
 def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> FilterValues:
-    """Simulate the consecutive ``replicas`` of the runs of ``seed``, R of them, and return their
-    values; a task of ``replicate_blocks``.
-    """
+    """Simulate ``replicas`` of ``seed`` and return their values; for ``replicate_blocks``."""
     batches = engine.run_many(scenario, seed, replicas)
     return join_values(*(_batch_values(scenario, batch) for batch in batches))
 

@@ -168,9 +168,7 @@ def at_once(messages: Messages, log: IntArray) -> Messages:
 
 
 def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
-    """Return those of the E rows of an EVENT ``log`` (E,) that influence the sample at ``at``
-    seconds.
-    """
+    """Return the rows of an EVENT ``log`` that influence the sample at ``at`` seconds."""
     return np.asarray(log[: _count_events(scenario, log["t"], at)])
 
 
@@ -230,7 +228,10 @@ def find_flow(
     node = nodes
     start = np.zeros(len(nodes), dtype=np.int64)
     origin = np.searchsorted(nodes, messages.sender)
-    readings = _carry_readings(combination, messages)
+    # Messages that carry the sender's reading and nothing else.
+    readings = np.full(len(messages), combination == "readings")
+    if combination == "readings, then estimates":
+        readings = np.asarray(messages.phase == 0)
     if readings.any():
         # A message that carries only the reading of its instant comes from a segment of its own,
         # which receives no messages.
@@ -249,13 +250,6 @@ def find_flow(
         last={n: k for k, n in enumerate(scenario.nodes)},  # segment k is that of the k-th node
         pooled=scenario.node_filter.pooled,
     )
-
-
-def _carry_readings(combination: str, messages: Messages) -> IntArray:
-    """Return a mask (M,) of the messages that carry the sender's reading and nothing else."""
-    if combination == "readings, then estimates":
-        return np.asarray(messages.phase == 0)
-    return np.full(len(messages), combination == "readings")
 
 
 def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -> Flow:
@@ -397,9 +391,7 @@ class KeptReadings:
         return rows[np.isin(plant.slots_of(self._times[rows]), read)]
 
     def newest(self, node: int, start: int, end: int) -> float:
-        """Return the time in seconds of the newest reading of ``node`` (its id) in the rows of the
-        log from ``start`` to before ``end``, nan without one.
-        """
+        """Return the time (s) of the newest reading of ``node`` in rows ``start`` to ``end``."""
         if node not in self._rows:
             return np.nan
         if node in self._scenario.increment_sensors:
@@ -410,9 +402,7 @@ class KeptReadings:
         return self.reading_time(int(rows[k])) if k >= 0 and rows[k] >= start else np.nan
 
     def reading_time(self, row: int) -> float:
-        """Return the time in seconds at which the reading that a node used at ``row`` of the log
-        was taken.
-        """
+        """Return the time (s) at which the reading used at ``row`` was taken."""
         time = float(self._times[row])
         if not self._scenario.slotted:
             return time

@@ -50,9 +50,7 @@ class RunMetrics(NamedTuple):
 
 
 def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> RunMetrics:
-    """Simulate the consecutive ``replicas`` of the runs of ``seed``, R of them, and return their
-    metrics; a task of ``replicate_blocks``.
-    """
+    """Simulate ``replicas`` of ``seed`` and return their metrics; for ``replicate_blocks``."""
     batches = engine.run_many(scenario, seed, replicas)
     return join_metrics(*(_batch_metrics(run_values(batch, scenario)) for batch in batches))
 
@@ -138,16 +136,12 @@ def mean_over_runs(values: FloatArray) -> MeanEstimate:
 
 
 def worst_node(values: FloatArray) -> MeanEstimate:
-    """Return the estimate of the node with the largest mean, from ``values`` (R, N) of R runs and N
-    nodes.
-    """
+    """Return the estimate of the node with the largest mean, from ``values`` (R, N)."""
     return mean_over_runs(values[:, int(np.argmax(values.mean(axis=0)))])
 
 
 def all_nodes(values: FloatArray) -> MeanEstimate:
-    """Return the estimate of the mean over all nodes, from ``values`` (R, N) of R runs and
-    N nodes.
-    """
+    """Return the estimate of the mean over all nodes, from ``values`` (R, N)."""
     return mean_over_runs(values.mean(axis=1))
 
 

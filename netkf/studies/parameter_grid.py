@@ -62,9 +62,7 @@ def _are_finite(*texts: str) -> bool:
 
 
 def check_grid(grid: Any) -> dict[str, list[Any]]:
-    """Return the values of each key of a ``grid`` that a user gave, as lists with at least one
-    value; raises ScenarioError, which names --vary, for anything else or too many points.
-    """
+    """Return the values of each key of a user's ``grid``; raises ScenarioError."""
     if not isinstance(grid, Mapping) or not grid:
         raise ScenarioError("--vary", "needs a key with its values", grid or None, "KEY=V1,V2,...")
     values_by_key = {}
@@ -120,9 +118,7 @@ def table_value(value: Any) -> Any:
 
 
 def parse_interval(setting: str) -> tuple[str, float | int, float | int]:
-    """Return the key and the ends, integers if written so, of the text ``key.path=LOW:HIGH`` of the
-    command line; raises ScenarioError, which names --vary.
-    """
+    """Return the key and the ends of ``key.path=LOW:HIGH``; raises ScenarioError."""
     key, text = split_setting("--vary", setting)
     low, colon, high = text.partition(":")
     if not colon or not _are_finite(low, high):

@@ -9,12 +9,7 @@ from netkf.studies.sweep import CompletedSweep
 
 
 def sweep_picture(title: str, completed: CompletedSweep) -> bool:
-    """Write ``sweep.png`` to the directory of a sweep and return True; return False if more than
-    two keys were varied, which have no picture.
-
-    Over one key it has the largest and the mean RMS error with 95 % intervals and the root of the
-    bound; over two keys a map of the largest RMS error. ``title`` is that of the figure.
-    """
+    """Write ``sweep.png`` and return True; False if more than two keys were varied."""
     try:
         with style_context():
             figure = sweep_figure(title, completed.table, completed.keys, "complete")

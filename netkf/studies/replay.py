@@ -96,9 +96,7 @@ class Replayer:
 
     @cached_property
     def full_log(self) -> IntArray:
-        """The E EVENT rows (E,) of the run with all messages delivered, up to the state at
-        ``at``.
-        """
+        """The EVENT rows (E,) of the run with all messages delivered, up to ``at``."""
         return self._replay(None, to_horizon=False)
 
     def outcome(self, chosen: Iterable[MessageKey] | None = (), error: bool = False) -> Outcome:
@@ -139,9 +137,7 @@ class Replayer:
 
 
 def delivering(scenario: Scenario, deliveries: Deliveries) -> Scenario:
-    """Return the scenario in which the channel delivers the messages that ``deliveries`` names at
-    the time of a replay, whatever is drawn, and all others as in ``scenario``.
-    """
+    """Return the scenario whose channel delivers what ``deliveries`` names, else as drawn."""
     network = scenario.network
     channel_of_run = network.channel
     loss, delay = DeliveringLoss(channel_of_run.loss, deliveries), channel_of_run.delay

@@ -141,9 +141,7 @@ class SimulationPlan:
 
 
 def decide_by_theory(problem: SizingProblem, value: float) -> Probe:
-    """Return the result (probe) of trying a ``value`` of the key by theory, which gives the
-    quantity of the target exactly or an upper bound on it.
-    """
+    """Return the probe of a ``value`` by theory: the quantity itself or an upper bound."""
     scenario, target = problem.at(value), problem.target
     quantity, _ = quantity_by_theory(scenario, target)
     reached = quantity <= target.limit
@@ -171,9 +169,7 @@ def decide_by_theory(problem: SizingProblem, value: float) -> Probe:
 
 
 def decide_by_both(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the result (probe) of trying a ``value`` of the key: by theory if its upper bound
-    shows that the target is reached, else by simulation as planned.
-    """
+    """Return the probe of a ``value``: by a bound if that suffices, else by simulation."""
     bound = decide_by_theory(problem, value)
     return decide_by_simulation(problem, plan, value) if bound.target == NOT_SHOWN else bound
 

@@ -222,20 +222,14 @@ def sweep_to_directory(
         completed = CompletedSweep(directory, pd.DataFrame(rows), tuple(plan.vary), seconds)
         if status == "complete" and take is not None:
             take(completed)
-        _write_rows(completed)
+        if len(completed.table):
+            columns = {str(name): column for name, column in completed.table.items()}
+            write_table(directory / "sweep.parquet", columns)
+            write_text(directory / "sweep.csv", completed.table.to_csv(index=False))
         if status == "complete" and finish is not None:
             finish(completed)
         _write_manifest(directory, plan, len(rows), status)
     return completed
-
-
-def _write_rows(completed: CompletedSweep) -> None:
-    """Write sweep.parquet and sweep.csv if there are rows."""
-    directory, table = completed.directory, completed.table
-    if len(table):
-        columns = {str(name): column for name, column in table.items()}
-        write_table(directory / "sweep.parquet", columns)
-        write_text(directory / "sweep.csv", table.to_csv(index=False))
 
 
 def _write_manifest(directory: Path, plan: SweepPlan, points_done: int, status: str) -> None:

@@ -10,7 +10,7 @@ from netkf.core.printable import shorten
 from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
 from netkf.studies.compare import Comparison
 from netkf.studies.compare_filters import QUANTITIES, FilterComparison
-from netkf.studies.consistency import Consistency, NodeConsistency
+from netkf.studies.consistency import Consistency
 from netkf.studies.filter_values import Quantity
 from netkf.studies.search import Sizing
 
@@ -48,9 +48,7 @@ def _format_short(value: Any) -> str:
 
 
 def format_sizing(sizing: Sizing) -> str:
-    """Return the result of ``netkf.size`` for a terminal: a table of the values of the key that
-    were tried, the answer, how sure it is, and what to do next.
-    """
+    """Return the values that were tried, the answer, how certain it is, and what to do next."""
     header = [sizing.key, sizing.target.quantity, "at least", "at most", "runs", "target", "by"]
     rows = [
         [
@@ -110,6 +108,9 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
     first and last of the others.
     """
     header = ["node", "NEES", "expected", "inside", "NIS", "expected", "verdict"]
+    listed = list(consistency.rows)
+    if not full and len(listed) > MAX_ROWS:
+        listed = sorted(listed, key=lambda row: not row.verdict.startswith("BROKEN"))
     rows = [
         [
             str(row.node),
@@ -120,7 +121,7 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
             format_number(row.expected_nis),
             row.verdict,
         ]
-        for row in _worst_first(consistency, full)
+        for row in listed
     ]
     level = f"{consistency.confidence:g}"
     ends = f"{consistency.low:.4g} .. {consistency.high:.4g}"
@@ -138,18 +139,8 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
     )
 
 
-def _worst_first(consistency: Consistency, full: bool) -> list[NodeConsistency]:
-    """Return the rows in order; in a shortened table inconsistent nodes come first."""
-    rows = list(consistency.rows)
-    if full or len(rows) <= MAX_ROWS:
-        return rows
-    return sorted(rows, key=lambda row: not row.verdict.startswith("BROKEN"))
-
-
 def format_filters(comparison: FilterComparison) -> str:
-    """Return the result of ``netkf.compare_filters`` for a terminal: one row per filter, reasons of
-    those that cannot run, and a legend of the columns.
-    """
+    """Return one row per filter, the reasons of those that cannot run, and a legend."""
     header = ["filter", "RMS error", "difference", "worst instant", "difference", "NEES / n"]
     header += ["difference", "consistency", "transmissions", "kB"]
     ran = [row for row in comparison.rows if row.ran]
@@ -198,9 +189,7 @@ def _format_quantity(cells: Quantity) -> tuple[str, str]:
 
 
 def format_comparison(comparison: Comparison) -> str:
-    """Return the result of ``netkf.compare`` for a terminal: finished runs side by side; a star
-    marks significant differences from the first.
-    """
+    """Return finished runs side by side, significant differences starred."""
     numbered = [f"({k + 1})" for k in range(len(comparison.directories))]
     lines = [
         f"{mark} {shorten(directory)}: {shorten(name)}, {runs:,} run{'s' if runs > 1 else ''}"

@@ -53,9 +53,7 @@ class QuantityInterval(NamedTuple):
 
 
 def parse_target(text: Any) -> Target:
-    """Return the target, a quantity and its upper limit, of a text like ``worst_rms<=0.5``; raises
-    ScenarioError, which names --target, for any other text.
-    """
+    """Return the target of a text like ``worst_rms<=0.5``; raises ScenarioError."""
     match = re.fullmatch(r"\s*(\w+)\s*<=\s*(\S+)\s*", text) if isinstance(text, str) else None
     listed = ", ".join(QUANTITIES)
     if match is None or match[1] not in QUANTITIES:

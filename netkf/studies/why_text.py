@@ -53,9 +53,7 @@ def source_table(explanation: Explanation) -> pd.DataFrame:
 
 
 def why_document(explanation: Explanation) -> dict[str, Any]:
-    """Return an explanation as plain JSON values, as ``netkf why --json`` prints them; what is
-    unknown is None.
-    """
+    """Return an explanation as plain JSON values; what is unknown is None."""
     smallest = explanation.smallest
     document: dict[str, Any] = {
         "scenario": explanation.scenario,
@@ -114,9 +112,7 @@ def _message_entry(explanation: Explanation, key: MessageKey) -> dict[str, Any]:
 
 
 def format_why(explanation: Explanation) -> str:
-    """Return an explanation for a terminal: sentences, the table of sources (what had reached the
-    node from whom), and the table of replays with missing messages.
-    """
+    """Return an explanation for a terminal: sentences, sources and replays."""
     lines = [
         *write_sentences(explanation),
         "",
@@ -129,9 +125,7 @@ def format_why(explanation: Explanation) -> str:
 
 
 def write_sentences(explanation: Explanation) -> list[str]:
-    """Return an explanation in sentences, one line each: on the estimate, the messages, the
-    readings and the smallest set of messages that was missing.
-    """
+    """Return an explanation in sentences, one line each."""
     return [
         *_state_sentences(explanation),
         *_heard_sentences(explanation),
