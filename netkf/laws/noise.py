@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 
 from netkf.laws.intervals import (
@@ -50,8 +51,8 @@ class NoiseDraws(NamedTuple):
 
 
 def noise_draws(z: FloatArray, states: FloatArray) -> NoiseDraws:
-    """Return the draws of one run from its noises ``z`` (S, d) and the ``states`` (S, n, d) to
-    which each is added, 0 where one is not known.
+    """Return the draws of one run from its noises ``z`` (S, d) and the ``states`` (S, n, d), or
+    (S, n, 1), to which each is added, 0 where one is not known.
     """
     known = (states != 0.0) & np.isfinite(z)[:, None]
     products = np.where(known, states, 0.0) * np.nan_to_num(z)[:, None]
@@ -77,6 +78,16 @@ def whiten(S: FloatArray, share: float = 1e-12) -> Whitening:
     positive = values > share * max(float(values[-1]), np.finfo(float).tiny)
     factor = (vectors[:, positive] / np.sqrt(values[positive])).T
     return Whitening(np.asarray(factor), vectors[:, ~positive].T)
+
+
+def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
+    """Return the transition matrix ``e^{A g}`` (n, n) of dx = A x dt + B dw over g = ``gap``
+    seconds, and the covariance (n, n) of its noise (Van Loan, 1978), for A (n, n) and B (n, m).
+    """
+    n = len(A)
+    E = scipy.linalg.expm(np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * gap)
+    W = E[n:, n:].T @ E[:n, n:]
+    return E[n:, n:].T, 0.5 * (W + W.T)
 
 
 def compare_variances(

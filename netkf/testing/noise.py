@@ -19,13 +19,16 @@ from netkf.laws.noise import (
     compare_means,
     compare_variances,
     compare_with,
+    whiten,
 )
 from netkf.linalg.arrays import FloatArray
-from netkf.testing.watching import fail
+from netkf.testing.watching import demand, fail
 
 LEVEL, FAMILIES = 1e-6, 200
 LAGS = (2, 3, 7)
 """Steps apart, beside 1, at which correlations in time are tested."""
+CERTAIN = 1e-6
+"""Noise in directions without any, relative to what it is added to, that counts as rounding."""
 NEGLIGIBLE = 1e-8
 """Share of a standard deviation that counts as rounding."""
 MIN_VALUES = 1000
@@ -128,6 +131,20 @@ def check_independent(
         if len(e) >= MIN_VALUES:
             text, rule = f"its {moment}: correlation", f"{labels.noise} must not depend on {name}"
             demand_agreement(comparison._replace(text=text), labels.where, rule)
+
+
+def whitened(
+    noise: FloatArray, S: FloatArray, size: float, where: str, rule: str, remedy: str = ""
+) -> FloatArray:
+    """Return ``noise`` (..., q) of covariance ``S`` (q, q) as standard white noise (..., r).
+
+    Raises AssertionError with the line ``where: rule; got ...; remedy`` unless it is 0, relative to
+    the ``size`` of what it is added to, in directions in which S has no noise.
+    """
+    whitening = whiten(S)
+    error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size
+    demand(error <= CERTAIN, where, rule, f"{error:.3g} of its size left over", remedy)
+    return np.asarray(noise @ whitening.factor.T)
 
 
 def mean_interval(values: FloatArray, expected: float, level: float) -> Interval:

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.core.errors import NetkfError
-from netkf.laws.noise import whiten
+from netkf.laws.noise import transition_law, whiten
 from netkf.linalg.arrays import FloatArray, is_semidefinite
 from netkf.linalg.spectra import eigenvalues, growth_factor, growth_rate
 from netkf.plants.diffusion import Diffusion
@@ -25,12 +25,15 @@ from netkf.testing.noise import (
     check_independent,
     check_uncorrelated,
     check_white,
+    whitened,
 )
 from netkf.testing.watching import (
+    ROUNDING,
     WatchedPart,
     call_user_function,
     demand,
     demand_array,
+    demand_close,
     guard_user_code,
     make_part,
     scaled_difference,
@@ -44,8 +47,8 @@ GRID_STEPS, MAX_RUNS = 51_200, 2000
 """Steps on the sensing grid in all runs together, and largest number of runs off that grid."""
 SHORT_LENGTH = 130
 """Slots in which paths are compared exactly."""
-ROUNDING, FRAME_TOLERANCE = 1e-9, 1e-6
-"""Relative differences of equal paths, and of paths in frames or of directions without noise."""
+FRAME_TOLERANCE = 1e-6
+"""Relative difference of equal paths in frames."""
 MAX_LOG_GROWTH = math.log(1e6)
 """Logarithm of the largest growth of the state of an unstable plant in a run."""
 GAPS = (0.7, 0.2, 1.0, 0.05)
@@ -134,14 +137,8 @@ def _make_generator(seed: int, run: int, purpose: str = "plant") -> np.random.Ge
 
 def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> None:
     """Check that two paths (K, n) from equal streams are equal."""
-    difference = scaled_difference(one, other)
-    demand(
-        difference <= ROUNDING,
-        where,
-        "must make the same path from equal streams",
-        f"a difference of {difference:.3g} of its size {when}",
-        "use only the generators given, and draw for each step in order",
-    )
+    remedy = "use only the generators given, and draw for each step in order"
+    demand_close(one, other, where, "must make the same path from equal streams", when, remedy)
 
 
 def _demand_moved(
@@ -168,18 +165,15 @@ def _check_starts(
     is_inherited: bool,
 ) -> None:
     """Check mean and covariance of x(0), which ``start`` draws from a generator."""
-    whitening = whiten(part.start_cov)
-    count = STARTS if len(whitening.factor) else FEW_STARTS
+    count = STARTS if part.start_cov.any() else FEW_STARTS
     with guard_user_code(where):
         starts = _draw_starts(part, seed, start, is_inherited, count)
     demand_array(where, "x(0)", starts[0], (part.n,))
     deviations = np.array(starts) - part.start_mean
     size = 1.0 + float(np.abs(part.start_mean).max())
-    error = float(np.abs(deviations @ whitening.null_space.T).max(initial=0.0)) / size
     rule = "x(0) must be its mean in the directions in which cov has no variance"
     remedy = "start at mean + root of cov times normals"
-    demand(error <= 1e-6, where, rule, f"{error:.3g} off", remedy)
-    unit = deviations @ whitening.factor.T
+    unit = whitened(deviations, part.start_cov, size, where, rule, remedy)
     if unit.size:
         check_white(unit[:, None], NoiseLabels(where, "x(0) less its mean", "cov"))
 
@@ -218,12 +212,7 @@ def _check_noise(
     noise: FloatArray, S: FloatArray, states: FloatArray, labels: NoiseLabels, rule: str
 ) -> None:
     """Check the noise of a user's plant."""
-    whitening = whiten(S)
-    size = 1.0 + float(np.abs(states).max())
-    error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size
-    text = f"{error:.3g} of the state left over without noise"
-    demand(error <= FRAME_TOLERANCE, labels.where, rule, text)
-    e = noise @ whitening.factor.T
+    e = whitened(noise, S, 1.0 + float(np.abs(states).max()), labels.where, rule)
     if not e.size:
         return
     check_white(e, labels)
@@ -297,17 +286,6 @@ def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any)
             is_zero = not np.any(truth.local(slot))
             rule = "the local state must be 0 where a frame begins"
             demand(is_zero, where, rule, truth.local(slot))
-
-
-def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the transition matrix ``e^{A g}`` (n, n) of dx = A x dt + B dw over g = ``gap``
-    seconds, and the covariance (n, n) of its noise (Van Loan, 1978), for A (n, n) and B (n, m).
-    """
-    n = len(A)
-    block = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * gap
-    E = scipy.linalg.expm(block)
-    Phi = E[n:, n:].T
-    return Phi, Phi @ E[:n, n:]
 
 
 def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:

@@ -44,18 +44,10 @@ class SensorReader:
         self.p, self.n = len(sensor.R), sensor.H.shape[1]
 
     def make_path(self, streams: Streams, node: int) -> Any:
-        """Return the object that gives the readings of a node in one run, its path, which the
-        sensor makes with the run's random ``streams``.
-        """
-
-        def generator(purpose: str) -> np.random.Generator:
-            """Return the random generator for a purpose of the sensor at the node."""
-            return streams.generator(purpose, node, 0)
-
-        return call_user_function(self.where, self._make_path, node, generator)
+        """Return the path of a node in one run, made with the run's random ``streams``."""
+        return call_user_function(self.where, self._make_path, node, generators(streams, node))
 
     def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
-        """Call ``slot_path`` of the sensor and return its path."""
         return self.sensor.slot_path(node, PERIOD, generator)
 
     def read_several(self, path: Any, ks: Sequence[int], x: FloatArray) -> ReadingSeries:
@@ -64,8 +56,7 @@ class SensorReader:
         """
         y, H = call_user_function(self.where, path.several, ks, x)
         y = demand_array(self.where, "y of several", y, (len(ks), self.p))
-        H = demand_array(self.where, "H of several", H, (len(ks), self.p, self.n))
-        return ReadingSeries(y, H)
+        return ReadingSeries(y, demand_array(self.where, "H of several", H, (*y.shape, self.n)))
 
     def read_one(self, path: Any, k: int, x: FloatArray) -> ReadingSeries:
         """Return reading number ``k`` at the state ``x`` (n,), as a series of one reading: y
@@ -74,13 +65,10 @@ class SensorReader:
         with guard_user_code(self.where):
             y, H = self._read_one(path, k, x)
         y = demand_array(self.where, "a reading", y, (self.p,))
-        H = demand_array(self.where, "H", H, (self.p, self.n))
-        return ReadingSeries(y[None], H[None])
+        return ReadingSeries(y[None], demand_array(self.where, "H", H, (self.p, self.n))[None])
 
     def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return reading number ``k`` (p,) at the state ``x`` (n,), and its H (p, n)."""
-        # In the order in which engines call them.
-        return path.reading(k, x), path.matrix(k)
+        return path.reading(k, x), path.matrix(k)  # in the order in which engines call them
 
 
 class SampleReader(SensorReader):
@@ -89,13 +77,16 @@ class SampleReader(SensorReader):
     method = "samples"
 
     def _make_path(self, node: int, generator: Callable[[str], np.random.Generator]) -> Any:
-        """Call ``samples`` of the sensor and return its path."""
         return self.sensor.samples(node, generator, HORIZON)
 
     def _read_one(self, path: Any, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return sample number ``k`` (p,) at the state ``x`` (n,), and its H (p, n)."""
         y, H = path.reading(k, x)
         return y, H
+
+
+def generators(streams: Streams, node: int) -> Callable[[str], np.random.Generator]:
+    """Return the function from purposes to random generators of the first sensor of a node."""
+    return lambda purpose: streams.generator(purpose, node, 0)
 
 
 def make_readers(sensor: Sensor, name: str) -> list[SensorReader]:
@@ -127,16 +118,10 @@ class IncrementPieces(NamedTuple):
     step: np.ndarray
 
 
-class IncrementReader:
-    """Reads the increments of a sensor of a constant state, over steps that may be cut into pieces.
+class IncrementReader(SensorReader):
+    """Reads the increments of a sensor of a constant state, over steps that may be cut."""
 
-    ``name`` is that of the user's class; ``p`` is the number of rows of a reading, ``n`` of states.
-    """
-
-    def __init__(self, sensor: Any, name: str) -> None:
-        """Take the ``sensor``, with a matrix H (p, n), and the name of its class."""
-        self.sensor, self.where = sensor, f"{name}.path"
-        self.p, self.n = len(sensor.R), sensor.H.shape[1]
+    method = "path"
 
     def read_pieces(
         self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
@@ -144,32 +129,21 @@ class IncrementReader:
         """Return the increments that ``node`` (an id) reads over ``steps`` steps at the constant
         state ``x`` (n,), each step ``cut`` into pieces at CUTS or not.
         """
-        with guard_user_code(self.where):
-            return self._read_pieces(streams, node, x, steps, cut)
-
-    def _read_pieces(
-        self, streams: Streams, node: int, x: FloatArray, steps: int, cut: bool
-    ) -> IncrementPieces:
-        """Return the pieces as :meth:`read_pieces`, without its guard."""
-        plant = Diffusion(
-            mean=x, A=np.zeros((self.n, self.n)), B=np.zeros((self.n, 1)), sensing_period=STEP
-        )
-        plant_random, probe_random, noise_random, cut_random = (
-            streams.generator(purpose, node, 0) for purpose in ("plant", "probe", "noise", "cut")
-        )
-        truth = plant.path(plant_random, probe_random, np.empty(0))
-        path = self.sensor.path(noise_random, cut_random)
+        generator, A = generators(streams, node), np.zeros((self.n, self.n))
+        plant = Diffusion(mean=x, A=A, B=A[:, :1], sensing_period=STEP)
         all_moments, spans, step = [], [], []
-        for k in range(steps):
-            first, last = truth.grid(k), truth.grid(k + 1)
-            shares = CUTS[k % len(CUTS)] if cut else ()
-            times = [first, *(first + share * (last - first) for share in shares), last]
-            for start, end in pairwise(times):
-                x_moments = truth.moments(start, end)
-                moments = path.moments(truth, x_moments, start, end)
-                all_moments.append(demand_array(self.where, "moments", moments, (2, self.p)))
-                spans.append((start, end))
-                step.append(k)
+        with guard_user_code(self.where):
+            truth = plant.path(generator("plant"), generator("probe"), np.empty(0))
+            path = self.sensor.path(generator("noise"), generator("cut"))
+            for k in range(steps):
+                first, last = truth.grid(k), truth.grid(k + 1)
+                shares = CUTS[k % len(CUTS)] if cut else ()
+                times = [first, *(first + share * (last - first) for share in shares), last]
+                for start, end in pairwise(times):
+                    moments = path.moments(truth, truth.moments(start, end), start, end)
+                    all_moments.append(demand_array(self.where, "moments", moments, (2, self.p)))
+                    spans.append((start, end))
+                    step.append(k)
         return IncrementPieces(np.array(all_moments), np.array(spans), np.array(step))
 
     def combine(self, pieces: IncrementPieces) -> FloatArray:
@@ -178,10 +152,9 @@ class IncrementReader:
         """
         total = np.zeros((int(pieces.step[-1]) + 1, 2, self.p))
         for moments, (start, end), k in zip(*pieces, strict=True):
-            first, last = k * STEP, (k + 1) * STEP
             # On a piece, P_1 of the step is its value in the middle of the piece plus the share of
             # the piece times P_1 of the piece.
-            middle = ((start - first) - (last - end)) / STEP
+            middle = ((start - k * STEP) - ((k + 1) * STEP - end)) / STEP
             total[k, 0] += moments[0]
             total[k, 1] += middle * moments[0] + (end - start) / STEP * moments[1]
         return total

@@ -23,6 +23,7 @@ from netkf.testing.noise import (
     demand_agreement,
     family_level,
     mean_interval,
+    whitened,
 )
 from netkf.testing.readings import (
     STEP,
@@ -30,17 +31,19 @@ from netkf.testing.readings import (
     ReadingSeries,
     SensorReader,
     demand_matrices,
+    generators,
     gives_increments,
     make_readers,
 )
 from netkf.testing.watching import (
+    ROUNDING,
     WatchedPart,
     call_user_function,
     demand,
+    demand_close,
     fail,
     guard_user_code,
     make_part,
-    scaled_difference,
 )
 
 READINGS, LENGTH, MAX_NODES = 100_000, 250, 8
@@ -53,8 +56,6 @@ SHORT_LENGTH = 40
 """Readings that are compared exactly."""
 TIMES_RUNS, EXPECTED_SAMPLES = 400, 50.0
 """Runs in which samples are counted, and the mean number of them in a run."""
-ROUNDING = 1e-9
-"""Scaled difference (:func:`scaled_difference`) up to which readings count as equal."""
 DERIVATIVE_STEP, DERIVATIVE_TOLERANCE = 1e-5, 1e-6
 """Step of the state in differences of h, and their tolerated error over 1 + the largest entry."""
 MAX_STATES = 12
@@ -163,15 +164,9 @@ def _demand_equal(
     reader: SensorReader, one: ReadingSeries, other: ReadingSeries, when: str
 ) -> None:
     """Check that two series of readings are equal."""
+    remedy = "use only the generators given, and draw for each reading in order"
     for name, a, b in zip(("readings", "matrices H"), one, other, strict=True):
-        difference = scaled_difference(a, b)
-        demand(
-            difference <= ROUNDING,
-            reader.where,
-            f"{name} must be the same for equal streams",
-            f"a difference of {difference:.3g} of their size {when}",
-            "use only the generators given, and draw for each reading in order",
-        )
+        demand_close(a, b, reader.where, f"{name} must be the same for equal streams", when, remedy)
 
 
 def _concatenate(series: list[ReadingSeries]) -> ReadingSeries:
@@ -190,9 +185,7 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
     x, other_x = (_make_states(seed, LENGTH, reader.n, run) for run in (0, 1))
     series = reader.read_several(reader.make_path(streams, node), numbers, x)
     other = reader.read_several(reader.make_path(streams, node), numbers, other_x)
-    difference = scaled_difference(series.H, other.H)
-    rule = "H must not depend on the state"
-    demand(difference <= ROUNDING, reader.where, rule, f"{difference:.3g} apart")
+    demand_close(series.H, other.H, reader.where, "H must not depend on the state")
     expected = np.einsum("kpn,kn->kp", series.H, other_x - x)
     error = np.abs(other.y - series.y - expected).max() / (1.0 + np.abs(expected).max())
     demand(
@@ -203,13 +196,9 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
         "return H @ x plus noise that does not depend on x",
     )
     if not reader.sensor.varying:
-        difference = max(scaled_difference(H, reader.sensor.H) for H in series.H)
-        demand(
-            difference <= ROUNDING,
-            reader.where,
-            "H must be the sensor's own unless varying is True",
-            f"{difference:.3g} of its size apart",
-        )
+        own = np.broadcast_to(reader.sensor.H, series.H.shape)
+        rule = "H must be the sensor's own unless varying is True"
+        demand_close(series.H, own, reader.where, rule)
 
 
 def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None:
@@ -243,41 +232,25 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
     streams = Streams(seed)
     cut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
     uncut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=False)
-    difference = scaled_difference(reader.combine(cut), uncut.moments)
-    demand(
-        difference <= ROUNDING,
-        reader.where,
-        "increments of the pieces of a step must add up to those of the step",
-        f"{difference:.3g} of their size apart",
-        "draw the noise of the grid first, and cut it by its conditional law",
-    )
+    rule = "increments of the pieces of a step must add up to those of the step"
+    remedy = "draw the noise of the grid first, and cut it by its conditional law"
+    demand_close(reader.combine(cut), uncut.moments, reader.where, rule, remedy=remedy)
     repeated = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
-    difference = scaled_difference(cut.moments, repeated.moments)
-    demand(
-        difference <= ROUNDING,
-        reader.where,
-        "increments must be the same for equal streams",
-        f"{difference:.3g} of their size apart",
-        "use only the generators given",
-    )
+    rule, remedy = "increments must be the same for equal streams", "use only the generators given"
+    demand_close(cut.moments, repeated.moments, reader.where, rule, remedy=remedy)
     other = reader.read_pieces(streams, node, other_x, SHORT_LENGTH, cut=True)
     gaps = (other.spans[:, 1] - other.spans[:, 0])[:, None]
     change = gaps * (reader.sensor.H @ (other_x - x))
     expected = cut.moments + np.stack([change, np.zeros_like(change)], axis=1)
-    difference = scaled_difference(other.moments, expected)
-    demand(
-        difference <= ROUNDING,
-        reader.where,
-        "another state must change increments by H times its integral, and the noise not at all",
-        f"{difference:.3g} of their size left over",
-    )
+    rule = "another state must change increments by H times its integral, and the noise not at all"
+    demand_close(other.moments, expected, reader.where, rule)
     _check_increment_noise(reader, node, x, seed)
 
 
 def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
     """Check that the noise of increments at the state ``x`` (n,) is white with R."""
     factor = whiten(reader.sensor.R).factor
-    whitened = []
+    noises = []
     for run in range(RUNS):
         pieces = reader.read_pieces(Streams(seed, run), node, x, STEPS, cut=True)
         gaps = (pieces.spans[:, 1] - pieces.spans[:, 0])[:, None]
@@ -285,9 +258,9 @@ def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, se
         noise = pieces.moments - np.stack([drift, np.zeros_like(drift)], axis=1)
         # The moments of unit noise over g seconds have the variances g and g / 3.
         deviations = np.sqrt(gaps[:, :, None] * np.array([[1.0], [1.0 / 3.0]]))
-        whitened.append((noise / deviations @ factor.T).reshape(len(noise), -1))
+        noises.append((noise / deviations @ factor.T).reshape(len(noise), -1))
     text = f"the noise of increments (their two moments, over steps of {STEP:g} s)"
-    check_white(np.array(whitened), NoiseLabels(reader.where, text, "R"))
+    check_white(np.array(noises), NoiseLabels(reader.where, text, "R"))
 
 
 def _check_regressors(
@@ -310,14 +283,9 @@ def _check_regressors(
     )
     noise_labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     for k in slots:
-        whitening = whiten(sensor.C @ cov @ sensor.C.T)
-        deviation = H[:, :, k] - sensor.C @ mean
-        size = 1.0 + float(np.abs(mean).max())
-        error = float(np.abs(deviation @ whitening.null_space.T).max(initial=0.0)) / size
-        if error > 1e-6:
-            rule = "H must be C s with s[0] = start and s[k+1] = A s[k] + B xi"
-            fail(reader.where, rule, f"{error:.3g} off where it is certain, in slot {k}")
-        unit = deviation @ whitening.factor.T
+        size, rule = 1.0 + float(np.abs(mean).max()), "H must be C s, s[k+1] = A s[k] + B xi"
+        deviation, S = H[:, :, k] - sensor.C @ mean, sensor.C @ cov @ sensor.C.T
+        unit = whitened(deviation, S, size, reader.where, rule)
         v = noise[:, :, k].reshape(-1, 1) / np.sqrt(sensor.R[0, 0])
         flat_H = H[:, :, k].reshape(len(v), -1)
         check_independent(v, flat_H, noise_labels, f"H, in slot {k}")
@@ -386,12 +354,7 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
 
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
     """Return the sample times (K,) at ``node`` in a run of ``horizon`` seconds."""
-    streams = Streams(seed)
-
-    def generator(purpose: str) -> np.random.Generator:
-        """Return the random generator for a purpose of the sensor at the node."""
-        return streams.generator(purpose, node, 0)
-
+    generator = generators(Streams(seed), node)
     times = np.asarray(call_user_function(where, sensor.sample_times, node, 0, generator, horizon))
     is_vector = times.ndim == 1 and times.dtype == np.float64
     demand(is_vector, where, "must be a vector of float64", f"{times.dtype} {times.shape}")

@@ -23,6 +23,8 @@ from netkf.scenario.plugins import describe_error, describe_failure
 
 Leaves = dict[str, Any]
 """Copies of the numbers, texts and arrays in a value, by their paths such as ``.P[0]``."""
+ROUNDING = 1e-9
+"""Difference (:func:`scaled_difference`) up to which arrays count as equal."""
 MERSENNE_BYTES = 4 * 625
 """Size of the state of a Mersenne twister: 624 words of 32 bits and the position in them."""
 
@@ -392,3 +394,14 @@ def scaled_difference(one: FloatArray, other: FloatArray) -> float:
     """
     size = 1.0 + max(np.abs(a).max(initial=0.0) for a in (one, other))
     return float(np.abs(one - other).max(initial=0.0) / size)
+
+
+def demand_close(
+    one: FloatArray, other: FloatArray, where: str, rule: str, when: str = "", remedy: str = ""
+) -> None:
+    """Raise AssertionError with the line ``where: rule; got ... ; remedy`` unless two arrays of one
+    shape are equal up to ROUNDING; ``when`` says how they were made.
+    """
+    difference = scaled_difference(one, other)
+    got = f"a difference of {difference:.3g} of their size {when}".rstrip()
+    demand(difference <= ROUNDING, where, rule, got, remedy)

@@ -9,46 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.evidence import (
-    CLOCKS,
-    DELAYS,
-    LOSSES,
-    MATCHINGS,
-    SAMPLING,
-    Assumption,
-    Finding,
-    Promise,
-    find_identity,
-)
+from netkf.checks import evidence
+from netkf.checks.evidence import Assumption, Finding, Promise, find_identity
 from netkf.checks.laws import find, find_largest
-from netkf.checks.parts.events import (
-    count_drawn_samples,
-    count_drawn_ticks,
-    loss_law,
-    network_clocks,
-    sampling_clocks,
-    stated_delay,
-)
+from netkf.checks.parts import events
+from netkf.checks.parts.events import loss_law, stated_delay
 from netkf.checks.parts.samples import PartSamples
 from netkf.core.errors import ScenarioError
-from netkf.laws.delays import compare_delays
+from netkf.laws import delays, losses, ticks
 from netkf.laws.intervals import Comparison, deviation_interval, with_drawn
-from netkf.laws.losses import (
-    compare_bursts,
-    compare_independence,
-    compare_losses,
-    compare_matchings,
-)
 from netkf.laws.stating import stated_part
-from netkf.laws.ticks import (
-    ClockGroup,
-    compare_clocks,
-    compare_gaps,
-    rates_of_all,
-    rates_of_each,
-    slack_of_start,
-    smallest_error,
-)
+from netkf.laws.ticks import ClockGroup
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import delay_depends_on_message
 from netkf.network.contacts import Contacts
@@ -72,6 +43,8 @@ ENOUGH_TICKS, MAX_DRAWN, MAX_DRAWN_TICKS, DRAWN_PER_RUN = 80_000, 20_000, 3e6, 4
 """Ticks of one clock that reveal an error of WANTED_RATE. Limits on the extra replicas in which
 only the clocks are drawn: clocks times replicas, ticks of all clocks, and replicas for each run.
 """
+Test = Callable[[PartSamples, float], Finding]
+"""A test of a row: a function of the samples of all runs and a level."""
 Draw = Callable[[Scenario, int, int], np.ndarray]
 """Function of (scenario, seed, replica) that returns the ticks (E,) of all clocks in a replica of
 which nothing else is simulated.
@@ -95,10 +68,10 @@ class Clocks(NamedTuple):
 
 
 NETWORK = Clocks(
-    network_clocks,
+    events.network_clocks,
     "ticks",
-    count_drawn_ticks,
-    CLOCKS,
+    events.count_drawn_ticks,
+    evidence.CLOCKS,
     rates="clocks tick at the rates of the scenario",
     exponential="gaps between ticks are exponential, and independent of those before",
     apart="clocks tick independently of each other",
@@ -106,10 +79,10 @@ NETWORK = Clocks(
     law="ticks follow the law of their clocks, and do not depend on those before",
 )
 SENSORS = Clocks(
-    sampling_clocks,
+    events.sampling_clocks,
     "sampling",
-    count_drawn_samples,
-    SAMPLING,
+    events.count_drawn_samples,
+    evidence.SAMPLING,
     rates="sensors sample at the rates of the scenario",
     exponential="gaps between samples are exponential, and independent of those before",
     apart="sensors sample independently of each other",
@@ -127,12 +100,12 @@ def _drawn_counts(draw: Draw, scenario: Scenario, seed: int, first: int, count: 
 
 def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
     """Return the number of replicas of clocks alone that reveal an error WANTED_RATE."""
-    ticks = group.rates * horizon
+    expected = group.rates * horizon
     further = min(
-        math.ceil(ENOUGH_TICKS / ticks.min() - runs),
+        math.ceil(ENOUGH_TICKS / expected.min() - runs),
         int(DRAWN_PER_RUN * runs),
-        int(MAX_DRAWN / len(ticks)),
-        int(MAX_DRAWN_TICKS / ticks.sum()),
+        int(MAX_DRAWN / len(expected)),
+        int(MAX_DRAWN_TICKS / expected.sum()),
     )
     return int(max(further, 0))
 
@@ -146,7 +119,7 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     if further:
         drawn = _drawn_counts(clocks.draw, scenario, samples.seed, runs, further)
         counts = np.concatenate([counts, drawn])
-    slack = slack_of_start(group, counts)
+    slack = ticks.slack_of_start(group, counts)
 
     def sample_factor(factor: float) -> float:
         """Return the factor on the number of counts of a clock for a factor on the runs."""
@@ -155,9 +128,9 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
 
     singles = [
         with_drawn(one, sample_factor)
-        for one in rates_of_each(group, counts, slack, horizon, level / 3.0)
+        for one in ticks.rates_of_each(group, counts, slack, horizon, level / 3.0)
     ]
-    distances = rates_of_all(group, windows, float(slack.sum()), horizon, level / 3.0)
+    distances = ticks.rates_of_all(group, windows, float(slack.sum()), horizon, level / 3.0)
     distances += zip(singles, group.labels, strict=True)
     text = f"{windows.sum():,.0f} ticks, relative difference from the rates,"
     finding = find(Comparison(distances, text, overall=1), RATE_TOLERANCE)
@@ -165,14 +138,14 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     worst = max(range(len(singles)), key=lambda k: singles[k].detectable)
     if singles[worst].detectable <= WANTED_RATE or not group.poisson:
         return finding
-    ticks = float(group.rates[worst]) * horizon * len(counts)
-    note = f"no test at this level finds less than {smallest_error(ticks, level):.2g} in"
-    return finding._replace(message=f"{finding.message}; of one clock, {note} {ticks:,.0f} ticks")
+    number = float(group.rates[worst]) * horizon * len(counts)
+    note = f"no test at this level finds less than {ticks.smallest_error(number, level):.2g} in"
+    return finding._replace(message=f"{finding.message}; of one clock, {note} {number:,.0f} ticks")
 
 
 def _check_gaps(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     """Compare the law of single gaps, and the correlation of neighbouring ones with 0."""
-    shares, correlation = compare_gaps(getattr(samples, clocks.field), level)
+    shares, correlation = ticks.compare_gaps(getattr(samples, clocks.field), level)
     finding = find(shares, SHARE_TOLERANCE)
     if correlation is None:
         return finding
@@ -198,7 +171,7 @@ def _check_lattice(clocks: Clocks, samples: PartSamples, level: float) -> Findin
 def _clocks_apart(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
     """Compare Poisson clocks with independent ones."""
     group, counts = clocks.group(samples.scenario), getattr(samples, clocks.field)
-    comparison = compare_clocks(group, counts.ticks, samples.scenario.horizon, level)
+    comparison = ticks.compare_clocks(group, counts.ticks, samples.scenario.horizon, level)
     return find(comparison, DISPERSION_TOLERANCE)
 
 
@@ -220,28 +193,14 @@ def _clock_promises(clocks: Clocks, samples: PartSamples) -> list[Promise]:
         elif counts.cells.any():
             rows.append((clocks.law, _check_gaps, False))
     return [
-        Promise(text, "the scenario", (), partial(test, clocks), exact, clocks.about)
-        for text, test, exact in rows
+        _row(text, clocks.about, partial(test, clocks), exact=exact) for text, test, exact in rows
     ]
 
 
-def _check_losses(samples: PartSamples, level: float) -> Finding:
-    """Compare the lost shares of messages with the stated ones."""
-    return find(
-        compare_losses(loss_law(samples.scenario), samples.fates, level), PROBABILITY_TOLERANCE
-    )
-
-
-def _losses_apart(samples: PartSamples, level: float) -> Finding:
-    """Compare losses with independent ones."""
-    law = loss_law(samples.scenario)
-    return find(compare_independence(law, samples.fates, level), CORRELATION_TOLERANCE)
-
-
-def _check_bursts(samples: PartSamples, level: float) -> Finding:
-    """Compare losses after losses with those of the stated two-state (Gilbert-Elliott) chain."""
-    return find(
-        compare_bursts(loss_law(samples.scenario), samples.fates, level), PROBABILITY_TOLERANCE
+def _of_losses(compare: Callable[..., Comparison], tolerance: float) -> Test:
+    """Return the test that compares what becomes of messages with the stated law."""
+    return lambda samples, level: find(
+        compare(loss_law(samples.scenario), samples.fates, level), tolerance
     )
 
 
@@ -265,7 +224,7 @@ def _check_matchings(samples: PartSamples, level: float) -> Finding:
     """Compare matchings with the stated probabilities of their pairs."""
     p, links = pair_probabilities(samples.scenario), samples.scenario.topology.links
     assert p is not None
-    return find(compare_matchings(p, samples.pairs, links, level), PROBABILITY_TOLERANCE)
+    return find(losses.compare_matchings(p, samples.pairs, links, level), PROBABILITY_TOLERANCE)
 
 
 def _check_fixed(samples: PartSamples, level: float) -> Finding:
@@ -277,7 +236,7 @@ def _check_fixed(samples: PartSamples, level: float) -> Finding:
 def _check_delays(samples: PartSamples, level: float) -> Finding:
     """Compare delays with their stated law, in each direction, and with those just before."""
     links = samples.scenario.topology.directions
-    law, means = compare_delays(samples.delays, links, level)
+    law, means = delays.compare_delays(samples.delays, links, level)
     finding = find(law, SHARE_TOLERANCE)
     # The law of all delays is reported if it is wrong, or if no direction is significantly off.
     if finding.margin[2] < 0.0 or means.worst is None:
@@ -287,48 +246,45 @@ def _check_delays(samples: PartSamples, level: float) -> Finding:
 
 DRAWN, STATED = "losses are drawn, not recorded", "losses state how often messages are lost"
 SAME = "all messages of a link are lost with one probability"
-LOSS_ROW = Promise(
+
+
+def _row(text: str, group: str, test: Test, *needs: str, exact: bool = False) -> Promise:
+    """Return a promise of the scenario."""
+    return Promise(text, "the scenario", needs, test, exact, group)
+
+
+LOSS_ROW = _row(
     "messages are lost as often as the scenario says, in each direction",
-    "the scenario",
-    (DRAWN, STATED),
-    _check_losses,
-    group=LOSSES,
+    evidence.LOSSES,
+    _of_losses(losses.compare_losses, PROBABILITY_TOLERANCE),
+    DRAWN,
+    STATED,
 )
-LOSSES_APART = Promise(
+LOSSES_APART = _row(
     "messages are lost independently of each other",
-    "the scenario",
-    (DRAWN, STATED, SAME),
-    _losses_apart,
-    group=LOSSES,
+    evidence.LOSSES,
+    _of_losses(losses.compare_independence, CORRELATION_TOLERANCE),
+    DRAWN,
+    STATED,
+    SAME,
 )
-BURSTS = Promise(
+BURSTS = _row(
     "losses follow each other as the scenario says",
-    "the scenario",
-    (DRAWN, STATED),
-    _check_bursts,
-    group=LOSSES,
+    evidence.LOSSES,
+    _of_losses(losses.compare_bursts, PROBABILITY_TOLERANCE),
+    DRAWN,
+    STATED,
 )
-MATCHING_ROW = Promise(
+MATCHING_ROW = _row(
     "links are paired as often as the protocol says, whatever happened before",
-    "the scenario",
-    (),
+    evidence.MATCHINGS,
     _check_matchings,
-    group=MATCHINGS,
 )
-FIXED = Promise(
-    "messages take the time of the scenario",
-    "the scenario",
-    (),
-    _check_fixed,
-    exact=True,
-    group=DELAYS,
-)
-DELAY_LAW = Promise(
+FIXED = _row("messages take the time of the scenario", evidence.DELAYS, _check_fixed, exact=True)
+DELAY_LAW = _row(
     "delays of messages have the law of the scenario, independent of each other",
-    "the scenario",
-    (),
+    evidence.DELAYS,
     _check_delays,
-    group=DELAYS,
 )
 
 
@@ -338,19 +294,19 @@ def loss_assumptions(scenario: Scenario) -> list[Assumption]:
     """
     channel, law = scenario.network.channel, loss_law(scenario)
     loss: Any = stated_part(channel.loss, "loss")
-    drawn, evidence = True, "links are up unless a message is lost"
+    drawn, why = True, "links are up unless a message is lost"
     if loss.deterministic and not loss.independent:
-        drawn, evidence = False, "a table lists which messages arrive"
+        drawn, why = False, "a table lists which messages arrive"
     elif delay_depends_on_message(channel.delay):
         # Such a delay may lose a message (nan), which the law of losses does not state.
-        drawn, evidence = False, "delays depend on the message, and may lose it"
+        drawn, why = False, "delays depend on the message, and may lose it"
     elif has_recorded_broadcasts(scenario):
-        drawn, evidence = False, "a table lists the links that are up; others lose their messages"
+        drawn, why = False, "a table lists the links that are up; others lose their messages"
     source, name = "the scenario", type(channel.loss).__name__
     stated = bool(np.isfinite(law.lost).all())
     changes = "" if law.steady else f"{name} changes it with the message"
     return [
-        Assumption(DRAWN, source, drawn, evidence),
+        Assumption(DRAWN, source, drawn, why),
         Assumption(STATED, source, stated, "for each link" if stated else f"{name} does not"),
         Assumption(SAME, source, law.steady, changes),
     ]

@@ -8,14 +8,19 @@ formulas that share no code with the plant.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
 
-from netkf.laws.noise import MIN_VARIANCE_SHARE, NoiseDraws, noise_draws, whiten
+from netkf.laws.noise import (
+    MIN_VARIANCE_SHARE,
+    NoiseDraws,
+    noise_draws,
+    transition_law,
+    whiten,
+)
 from netkf.laws.stating import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.diffusion import Diffusion
@@ -35,13 +40,9 @@ VISIBLE = 1e-5
 
 
 class PathLaw(NamedTuple):
-    """The law of S steps ``x(t + gap) = Phi x(t) + w`` of a path.
-
-    times     : (S + 1,) seconds of the states
-    Phi       : (n, n)
-    white     : (d, n) matrix that whitens w, which has rank d
-    deviation : largest standard deviation of an entry of w
-    sizes     : (S, n) root mean squares of the states before the steps
+    """The law of S steps ``x(t + gap) = Phi x(t) + w`` of a path: ``times`` (S + 1,) of the states
+    in seconds, Phi (n, n), ``white`` (d, n) that whitens w of rank d, the largest standard
+    ``deviation`` of an entry of w, and the root mean squares ``sizes`` (S, n) of states before.
     """
 
     times: FloatArray
@@ -54,47 +55,24 @@ class PathLaw(NamedTuple):
 @lru_cache(maxsize=8)
 def path_law(scenario: Scenario) -> PathLaw | None:
     """Return the law of the true state at up to MAX_STEPS + 1 times of a run, by the matrices of
-    the scenario: the transition (n, n) of a step between two times, and the whitening (d, n) of its
-    noise, with which simulated paths are compared; None for recorded states.
+    the scenario; None for recorded states.
     """
     if not scenario.plant.is_random:
         return None
     stated: Any = stated_part(scenario.plant, "plant")
     if scenario.slotted:
         slots = min(MAX_STEPS, int(scenario.horizon / stated.period))
-        times = stated.period * np.arange(slots + 1)
-        Phi, W = np.asarray(stated.F), np.asarray(stated.Q)
+        times, Phi, W = stated.period * np.arange(slots + 1), np.asarray(stated.F), stated.Q
     else:
         even = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
         times = scenario.time_grid.snap(even)
-        Phi, W = _discretise(stated.A, stated.B, float(times[1]))
-    deviation = float(np.sqrt(np.diagonal(W).max()))
-    return PathLaw(
-        times,
-        Phi,
-        whiten(W, MIN_VARIANCE_SHARE).factor,
-        deviation,
-        _sizes(stated, Phi, W, len(times) - 1),
-    )
-
-
-def _sizes(plant: Any, Phi: FloatArray, W: FloatArray, steps: int) -> FloatArray:
-    """Return the root mean squares (steps, n) of the states before each of ``steps`` steps."""
-    mean, covariance, sizes = plant.start_mean, plant.start_cov, []
-    for _ in range(steps):
+        Phi, W = transition_law(stated.A, stated.B, float(times[1]))
+    mean, covariance, sizes = stated.start_mean, stated.start_cov, []
+    for _ in times[1:]:
         sizes.append(np.sqrt(np.diagonal(covariance) + mean**2))
         mean, covariance = Phi @ mean, Phi @ covariance @ Phi.T + W
-    return np.array(sizes).reshape(steps, len(W))
-
-
-def _discretise(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A gap)`` and the covariance (n, n) of the noise (Van Loan 1978)."""
-    n = len(A)
-    blocks = np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]])
-    exponential = scipy.linalg.expm(blocks * gap)
-    Phi = exponential[n:, n:].T
-    W = Phi @ exponential[:n, n:]
-    return Phi, 0.5 * (W + W.T)
+    white, deviation = whiten(W, MIN_VARIANCE_SHARE).factor, float(np.sqrt(np.diagonal(W).max()))
+    return PathLaw(times, Phi, white, deviation, np.array(sizes).reshape(-1, len(W)))
 
 
 def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
@@ -110,13 +88,12 @@ def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
     accurate = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
     usable = np.logical_and.accumulate(accurate)
     whitened = np.where(usable[:, None], noise @ law.white.T, np.nan)
-    states = _standardise(x[:-1], law.sizes)
-    return noise_draws(whitened, np.repeat(states[:, :, None], whitened.shape[1], axis=2))
+    return noise_draws(whitened, _standardise(x[:-1], law.sizes)[:, :, None])
 
 
 def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return S states ``x`` (S, n) in units of their root mean squares ``sizes`` (S, n)."""
-    return np.divide(x, sizes, out=np.zeros_like(x), where=sizes > 0.0)
+    """Return S states ``x`` (S, n) in units of their root mean squares ``sizes``."""
+    return np.divide(x, sizes, out=np.zeros_like(x), where=np.broadcast_to(sizes > 0.0, x.shape))
 
 
 def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
@@ -158,9 +135,7 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
 
 class SensorLaw(NamedTuple):
     """One sensor on one node: H (p, n), None if it varies or the readings are not linear, and the
-    Cholesky factor (p, p) of R.
-
-    ``sampled`` is True for a sensor that takes samples under a continuous plant.
+    Cholesky factor (p, p) of R. ``sampled``: it takes samples under a continuous plant.
     """
 
     label: str
@@ -189,21 +164,15 @@ def sensor_laws(scenario: Scenario) -> tuple[SensorLaw, ...]:
                 return tuple(laws)
             # An H that varies is random and comes with each reading.
             H = None if stated.varying else np.asarray(stated.H)
-            label = (
-                f"sensor {placed_sensor.ordinal} of node {node}"
-                if len(placed_sensors) > 1
-                else f"node {node}"
-            )
+            several = f"sensor {placed_sensor.ordinal} of " if len(placed_sensors) > 1 else ""
             root = np.linalg.cholesky(stated.R)
             sampled = not scenario.slotted and takes_samples(sensor)
-            laws.append(SensorLaw(label, node, placed_sensor, H, root, sampled))
+            laws.append(SensorLaw(f"{several}node {node}", node, placed_sensor, H, root, sampled))
     return tuple(laws)
 
 
 def reading_labels(scenario: Scenario) -> list[str]:
-    """Return a label for each of the d noises of readings that are tested, in the order of their
-    sums: one for each row of each sensor.
-    """
+    """Return a label for each of the d noises of readings that are tested."""
     return [
         f"reading {row} of {law.label}" if len(law.root) > 1 else f"the reading of {law.label}"
         for law in sensor_laws(scenario)
@@ -238,63 +207,46 @@ def _whitened_noises(
     scenario: Scenario, streams: Streams, law: SensorLaw
 ) -> tuple[FloatArray, FloatArray]:
     """Return whitened noises (S, p) of a sensor's first readings, and scaled states (S, n)."""
-    random = streams.generator("check readings", law.node, law.placed_sensor.ordinal)
+    node, ordinal = law.node, law.placed_sensor.ordinal
+    plant: Any = scenario.plant
+    random = streams.generator("check readings", node, ordinal)
+    # Gaussian states of the size of the plant's: with the noise of ten slots, or ten seconds.
+    covariance = plant.start_cov + 10.0 * np.asarray(plant.Q)
+    root, sizes = square_root(covariance), np.sqrt(np.diagonal(covariance) + plant.start_mean**2)
+
+    def draw(count: int) -> FloatArray:
+        return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
+
     if scenario.slotted:
         count = min(MAX_STEPS, int(scenario.horizon / scenario.slot_plant.period))
-        path: Any = scenario.slot_path(streams, law.node, law.placed_sensor)
+        path: Any = scenario.slot_path(streams, node, law.placed_sensor)
     elif law.sampled:
-        times = scenario.sample_times(streams)[law.node, law.placed_sensor.ordinal]
-        count = min(MAX_STEPS, len(times))
-        path = scenario.sample_path(streams, law.node, law.placed_sensor)
+        count = min(MAX_STEPS, len(scenario.sample_times(streams)[node, ordinal]))
+        path = scenario.sample_path(streams, node, law.placed_sensor)
     else:
-        # A run may be shorter than one step of the sensor, and then has no reading.
-        empty = np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
-        steps = [empty, *_increment_noises(scenario, streams, law, random)]
-        noises, states = (np.concatenate(part) for part in zip(*steps, strict=True))
-        return noises, states
-    x = _typical_states(scenario, random, count)
-    if not count:
-        return np.empty((0, len(law.root))), np.empty((0, scenario.plant.n))
+        path = scenario.sensors[law.placed_sensor.entry].path(
+            *(streams.generator(purpose, node, ordinal) for purpose in ("noise", "cut"))
+        )
+        noises, x = _increment_noises(scenario, path, law, draw)
+        return noises, _standardise(x, sizes)
+    x = draw(count)
+    if not count:  # a run may be shorter than the first gap of the sensor
+        return np.empty((0, len(law.root))), x
     sensor = scenario.located_sensors[law.placed_sensor.entry]
     if isinstance(sensor, NonlinearSensor):
-        y = np.array([_reading_of(path, k, x[k]) for k in range(count)], dtype=np.float64)
-        expected = np.array([sensor.h(state, law.node) for state in x], dtype=np.float64)
+        readings = [path.reading(k, x[k]) for k in range(count)]
+        # Samples in continuous time come with a function that linearises them.
+        y = np.array([one[0] if isinstance(one, tuple) else one for one in readings], dtype=float)
+        expected = np.array([sensor.h(state, node) for state in x], dtype=np.float64)
     else:
         y, H = path.several(range(count), x)
         expected = np.einsum("spn,sn->sp", H, x) if law.H is None else x @ law.H.T
     noises = np.asarray(np.linalg.solve(law.root, (y - expected).T).T, dtype=np.float64)
-    return noises, _standardise(x, _state_sizes(scenario, x))
-
-
-def _reading_of(path: Any, k: int, x: FloatArray) -> FloatArray:
-    """Return reading number ``k`` (p,) of a sensor that is not linear where the state is x (n,)."""
-    reading = path.reading(k, x)
-    return np.asarray(reading[0] if isinstance(reading, tuple) else reading)
-
-
-def _typical_states(scenario: Scenario, random: np.random.Generator, count: int) -> FloatArray:
-    """Return ``count`` Gaussian states (count, n) of the size that the plant's states have."""
-    root = square_root(_typical_covariance(scenario))
-    plant: Any = scenario.plant
-    return np.asarray(plant.start_mean + random.standard_normal((count, len(root))) @ root.T)
-
-
-def _typical_covariance(scenario: Scenario) -> FloatArray:
-    """Return the covariance (n, n) of x(0) and of the noise of ten slots or seconds."""
-    plant: Any = scenario.plant
-    return np.asarray(plant.start_cov + 10.0 * np.asarray(plant.Q))
-
-
-def _state_sizes(scenario: Scenario, x: FloatArray) -> FloatArray:
-    """Return the root mean squares (S, n) of states that :func:`_typical_states` draws."""
-    sizes = np.sqrt(np.diagonal(_typical_covariance(scenario)) + scenario.plant.start_mean**2)
-    return np.asarray(np.broadcast_to(sizes, x.shape))
+    return noises, _standardise(x, sizes)
 
 
 class _Grid(NamedTuple):
-    """Stand-in for the path that a sensor of increments reads: sensing period and end of the
-    present step in seconds.
-    """
+    """Stand-in for the path that a sensor of increments reads: sensing period, end of the step."""
 
     period: float
     end: float
@@ -305,27 +257,26 @@ class _Grid(NamedTuple):
 
 
 def _increment_noises(
-    scenario: Scenario, streams: Streams, law: SensorLaw, random: np.random.Generator
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield whitened noises (2, p) of a continuous sensor's increments, and states (2, n)."""
-    sensor: Any = scenario.sensors[law.placed_sensor.entry]
-    node, ordinal = law.node, law.placed_sensor.ordinal
-    path = sensor.path(*(streams.generator(p, node, ordinal) for p in ("noise", "cut")))
-    period = scenario.diffusion.sensing_period
+    scenario: Scenario, path: Any, law: SensorLaw, draw: Callable[[int], FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return whitened noises (S, p) of a continuous sensor's increments, and states (S, n)."""
+    period, noises, states = scenario.diffusion.sensing_period, [], []
     assert period is not None
     assert law.H is not None
     for k in range(min(MAX_STEPS // 4, int(scenario.horizon / period))):
         start, end = k * period, (k + 1) * period
         # Whole steps and cut ones take turns.
-        ends = [end] if k % 2 else [start + 0.3 * period, end]
-        for piece_end in ends:
-            x = _typical_states(scenario, random, 2)
+        for piece_end in [end] if k % 2 else [start + 0.3 * period, end]:
+            x = draw(2)
             x_integral = x * (piece_end - start)
             dy = path.moments(_Grid(period, end), x_integral, start, piece_end)
+            # The moments of unit noise over g seconds have the variances g and g / 3.
             scale = np.sqrt((piece_end - start) * np.array([[1.0], [1.0 / 3.0]]))
-            noises = np.linalg.solve(law.root, ((dy - x_integral @ law.H.T) / scale).T).T
-            yield noises, _standardise(x, _state_sizes(scenario, x))
+            noises.append(np.linalg.solve(law.root, ((dy - x_integral @ law.H.T) / scale).T).T)
+            states.append(x)
             start = piece_end
+    p, n = law.H.shape
+    return np.reshape(noises, (-1, p)), np.reshape(states, (-1, n))
 
 
 def whitened_starts(scenario: Scenario, x: FloatArray) -> FloatArray:

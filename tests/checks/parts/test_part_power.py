@@ -12,9 +12,9 @@ from netkf.checks.exact import _length_interval
 from netkf.checks.laws import find
 from netkf.checks.parts.events import loss_law
 from netkf.checks.parts.network_rows import (
-    _check_bursts,
-    _check_matchings,
-    _losses_apart,
+    BURSTS,
+    LOSSES_APART,
+    MATCHING_ROW,
     pair_probabilities,
 )
 from netkf.checks.parts.samples import PartSamples
@@ -65,7 +65,7 @@ def _losses_between_links(folder):
         lost = random.random((RUNS, WINDOWS * MESSAGES, len(directions))) < 0.3
         same = random.random(lost.shape[:2]) < size
         lost[..., other] = np.where(same, lost[..., 0], lost[..., other])
-        return _of(_losses_apart(_samples(scenario, _count(scenario, lost)), LEVEL))
+        return _of(LOSSES_APART.test(_samples(scenario, _count(scenario, lost)), LEVEL))
 
     return draw
 
@@ -82,7 +82,7 @@ def _bursts_of_losses(folder):
         for u in random.random((WINDOWS * MESSAGES - 1, *size_of)):
             steps.append(np.where(steps[-1], u >= leaves, u < arrives))
         lost = np.swapaxes(np.array(steps), 0, 1)
-        return _of(_check_bursts(_samples(scenario, _count(scenario, lost)), LEVEL))
+        return _of(BURSTS.test(_samples(scenario, _count(scenario, lost)), LEVEL))
 
     return draw
 
@@ -96,7 +96,7 @@ def _matchings_of_slots(folder):
         paired = random.random((RUNS, slots, len(p))) < p + size / len(p)
         again = (paired[:, 1:] & paired[:, :-1]).sum(axis=1)
         pairs = PairCounts(paired.sum(axis=1), again, np.full(RUNS, float(slots)))
-        return _of(_check_matchings(_samples(scenario, pairs=pairs), LEVEL))
+        return _of(MATCHING_ROW.test(_samples(scenario, pairs=pairs), LEVEL))
 
     return draw
 
