@@ -23,9 +23,11 @@ from netkf.linalg.spectra import eigenvalues
 from netkf.plants.laws import GridLaws
 from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
-from netkf.plants.transitions import Transitions, frame_period
-from netkf.plants.truth import SampledTruth, TruthTimes, multiples
+from netkf.plants.transitions import Transitions, decimal_below, frame_period
+from netkf.plants.tree import Tree
+from netkf.plants.truth import SampledTruth, multiples
 from netkf.rng.normals import GeneratorNormals, Normals
+from netkf.rng.streams import state_of
 
 MAX_STEP = 8.0  # norm of A times a step, beyond which the series of e^{A g} loses digits
 NO_TIMES = np.empty(0)
@@ -126,24 +128,29 @@ class Diffusion(Plant):
         return None if period is None else max(1, int(period / self.sensing_period))
 
     def sampled_truth(
-        self,
-        random: np.random.Generator,
-        probing: np.random.Generator,
-        samples: FloatArray,
-        probes: FloatArray,
-        horizon: float,
-        frames: bool = False,
+        self, random: np.random.Generator, times: FloatArray, horizon: float, frames: bool = False
     ) -> SampledTruth:
-        """Return a path without a sensing grid: it has states only at ``samples`` (K,), ``probes``
-        (P,) and frame times (seconds), up to the ``horizon``. ``random`` draws x(0) and the states
-        at samples, ``probing`` those at probes. With ``frames`` states are relative to the origin
-        of their frame. Used if all sensors take samples, so that nothing needs the grid.
+        """Return a path without a sensing grid, which has states at ``times`` (K,) in seconds, all
+        below the ``horizon``, and at frame times. A state depends on its time only, whatever other
+        times are asked for: ``random``, a generator of ``rng.streams``, draws x(0), and names the
+        streams of all else. With ``frames`` states are relative to the origin of their frame. Used
+        if all sensors take samples, so that nothing needs the grid.
         """
-        # Drawn at the frame times also without frames: then the path is the same.
-        marks = multiples(frame_period(self.A), horizon, self.time_grid)
+        stream, tree = state_of(random), self._tree(horizon)
+        frame_times = multiples(frame_period(self.A), horizon, self.time_grid)
         start = self.start(random)
-        times = TruthTimes(samples, probes, marks)
-        return SampledTruth(self.moves, start, random, probing, times, frames)
+        return SampledTruth(self.moves, tree, start, stream, times, frame_times, frames)
+
+    def _tree(self, horizon: float) -> Tree:
+        """Return the cells of paths up to a horizon (seconds), made once for all runs."""
+        if horizon not in self._trees:
+            self._trees[horizon] = Tree(self.moves, horizon, frame_period(self.A))
+        return self._trees[horizon]
+
+    @cached_property
+    def _trees(self) -> dict[float, Tree]:
+        """Trees by their horizon."""
+        return {}
 
 
 def default_sensing_period(
@@ -166,7 +173,4 @@ def default_sensing_period(
         M = np.block([[-plant.A.T, G], [plant.Q, plant.A]])
         fastest = max(fastest, float(np.abs(eigenvalues(M)).max()))
     bound = min(0.5 / fastest if fastest > 0.0 else 1.0, longest, plant.longest_period)
-    power = 10.0 ** math.floor(math.log10(bound))
-    digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= bound * (1.0 + 1e-9))
-    # Rounded, since the product may differ from the decimal number in its last bit.
-    return float(f"{digit * power:.12g}")
+    return decimal_below(bound)

@@ -12,8 +12,6 @@ from netkf.linalg.spectra import growth_factor, growth_rate
 
 UNIT_SIZE = 0.5  # largest norm of A times a gap for which one power series is used
 DEPENDENT = 1e-9  # a remainder below this share of the row's norm counts as rounding
-MAX_CACHED_LAWS = 32
-"""Cached sets of gaps."""
 _NODES, _WEIGHTS = gauss_legendre(10)  # exact to rounding for gaps of that size
 
 
@@ -43,30 +41,16 @@ class Transitions:
             k += 1
         self._series = np.stack(powers)
         self._response = product(self._series, B)
-        # Runs that are sampled at the same times ask for the same gaps again.
-        self._laws: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def laws(self, gaps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``Phi`` and ``L``, both (K, n, n), of the K ``gaps`` (K,) in seconds, none below
         0.
-        """
-        distinct, index = np.unique(gaps, return_inverse=True)
-        key = distinct.tobytes()
-        if key not in self._laws:
-            if len(self._laws) >= MAX_CACHED_LAWS:
-                self._laws.clear()
-            self._laws[key] = self._distinct_laws(distinct)
-        Phi, L = self._laws[key]
-        return Phi[index], L[index]
-
-    def _distinct_laws(self, distinct: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``Phi`` and ``L``, both (K, n, n), of K ``distinct`` gaps in seconds.
 
         Each gap is halved until the power series applies, then doubled:
         Phi(2 g) = Phi(g)^2 and L(2 g) L(2 g)' = [L, Phi L] [L, Phi L]'.
         """
-        doublings = self._doublings(distinct)
-        units = np.ldexp(distinct, -doublings)
+        doublings = self._doublings(gaps)
+        units = np.ldexp(gaps, -doublings)
         Phi = self._unit_transition(units)
         L, _ = noise_factors(self._unit_noise(units))
         with np.errstate(over="ignore", invalid="ignore"):  # unstable A over a very long gap
@@ -86,19 +70,6 @@ class Transitions:
                 k = np.flatnonzero(doublings > level)
                 Phi[k] = product(Phi[k], Phi[k])
         return np.asarray(Phi[index])
-
-    def bridges(self, before: FloatArray, after: FloatArray) -> FloatArray:
-        """Return D (K, n, 2 n) with ``z = D [z1; z2]`` for K gaps that consist of two parts of
-        ``before`` and ``after`` seconds (K,): with it a state inside a gap can be drawn when the
-        state at its end is known already.
-
-        z are the standard normals of a whole gap, z1 and z2 those of its parts: L z = Phi2 L1 z1 +
-        L2 z2. The rows of D are orthonormal or zero.
-        """
-        pairs, index = np.unique(np.stack([before, after]), axis=1, return_inverse=True)
-        (_, L1), (Phi2, L2) = self.laws(pairs[0]), self.laws(pairs[1])
-        _, directions = noise_factors(np.concatenate([product(Phi2, L1), L2], axis=2))
-        return np.asarray(directions[index.reshape(-1)])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
         """Return the number of halvings (K,) after which the power series applies to each of K
@@ -176,12 +147,23 @@ interval after which states are taken relative to a new origin, so that errors k
 
 def frame_period(A: FloatArray) -> float | None:
     """Return the seconds g after which the states of ``dx = A x dt``, ``A`` (n, n) in 1/s, are
-    taken relative to a new origin: the length of a frame.
+    taken relative to a new origin: the length of a frame, 1, 2 or 5 times a power of ten.
 
-    The growth e^{a g} is 2^10 for the spectral abscissa a of A; None if a <= 0 up to rounding.
+    The growth e^{a g} is at most 2^10 for the spectral abscissa a of A; None if a <= 0 up to
+    rounding.
     """
     rate = growth_rate(A)
-    return _round_seconds(GROWTH / rate) if rate > 0.0 else None
+    return decimal_below(GROWTH / rate) if rate > 0.0 else None
+
+
+def decimal_below(bound: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that is at most ``bound``, up to rounding:
+    it does not depend on the last bits of an eigenvalue, which differ between machines.
+    """
+    power = 10.0 ** math.floor(math.log10(bound))
+    digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= bound * (1.0 + 1e-9))
+    # Rounded, since the product may differ from the decimal number in its last bit.
+    return float(f"{digit * power:.12g}")
 
 
 def _round_seconds(seconds: float) -> float:

@@ -7,13 +7,13 @@ relative to the origin of the present frame, which moves with the plant; they ke
 ``absolute`` states lose as they grow.
 
 *Samples* are the times at which a sensor reads the state at an instant, *probes* those at which the
-run records it. They have separate random streams, so that recording does not change the path.
+run records it.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -23,9 +23,9 @@ from netkf.core.instants import TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
 from netkf.plants.transitions import Transitions
+from netkf.plants.tree import Tree
 
 TOLERANCE = 1e-9  # seconds by which a recorded time may be off
-BLOCK = 1024  # gaps whose laws are computed at once
 
 
 class ContinuousTruth(Protocol):
@@ -101,56 +101,36 @@ def absolute_states(
         return np.asarray(x + shift)
 
 
-class TruthTimes(NamedTuple):
-    """Times in seconds of samples (K,), of probes (P,) and of the ``marks`` (F,) at which frames
-    begin if they are used.
-    """
-
-    samples: FloatArray
-    probes: FloatArray
-    marks: FloatArray
-
-
 class SampledTruth:
-    """A path from x(0) = ``start`` (n,) on, drawn exactly at the times ``at`` and nowhere else.
-
-    ``random`` draws the states at samples and marks; ``probing`` draws those at probes from their
-    exact law given the others, so that the path does not depend on the probes. The marks are the
-    frame times if ``frames``; without frames the path is the same. All times are in seconds and at
-    least 0.
+    """A path of a plant that is drawn at some instants only, from the ``tree`` of its cells, so
+    that a state depends on its instant and not on the others.
     """
 
     def __init__(
         self,
         moves: Transitions,
+        tree: Tree,
         start: FloatArray,
-        random: np.random.Generator,
-        probing: np.random.Generator,
-        at: TruthTimes,
+        stream: np.ndarray,
+        times: FloatArray,
+        frame_times: FloatArray,
         frames: bool,
     ) -> None:
-        """Draw the whole path from ``start`` (n,) on, at the times ``at``; ``moves`` are the
-        transitions of the plant, and marks are frame times if ``frames``.
+        """Draw the path from ``start`` (n,) on at ``times`` (K,) in seconds, any but below 0.
+
+        ``moves`` are the transitions of the plant, ``stream`` (1, WIDTH) is the state of its random
+        stream, and ``frame_times`` (F,) are those of the tree up to the last of ``times``. Without
+        ``frames`` the path is the same, and its origin does not move.
         """
-        self._moves = moves
-        # Samples and marks are drawn first, one after the other, then probes between them.
-        samples, probes, marks = at
-        self.frame_times = marks if frames else np.empty(0)
-        times = np.unique(np.concatenate([[0.0], samples, marks]))
-        inside = np.unique(probes[~np.isin(probes, times)])
-        rebased = np.isin(times, self.frame_times)
-        before, normals = _draw_states(moves, start, random, times, rebased)
-        self.offsets = before[rebased]
-        after = np.where(rebased[:, None], 0.0, before)
-        between = _bridge_gap(moves, times, after, normals, probing, inside)
-        order = np.argsort(np.concatenate([times, inside]), kind="stable")
-        self._times = np.concatenate([times, inside])[order]
-        self._local = np.concatenate([after, between])[order]
-        self._absolute = self._local
-        if frames:
+        self._times = np.unique(np.concatenate([[0.0], times, frame_times]))
+        self._local, self.offsets = tree.states(self._times, start, stream, len(frame_times))
+        self.frame_times, self._absolute = frame_times, self._local
+        if len(frame_times):
             self._absolute = absolute_states(
-                moves, self.frame_times, self.offsets, self._times, self._local
+                moves, frame_times, self.offsets, self._times, self._local
             )
+        if not frames:
+            self.frame_times, self._local = np.empty(0), self._absolute
 
     def _index_of(self, time: float) -> int:
         """Return the index of ``time`` (seconds) among those of the path."""
@@ -177,87 +157,6 @@ class SampledTruth:
         """
         indices = np.searchsorted(self._times, times)
         return self._local[indices], self._absolute[indices]
-
-
-def _draw_states(
-    moves: Transitions,
-    start: FloatArray,
-    random: np.random.Generator,
-    times: FloatArray,
-    rebased: np.ndarray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return states (K, n) at ``times`` (K,) in seconds, each before a rebase, and the standard
-    normals (K - 1, n) of the gaps.
-
-    ``x <- Phi x + L z`` from ``start`` (n,) on, with Phi and L of each gap from ``moves`` and z
-    drawn from ``random``; at times marked in ``rebased`` (K,) it restarts from 0.
-    """
-    gaps = np.diff(times)
-    states = np.empty((len(times), moves.n))
-    states[0] = x = start
-    blocks = [np.empty((0, moves.n))]
-    for first in range(0, len(gaps), BLOCK):
-        Phi, L = moves.laws(gaps[first : first + BLOCK])
-        normals = random.standard_normal((len(Phi), moves.n))
-        blocks.append(normals)
-        noise = apply(L, normals)
-        for k in range(len(Phi)):
-            x = states[first + k + 1] = apply(Phi[k], x) + noise[k]
-            if rebased[first + k + 1]:
-                x = np.zeros(moves.n)
-    return states, np.concatenate(blocks)
-
-
-def _bridge_gap(
-    moves: Transitions,
-    times: FloatArray,
-    states: FloatArray,
-    normals: FloatArray,
-    probing: np.random.Generator,
-    probes: FloatArray,
-) -> FloatArray:
-    """Return states (P, n) at P increasing ``probes`` (P,) given the ``states`` (K, n) at ``times``
-    (K,), both in seconds.
-
-    ``normals`` (K - 1, n) are those z from which the state at the end of each gap between the times
-    was drawn, ``x <- Phi x + L z``. A state is in the frame of the last time before it. After the
-    last of ``times`` the path is drawn without a condition.
-
-    A probe divides a gap, or what follows the previous probe in it, in two parts with normals z1
-    and z2. Given the normals z = D [z1; z2] of the whole, [z1; z2] = D' z + (I - D' D) w with
-    standard normal w, drawn from ``probing`` (see ``moves.bridges``); z2 is the z of the part that
-    the next probe in the gap divides.
-    """
-    n = moves.n
-    # z_gap: the normals of the present gap, or of its part after the probes so far.
-    x_probes, z_gap = np.empty((len(probes), n)), np.empty(0)
-    gap = np.searchsorted(times, probes) - 1  # index of the gap that contains each probe
-    # Each part begins at the last time before the probe, or at the probe before it in the same gap.
-    starts = times[gap]
-    shared = np.flatnonzero(np.diff(gap) == 0) + 1
-    starts[shared] = probes[shared - 1]
-    ends = np.append(times, math.inf)[gap + 1]
-    for first in range(0, len(probes), BLOCK):
-        block = slice(first, first + BLOCK)
-        before, after = probes[block] - starts[block], ends[block] - probes[block]
-        Phi, L = moves.laws(before)
-        unconditional = np.isinf(after)
-        # D is not used after the last time; 0 stands for the infinite gap there.
-        D = moves.bridges(before, np.where(unconditional, 0.0, after))
-        w = probing.standard_normal((len(before), 2 * n))
-        for k in range(len(before)):
-            index = first + k
-            if index and gap[index] == gap[index - 1]:
-                x = x_probes[index - 1]
-            else:
-                x = states[gap[index]]
-                z_gap = z_gap if unconditional[k] else normals[gap[index]]
-            z_parts = w[k]
-            if not unconditional[k]:
-                z_parts = apply(D[k].T, z_gap) + (z_parts - apply(D[k].T, apply(D[k], z_parts)))
-                z_gap = z_parts[n:]
-            x_probes[index] = apply(Phi[k], x) + apply(L[k], z_parts[:n])
-    return x_probes
 
 
 class RecordedTruth:

@@ -104,6 +104,16 @@ class ReplicaStreams:
         return states.reshape(-1, WIDTH)
 
 
+def state_of(random: np.random.Generator) -> np.ndarray:
+    """Return the state (1, WIDTH) for kernels, at its start, of the stream of a generator."""
+    bits: Any = random.bit_generator
+    assert isinstance(bits, np.random.Philox), "a stream is a generator of Streams"
+    state = np.zeros((1, WIDTH), dtype=np.uint64)
+    state[0, COUNTER + 1 : KEY] = bits.state["state"]["counter"][1:]
+    state[0, KEY:BUFFER], state[0, USED] = bits.state["state"]["key"], BLOCK_WORDS
+    return state
+
+
 class _Key(ISeedSequence):
     """The two 64-bit ``words`` (2,) of a key, in the form in which numpy's Philox takes them."""
 

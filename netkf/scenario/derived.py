@@ -187,13 +187,13 @@ class DerivedScenario(ScenarioModel):
             require_states(self, times_of_sensors)
             return plant.recorded_truth
         instants = all_sample_times(times_of_sensors)
-        random, probe_random = streams.generator("plant"), streams.generator("probe")
+        random, probes = streams.generator("plant"), self.times
         if not uses_grid(self):
-            return plant.sampled_truth(random, probe_random, instants, self.times, horizon, frames)
+            instants = np.concatenate([instants, probes])
+            return plant.sampled_truth(random, instants, horizon, frames)
+        probe_random = streams.generator("probe")
         sample_random = streams.generator("samples") if len(instants) else None
-        return plant.path(
-            random, probe_random, self.times, sample_random, instants, horizon, frames
-        )
+        return plant.path(random, probe_random, probes, sample_random, instants, horizon, frames)
 
     def slot_truth(self, streams: Streams) -> Any:
         """Return the true state of one run in slots, a plants.linear.Truth; if ``exact_errors``,

@@ -62,9 +62,9 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
     cov(w) = Q, or dx = A x dt + B dw.
 
     Exact checks: shapes; equal streams give equal paths, whether states are read one by one or some
-    are left out, in frames or not, alone or with other runs, and with more probe times or fewer; a
-    start that is moved moves the path by F^k or e^{A t} times as much, which finds an error of F or
-    A of any size; there is no noise in directions in which Q or ``cov`` have none; only the given
+    are left out, in frames or not, alone or with other runs, and at more times or fewer; a start
+    that is moved moves the path by F^k or e^{A t} times as much, which finds an error of F or A of
+    any size; there is no noise in directions in which Q or ``cov`` have none; only the given
     generators are used; the plant survives pickle.
 
     Statistical checks find these errors with probability 0.9. From 40,000 starts: a mean of x(0)
@@ -320,22 +320,16 @@ def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> 
 def _check_sampled(
     part: Diffusion, copy: Diffusion, where: str, seed: int, scale: tuple[float, float]
 ) -> None:
-    """Check paths at sample and probe times."""
+    """Check paths at times of samples."""
     time_constant, max_seconds = scale
     times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
     # At least eight times, two for each gap, however fast the plant grows.
     times = times[times <= max(max_seconds, times[7])]
-    # Every third time is one at which the state is only looked at; sensors sample at the others.
-    sample_times, probe_times = np.delete(times, np.s_[::3]), times[::3]
     horizon = float(times[-1]) * 1.01
 
-    def draw_path(
-        plant: Any, at: FloatArray, run: int = 0, probes: FloatArray = probe_times
-    ) -> FloatArray:
-        randoms = [_make_generator(seed, run, purpose) for purpose in ("plant", "probe")]
-        truth = call_user_function(
-            where, plant.sampled_truth, *randoms, sample_times, probes, horizon
-        )
+    def draw_path(plant: Any, at: FloatArray, run: int = 0) -> FloatArray:
+        random = _make_generator(seed, run)
+        truth = call_user_function(where, plant.sampled_truth, random, at, horizon)
         with_start = np.concatenate([[0.0], at])
         states = np.asarray(call_user_function(where, truth.states, with_start)[1])
         return demand_array(where, "states", states, (len(with_start), part.n))
@@ -343,9 +337,7 @@ def _check_sampled(
     path = draw_path(part, times)
     _demand_same(where, path, draw_path(part, times), "at the second call")
     _demand_same(where, path, draw_path(copy, times), "of a pickled plant")
-    is_sampled = np.isin(np.concatenate([[0.0], times]), probe_times, invert=True)
-    unprobed = draw_path(part, sample_times, probes=probe_times[:0])
-    _demand_same(where, path[is_sampled], unprobed, "when nothing is probed")
+    _demand_same(where, path[::3], draw_path(part, times[2::3]), "at every third time alone")
     laws = [transition_law(part.A, part.B, time_constant * gap) for gap in GAPS]
     moved = _move_start(part)
     if moved is not None:

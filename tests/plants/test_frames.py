@@ -9,6 +9,7 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.transitions import Transitions, frame_period, frame_slots
 from netkf.rng.normals import GeneratorNormals
+from netkf.rng.streams import Streams
 
 SPIRAL = np.array([[0.3, 1.0], [-1.0, 0.3]])
 COV = np.array([[2.0, 0.5], [0.5, 1.0]])
@@ -19,7 +20,7 @@ def generators(count):
 
 
 def test_periods_allow_a_growth_of_two_to_the_tenth():
-    assert frame_period(np.array([[0.5, 7.0], [0.0, -3.0]])) == pytest.approx(20 * np.log(2.0))
+    assert frame_period(np.array([[0.5, 7.0], [0.0, -3.0]])) == 10.0  # 13.9 s, rounded down
     assert frame_slots(np.array([[np.sqrt(2.0)]])) in (19, 20)
     assert frame_slots(np.array([[5000.0]])) == 1
     for stable in (-np.eye(2), np.array([[0.0, 1.0], [0.0, 0.0]])):
@@ -78,7 +79,8 @@ def test_local_states_and_origins_make_the_absolute_ones(kind):
         if kind == "grid":
             return plant.path(*generators(2), probes, horizon=100.0, frames=frames)
         samples = np.round(np.arange(0.3, 100.0, 0.9), 12)
-        return plant.sampled_truth(*generators(2), samples, probes, 100.0, frames)
+        random = Streams(1).generator("plant")
+        return plant.sampled_truth(random, np.concatenate([samples, probes]), 100.0, frames)
 
     framed, plain = make(True), make(False)
     assert len(framed.frame_times) == 4
@@ -110,7 +112,7 @@ def test_blocks_do_not_show_in_frames():
     for name in ("x_start", "x_end", "moments"):
         joined = np.concatenate([getattr(part, name) for part in parts], axis=1)
         np.testing.assert_array_equal(getattr(one, name), joined)
-    assert (made.frame_steps, len(one.x_start[0]) - 256) == (115, 1)
+    assert (made.frame_steps, len(one.x_start[0]) - 256) == (100, 1)
 
 
 def test_errors_in_frames_against_mpmath():
@@ -118,7 +120,7 @@ def test_errors_in_frames_against_mpmath():
     a, period, count = 0.5, 0.25, 1600
     plant = Diffusion([[a]], [[1.0]], mean=[0.0], cov=[[4.0]])
     samples = period * np.arange(1, count + 1)
-    path = plant.sampled_truth(*generators(2), samples, np.empty(0), 401.0, frames=True)
+    path = plant.sampled_truth(Streams(3).generator("plant"), samples, 401.0, frames=True)
     noise = np.random.default_rng(5).standard_normal(count)
     F = float(np.exp(a * period))
     gain = 1.0 - 1.0 / (F * F)  # near that of the steady filter
@@ -134,21 +136,19 @@ def test_errors_in_frames_against_mpmath():
         x = path.local(t)[0]
         xhat += gain * (x + v - xhat)
         local.append(x - xhat)
-    # With many digits: the same normals, drawn at samples and frame times.
+    # With many digits: the same noise, what local states add to those before.
     with mpmath.workdps(120):
-        times = np.unique(np.concatenate([[0.0], samples, path.frame_times]))
-        draws = np.random.default_rng(0).standard_normal(1 + len(times) - 1)
-        x = mpmath.mpf(2.0 * draws[0])
-        errors = []
+        x = mpmath.mpf(path.absolute(0.0)[0])
+        errors, xhat, before, first = [], mpmath.mpf(0), 0.0, mpmath.mpf(path.absolute(0.0)[0])
         readings = dict(zip(samples.tolist(), noise.tolist(), strict=True))
-        xhat = mpmath.mpf(0)
-        for before, t, z in zip(times, times[1:], draws[1:], strict=False):
-            g = mpmath.mpf(float(t)) - mpmath.mpf(float(before))
-            grown = mpmath.exp(a * g)
-            spread = mpmath.sqrt((grown**2 - 1) / (2 * mpmath.mpf(a)))
-            x, xhat = grown * x + spread * mpmath.mpf(z), grown * xhat
-            if float(t) in readings:
-                xhat += mpmath.mpf(gain) * (x + mpmath.mpf(readings[float(t)]) - xhat)
+        frames = dict(zip(path.frame_times.tolist(), path.offsets[:, 0].tolist(), strict=True))
+        for t in np.unique(np.concatenate([samples, path.frame_times])).tolist():
+            grown = mpmath.exp(a * (mpmath.mpf(t) - mpmath.mpf(before)))
+            last = mpmath.mpf(frames.get(t, path.local(t)[0]))
+            x, xhat, before = grown * x + last - grown * first, grown * xhat, t
+            first = mpmath.mpf(path.local(t)[0])
+            if t in readings:
+                xhat += mpmath.mpf(gain) * (x + mpmath.mpf(readings[t]) - xhat)
                 errors.append(float(x - xhat))
     assert abs(float(mpmath.log(abs(x)))) > 190.0
     np.testing.assert_allclose(local, errors, rtol=0, atol=1e-11)
@@ -158,11 +158,11 @@ def test_frames_on_the_grid_rebase_the_moments():
     """Moments of pieces after a rebase are those of the local state."""
     plant = Diffusion([[0.5]], [[0.0]], mean=[1.0], cov=[[0.0]], sensing_period=0.1)
     path = plant.path(*generators(2), np.empty(0), horizon=40.0, frames=True)
-    assert plant.frame_steps == 138
-    start = path.grid(137)
-    whole = (np.exp(6.9) - np.exp(6.85)) / 0.5  # the integral of e^{0.5 t}
-    np.testing.assert_allclose(path.moments(start, path.grid(138))[0], whole, rtol=1e-9)
-    np.testing.assert_allclose(path.rebase(0), np.exp(6.9), rtol=1e-10)
-    assert not path.moments(path.grid(138), path.grid(139)).any()
+    assert plant.frame_steps == 100
+    start = path.grid(99)
+    whole = (np.exp(5.0) - np.exp(4.95)) / 0.5  # the integral of e^{0.5 t}
+    np.testing.assert_allclose(path.moments(start, path.grid(100))[0], whole, rtol=1e-9)
+    np.testing.assert_allclose(path.rebase(0), np.exp(5.0), rtol=1e-10)
+    assert not path.moments(path.grid(100), path.grid(101)).any()
     assert not path.local(path.grid(150)).any()
     np.testing.assert_allclose(path.absolute(path.grid(150)), np.exp(7.5), rtol=1e-10)

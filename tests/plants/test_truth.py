@@ -1,4 +1,4 @@
-"""Paths drawn from sample to sample, with their laws worked out exactly from unit normals."""
+"""Paths at any instants, with their laws worked out exactly from unit normals."""
 
 from itertools import pairwise
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from netkf.plants import truth
+from netkf.plants import tree, truth
 from netkf.plants.diffusion import Diffusion
-from netkf.plants.transitions import Transitions
+from netkf.plants.transitions import Transitions, frame_period
+from netkf.plants.truth import multiples
+from netkf.rng.streams import WIDTH, Streams
 from tests.plants.test_path import COV, A, B, covariance_of
 
 DEFECTIVE = np.array([[0.4, 1.0], [0.0, 0.4]])
@@ -49,36 +51,94 @@ def joint_covariance(A, B, times, cov=COV):
     )
 
 
-def make(A, B, samples, probes, random, probing, horizon=9.0, frames=False, **changes):
+def make(A, B, times, seed=1, horizon=9.0, frames=False, **changes):
     plant = Diffusion(A, B, **{"mean": np.zeros(len(A)), "cov": COV, **changes})
-    return plant.sampled_truth(
-        random, probing, np.array(samples), np.array(probes), horizon, frames
-    )
+    return plant.sampled_truth(Streams(seed).generator("plant"), np.array(times), horizon, frames)
+
+
+def linear_map(monkeypatch, plant, times, horizon):
+    """The states at times as a linear map of all normals, by running the kernels' Python code once
+    for each normal: (K n, normals).
+    """
+    used, place = {}, [-1]
+
+    def draw(stream, first, second, ziggurat, out):
+        here = used.setdefault((first, second), len(used) * len(out))
+        out[:] = [float(here + i == place[0]) for i in range(len(out))]
+
+    for name in ("fill_states", "enter_knot", "move_to_knot", "divide_cell"):
+        monkeypatch.setattr(tree, name, getattr(tree, name).__wrapped__)
+    monkeypatch.setattr(tree, "draw_normals_of_point", draw)
+    cells = tree.Tree(plant.moves, horizon, frame_period(plant.A))
+    at = np.unique(np.concatenate([[0.0], times, multiples(frame_period(plant.A), horizon)]))
+
+    def states(start):
+        local, offsets = cells.states(at, start, np.zeros((1, WIDTH), dtype=np.uint64), 9)
+        frame_times = multiples(frame_period(plant.A), horizon)
+        x = truth.absolute_states(plant.moves, frame_times, offsets[: len(frame_times)], at, local)
+        return x[np.searchsorted(at, times)].ravel()
+
+    columns = [states(column) for column in np.linalg.cholesky(COV).T]
+    while place[0] < len(used) * plant.n:
+        place[0] += 1
+        columns.append(states(np.zeros(plant.n)))
+    return np.array(columns).T
 
 
 @pytest.mark.parametrize("kind", PLANTS)
 @pytest.mark.parametrize(
-    ("samples", "probes"),
+    "times",
     [
-        ([0.3, 0.8, 2.0], []),
-        ([0.3, 0.8, 2.0], [0.0, 0.1, 0.3, 1.0]),  # at the start, before, at and between samples
-        ([0.3, 2.0], [0.5, 0.50001, 1.0, 1.9, 2.5, 3.0]),  # several in one gap, and after the last
-        ([], [0.2, 1.0]),
-        ([1e-9, 2e-9], [1.5e-9]),
+        [0.3, 0.8, 2.0],
+        [0.1, 1.0, 7.5],
+        [1e-9, 1.5e-9, 2e-9],
+        [1.0 / 3.0, 0.5, 0.500001, 6.123456789],
     ],
 )
-def test_samples_and_probes_have_their_exact_joint_law(kind, samples, probes):
+def test_states_at_any_times_have_their_exact_joint_law(kind, times, monkeypatch):
+    """Means, variances and covariances of x, whatever the numbers are that are drawn."""
     A, B = PLANTS[kind]
-    times = sorted({*samples, *probes})
-
-    def compute(random, probing):
-        path = make(A, B, samples, probes, random, probing)
-        return np.concatenate([path.absolute(t) for t in times])
-
+    plant = Diffusion(A, B, mean=np.zeros(2), cov=COV)
+    found = linear_map(monkeypatch, plant, np.array(times), 9.0)
     exact = joint_covariance(A, B, times)
-    np.testing.assert_allclose(
-        covariance_of(compute, 2), exact, rtol=0, atol=1e-12 * np.abs(exact).max()
+    np.testing.assert_allclose(found @ found.T, exact, rtol=0, atol=1e-11 * np.abs(exact).max())
+
+
+def test_paths_of_many_runs_have_the_law():
+    """The numbers of the generator themselves: runs, instants and cells are independent."""
+    A, B = PLANTS["oscillator"]
+    times = np.array([0.25, 0.9, 0.91234567, 3.0])
+    exact = joint_covariance(A, B, times)
+    root = np.linalg.cholesky(exact)
+    plant = Diffusion(A, B, mean=np.zeros(2), cov=COV)
+    paths = [
+        plant.sampled_truth(Streams(3, run).generator("plant"), times, 9.0) for run in range(4000)
+    ]
+    z = np.array([np.linalg.solve(root, path.states(times)[1].ravel()) for path in paths])
+    # 44 moments of 4000 runs, each within 5 standard errors: once in 40,000 tries.
+    assert np.abs(z.mean(axis=0)).max() < 5.0 / np.sqrt(len(z))
+    errors = z.T @ z / len(z) - np.eye(len(root))
+    assert np.abs(errors).max() < 5.0 * np.sqrt(2.0 / len(z))
+
+
+def test_streams_are_those_that_the_documentation_names():
+    """The state at 1500 s from numpy's normals: a knot at 1000 s, then its cell's half."""
+    plant = Diffusion([[-1e-3]], [[1.0]], mean=[2.0], cov=[[1.0]])
+    streams = Streams(7, 2)
+    found = plant.sampled_truth(streams.generator("plant"), np.array([1500.0]), 9000.0)
+    decay, steady = np.exp(-0.5), 500.0
+    half, whole = steady * (1.0 - decay**2), steady * (1.0 - decay**4)
+    x = 2.0 + streams.generator("plant").standard_normal()
+    z, then, w = (
+        streams.generator("plant", *ids).standard_normal()
+        for ids in ((0,), (1,), (15, 2 + tree.LEVELS))
     )
+    knot = decay**2 * x + np.sqrt(whole) * z
+    # z of the cell is the sum of the two parts, and w what is orthogonal to it.
+    share = np.sqrt(half) / np.sqrt(whole) * np.array([decay, 1.0])
+    first = share[0] * then + share[1] * abs(w) * np.sign(w)
+    exact = decay * knot + np.sqrt(half) * np.array([first, share[0] * then - share[1] * w])
+    assert np.abs(exact - found.absolute(1500.0)).min() < 1e-9
 
 
 @pytest.mark.parametrize("kind", PLANTS)
@@ -98,65 +158,17 @@ def test_increments_over_short_gaps_keep_their_relative_law(kind):
         assert not np.triu(L, 1).any()
 
 
-def test_bridges_leave_what_the_gap_adds_as_it_is():
-    """x at the end from x at the probe and the second part of the noise is x at the end."""
-    for matrices in PLANTS.values():
-        moves = Transitions(*matrices)
-        before, after = np.array([0.1, 1e-9, 0.5]), np.array([0.4, 0.5, 1e-9])
-        Phi, L = moves.laws(after)
-        first, whole = moves.laws(before)[1], moves.laws(before + after)[1]
-        D = moves.bridges(before, after)
-        parts = np.concatenate([Phi @ first, L], axis=2)
-        np.testing.assert_allclose(whole @ D, parts, rtol=0, atol=1e-9 * np.abs(parts).max())
-
-
-def test_neither_probes_nor_later_samples_move_the_samples():
-    samples = [0.3, 0.8, 2.0]
-
-    def path(samples, probes, frames=False):
-        seeds = np.random.default_rng(1), np.random.default_rng(2)
-        return make(*PLANTS["unstable"], samples, probes, *seeds, frames=frames)
-
-    plain = path(samples, [])
-    for other in (path(samples, [0.1, 0.3, 0.31, 1.0]), path([*samples, 2.5], [])):
-        for t in samples:
-            np.testing.assert_array_equal(other.absolute(t), plain.absolute(t))
-    early = path([*samples, 7.0], [0.5], frames=True)
-    np.testing.assert_array_equal(early.local(2.0), plain.absolute(2.0))
-
-
-def test_blocks_do_not_show(monkeypatch):
-    samples, probes = np.arange(1, 40) * 0.3, np.arange(0, 60) * 0.17
-
-    def states():
-        seeds = np.random.default_rng(1), np.random.default_rng(2)
-        path = make(*PLANTS["unstable"], samples, probes, *seeds, horizon=20.0, frames=True)
-        return path.states(np.concatenate([samples, probes]))
-
-    whole = states()
-    monkeypatch.setattr(truth, "BLOCK", 1)
-    for one, other in zip(states(), whole, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_samples_at_multiples_of_a_period_are_a_plant_in_slots():
-    """Cov x[k+1] = F Cov x[k] F' + Q with F = e^{A T} and the Q of Van Loan."""
-    T, count = 0.7, 6
-    times = T * np.arange(1, count + 1)
-
-    def compute(random, probing):
-        path = make(A, B, times, [], random, probing)
-        return np.concatenate([path.local(t) for t in times])
-
-    found = covariance_of(compute, 2)
-    F, Q, cov = scipy.linalg.expm(A * T), noise_covariance(A, B, T), COV
-    for k in range(count):
-        cov = F @ cov @ F.T + Q
-        here = slice(2 * k, 2 * k + 2)
-        np.testing.assert_allclose(found[here, here], cov, rtol=1e-12)
-        if k:
-            before = slice(2 * k - 2, 2 * k)
-            np.testing.assert_allclose(found[here, before], F @ found[before, before], atol=1e-12)
+@pytest.mark.parametrize("kind", PLANTS)
+def test_a_state_depends_on_its_time_only(kind):
+    """Not on other times, before, after or between, nor on frames or on a horizon of that size."""
+    times = np.array([0.3, 0.8, 1.0 / 3.0, 2.0, 6.5])
+    plain = make(*PLANTS[kind], times)
+    for others in ([], [0.1, 0.30000001, 1.0, 7.0], np.random.default_rng(1).random(50) * 9.0):
+        for time in times:
+            for horizon in (9.0, 8.0):
+                for frames in (False, True):
+                    other = make(*PLANTS[kind], [time, *others], horizon=horizon, frames=frames)
+                    np.testing.assert_array_equal(other.absolute(time), plain.absolute(time))
 
 
 @pytest.mark.parametrize(

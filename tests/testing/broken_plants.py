@@ -1,6 +1,7 @@
 """Sensors, plants and matchings with one breach each, and what their checkers must say."""
 
 from functools import cache
+from itertools import count
 from typing import ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant, SlotReadings
 from netkf.plants.regressors import RegressorReadings, RegressorSensor
 from netkf.plants.sensors import LinearSensor, SensorPath
+from netkf.rng.streams import Streams
 from tests.testing.broken_channels import says
 
 SENSORS, PLANTS, MATCHINGS = {}, {}, {}
@@ -482,19 +484,23 @@ class Wide(Diffusion):
         return self.start_mean + drawn[:, 0]
 
 
-@says(PLANTS, "OwnProbe.sampled_truth: must make the same path from equal streams", **FLOW)
-class OwnProbe(Diffusion):
-    def sampled_truth(self, random, probing, *arguments, **named):
-        return super().sampled_truth(random, np.random.default_rng(), *arguments, **named)
+NUMBERS = count()
 
 
-@says(PLANTS, "ProbesMove.sampled_truth: must make the same path", **FLOW)
-class ProbesMove(Diffusion):
-    """Probes are drawn from the stream of the path."""
+@says(PLANTS, "OwnStream.sampled_truth: must make the same path from equal streams", **FLOW)
+class OwnStream(Diffusion):
+    def sampled_truth(self, random, *arguments, **named):
+        own = Streams(next(NUMBERS)).generator("plant")
+        return super().sampled_truth(own, *arguments, **named)
 
-    def sampled_truth(self, random, probing, samples, probes, horizon, frames=False):
-        both = np.union1d(samples, probes)
-        return super().sampled_truth(random, probing, both, probes, horizon, frames)
+
+@says(PLANTS, "TimesMove.sampled_truth: must make the same path", **FLOW)
+class TimesMove(Diffusion):
+    """The path depends on how often it is looked at."""
+
+    def sampled_truth(self, random, times, horizon, frames=False):
+        random = Streams(len(times)).generator("plant")
+        return super().sampled_truth(random, times, horizon, frames)
 
 
 ONE_EDGE = {"protocol": "one-edge"}
