@@ -29,7 +29,8 @@ def _declare(parser: argparse.ArgumentParser) -> None:
     add_vary(
         parser,
         "KEY.PATH=V1,V2,...",
-        "values of a key, or START:STOP:COUNT; repeat it for a grid over several keys",
+        "values of a key, or START:STOP:COUNT; repeat it for a grid over several keys; all on one "
+        "truth, or the status says another",
     )
     parser.add_argument(
         "--runs", type=parse_count, default=1, help="runs at each point (default: 1)"

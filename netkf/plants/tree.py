@@ -149,7 +149,7 @@ def fill_states(
             knot, depth = knot + 1, 0
             move_to_knot(cells, walk)
             enter_knot(cells, stream, knot, ziggurat, walk)
-            if every > 0 and knot % every == 0:
+            if every > 0 and knot % every == 0 and frame < len(offsets):
                 for i in range(n):
                     offsets[frame, i], walk.x[0, i] = walk.x[0, i], 0.0
                 frame += 1

@@ -17,6 +17,8 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer
 from netkf.ensembles.pools import ANYWHERE, PoolOptions
 from netkf.ensembles.replicas import replicate_blocks
+from netkf.linalg.arrays import FloatArray
+from netkf.rng.streams import Streams
 from netkf.runs.documents import write_sealed
 from netkf.runs.failures import InterruptedRunError, explain_failures
 from netkf.runs.files import (
@@ -46,6 +48,7 @@ from netkf.studies.pools import shared_pool
 if TYPE_CHECKING:
     import pandas as pd
 
+SHOWN = 20  # instants at which truths are compared
 LOAD = "load it first: netkf.sweep(netkf.load(path), ...)"
 Row = dict[str, Any]
 Progress = Callable[[int, int], None]
@@ -66,12 +69,17 @@ def sweep(
     ``{"network.activation.rate": [1.0, 2.0]}``.
 
     All points use the same seed, so the same truth, readings and channel draws: differences between
-    rows are due to the keys. A row has the varied keys, ``runs``; ``worst_rms`` (of the node with
-    the largest), ``mean_rms`` (of all nodes together), ``mean_trace`` and ``worst_trace`` of P,
-    each with its standard error ``_se`` over runs; ``bound`` and ``central``, mean traces of the
-    bound on P (hybrid paper, H equation 12) and of the covariance of the centralised filter if they
-    exist; messages ``sent``, ``delivered`` and ``lost`` per run; ``status``, complete or diverged.
-    All but messages are averages over the samples after time 0.
+    rows are due to the keys. The truth does not depend on what is sampled, probed or sent. It
+    changes with the plant, and where sensors give increments also with ``plant.sensing_period``
+    (its default follows the sensors) and, at instants off the sensing grid, with other such
+    instants: ``status`` then says "another truth".
+
+    A row has the varied keys, ``runs``; ``worst_rms`` (of the node with the largest), ``mean_rms``
+    (of all nodes together), ``mean_trace`` and ``worst_trace`` of P, each with its standard error
+    ``_se`` over runs; ``bound`` and ``central``, mean traces of the bound on P (hybrid paper, H
+    equation 12) and of the covariance of the centralised filter if they exist; messages ``sent``,
+    ``delivered`` and ``lost`` per run; ``status``, complete or diverged, and whether the truth is
+    another than in the first row. All but messages are averages over the samples after time 0.
 
     ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of ``netkf.monte_carlo``;
     ``progress(done, wanted)`` is called with numbers of points. Raises ScenarioError, before
@@ -127,7 +135,10 @@ def _simulate_points(
             with explain_failures(point.scenario):
                 task = partial(block_metrics, engine=choose_engine(plan.engine, point.scenario))
                 metrics = replicate_blocks(task, join_metrics, point.scenario, plan.runs, pool=pool)
-            yield _make_row(point, metrics)
+            row = _make_row(point, metrics)
+            if not _same_truth(plan.points[0].scenario, point.scenario):
+                row["status"] += "; another truth"
+            yield row
             if progress is not None:
                 progress(k + 1, len(plan.points))
 
@@ -158,6 +169,25 @@ def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
     if np.isfinite(blurred) and scenario.plant.truth_known:
         status += f"; rounding blurs errors from {blurred:g} s on, they are left out"
     return status
+
+
+def _same_truth(first: Scenario, other: Scenario) -> bool:
+    """Return True if replica 0 of both has the same true states at instants that both probe."""
+    times = np.intersect1d(first.times, other.times)[:SHOWN]
+    if first is other or not len(times) or not (first.plant.is_random or other.plant.is_random):
+        return True
+    x, other_x = (_true_states(scenario, times) for scenario in (first, other))
+    return np.array_equal(x, other_x, equal_nan=True)
+
+
+def _true_states(scenario: Scenario, times: FloatArray) -> FloatArray:
+    """Return the true states (T, n) of replica 0 at increasing ``times`` (T,), in seconds."""
+    streams = Streams(scenario.seed)
+    if scenario.slotted:
+        truth, slots = scenario.slot_truth(streams), scenario.slot_plant.slots_of(times)
+        return np.array([truth.state(slot) for slot in slots.tolist()])
+    truth = scenario.continuous_truth(streams, frames=False)
+    return np.array([truth.absolute(time) for time in times.tolist()])
 
 
 def _value_or_nan(function: Callable[[], float]) -> float:
