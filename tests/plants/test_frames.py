@@ -79,10 +79,8 @@ def test_local_states_and_origins_make_the_absolute_ones(kind):
         if kind == "grid":
             return plant.path(*generators(2), probes, horizon=100.0, frames=frames)
         samples = np.round(np.arange(0.3, 100.0, 0.9), 12)
-        random = Streams(1).generator("plant")
-        return plant.sampled_truth(
-            random, np.concatenate([samples, probes, [100.0]]), 100.0, frames
-        )
+        random, times = Streams(1).generator("plant"), np.concatenate([samples, probes, [100.0]])
+        return plant.sampled_truth(random, times, 100.0, frames)
 
     framed, plain = make(True), make(False)
     assert len(framed.frame_times) == 4

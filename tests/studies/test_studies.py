@@ -203,6 +203,52 @@ def test_the_command_writes_table_picture_and_manifest(tmp_path, capsys):
     assert main([*arguments, "--out", str(out)]) == 2
 
 
+SAMPLED = {
+    "format": 1,
+    "name": "sampled",
+    "plant": {"kind": "diffusion", "A": [[-0.2]], "B": [[1.0]], "cov": [[1.0]]},
+    "sensors": [
+        {
+            "nodes": [0],
+            "H": [[1.0]],
+            "R": [[0.1]],
+            "sampling": {"kind": "periodic", "period": 0.5},
+        }
+    ],
+    "network": {
+        "graph": {"kind": "path", "nodes": 2},
+        "activation": {"kind": "poisson", "rate": 1.0},
+    },
+    "filter": {"kind": "local"},
+    "horizon": 4.0,
+    "probe": 1.0,
+}
+POISSON = {"kind": "poisson", "rate": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "moved"),
+    [
+        ("sensors.0.sampling.period", [0.5, 1.0, 0.3], ()),
+        ("sensors.0.sampling", [POISSON, {"kind": "periodic", "period": 1.0}], ()),
+        ("probe", [1.0, 0.25], ()),
+        ("sensors.0.nodes", [[0], [0, 1]], ()),
+        ("horizon", [4.0, 3.0], ()),
+        ("plant.B", [[[1.0]], [[2.0]], [[1.0]]], (1,)),
+        ("sensors.0.sampling", [POISSON, "continuous"], (1,)),
+    ],
+)
+def test_sweeps_meet_one_truth_or_say_another(key, values, moved):
+    """Rows keep their truth whatever is sampled; what moves it is marked in the status."""
+    scenario = from_table(SAMPLED, Path())
+    table = sweep(scenario, {key: values}, workers=1, engine="simpy")
+    assert [k for k, status in enumerate(table.status) if "another truth" in status] == [*moved]
+    runs = [netkf.simulate(scenario.replace({key: value}), engine="simpy") for value in values]
+    for k, run in enumerate(runs):
+        _, here, there = np.intersect1d(runs[0].times, run.times, return_indices=True)
+        assert np.array_equal(runs[0].x[here], run.x[there]) != (k in moved)
+
+
 def test_json_of_a_sweep_is_one_document(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments = ["sweep", RING, "--set", "horizon=1.0", "--vary", f"{RATE}=1.0,4.0", "--json"]
