@@ -70,11 +70,13 @@ def linear_map(monkeypatch, plant, times, horizon):
         monkeypatch.setattr(tree, name, getattr(tree, name).__wrapped__)
     monkeypatch.setattr(tree, "draw_normals_of_point", draw)
     cells = tree.Tree(plant.moves, horizon, frame_period(plant.A))
-    at = np.unique(np.concatenate([[0.0], times, multiples(frame_period(plant.A), horizon)]))
+    at = np.unique(
+        np.concatenate([[0.0], times, multiples(frame_period(plant.A), horizon, plant.time_grid)])
+    )
 
     def states(start):
         local, offsets = cells.states(at, start, np.zeros((1, WIDTH), dtype=np.uint64), 9)
-        frame_times = multiples(frame_period(plant.A), horizon)
+        frame_times = multiples(frame_period(plant.A), horizon, plant.time_grid)
         x = truth.absolute_states(plant.moves, frame_times, offsets[: len(frame_times)], at, local)
         return x[np.searchsorted(at, times)].ravel()
 
