@@ -6,6 +6,7 @@ import importlib
 
 from netkf.core.errors import EngineError, NetkfError, ScenarioError, TheoryError
 from netkf.core.version import __version__ as __version__
+from netkf.core.wings import WINGS
 
 TYPE_CHECKING = False
 """Type checkers take it as True. It is not imported from ``typing``, because that import takes half
@@ -89,6 +90,23 @@ __all__ = [
     "theory",
     "why",
 ]
+
+
+def _promise_traces(*arguments: Any) -> Any:
+    """Call ``theory.traces.promise_traces`` for the core."""
+    from netkf.theory.traces import promise_traces
+
+    return promise_traces(*arguments)
+
+
+def _draw(*arguments: Any) -> Any:
+    """Call ``figures.catalogue.plot`` for the core."""
+    from netkf.figures.catalogue import plot
+
+    return plot(*arguments)
+
+
+WINGS.promise_traces, WINGS.draw = _promise_traces, _draw
 
 
 def __getattr__(name: str) -> Any:

@@ -138,7 +138,7 @@ def test_nothing_is_claimed_to_be_kept_where_nothing_was_written(capsys, monkeyp
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("netkf.runs.promises.compute_promises", stop)
+    monkeypatch.setattr("netkf.theory.promises.compute_promises", stop)
     assert main(["theory", RING]) == 130
     assert capsys.readouterr().err == "netkf: interrupted\n"
 

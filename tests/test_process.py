@@ -106,7 +106,7 @@ def test_what_fails_because_of_an_interrupt_is_an_interrupt(monkeypatch, capsys)
         except KeyboardInterrupt:
             raise ImportError("half") from None
 
-    monkeypatch.setattr("netkf.runs.promises.compute_promises", fail)
+    monkeypatch.setattr("netkf.theory.promises.compute_promises", fail)
     assert main(["theory", RING]) == 130
     assert capsys.readouterr().err == "netkf: interrupted\n"
 
@@ -179,7 +179,7 @@ def test_an_error_that_is_not_about_writing_is_not_called_one(monkeypatch, capsy
     def refuse(*_):
         raise ConnectionRefusedError(111, "Connection refused")
 
-    monkeypatch.setattr("netkf.runs.promises.compute_promises", refuse)
+    monkeypatch.setattr("netkf.theory.promises.compute_promises", refuse)
     assert main(["theory", RING]) == 2
     assert capsys.readouterr().err == "netkf: Connection refused\n"
 

@@ -17,7 +17,7 @@ RUN = "netkf.figures.pictures", "run_picture"
 ENSEMBLE = "netkf.figures.pictures", "ensemble_picture"
 SWEEP = "netkf.studies.picture", "sweep_picture"
 FILTERS = "netkf.studies.filter_picture", "filter_picture"
-VERDICT = "netkf.checks.picture", "verdict_picture"
+VERDICT = "netkf.figures.verdict", "verdict_picture"
 REASONS = {SWEEP: "it shows one or two keys", VERDICT: "no row has an interval"}
 """The reason for which a drawing function returns False, which means that it drew nothing."""
 

@@ -15,7 +15,7 @@ def _run(options: argparse.Namespace) -> int:
     scenario = load_scenario(options)
     # These imports take half a second, which an invalid scenario need not wait for.
     from netkf.runs.failures import explain_failures
-    from netkf.runs.promises import compute_promises, promises_text
+    from netkf.theory.promises import compute_promises, promises_text
 
     with explain_failures(scenario):
         promises = compute_promises(scenario)

@@ -6,6 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from netkf.checks.innovations import (
+    MIN_READINGS,
+    Innovations,
+    autocorrelations,
+)
 from netkf.core.errors import NetkfError
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import draw_nees
@@ -22,11 +27,6 @@ from netkf.figures.style import (
     set_scale,
 )
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.innovations import (
-    MIN_READINGS,
-    Innovations,
-    autocorrelations,
-)
 from netkf.runs.summary import CONFIDENCE, NORMAL_QUANTILE, chi_square_interval, nees_bounds
 
 BINS = 40  # of time, few enough that each has many readings

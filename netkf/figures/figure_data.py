@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from netkf.checks.innovations import Innovations, compute_innovations
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.monte_carlo import Ensemble
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.innovations import Innovations, compute_innovations
 from netkf.runs.run import CompletedRun
 from netkf.runs.summary import (
     NO_COVARIANCE,

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import scipy.special
 
+from netkf.checks.innovations import Innovations
 from netkf.engines.soundness import describe_divergence
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import describe_innovations
 from netkf.report.messages import DELIVERED, LATE, LOST, information_age
 from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_samples
-from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
 from netkf.runs.tables import format_number, format_with_error

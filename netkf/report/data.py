@@ -10,6 +10,7 @@ import networkx
 import numpy as np
 import scipy.special
 
+from netkf.checks.innovations import Innovations
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import innovation_columns
 from netkf.report.messages import (
@@ -20,7 +21,6 @@ from netkf.report.messages import (
 )
 from netkf.report.packing import Packer
 from netkf.report.worst import WorstSample
-from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import nees_bounds
 from netkf.trace.schema import CODES

@@ -6,15 +6,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import NetkfError
-from netkf.linalg.arrays import FloatArray
-from netkf.report.directories import ReportSource
-from netkf.report.packing import Packer
-from netkf.runs.innovations import (
+from netkf.checks.innovations import (
     Innovations,
     autocorrelations,
     compute_innovations,
 )
+from netkf.core.errors import NetkfError
+from netkf.linalg.arrays import FloatArray
+from netkf.report.directories import ReportSource
+from netkf.report.packing import Packer
 from netkf.runs.summary import NORMAL_QUANTILE, chi_square_interval
 from netkf.runs.tables import format_number
 

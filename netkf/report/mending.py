@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.algorithms.baselines import Central
+from netkf.checks.innovations import with_filter
 from netkf.core.errors import NetkfError
 from netkf.network.clocks import LinkClock
 from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
 from netkf.report.worst import WorstSample
-from netkf.runs.innovations import with_filter
 from netkf.runs.simulate import simulate
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Explanation

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.checks.innovations import Innovations
 from netkf.core.errors import ScenarioError, WriteError
 from netkf.core.version import __version__
 from netkf.report import tables
@@ -34,7 +35,6 @@ from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
 from netkf.runs.files import require_own, write_text
-from netkf.runs.innovations import Innovations
 from netkf.runs.stored import StoredRun
 from netkf.scenario.writing import toml_text
 from netkf.studies.compare import Comparison, compare, damage_named

@@ -1,32 +1,9 @@
-"""Names of limits and notes on covariances, shared by `netkf theory`, tables and pictures.
-
-H(13) is an equation of paper H on the hybrid filter, see theory/README.md.
-"""
+"""Notes on covariances, shared by `netkf theory`, tables and pictures."""
 
 from __future__ import annotations
 
 from netkf.algorithms.registry import overridden
 from netkf.scenario.scenario import Scenario
-from netkf.theory.hybrid.coupled import concerns_hybrid_paper, has_balanced_rates
-
-
-def limit_label(scenario: Scenario) -> str:
-    """Return the name of the limit that the bound on P approaches as the link rates grow; empty if
-    the hybrid paper, whose bound it is, is not about the filter.
-    """
-    if not concerns_hybrid_paper(scenario):
-        return ""
-    balanced = has_balanced_rates(scenario)
-    name = "limit S of Tanwani's H(13)" if balanced else "weighted limit (not S of Tanwani's H(13))"
-    return name + delay_suffix(scenario)
-
-
-def delay_suffix(scenario: Scenario) -> str:
-    """Return text to append to the name of a limit that assumes no delays: empty unless messages
-    are delayed.
-    """
-    delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
-    return ", if messages took no time" if delayed else ""
 
 
 def covariance_bias(scenario: Scenario) -> str:
@@ -41,6 +18,11 @@ def covariance_bias(scenario: Scenario) -> str:
         return ""
     # With a wrong model P need not be larger.
     return "" if design == "larger" and not scenario.filters_know_the_truth else design
+
+
+def covariance_notes(scenario: Scenario) -> tuple[str, ...]:
+    """Return notes for users on P, on its bound and on NEES."""
+    return tuple(filter(None, (mismatch_note(scenario), nees_note(scenario))))
 
 
 def nees_note(scenario: Scenario) -> str:

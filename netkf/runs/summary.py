@@ -12,15 +12,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from netkf.core.errors import TheoryError
+from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import node_columns
-from netkf.runs.labels import limit_label, mismatch_note, nees_note
+from netkf.runs.labels import covariance_notes
 from netkf.runs.transmissions import Transmissions
 from netkf.scenario.scenario import Scenario
-from netkf.theory import central_covariance, covariance_bound, limit_covariance
-from netkf.theory.hybrid.coupled import reason_without_bound
-from netkf.theory.hybrid.steady import has_steady_state
 from netkf.trace.nees import errors
 from netkf.trace.recorder import Sink
 from netkf.trace.run import carried_size, rounding_from
@@ -29,11 +26,6 @@ from netkf.trace.schema import CODES
 CONFIDENCE = 0.95
 NORMAL_QUANTILE = 1.96
 """Standard deviations within which a normal variable lies with the probability CONFIDENCE."""
-MAX_BOUND_BYTES, SERIES_TERMS = 1.5 * 2**30, 30
-"""Largest memory of a bound that is computed, and the terms of the series that computing it stores.
-"""
-MAX_STEADY_ENTRIES = 100_000
-"""Largest number of entries of all covariances for which a run computes the steady state."""
 
 
 class SummarySink(Sink):
@@ -179,74 +171,18 @@ class PromisedTraces:
 
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
-    """Return the traces that theory gives to compare those of P with: the bound on the mean of P at
-    the sample ``times`` (T,), its limit for ever faster links, and a centralised filter.
-
-    If theory does not apply or takes too much memory, the reason is given instead.
+    """Return the traces that theory gives to compare those of P with at the sample ``times`` (T,),
+    see ``theory.traces``; none of them without the theory wing.
     """
-    bound, reason = None, ""
     try:
-        if len(times):
-            _require_small_bound(scenario, len(times))
-            bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
-    except TheoryError as error:
-        reason = str(error)
-    notes = (_steady_note(scenario), mismatch_note(scenario), nees_note(scenario))
-    return PromisedTraces(
-        bound=bound,
-        limit=_trace_or_nan(limit_covariance, scenario),
-        central=_trace_or_nan(central_covariance, scenario),
-        reason=reason or reason_without_bound(scenario) or "",
-        limit_label=limit_label(scenario),
-        notes=tuple(filter(None, notes)),
-    )
-
-
-def _require_small_bound(scenario: Scenario, samples: int) -> None:
-    """Raise TheoryError if the bound on the mean of P (hybrid paper, H equation 12) at so many
-    ``samples`` takes more memory than MAX_BOUND_BYTES.
-    """
-    if reason_without_bound(scenario):
-        return
-    n = scenario.plant.n
-    # Numbers that computing it stores: at each sample, and for the terms of a series.
-    entries = (samples * (1.5 * n * n + n) + SERIES_TERMS * n * (n + 1)) * len(scenario.nodes)
-    if 8.0 * entries > MAX_BOUND_BYTES:
-        raise TheoryError(
-            f"not computed: Tanwani's H(12) of {len(scenario.nodes):,} nodes, {samples:,} samples, "
-            f"takes {8.0 * entries / 2**30:.1f} GiB; sample less often (probe), or call "
-            "netkf.theory.covariance_bound"
-        )
-
-
-def _steady_note(scenario: Scenario) -> str:
-    """Return a note for users if the bound on P has no steady state, or if this is not known; else
-    an empty text.
-    """
-    if scenario.slotted or reason_without_bound(scenario):
-        return ""
-    if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:
-        size = MAX_STEADY_ENTRIES // scenario.plant.n**2
-        return (
-            f"whether the bound has a steady state is not looked into beyond {size:,} nodes; see "
-            "netkf theory"
-        )
-    try:
-        if has_steady_state(scenario):
-            return ""
-    except TheoryError as error:
-        return f"steady state of the bound: {error}"
-    if not scenario.filter.algorithm.talks:
-        return "at some nodes P has no steady state, it grows without end; see netkf theory"
-    return "the bound has no steady state, it grows without end; see netkf theory"
-
-
-def _trace_or_nan(function: Any, scenario: Scenario) -> float:
-    """Return the trace of the matrix ``function(scenario)``; nan if it raises TheoryError."""
-    try:
-        return float(np.trace(function(scenario)))
-    except TheoryError:
-        return float("nan")
+        promised: PromisedTraces = WINGS.promise_traces(scenario, times)
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("netkf.theory"):
+            raise
+        reason = "not computed: netkf.theory is not installed"
+        notes = covariance_notes(scenario)
+        return PromisedTraces(None, np.nan, np.nan, reason, limit_label="", notes=notes)
+    return promised
 
 
 def summarise(

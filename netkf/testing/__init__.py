@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from netkf.testing.channels import check_channel
     from netkf.testing.clocks import check_clock
     from netkf.testing.filters import check_filter
-    from netkf.testing.intervals import check_intervals
     from netkf.testing.matchings import check_matching
     from netkf.testing.matrices import assert_dominated
     from netkf.testing.plants import check_plant
@@ -26,7 +25,6 @@ _WHERE = {
     "check_channel": "channels",
     "check_clock": "clocks",
     "check_filter": "filters",
-    "check_intervals": "intervals",
     "check_matching": "matchings",
     "check_plant": "plants",
     "check_sensor": "sensors",
@@ -39,7 +37,6 @@ __all__ = [
     "check_channel",
     "check_clock",
     "check_filter",
-    "check_intervals",
     "check_matching",
     "check_plant",
     "check_sensor",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,6 +10,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.notebook import NotebookTable
+from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.nees import errors
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
@@ -135,19 +135,16 @@ class Run(NotebookTable):
 
 
 def plot_by_name(result: Any, figure: str) -> Any:
-    """Return a figure of a result, drawn by netkf.figures.
-
-    That room is above this one, and it needs matplotlib, which may be missing. So it is looked up
-    by name when it is needed, as pandas looks up its plotting backend.
+    """Return a figure of a result, drawn by netkf.figures; raises ScenarioError for another name
+    and without matplotlib.
     """
     try:
-        catalogue = importlib.import_module("netkf.figures.catalogue")
+        return WINGS.draw(result, figure)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "matplotlib":
             raise
         rule, remedy = "needs matplotlib", "install it: pip install 'netkf[plot]'"
         raise ScenarioError("plot", rule, None, remedy) from None
-    return catalogue.plot(result, figure)
 
 
 def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import pytest
 import netkf
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.runs.labels import covariance_bias, nees_note
-from netkf.runs.promises import compute_promises, promises_text
+from netkf.theory.promises import compute_promises, promises_text
 
 SENSOR = {"H": [[1.0]], "R": [[0.5]], "sampling": {"kind": "periodic", "period": 0.4}}
 LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.7}, "symmetric": False}

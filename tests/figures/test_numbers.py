@@ -8,9 +8,9 @@ import scipy.stats
 
 import netkf
 from netkf.algorithms.models import FlowModel
+from netkf.checks.increments import ExpectedIncrements
+from netkf.checks.innovations import autocorrelation, compute_innovations
 from netkf.figures.traffic import age_of_information, messages_by_direction, wilson_interval
-from netkf.runs.increments import ExpectedIncrements
-from netkf.runs.innovations import autocorrelation, compute_innovations
 from netkf.studies.consistency import run_consistency
 from tests.conftest import SCENARIOS
 from tests.figures.conftest import one_node

@@ -11,9 +11,9 @@ import pytest
 import netkf
 from netkf import parts, theory
 from netkf.rng.streams import Streams
-from netkf.runs.promises import compute_promises, promises_text
 from netkf.scenario.reading import from_table
 from netkf.testing import check_sensor
+from netkf.theory.promises import compute_promises, promises_text
 from tests.algorithms.test_literature import ROTATION, scenario_of
 from tests.conftest import ROOT
 

@@ -15,6 +15,7 @@ import pytest
 import scipy.stats
 
 import netkf
+from netkf.checks.innovations import compute_innovations
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
@@ -30,7 +31,6 @@ from netkf.report.messages import MESSAGE, information_age, join_messages, thin_
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
 from netkf.runs.documents import file_digests, write_sealed
-from netkf.runs.innovations import compute_innovations
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
 from netkf.studies.compare_filters import compare_filters, write_comparison

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.runs.promises import compute_promises, promises_text
 from netkf.runs.run import run_to_directory
 from netkf.runs.summary import promise_traces
 from netkf.runs.tables import summary_table
+from netkf.theory.promises import compute_promises, promises_text
 from tests.benchmarks.cases import load
 
 UNSTABLE = {"kind": "diffusion", "A": [[0.5]], "B": [[1.0]], "cov": [[1.0]]}

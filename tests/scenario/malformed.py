@@ -594,9 +594,6 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=5000)
     parser.add_argument("--seed", type=int, default=1, help="the first case")
     options = parser.parse_args()
-    import netkf.checks.check
-    import netkf.runs.promises
-    import netkf.runs.simulate  # noqa: F401 - loaded once, before processes are forked
 
     statuses: dict[int, int] = {}
     wrong = 0

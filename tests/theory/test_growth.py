@@ -12,12 +12,12 @@ from netkf.checks.points import MAX_NODES, sampled_indices, sampling_note
 from netkf.core.errors import TheoryError
 from netkf.figures.layout import get_positions
 from netkf.network import graphs
-from netkf.runs import promises
 from netkf.runs.files import write_scenario
-from netkf.runs.promises import compute_promises, promises_text
+from netkf.theory import promises
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid import coupled, linearised, steady
 from netkf.theory.hybrid.packed import PackedRiccati
+from netkf.theory.promises import compute_promises, promises_text
 
 FLOW = """
 format = 1

@@ -10,7 +10,7 @@ import scipy.optimize
 import netkf
 from netkf import theory
 from netkf.core.errors import TheoryError
-from netkf.runs.promises import compute_promises, promises_text
+from netkf.theory.promises import compute_promises, promises_text
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
 

@@ -11,8 +11,8 @@ from scipy.integrate import quad
 import netkf
 from netkf import theory
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.runs.promises import compute_promises, promises_text
 from netkf.theory.common import delayed_jumps, mean_square
+from netkf.theory.promises import compute_promises, promises_text
 from tests.algorithms.test_literature import ROTATION, discretised, scenario_of
 
 GAIN = [[0.4], [0.15]]

@@ -9,8 +9,8 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.cli.main import main
-from netkf.runs.promises import compute_promises, promises_text
 from netkf.scenario.writing import resolve_defaults, to_toml
+from netkf.theory.promises import compute_promises, promises_text
 from tests.theory.push_sum_systems import RHO_T1, planar, scenario
 
 

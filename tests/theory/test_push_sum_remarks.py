@@ -11,7 +11,7 @@ import scipy.stats
 from netkf import theory
 from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
-from netkf.runs.promises import compute_promises, promises_text
+from netkf.theory.promises import compute_promises, promises_text
 from tests.cases import FOLDER
 from tests.theory.push_sum_systems import of_case, planar, scenario
 

@@ -15,7 +15,7 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import to_json_value
-from netkf.runs.labels import delay_suffix, limit_label, mismatch_note
+from netkf.runs.labels import mismatch_note
 from netkf.runs.tables import MAX_NODES, format_number, format_table
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
@@ -35,6 +35,7 @@ from netkf.theory.common.mean_square import has_linear_errors, is_quickly_solved
 from netkf.theory.common.papers import paper_function, paper_legend
 from netkf.theory.hybrid.coupled import concerns_hybrid_paper
 from netkf.theory.hybrid.steady import steady_by_node
+from netkf.theory.traces import delay_suffix, limit_label
 
 CLOSE_TO_S = 0.1  # distance from S, as a share of its Frobenius norm, to find link rates for
 MAX_RATE_NODES = 60  # largest network for which they are found within seconds

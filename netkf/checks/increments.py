@@ -142,7 +142,7 @@ class _IncrementRecorder(_Filter):
 
     def absorb(self, state: TimedState, messages: Sequence[Any], exchange: Any) -> TimedState:
         """Return the state after ``messages``, as the filter does."""
-        inner = super().absorb(state.inner, messages, exchange)  # type: ignore[safe-super]
+        inner = super().absorb(state.inner, messages, exchange)
         return state._replace(inner=inner)
 
     def estimate(self, state: TimedState) -> tuple[FloatArray, FloatArray | None]:

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter, Reading
+from netkf.checks.increments import WhitenedInnovation, record_increments
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
-from netkf.runs.increments import WhitenedInnovation, record_increments
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
@@ -40,7 +40,7 @@ class Innovations(NamedTuple):
     """Innovations v (p,) of M readings in order of time, with covariances S.
 
     A sample y has v = y - H xhat and S = H P H' + R, with the estimate just before it; increments
-    over an interval have the v and S of runs.increments, with the estimate at its beginning.
+    over an interval have the v and S of checks.increments, with the estimate at its beginning.
 
     times      : (M,) seconds; of increments, the end of the interval
     nodes      : (M,) node that read it, -1 for a pooled filter, which reads all sensors

@@ -1,0 +1,22 @@
+"""What the core asks of the wings above it, which it does not import: ``netkf`` hands it in."""
+
+from __future__ import annotations
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+
+class Wings:
+    """Functions of the theory and of the tools; ModuleNotFoundError where these are missing.
+
+    promise_traces : (scenario, times) -> PromisedTraces, see ``runs.summary``
+    draw : (result, name of a figure) -> the figure, see ``figures.catalogue``
+    """
+
+    promise_traces: Callable[..., Any]
+    draw: Callable[..., Any]
+
+
+WINGS = Wings()

@@ -1,0 +1,121 @@
+"""Traces of covariances that theory gives to compare those of a run with, and their names.
+
+H(12) and H(13) are equations of paper H on the hybrid filter, see theory/README.md: the bound on
+the mean of P over time, and its limit S for fast links.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.labels import covariance_notes
+from netkf.runs.summary import PromisedTraces
+from netkf.scenario.scenario import Scenario
+from netkf.theory.hybrid.bounds import covariance_bound
+from netkf.theory.hybrid.coupled import (
+    concerns_hybrid_paper,
+    has_balanced_rates,
+    reason_without_bound,
+)
+from netkf.theory.hybrid.limits import central_covariance, limit_covariance
+from netkf.theory.hybrid.steady import has_steady_state
+
+MAX_BOUND_BYTES, SERIES_TERMS = 1.5 * 2**30, 30
+"""Largest memory of a bound that is computed, and the terms of the series that computing it stores.
+"""
+MAX_STEADY_ENTRIES = 100_000
+"""Largest number of entries of all covariances for which a run computes the steady state."""
+
+
+def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
+    """Return the traces that theory gives to compare those of P with: the bound on the mean of P at
+    the sample ``times`` (T,), its limit for ever faster links, and a centralised filter.
+
+    If theory does not apply or takes too much memory, the reason is given instead.
+    """
+    bound, reason = None, ""
+    try:
+        if len(times):
+            _require_small_bound(scenario, len(times))
+            bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
+    except TheoryError as error:
+        reason = str(error)
+    steady_note = _steady_note(scenario)
+    return PromisedTraces(
+        bound=bound,
+        limit=_trace_or_nan(limit_covariance, scenario),
+        central=_trace_or_nan(central_covariance, scenario),
+        reason=reason or reason_without_bound(scenario) or "",
+        limit_label=limit_label(scenario),
+        notes=(*([steady_note] if steady_note else []), *covariance_notes(scenario)),
+    )
+
+
+def _require_small_bound(scenario: Scenario, samples: int) -> None:
+    """Raise TheoryError if the bound on the mean of P (hybrid paper, H equation 12) at so many
+    ``samples`` takes more memory than MAX_BOUND_BYTES.
+    """
+    if reason_without_bound(scenario):
+        return
+    n = scenario.plant.n
+    # Numbers that computing it stores: at each sample, and for the terms of a series.
+    entries = (samples * (1.5 * n * n + n) + SERIES_TERMS * n * (n + 1)) * len(scenario.nodes)
+    if 8.0 * entries > MAX_BOUND_BYTES:
+        raise TheoryError(
+            f"not computed: Tanwani's H(12) of {len(scenario.nodes):,} nodes, {samples:,} samples, "
+            f"takes {8.0 * entries / 2**30:.1f} GiB; sample less often (probe), or call "
+            "netkf.theory.covariance_bound"
+        )
+
+
+def _steady_note(scenario: Scenario) -> str:
+    """Return a note for users if the bound on P has no steady state, or if this is not known; else
+    an empty text.
+    """
+    if scenario.slotted or reason_without_bound(scenario):
+        return ""
+    if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:
+        size = MAX_STEADY_ENTRIES // scenario.plant.n**2
+        return (
+            f"whether the bound has a steady state is not looked into beyond {size:,} nodes; see "
+            "netkf theory"
+        )
+    try:
+        if has_steady_state(scenario):
+            return ""
+    except TheoryError as error:
+        return f"steady state of the bound: {error}"
+    if not scenario.filter.algorithm.talks:
+        return "at some nodes P has no steady state, it grows without end; see netkf theory"
+    return "the bound has no steady state, it grows without end; see netkf theory"
+
+
+def _trace_or_nan(function: Any, scenario: Scenario) -> float:
+    """Return the trace of the matrix ``function(scenario)``; nan if it raises TheoryError."""
+    try:
+        return float(np.trace(function(scenario)))
+    except TheoryError:
+        return float("nan")
+
+
+def limit_label(scenario: Scenario) -> str:
+    """Return the name of the limit that the bound on P approaches as the link rates grow; empty if
+    the hybrid paper, whose bound it is, is not about the filter.
+    """
+    if not concerns_hybrid_paper(scenario):
+        return ""
+    balanced = has_balanced_rates(scenario)
+    name = "limit S of Tanwani's H(13)" if balanced else "weighted limit (not S of Tanwani's H(13))"
+    return name + delay_suffix(scenario)
+
+
+def delay_suffix(scenario: Scenario) -> str:
+    """Return text to append to the name of a limit that assumes no delays: empty unless messages
+    are delayed.
+    """
+    delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
+    return ", if messages took no time" if delayed else ""

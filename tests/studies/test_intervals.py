@@ -1,0 +1,125 @@
+"""Intervals of comparisons and searches miss as often as they say, and each wrong one is found.
+
+Their values are replaced by ones whose law is known: normal ones, for which Student's intervals
+are exact. Intervals that miss on one side 2 percentage points too often or too rarely are found
+with probability 0.9.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import scipy.special
+
+from netkf.studies import filter_values, targets
+from netkf.studies.filter_values import FilterValues, estimate_quantities
+from netkf.studies.metrics import RunMetrics
+from netkf.studies.targets import Target, quantity_by_simulation
+
+TRIALS, RUNS = 6_000, 5
+"""Intervals of each quantity, and runs behind one: few, so that the number of runs matters."""
+MISS, LEVEL = 0.1, 5e-9
+"""Probability with which each interval misses, and that of a false alarm."""
+BEFORE, AFTER, SPREAD = 20.0, 21.0, 1.0
+"""True means of two filters, and the standard deviation of a run: the square root of a mean, which
+is linear only nearly, is so within the error of the test.
+"""
+
+
+class Misses(NamedTuple):
+    """How often the intervals of a quantity end below the truth, and how often they begin above."""
+
+    below: int
+    above: int
+
+
+def wrong_sides(trials=TRIALS):
+    """The quantities and sides on which intervals miss too often or too rarely."""
+    # A binomial count is within this many standard deviations of its mean.
+    reach = -float(scipy.special.ndtri(0.5 * LEVEL))
+    allowed = reach * float(np.sqrt(trials * 0.5 * MISS * (1.0 - 0.5 * MISS)))
+    return [
+        (name, side)
+        for name, misses in {**compared(trials), **searched(trials)}.items()
+        for side, count in misses._asdict().items()
+        if abs(count - 0.5 * MISS * trials) > allowed
+    ]
+
+
+def drawn(random, mean):
+    return mean + SPREAD * random.standard_normal(RUNS)
+
+
+def count(intervals, truth):
+    low, high = np.array(intervals).T
+    return Misses(int((high < truth).sum()), int((low > truth).sum()))
+
+
+def compared(trials):
+    """Paired differences of two filters, by quantity."""
+    random = np.random.default_rng(0)
+    found = {}
+    for _ in range(trials):
+        values = []
+        for mean in (BEFORE, AFTER):
+            square, worst, nees = (drawn(random, mean) for _ in range(3))
+            values.append(FilterValues(square, worst, nees, np.zeros(RUNS, dtype=bool)))
+        for name, quantity in estimate_quantities(values[1], values[0], 1, MISS).items():
+            found.setdefault(name, []).append((quantity.low, quantity.high))
+    truths = {"rms_error": AFTER**0.5 - BEFORE**0.5}
+    return {
+        f"compare_filters {name}": count(intervals, truths.get(name, AFTER - BEFORE))
+        for name, intervals in found.items()
+    }
+
+
+def searched(trials):
+    """Quantities of a search for a parameter."""
+    random, nothing = np.random.default_rng(1), np.zeros((RUNS, 1))
+    truths = {"mean_rms": BEFORE**0.5, "mean_trace": BEFORE}
+    found = {name: [] for name in truths}
+    for _ in range(trials):
+        square, trace = (drawn(random, BEFORE)[:, None] for _ in range(2))
+        metrics = RunMetrics(square, trace, np.zeros((RUNS, 5)), nothing, nothing + np.inf)
+        for name, intervals in found.items():
+            estimate = quantity_by_simulation(metrics, Target(name, 1.0), MISS, None)
+            intervals.append((estimate.low, estimate.high))
+    return {f"size {name}": count(found[name], truth) for name, truth in truths.items()}
+
+
+def test_intervals_of_comparisons_and_searches_miss_as_often_as_they_say():
+    assert wrong_sides() == []
+
+
+def normal_quantile(freedom, probability):
+    return scipy.special.ndtri(probability)
+
+
+class OneSided:
+    """Takes all of the level on each side."""
+
+    @staticmethod
+    def stdtrit(freedom, probability):
+        return scipy.special.stdtrit(freedom, 2.0 * probability - 1.0)
+
+
+class Normal:
+    """Ignores how few runs there are."""
+
+    stdtrit = staticmethod(normal_quantile)
+
+
+class Scipy:
+    """A module whose special functions are others."""
+
+    def __init__(self, special):
+        self.special = special
+
+
+@pytest.mark.parametrize("special", [OneSided, Normal])
+@pytest.mark.parametrize(
+    ("module", "name"), [(filter_values, "compare_filters"), (targets, "size")]
+)
+def test_a_wrong_quantile_is_found(module, name, special, monkeypatch):
+    monkeypatch.setattr(module, "scipy", Scipy(special))
+    assert {found.split()[0] for found, _ in wrong_sides(1500)} == {name}
