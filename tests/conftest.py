@@ -68,6 +68,23 @@ LONGEST = (
 """Files of more than ten seconds. They run first: a long one at the end would run alone."""
 
 
+WINGS = {
+    "core": (
+        *("core", "linalg", "rng", "plants", "network", "algorithms", "trace", "scenario"),
+        *("engines", "runs", "ensembles"),
+    ),
+    "theory": ("theory", "checks", "testing"),
+    "tools": ("studies", "figures", "report", "cli"),
+}
+"""The rooms of each wing, in netkf/ and in tests/: the core knows neither theory nor tools."""
+CORE_TESTS = (
+    *("core/test_csv_values.py", "core/test_interrupts.py", "core/test_memory.py"),
+    *("rng/test_streams.py", "network/test_graphs.py", "scenario/test_compatibility.py"),
+    *("runs/test_files.py",),
+)
+"""Tests of the core that take seconds; tests/test_rooms.py runs them without the other wings."""
+
+
 def scenario_files():
     return sorted(SCENARIOS.glob("*.toml"))
 

@@ -1,7 +1,11 @@
 """The structure of the package: no circles of imports, and no public name with two meanings."""
 
 import ast
+import os
 import re
+import shutil
+import subprocess
+import sys
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -89,6 +93,64 @@ def test_the_readme_of_a_room_names_all_of_its_modules_and_no_others():
             f"{readme}: {name}" for name in re.findall(r"`(\w+\.py)`", text) if name not in files
         ]
     assert (missing, unknown) == ([], [])
+
+
+def test_every_room_is_in_a_wing():
+    rooms = {file.parent.name for file in ROOT.glob("*/__init__.py")}
+    assert rooms == {room for wing in conftest.WINGS.values() for room in wing}
+
+
+CORE_ALONE = """
+import importlib, pkgutil
+import netkf
+
+for module in pkgutil.walk_packages(netkf.__path__, "netkf."):
+    if module.name != "netkf.__main__":
+        importlib.import_module(module.name)
+scenario = netkf.load("scenarios/gossip_ring.toml", {"horizon": 4.0, "probe": 1.0})
+run = netkf.simulate(scenario, engine="simpy")
+directory = netkf.save(run, scenario, "run")
+assert "netkf.theory is not installed" in (directory / "summary.json").read_text()
+assert netkf.monte_carlo(scenario, 2, workers=1, engine="simpy").runs.max() == 2
+try:
+    netkf.theory
+except ModuleNotFoundError:
+    print("alone")
+"""
+
+
+def test_the_core_passes_its_tests_without_the_other_wings(tmp_path):
+    """In plain Python: nothing is compiled, so that it takes seconds."""
+    known = conftest.ROOT
+    for name in ("netkf", "tests", "scenarios"):
+        others = {*conftest.WINGS["theory"], *conftest.WINGS["tools"]} if name == "netkf" else set()
+        where = str(known / name)
+        shutil.copytree(
+            known / name,
+            tmp_path / name,
+            ignore=lambda folder, _, where=where, others=others: {
+                "__pycache__",
+                *(others if folder == where else ()),
+            },
+        )
+    shutil.copy(known / "pyproject.toml", tmp_path)
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(tmp_path)}
+
+    def run(*command):
+        return subprocess.run(
+            [sys.executable, "-P", *command],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+
+    alone = run("-c", CORE_ALONE)
+    assert (alone.stdout, alone.stderr.count("\n")) == ("alone\n", 1)  # a note of plain Python
+    tested = run("-m", "pytest", "-q", *(f"tests/{name}" for name in conftest.CORE_TESTS))
+    assert tested.returncode == 0, tested.stdout
 
 
 def test_files_that_run_first_are_there():
