@@ -73,7 +73,7 @@ WINGS = {
         *("core", "linalg", "rng", "plants", "network", "algorithms", "trace", "scenario"),
         *("engines", "runs", "ensembles"),
     ),
-    "theory": ("theory", "checks", "testing"),
+    "theory": ("theory", "checks", "testing", "laws"),
     "tools": ("studies", "figures", "report", "cli"),
 }
 """The rooms of each wing, in netkf/ and in tests/: the core knows neither theory nor tools."""
