@@ -157,13 +157,9 @@ class DelayedJumps:
 
     @cached_property
     def _message_noise(self) -> tuple[FloatArray, FloatArray]:
-        """Return what the plant's noise during the delay adds to the second moments of the errors
-        of messages: its covariance F(s) (k + 1, n, M) with the errors s seconds earlier, at the
-        k + 1 points s of the delay, the same for all messages, and its own covariance (n, n).
-
-        An impulse of the plant's noise moves errors by h, ``dh/ds = B h + G e^{U s}``, and messages
-        that are under way by e^{A s}: ``F(s) = e^{A s} int_0^{d - s} e^{A u} Q h(u)' du``.
-        """
+        """Return F(s) (k + 1, n, M) and a covariance (n, n): noise during the delay in messages."""
+        # An impulse of noise moves errors by h, dh/ds = B h + G e^{U s}, and messages under way by
+        # e^{A s}: F(s) = e^{A s} int_0^{d - s} e^{A u} Q h(u)' du.
         N, n, G = self.nodes, len(self.A), self._mean[1]
         times = self.delay * chebyshev_points(self.points)
         E = np.stack([scipy.linalg.expm(s * self.A) for s in times])
@@ -195,13 +191,9 @@ class DelayedJumps:
         return np.asarray(right)
 
     def _residual(self, K: FloatArray, right: FloatArray, jumps: bool) -> FloatArray:
-        """Return the residuals (k + 1, M, M) of the boundary value problem for the autocovariances
-        K(s) = E[E(t) E(t - s)'] of the M errors and a ``right``-hand side, of the same shape; the
-        first axis are the k + 1 points s of the delay.
-
-        Entry 0 is the residual of its second equation, the others are those of the first equation
-        integrated from 0 to each point. With ``jumps`` Phi is the inflow computed from K.
-        """
+        """Return the residuals (k + 1, M, M) of K(s) = E[E(t) E(t - s)'] and ``right``."""
+        # Entry 0 is that of the second equation, the others those of the first, integrated from 0.
+        # With ``jumps`` Phi is the inflow computed from K.
         k, M, _ = K.shape
         driven = (self._drift_blocks @ K.reshape(k, self.nodes, -1, M)).reshape(K.shape)
         heard = self._heard_products(K)
@@ -239,13 +231,7 @@ class DelayedJumps:
         )
 
     def _solve(self, right: FloatArray, jumps: bool, tolerance: float) -> FloatArray:
-        """Return the autocovariances K (k + 1, M, M) of the M errors that solve the boundary value
-        problem to a relative ``tolerance``.
-
-        ``right`` (k + 1, M, M) is the right-hand side at the k + 1 points of the delay; with
-        ``jumps`` the white noise Phi of the jumps is not given but follows from K. Small problems
-        are solved by elimination, others by GMRES.
-        """
+        """Return K (k + 1, M, M) to a relative ``tolerance``, by elimination or GMRES."""
         if right.size <= MAX_DENSE:
             return self._by_elimination(right, jumps)
         zeros = np.zeros_like(right)

@@ -128,11 +128,7 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _information_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row (assumption, source, whether it holds or None if undecided, evidence) on the
-    cooperative information condition, paper D (19): given the past of the regressors H, readings
-    that all sensors together take in the next window of slots excite every direction, if the least
-    eigenvalue of their expected information, the level, is positive for each past.
-    """
+    """Return the row on the cooperative information condition D (19): its least level."""
     name = "the sensors together excite every direction (sufficient)"
     if not few_regressors(scenario):
         evidence = f"not computed beyond {MAX_REGRESSORS} sensors whose H varies"

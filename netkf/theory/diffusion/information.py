@@ -169,13 +169,7 @@ def _make_row(node: int, sources: list[_Source], past: list[FloatArray], window:
 def _search_least(
     sources: list[_Source], past: list[FloatArray], values: FloatArray, window: int
 ) -> float:
-    """Return the least level lambda_k found: by drawing, at states 0, and by a search from both.
-
-    The level is the least eigenvalue of the mean information that ``window`` slots of regressors
-    bring, given the past; the condition of the diffusion paper asks that it stays above 0. A source
-    is a random process that makes regressors. ``past`` holds the states (K, m) of each source in K
-    pasts, ``values`` (K,) the levels there.
-    """
+    """Return the least level lambda_k found: by drawing, at states 0, and by a search from both."""
     # The least level may be attained far from all pasts drawn.
     lowest = int(np.argmin(values))
     # A fixed regressor has no state that could differ.

@@ -142,17 +142,11 @@ class _PiecewiseSolution:
         return self._outputs[piece](t).reshape(start.shape)
 
     def extend(self, last: float) -> None:
-        """Integrate the coupled Riccati equations of all nodes' covariances up to time ``last``
-        (seconds), and append the pieces of their solution to ``_outputs`` and ``_piece_ends``.
-
-        If messages have a delay, the covariances of one delay ago enter the equations, which are
-        then solved piece by piece; nothing arrives in the first one. A piece is one delay long, so
-        that all that arrives in it is known; if the delay is much shorter than the time between
-        messages, a piece is half that time long, and its own arrivals are found by Picard
-        iteration: with h the length of the piece and c the rate of arrivals its error after k
-        rounds falls like (c h)^k / k!, here with c h = 1/2. Pieces end where the solution jumps,
-        since sensors sample there, and where messages sent at jumps arrive.
-        """
+        """Integrate H(12) up to time ``last`` (seconds), and append the pieces of its solution."""
+        # With a delay, covariances of one delay ago enter: a piece is one delay long, so that all that
+        # arrives in it is known. If the delay is much shorter than the time between messages, a piece
+        # is half that time long, and Picard iteration finds its arrivals: with h its length and c their
+        # rate the error after k rounds falls like (c h)^k / k!, c h = 1/2. Pieces end at jumps.
         delay = self._packed.equations.delay
         while self._piece_ends[-1] < last:
             begin = self._piece_ends[-1]
@@ -285,13 +279,9 @@ class _PiecewiseSolution:
         )
 
     def _absolute_tolerance(self, begin: float) -> FloatArray:
-        """Return the absolute tolerance (N m,) of the piece from ``begin`` (seconds) on, relative
-        to the covariance of each node.
-
-        A node with precise sensors next to one that nobody can follow has a covariance of the order
-        of the root of the other's, whose inflow is rounded: a solver that is asked for more makes
-        ever smaller steps. Raises TheoryError where rounding exceeds DEFECT_TOLERANCE.
-        """
+        """Return the absolute tolerance (N m,) of a piece; raises TheoryError."""
+        # Beside a node that nobody can follow, one with precise sensors has a covariance of the order
+        # of the root of the other's, whose inflow is rounded: asked for more, steps get ever smaller.
         sizes = self._entry_sizes()
         rounding = ROUNDING * sizes.max()
         if rounding > DEFECT_TOLERANCE * sizes.min():

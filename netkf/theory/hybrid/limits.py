@@ -74,13 +74,8 @@ def _require_limit(scenario: Scenario) -> None:
 def _shared_equation(
     scenario: Scenario, A: FloatArray, Q: FloatArray, G: FloatArray, w: FloatArray
 ) -> CoupledRiccati:
-    """Return the Riccati equations H(12) of N nodes that share one covariance, as they do in the
-    limit of fast links, in the form of the equations of a single node.
-
-    A and Q (n, n) are the drift and noise that the filters assume, G (n, n) is the information per
-    second of the increments of all nodes, each with its weight w (N,); the rate of a sensor that
-    samples is multiplied by its node's weight.
-    """
+    """Return H(12) of N nodes with one covariance, as in the limit of fast links, as one node."""
+    # G (n, n) is the information per second of all increments, each with its node's weight w.
     groups = []
     for group in poisson_samples(scenario):
         silent = scipy.sparse.csr_array((1, len(group.nodes)))

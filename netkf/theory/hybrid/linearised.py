@@ -100,13 +100,8 @@ def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
 def _solve_by_gmres(
     linear: LinearisedRiccati, right: FloatArray, tolerance: float
 ) -> FloatArray | None:
-    """Return the solution X (N, m) of ``L(X) = -right`` by GMRES with rounds of iterative
-    refinement, for ``right`` (N, m); None if it diverges. L, ``linear``, maps the rows of N nodes:
-    each by a block of its own, plus what arrives from other nodes.
-
-    The preconditioner solves for a change that all nodes share, and then inverts each node's own
-    block. ``tolerance`` is relative to the norm of ``right``.
-    """
+    """Return X (N, m) of ``L(X) = -right`` by refined GMRES; None if it diverges."""
+    # The preconditioner solves for a change that all nodes share, then inverts each node's block.
     blocks = linear.blocks
     try:
         inverse = np.linalg.inv(blocks)

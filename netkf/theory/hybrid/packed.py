@@ -135,13 +135,8 @@ class PackedRiccati:
     def _add_samples(
         self, change: FloatArray, group: PoissonSamples, P: FloatArray, sent: FloatArray | None
     ) -> None:
-        """Add to ``change`` (N, m), in place, ``s (g(P) - P)`` of the sensors of a ``group`` with
-        Poisson rates s, where g is the update by a sample, and the arrivals of estimates that nodes
-        sent at these samples, by the rates ``group.heard`` of receivers and samples.
-
-        P (N, n, n) are the present covariances, ``sent`` (N, n, n) those one delay ago (None: no
-        delay).
-        """
+        """Add ``s (g(P) - P)`` of a ``group`` of Poisson samples to ``change`` (N, m), in place."""
+        # g is the update by a sample; also the arrivals of what was ``sent`` (N, n, n) at samples.
         decrease = self.pack(group.sample_decrease(P))
         np.subtract.at(change, group.nodes, group.rate[:, None] * decrease)
         if not group.heard.nnz:
@@ -217,12 +212,9 @@ class PackedRiccati:
         return LinearisedRiccati(blocks, heard, self)
 
     def _blocks(self, nodes: np.ndarray, corrections: FloatArray) -> FloatArray:
-        """Return each node's own part (N, m, m) of the linearised equations, as maps of rows X_i
-        (the m entries of a symmetric matrix): ``(A - C_i) X_i + X_i (A - C_i)'`` less X_i times the
-        rate at which it is replaced by what arrives.
-
-        ``corrections`` (S, n, n) has the C_i of the S ``nodes`` (S,); C_i is 0 at all others.
-        """
+        """Return each node's own part (N, m, m) of the linearised equations."""
+        # (A - C_i) X_i + X_i (A - C_i)' less X_i times the rate at which it is replaced; C_i is that
+        # of ``corrections`` (S, n, n) at the ``nodes`` (S,), 0 at all others.
         blocks = np.tile(self._drift_map, (len(self.leaving), 1, 1))
         # In parts: the products of all nodes take 278 MB at 1000 nodes and n = 16.
         chunk_count = max(1, -(-len(nodes) * self._basis.size // MAX_PRODUCTS))

@@ -139,23 +139,14 @@ def _stabilising_covariances(packed: PackedRiccati) -> FloatArray | None:
 
 
 def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
-    """Return one step (N, n, n) of Newton's method for the steady state of the coupled Riccati
-    equations H(12): their fixed point with the gains of P (N, n, n) held fixed (Kleinman).
-
-    Solved for the change of P, so that a few digits of it are enough.
-    """
+    """Return one step (N, n, n) of Newton's method (Kleinman), solved for the change of P."""
     Y = packed.pack(P)
     change = solve_linearised(packed, P, packed.slope(Y, Y), NEWTON_TOLERANCE)
     return packed.unpack(Y + change)
 
 
 def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) -> FloatArray | None:
-    """Return covariances (N, n, n) whose gains stabilise H(12), the coupled Riccati equations that
-    bound the mean of each of N nodes' P, or None if none were found.
-
-    The search follows H(12) by implicit steps; it starts from ``first`` (N, n, n), or from the
-    first covariances of the nodes.
-    """
+    """Return covariances (N, n, n) whose gains stabilise H(12), by implicit steps, or None."""
     equations, n = packed.equations, len(packed.equations.A)
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
     # The multiple of I makes P positive definite where start and Q are singular.
@@ -183,13 +174,9 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
 
 
 def _implicit_step(implicit: PackedRiccati, P: FloatArray) -> FloatArray | None:
-    """Return the covariances (N, n, n) after an implicit Euler step of the coupled Riccati
-    equations from P (N, n, n), closely enough to follow their solution, or None if the step is too
-    long. ``implicit`` are the equations whose steady state the step leads to.
-
-    Q + P / step is positive definite. So the gains of P stabilise the equations of the step if and
-    only if their fixed point with these gains is positive definite too.
-    """
+    """Return covariances (N, n, n) after an implicit Euler step; None if it is too long."""
+    # ``implicit`` are the equations of the step. Q + P / step is positive definite, so the gains
+    # of P stabilise them if and only if their fixed point is positive definite too.
     for _ in range(IMPLICIT_STEPS):
         previous, P = P, _newton(implicit, P)
         if not (np.isfinite(P).all() and np.linalg.eigvalsh(P)[:, 0].min() > 0.0):
@@ -279,13 +266,8 @@ def _steady_at(
 
 
 def _guess(points: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
-    """Return a factor on all link rates close to the threshold above which the bound on the mean of
-    P has a steady state, extrapolated from the last two ``points``, pairs (factor, 1 / max P).
-
-    1 / max P falls to 0 at the threshold, which lies between ``low`` (no steady state) and
-    ``high`` (a steady state) and is sought to the relative accuracy ``fine``. The guess lies
-    between them too; it is their geometric mean if the extrapolation does not.
-    """
+    """Return a factor near the threshold, extrapolated from ``points`` (factor, 1 / max P)."""
+    # 1 / max P falls to 0 at the threshold, between ``low`` and ``high``; so is the guess.
     (f, inverse), (g, following) = points[-2:]
     # The secant through both points meets 0 at ``root``. It usually lies slightly above the
     # threshold, since both points do.
@@ -299,13 +281,8 @@ def _guess(points: list[tuple[float, float]], low: float, high: float, fine: flo
 
 
 def _necessary_factor(equations: CoupledRiccati) -> float | None:
-    """Return a factor on all link rates at or below which H(12), the coupled Riccati equations that
-    bound the mean of each node's P, has no steady state; cheap to compute.
-
-    None if no factor gives it one. The covariances of nodes without sensors grow at least as if all
-    other nodes had no error: by the largest eigenvalue of their own coupling and 2 a, where a is
-    the growth rate of the plant's fastest mode.
-    """
+    """Return a factor at or below which H(12) has no steady state; None if none helps."""
+    # Covariances of nodes without sensors grow at least as if all others had no error.
     if not equations.coupling.nnz:
         return None
     # Without readings P grows like exp(2 a t) in the direction of the fastest mode.
@@ -325,14 +302,8 @@ def _necessary_factor(equations: CoupledRiccati) -> float | None:
 
 
 def _longest_lag(M: scipy.sparse.csc_array) -> float | None:
-    """Return a lower bound on the largest eigenvalue of ``M^-1`` (seconds), for M (K, K) per
-    second: the time in which information reaches K nodes without sensors from the others.
-
-    None if M, whose off-diagonal entries are at most 0, is not a nonsingular M-matrix, so that some
-    eigenvalue of M is at most 0. The least factor by which a step of the power method multiplies an
-    entry is below the eigenvalue (Collatz and Wielandt); disconnected parts of the network have
-    eigenvalues of their own.
-    """
+    """Return a lower bound on the largest eigenvalue of M^-1 (seconds); None unless M-matrix."""
+    # By Collatz and Wielandt: the least factor of a step of the power method is below it.
     try:
         factors = scipy.sparse.linalg.splu(M)
     except RuntimeError:  # exactly singular

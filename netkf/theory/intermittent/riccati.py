@@ -297,14 +297,9 @@ class _GainSearch:
     def _first_gains(
         self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> list[FloatArray]:
-        """Return gains (n, p), one for each set of readings, close to the best ones for its
-        ``probabilities``, starting from any ``gains``.
-
-        Policy iteration with the resolvent ``X = (s - L)^-1 I``, s above the radius of L, instead
-        of the Perron matrix, which may be singular and then leaves gains undetermined in some
-        direction. Since X > 0, the radius of the improved gains is below s, which is lowered step
-        by step.
-        """
+        """Return gains (n, p) close to the best ones, by policy iteration with the resolvent."""
+        # X = (s - L)^-1 I > 0 in place of the Perron matrix, which may leave gains undetermined; the
+        # radius of the improved gains is below s, which is lowered step by step.
         radius = self._perron(probabilities, gains)[0]
         for excess in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8):
             for _ in range(MAX_POLICIES):
@@ -323,13 +318,7 @@ class _GainSearch:
     def _resolvent(
         self, probabilities: Sequence[float], gains: list[FloatArray], s: float
     ) -> FloatArray | None:
-        """Return ``(s - L)^-1 I`` (n, n) times a power of two that brings its trace to about 1, or
-        None if it is not positive definite.
-
-        L is the linear part of the mean Riccati map with fixed gains, X to the sum of p (F + K H) X
-        (F + K H)' over all sets of readings that may arrive, with these ``probabilities`` p and
-        ``gains`` K (n, p), one for each set.
-        """
+        """Return (s - L)^-1 I (n, n), scaled to a trace of about 1; None if not positive."""
         n, operator = len(self._F), self._operator(probabilities, gains)
         identity = np.eye(n).reshape(-1)[self._pick]
         try:

@@ -92,13 +92,8 @@ def _confirm(T: PositiveMap, X: FloatArray, value: float) -> float:
 def _extreme_eigenvalue(
     T: PositiveMap, start: FloatArray, which: Literal["LR", "LM"]
 ) -> tuple[float, FloatArray]:
-    """Return the modulus of an extreme eigenvalue of the positive map T on stacks of S symmetric
-    matrices, and its eigenvector X (S, M, M) of positive trace.
-
-    ``which`` is "LR" for the rightmost eigenvalue, "LM" for that of largest modulus. Arnoldi's
-    method begins at ``start`` (S, M, M), which has a component along X if it is positive definite.
-    Returns (0, zeros) if it fails for a map small enough for dense eigenvalues.
-    """
+    """Return the modulus of an extreme eigenvalue ("LR", "LM") of T, and its eigenvector."""
+    # Arnoldi's method from ``start`` (S, M, M) > 0; (0, zeros) if it fails for a small map.
     shape = start.shape
     try:
         values, vectors = scipy.sparse.linalg.eigs(

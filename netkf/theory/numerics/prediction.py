@@ -217,12 +217,8 @@ class ErrorFlow:
     def _exponential_blocks(
         self, times: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the transposes (K, n, n) of the four blocks of exp(M s) (2 n, 2 n), row by row, at
-        K ``times`` s in seconds.
-
-        M, with the rows (-A' G) and (Q A), is the Hamiltonian of ``dP/dt = A P + P A' + Q - P G P``
-        with ``G = H' R^-1 H``.
-        """
+        """Return the transposes (K, n, n) of the blocks of exp(M s) at K ``times`` (s)."""
+        # M = [-A' G; Q A] is the Hamiltonian of dP/dt = A P + P A' + Q - P G P, G = H' R^-1 H.
         n, c = self._n, self._scale
         E = np.swapaxes(self._exp(times), 1, 2)
         return E[:, :n, :n], E[:, n:, :n] / c, E[:, :n, n:] * c, E[:, n:, n:]
@@ -285,13 +281,8 @@ class ErrorFlow:
     def _update_gramian(
         self, roots: FloatArray, gamma_rows: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return ``J = (I + P G)^-1``, ``J P`` and the root S Z_1 of J P, (K, n, n) each: how the
-        readings of a gap change K covariances P at its start, about which they give the information
-        G = Gamma' Gamma.
-
-        ``roots`` (K, n, n) are S with P = S S'; ``gamma_rows`` (8, p, n) are the rows of Gamma, p
-        for each node of the quadrature. The QR factorisation is [I; Gamma S] = Z U.
-        """
+        """Return J = (I + P G)^-1, J P and its root S Z_1, (K, n, n) each."""
+        # G = Gamma' Gamma is the information of the gap's readings, P = S S', [I; Gamma S] = Z U.
         n, Gamma = self._n, gamma_rows.reshape(-1, self._n)
         eye = np.broadcast_to(np.eye(n), roots.shape)
         if not len(Gamma):
@@ -311,13 +302,8 @@ class ErrorFlow:
         T21: FloatArray,
         root_weights: FloatArray,
     ) -> FloatArray:
-        """Return the roots (K, n, n) of P of K filters at the end of the gap.
-
-        P(g) = (F S Z_1)(F S Z_1)' plus the solution from P(0) = 0: ``start_factor`` (K, n, n) is F
-        S Z_1, F (n, n) is X(g)^-T for P(0) = 0, and T11 and T21 (8, n, n) are blocks of exp(M s) at
-        the nodes of the quadrature, whose square roots of the weights are ``root_weights``
-        (8, 1, 1).
-        """
+        """Return the roots (K, n, n) of P at the end of the gap."""
+        # P(g) = (F S Z_1)(F S Z_1)' plus the solution from P(0) = 0, by quadrature at 8 nodes.
         noise_factors = [_side_by_side((root_weights * (F @ T11 @ self._B))[None])[0]]
         noise_factors.append(
             _side_by_side((root_weights * (F @ T21 @ self._weight @ self._root_R))[None])[0]
@@ -329,13 +315,8 @@ class ErrorFlow:
         return triangular_root(factor)
 
     def _response_through_state(self, FJ: FloatArray, FC: FloatArray, gap: float) -> FloatArray:
-        """Return the response (K, 8, n, m) of the errors of K filters to the m noises of the plant
-        at each of the 8 nodes of a ``gap`` in seconds, by way of the state: noise moves the state,
-        and errors follow the state because the filters' A is not the plant's.
-
-        FJ and FC (K, n, n) give the error's transition from s,
-        ``Phi(g, s) = FJ T11(s) + FC T12(s)``.
-        """
+        """Return the response (K, 8, n, m) of errors to plant noise by way of the state."""
+        # The filters' A is not the plant's. Phi(g, s) = FJ T11(s) + FC T12(s) is the transition.
         assert self._state is not None
         responses = []
         for s in NODES * gap:  # noise at s moves the state from s on, and that the errors

@@ -84,12 +84,8 @@ class GaussianStack:
         return self.table[self.indices(names), :, : self._frozen]
 
     def _reduce(self, names: Iterable[Hashable], count: int) -> None:
-        """Replace the columns of T that are not frozen by at most as many as T has rows, and make
-        space for ``count`` more inputs.
-
-        T (rows, inputs) has the linear forms of all vectors, stacked in the order of ``names``.
-        Joint covariances T T' do not change. The new columns are lower triangular in that order.
-        """
+        """Replace free columns of T by at most as many as rows, with space for ``count`` more."""
+        # Joint covariances T T' stay; the new columns are lower triangular in the order of ``names``.
         rows = self.indices(names)
         stacked = self.table[rows, :, self._frozen : self.used].reshape(len(rows) * self._n, -1)
         # Only T T' matters, so that T may be multiplied by any orthogonal matrix from the right:

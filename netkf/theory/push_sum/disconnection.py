@@ -202,13 +202,8 @@ def _is_connected(neighbours: list[dict[int, float]]) -> bool:
 
 
 def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
-    """Return an order of the nodes (indices) for ``_exact_probability``, which takes one node after
-    the other, in which few are open at a time: taken, but with neighbours still to come.
-
-    ``neighbours`` has the probabilities of the links of each node, by the index of the other end.
-    It is the greedy order of least effort from several first nodes; None if in each of them more
-    than MAX_OPEN nodes are open at a time.
-    """
+    """Return the greedy order of least effort from several first nodes; None if too many open."""
+    # A node is open while it is taken and some of its neighbours are not.
     nodes = range(len(neighbours))
     roots = sorted(nodes, key=lambda node: len(neighbours[node]))[:MAX_ROOTS]
     orders = [_greedy_order(neighbours, root) for root in roots]
@@ -216,14 +211,8 @@ def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
 
 
 def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float, list[int]] | None:
-    """Return an estimate of the effort (number of partitions) and a greedy order of the nodes,
-    which begins at node ``root``.
-
-    ``neighbours`` has the probabilities of the links of each node, by the index of the other end.
-    A node is open while it is in the order and some of its neighbours are not. The next node is the
-    one that closes the most open nodes and then adds the fewest candidates. None as soon as more
-    than MAX_OPEN nodes are open.
-    """
+    """Return the effort (number of partitions) and a greedy order from ``root``, or None."""
+    # The next node closes the most open nodes, and then adds the fewest candidates.
     waiting = [set(links) for links in neighbours]  # the neighbours of each node still to come
     effort, order, opened, eliminated = 0.0, [], set[int](), set[int]()
     candidates = {root}
@@ -249,13 +238,10 @@ def _greedy_order(neighbours: list[dict[int, float]], root: int) -> tuple[float,
 
 
 def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> float | None:
-    """Return the probability that the network is disconnected, None for too many partitions.
-
-    ``neighbours`` has the probabilities of the links of each node, by the index of the other end,
-    and ``order`` lists all nodes, which are added one by one with their links to earlier ones. A
-    node is open until all its neighbours are added. A partition says which open nodes are connected
-    so far: the tuple of the labels of their parts, numbered in order of appearance.
-    """
+    """Return the probability that the network is disconnected, None for too many partitions."""
+    # Nodes are added one by one with their links to earlier ones; a node is open until all its
+    # neighbours are added. A partition says which open nodes are connected so far: the labels of
+    # their parts, numbered in order of appearance.
     index = {node: k for k, node in enumerate(order)}
     # A node stays open until all of its neighbours have been opened.
     last = [max(index[k] for k in (node, *links)) for node, links in enumerate(neighbours)]
@@ -283,12 +269,8 @@ def _exact_probability(neighbours: list[dict[int, float]], order: list[int]) -> 
 def _apply_link(
     states: dict[tuple[int, ...], float], index: int, up: float
 ) -> dict[tuple[int, ...], float]:
-    """Return the probability of each partition of the open nodes into connected parts after the
-    link between open node ``index`` and the last open node, which is up with probability ``up``.
-
-    ``states`` has the probabilities before it; a partition is the tuple of the labels of the open
-    nodes' parts. A node is open while some of its links are still to come.
-    """
+    """Return the probabilities of partitions after the link between ``index`` and the last node."""
+    # A partition is the tuple of the labels of the open nodes' connected parts.
     partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     for labels, p in states.items():
         first, second = labels[index], labels[-1]
@@ -305,13 +287,8 @@ def _apply_link(
 def _close_nodes(
     states: dict[tuple[int, ...], float], keep: list[int]
 ) -> tuple[dict[tuple[int, ...], float], float]:
-    """Return the probabilities of the partitions of the nodes that stay open (indices ``keep``
-    among the open ones), and the probability of a cut: that of the partitions with a part of which
-    no node stays open.
-
-    ``states`` has the probabilities before, by the labels of the connected parts of the open nodes:
-    those with links still to come.
-    """
+    """Return the probabilities of partitions of the nodes ``keep``, and that of a cut."""
+    # A cut: a part of which no node stays open.
     partitions: defaultdict[tuple[int, ...], float] = defaultdict(float)
     lost = []
     for labels, p in states.items():

@@ -120,12 +120,8 @@ def _mean_radius_by_arnoldi(law: Averaging, closed: FloatArray) -> float:
 
 
 def _groups(closed: FloatArray) -> list[FloatArray]:
-    """Return the nodes' closed loops A_i (N, k, k) for each group of k states that no A_i mixes
-    with others, such as plane axes; ``closed`` (N, n, n) are the A_i of all states.
-
-    Radii are computed for each group alone, since the cross covariance of two groups grows no
-    faster than the geometric mean of their own.
-    """
+    """Return the closed loops (N, k, k) of each group of states that no loop mixes with others."""
+    # The cross covariance of two groups grows no faster than the geometric mean of their own.
     size = np.abs(closed).max(axis=0)
     # Two states mix if some A_i has an entry between them.
     linked = size > 1e-13 * size.max()
