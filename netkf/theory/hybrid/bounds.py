@@ -143,10 +143,11 @@ class _PiecewiseSolution:
 
     def extend(self, last: float) -> None:
         """Integrate H(12) up to time ``last`` (seconds), and append the pieces of its solution."""
-        # With a delay, covariances of one delay ago enter: a piece is one delay long, so that all that
-        # arrives in it is known. If the delay is much shorter than the time between messages, a piece
-        # is half that time long, and Picard iteration finds its arrivals: with h its length and c their
-        # rate the error after k rounds falls like (c h)^k / k!, c h = 1/2. Pieces end at jumps.
+        # With a delay, covariances of one delay ago enter: a piece is one delay long, so that all
+        # that arrives in it is known. If the delay is much shorter than the time between messages,
+        # a piece is half that time long, and Picard iteration finds its arrivals: with h its length
+        # and c their rate the error after k rounds falls like (c h)^k / k!, c h = 1/2. Pieces end
+        # at jumps.
         delay = self._packed.equations.delay
         while self._piece_ends[-1] < last:
             begin = self._piece_ends[-1]
@@ -280,8 +281,9 @@ class _PiecewiseSolution:
 
     def _absolute_tolerance(self, begin: float) -> FloatArray:
         """Return the absolute tolerance (N m,) of a piece; raises TheoryError."""
-        # Beside a node that nobody can follow, one with precise sensors has a covariance of the order
-        # of the root of the other's, whose inflow is rounded: asked for more, steps get ever smaller.
+        # Beside a node that nobody can follow, one with precise sensors has a covariance of the
+        # order of the root of the other's, whose inflow is rounded: asked for more, steps get ever
+        # smaller.
         sizes = self._entry_sizes()
         rounding = ROUNDING * sizes.max()
         if rounding > DEFECT_TOLERANCE * sizes.min():

@@ -213,8 +213,8 @@ class PackedRiccati:
 
     def _blocks(self, nodes: np.ndarray, corrections: FloatArray) -> FloatArray:
         """Return each node's own part (N, m, m) of the linearised equations."""
-        # (A - C_i) X_i + X_i (A - C_i)' less X_i times the rate at which it is replaced; C_i is that
-        # of ``corrections`` (S, n, n) at the ``nodes`` (S,), 0 at all others.
+        # (A - C_i) X_i + X_i (A - C_i)' less X_i times the rate at which it is replaced; C_i is
+        # that of ``corrections`` (S, n, n) at the ``nodes`` (S,), 0 at all others.
         blocks = np.tile(self._drift_map, (len(self.leaving), 1, 1))
         # In parts: the products of all nodes take 278 MB at 1000 nodes and n = 16.
         chunk_count = max(1, -(-len(nodes) * self._basis.size // MAX_PRODUCTS))

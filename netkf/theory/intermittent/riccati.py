@@ -298,8 +298,8 @@ class _GainSearch:
         self, probabilities: Sequence[float], gains: list[FloatArray]
     ) -> list[FloatArray]:
         """Return gains (n, p) close to the best ones, by policy iteration with the resolvent."""
-        # X = (s - L)^-1 I > 0 in place of the Perron matrix, which may leave gains undetermined; the
-        # radius of the improved gains is below s, which is lowered step by step.
+        # X = (s - L)^-1 I > 0 in place of the Perron matrix, which may leave gains undetermined;
+        # the radius of the improved gains is below s, which is lowered step by step.
         radius = self._perron(probabilities, gains)[0]
         for excess in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8):
             for _ in range(MAX_POLICIES):

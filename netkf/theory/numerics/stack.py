@@ -85,7 +85,8 @@ class GaussianStack:
 
     def _reduce(self, names: Iterable[Hashable], count: int) -> None:
         """Replace free columns of T by at most as many as rows, with space for ``count`` more."""
-        # Joint covariances T T' stay; the new columns are lower triangular in the order of ``names``.
+        # Joint covariances T T' stay; the new columns are lower triangular in the order of
+        # ``names``.
         rows = self.indices(names)
         stacked = self.table[rows, :, self._frozen : self.used].reshape(len(rows) * self._n, -1)
         # Only T T' matters, so that T may be multiplied by any orthogonal matrix from the right:
