@@ -55,6 +55,12 @@ class CodeFiles:
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compile result of a signature, or None."""
+        try:
+            return self._load(sig, target_context)
+        except Exception:  # a module that it names may have changed, or a private name of numba
+            return None
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
         from numba.core.compiler import CompileResult
 
         compile_result: Any = CompileResult
@@ -65,15 +71,16 @@ class CodeFiles:
         data = _read_own(self._data_path(key)) if expected else None
         if data is None or _digest(data).hex() != expected:
             return None
-        try:
-            return compile_result._rebuild(target_context, *pickle.loads(data))
-        except Exception:  # a module that it names may have changed
-            return None
+        return compile_result._rebuild(target_context, *pickle.loads(data))
 
     def save_overload(self, sig: Any, result: Any) -> None:
-        """Save the compile result of a signature, unless it refers to addresses of this process or
-        the files cannot be written.
+        """Save the compile result of a signature, unless it refers to addresses of this process,
+        the files cannot be written, or this numba lacks a private name.
         """
+        with suppress(Exception):
+            self._save(sig, result)
+
+    def _save(self, sig: Any, result: Any) -> None:
         from numba.core import serialize
 
         bound = result.library.has_dynamic_globals or any(not x.can_cache for x in result.lifted)
@@ -83,12 +90,11 @@ class CodeFiles:
         dumps: Any = serialize.dumps
         data = dumps(result._reduce())
         index = json.dumps({**self._read_index(), key: _digest(data).hex()}).encode()
-        with suppress(OSError):
-            make_own_folder(self._folder)
-            # The data first: an index that names what is not there yet, or was there before, is
-            # known by the digest.
-            _replace(self._data_path(key), data)
-            _replace(self._index_path, MARK + self._seal(index) + index)
+        make_own_folder(self._folder)
+        # The data first: an index that names what is not there yet, or was there before, is known
+        # by the digest.
+        _replace(self._data_path(key), data)
+        _replace(self._index_path, MARK + self._seal(index) + index)
 
     def flush(self) -> None:
         """Forget all signatures."""

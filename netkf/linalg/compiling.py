@@ -25,7 +25,7 @@ from typing import Any, TypeVar, cast, overload
 
 from netkf.linalg.code_files import CodeFiles, make_own_folder
 from netkf.linalg.compile_once import SharedCache
-from netkf.linalg.linking import linked_once
+from netkf.linalg.linking import give_up, linked_once
 from netkf.linalg.plain import is_plain, plain_kernel
 
 ROOT = Path(__file__).parents[1]
@@ -54,6 +54,7 @@ nested loops over up to four states are unrolled completely, and in other functi
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 # Kernels are not called from C: the wrapper would be a seventh of the compiled code.
+PRIVATE_OPTIONS = ("no_cfunc_wrapper", "_nrt")
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _announced: set[Callable[..., Any]] = set()
 _compile_times: list[float] = []
@@ -95,6 +96,7 @@ def kernel(
     return _make_kernel(function, allocates, inlined, fused)
 
 
+@cache
 def _numba() -> Any:
     """Return the module numba, with the types that kernels use registered."""
     # Imported by the first call of a kernel: importing netkf must not import numba.
@@ -109,7 +111,29 @@ def _numba() -> Any:
         word_types,
     )
 
+    def type_of(value: Kernel, _: Any) -> Any:
+        return numba.typeof(value._kernel_dispatcher)
+
+    numba.extending.typeof_impl.register(Kernel)(type_of)
     return numba
+
+
+@cache
+def _unknown_options() -> set[str]:
+    """Return those of numba's private options that this numba does not have: they save time."""
+    try:
+        from numba.core.cpu import CPUTargetOptions
+    except ImportError:
+        return set(PRIVATE_OPTIONS)
+    return {name for name in PRIVATE_OPTIONS if not hasattr(CPUTargetOptions, name)}
+
+
+def _if_numba_can(step: Callable[..., None], *args: Any) -> None:
+    """Take a step that needs private names of numba, of which a release may lack one: it makes
+    kernels faster, or quicker to compile, and nothing else.
+    """
+    with suppress(Exception):
+        step(*args)
 
 
 @cache
@@ -154,30 +178,25 @@ class Kernel:
         """Return the name of the kernel in its module: pickle stores that, and not the code."""
         return self._loops.__qualname__
 
-    @property
-    def _numba_type_(self) -> Any:
-        """The numba type of the function; numba reads this attribute of names in kernels."""
-        return self._kernel_dispatcher._numba_type_
-
     @cached_property
     def _kernel_dispatcher(self) -> Any:
         """The numba dispatcher for calls by other kernels; not cached on disk by itself."""
-        dispatcher = _numba().njit(**self._options)(self._loops)
-        _widen_arguments(dispatcher)
+        dispatcher = self._new_dispatcher()
+        _if_numba_can(_widen_arguments, dispatcher)
         return dispatcher
 
     @cached_property
     def _python_dispatcher(self) -> Callable[..., Any]:
         """The numba dispatcher for calls by Python; cached on disk with all its callees."""
-        numba = _numba()
-        dispatcher: Any = numba.njit(**self._options)(self._loops)
-        # Not numba's own cache, which executes what it finds, and whose files are known by the file
-        # of the function alone, while callees may change.
-        files = CodeFiles(self._loops, _cache_folder(numba.config.CACHE_DIR))
-        # Of several processes that need the same code one compiles, and the others wait.
-        dispatcher._cache = SharedCache(files, self._loops.__name__)
-        _use_compile_settings(dispatcher, numba.config)
+        dispatcher = self._new_dispatcher()
+        _if_numba_can(_compile_well, dispatcher, self._loops)
         return cast(Callable[..., Any], dispatcher)
+
+    def _new_dispatcher(self) -> Any:
+        """Return a numba dispatcher of the function."""
+        numba = _numba()
+        options = {name: self._options[name] for name in self._options.keys() - _unknown_options()}
+        return numba.njit(**options)(self._loops)
 
 
 def _make_kernel(
@@ -221,40 +240,47 @@ def _widen_arguments(function: Any) -> None:
     function.get_call_template = template_of_widened
 
 
-def _use_compile_settings(dispatcher: Any, config: Any) -> None:
-    """Set LLVM's optimisation level 2 and a larger unroll threshold for a dispatcher.
+def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
+    """Let a dispatcher keep its code on disk, and compile with LLVM's optimisation level 2, a
+    larger unroll threshold, and one link step (see linking).
 
-    Level 3 takes a quarter longer and gains nothing here. Both settings are global, so that they
-    are set around the compilation of this function only. Its duration is added to _compile_times.
+    Level 3 takes a quarter longer and gains nothing here. The settings are global, so that they are
+    set around the compilation of this function only. Its duration is added to _compile_times.
     """
     from llvmlite.binding import set_option
-    from numba.core.errors import NumbaError as numba_error  # noqa: N813
 
-    compile_for = dispatcher._compile_for_args
+    config: Any = import_module("numba.core.config")
+    compile_for, level = dispatcher._compile_for_args, type(config.OPT)
+    # Not numba's own cache, which executes what it finds, and whose files are known by the file of
+    # the function alone, while callees may change. Of several processes one compiles.
+    files = CodeFiles(loops, _cache_folder(config.CACHE_DIR))
+    shared = dispatcher._cache = SharedCache(files, loops.__name__)
+
+    def compile_linked(*args: Any, **kwargs: Any) -> Any:
+        try:
+            with linked_once(), _without_collection():
+                return compile_for(*args, **kwargs)
+        except Exception:
+            # The lock that the failed attempt holds would block this one. Where numba's own way
+            # works, the other is of no use with this numba; else it is an error of the function.
+            shared.release()
+            made = compile_for(*args, **kwargs)
+            give_up()
+            return made
 
     def compile_with_settings(*args: Any, **kwargs: Any) -> Any:
-        """Compile the kernel for these arguments with other settings of LLVM, and restore them;
-        numba calls it for a kernel that has no code for the types of its arguments yet.
-        """
-        level, started = config.OPT, time.perf_counter()
-        config.OPT = type(level)(2)
+        """Numba calls it for a kernel that has no code for the types of its arguments yet."""
+        before, started = config.OPT, time.perf_counter()
+        config.OPT = level(2)
         set_option("netkf", f"-unroll-threshold={UNROLLED}")
         try:
-            # One link step for the function and all that it calls, see linking.
-            try:
-                with linked_once(), _without_collection():
-                    return compile_for(*args, **kwargs)
-            except numba_error:
-                # Once more without the replacements, for an error message with the source line. The
-                # lock of the cache, which the failed attempt holds, would block this one.
-                dispatcher._cache.release()
-                return compile_for(*args, **kwargs)
+            return compile_linked(*args, **kwargs)
         finally:
-            config.OPT = level
+            config.OPT = before
             # LLVM options cannot be unset: this is the value that numba's own level implies.
             set_option("netkf", f"-unroll-threshold={UNROLLED_BY_NUMBA}")
             # Other processes wait at the lock for this code.
-            dispatcher._cache.release()
+            shared.release()
             _compile_times.append(time.perf_counter() - started)
 
     dispatcher._compile_for_args = compile_with_settings

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import types
+from numba import typeof, types
 from numba.core import cgutils
 from numba.extending import (
     intrinsic,
@@ -32,7 +32,7 @@ class GenericType(types.Callable, types.Opaque):
 
     def _kernel(self, args: Any) -> Any:
         """Return the numba type of the chosen kernel."""
-        return self._function.kernel_of(class_of(args[0]))._numba_type_
+        return typeof(self._function.kernel_of(class_of(args[0])))
 
     def get_call_type(self, context: Any, args: Any, kws: Any) -> Any:
         """Return the signature of a call, as numba asks."""

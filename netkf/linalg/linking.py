@@ -27,6 +27,8 @@ class _Depth(threading.local):
 
 
 _DEPTH = _Depth()
+_given_up: list[bool] = []
+"""Not empty once numba could not compile so what it could compile in its own way."""
 _INNER_NAMES: set[str] = set()
 """LLVM names of the functions of inner libraries."""
 _UNLINKED: weakref.WeakSet[Any] = weakref.WeakSet()
@@ -47,13 +49,18 @@ def linked_once() -> Iterator[None]:
         yield
 
 
+def give_up() -> None:
+    """Let numba compile in its own way from now on: it is not as it was when this was written."""
+    _given_up.append(True)
+
+
 @contextmanager
 def _patched_numba() -> Iterator[None]:
     """Replace the methods of numba that ``_patches`` lists within this context:
     all of them, or none if this version of numba lacks one. They are restored at the end.
     """
     try:
-        patches = _patches()
+        patches = [] if _given_up else _patches()
         # All originals are looked up before the first is replaced.
         originals = [(owner, name, owner.__dict__[name]) for owner, name, _ in patches]
     except (AttributeError, ImportError, KeyError):
