@@ -82,12 +82,7 @@ class ExpectedIncrements:
 
 
 def _expected_increments_of_models() -> Callable[[Any], ExpectedIncrements]:
-    """Return a function from a node's model to its ExpectedIncrements, which give innovations of
-    the increments y = int dy that a continuous sensor of the node reads over an interval: y minus H
-    times the integral of the predicted state.
-
-    They are set up once for each model.
-    """
+    """Return a function from a node's model to its ExpectedIncrements, set up once each."""
     cache: dict[int, tuple[Any, ExpectedIncrements]] = {}
 
     def expected_increments(model: Any) -> ExpectedIncrements:
@@ -123,9 +118,7 @@ class _IncrementRecorder(_Filter):
         return TimedState(super().predict(state.inner, gap), state.node, state.time + gap, start)
 
     def update(self, state: TimedState, reading: Increments | Reading) -> TimedState:
-        """Update by ``reading`` as the filter does; of increments (an interval of a continuous
-        sensor), append the whitened innovation from the estimate at its start first.
-        """
+        """Update as the filter does; append the whitened innovations of increments first."""
         xhat, P = state.start
         if isinstance(reading, Increments) and P is not None and np.isfinite(P).all():
             # The first half of the moments is the integral of dy.

@@ -94,16 +94,11 @@ def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
 
 
 def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
-    """Return a filter with the estimates of ``algorithm`` that also appends each reading that it is
-    updated with, and the estimate before it, to ``samples``: a replay of a run with it gives the
-    readings, which traces do not contain.
-    """
+    """Return the filter ``algorithm`` that also appends what it is updated with to ``samples``."""
     base: Any = type(algorithm)
 
     def update(self: Any, state: Any, reading: Any) -> Any:
-        """Append the sample, with the estimate before it, to ``samples``, then update as the filter
-        does.
-        """
+        """Append the sample with the estimate before it, then update as the filter does."""
         if isinstance(reading, Reading):
             samples.append(RecordedSample(reading, *self.estimate(state)))
         return base.update(self, state, reading)
@@ -124,12 +119,7 @@ def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
 def _collect_innovations(
     run: Run, samples: list[RecordedSample], intervals: list[WhitenedInnovation]
 ) -> Innovations:
-    """Return the innovations of the M readings that a replay of a run recorded, in order of time:
-    times, nodes and NIS, (M,) each, and the whitened innovations (p,).
-
-    ``samples`` are readings at an instant, ``intervals`` those of continuous sensors.
-    Raises NetkfError if there are none, or no covariance to judge them by.
-    """
+    """Return the innovations of a replay in order of time; raises NetkfError."""
     nodes, samples = _match_nodes(run, [sample for sample in samples if len(sample.reading.y)])
     whitened = [_whiten(sample) for sample in samples]
     whitened += [interval.whitened for interval in intervals]
@@ -158,12 +148,7 @@ def _collect_innovations(
 def _match_nodes(
     run: Run, samples: list[RecordedSample]
 ) -> tuple[np.ndarray, list[RecordedSample]]:
-    """Return the node id of each sample (M,), -1 if a pooled filter reads for all, and the M
-    samples without those after the last event of the run.
-
-    Readings do not name their node: it is that of the ``sense`` event in the same place of the
-    order.
-    """
+    """Return the node of each sample (M,), by its ``sense`` event; -1 if a pooled filter reads."""
     senses = run.log[run.log["kind"] == CODES["sense"]][["t", "node"]]
     # A node with several sensors uses them together, and may have an event for each.
     first = np.ones(len(senses), dtype=bool)
@@ -177,9 +162,7 @@ def _match_nodes(
 
 
 def _whiten(sample: RecordedSample) -> FloatArray:
-    """Return the innovation (p,) of a sample times the inverse Cholesky factor of its covariance;
-    nan if the filter gives no finite P.
-    """
+    """Return the innovation (p,) in units of its covariance; nan without a finite P."""
     reading, xhat, P = sample
     if P is None or not np.isfinite(P).all():
         return np.full(len(reading.y), np.nan)

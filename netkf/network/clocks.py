@@ -395,9 +395,7 @@ class RecordedClock(LinkClock):
 
     @cached_property
     def _rows(self) -> tuple[list[tuple[Entity, float]], dict[Entity, int]]:
-        """The entity and the time in seconds of each row, and the line number of the first row of
-        each node, or of each pair (node, peer) as listed.
-        """
+        """Entity and time (s) of each row, and the first line of each node or pair."""
         columns = ("node",) if self.at == "nodes" else ("node", "peer")
         if self.at == "nodes" and "peer" in read_header(self.path):
             raise ScenarioError(

@@ -82,9 +82,7 @@ class Contacts(LinkClock):
 
     @cached_property
     def _intervals(self) -> dict[Entity, tuple[FloatArray, FloatArray]]:
-        """Beginnings and ends (K,) each, in seconds, of the contacts of each link, which increase:
-        overlapping ones are joined.
-        """
+        """Beginnings and ends (K,) of the contacts of each link, in seconds, joined if they overlap."""
         intervals: dict[Entity, tuple[list[float], list[float]]] = {}
         for pair, begin, end in sorted(set(self.row_keys)):
             begins, ends = intervals.setdefault(pair, ([], []))
@@ -168,9 +166,7 @@ class Contacts(LinkClock):
         return np.array(ticks)
 
     def _next_number(self, origin: float, now: float) -> int:
-        """Return the number of the first tick of ``clock`` after one at ``now`` (0 before the
-        first), in seconds, if its ticks are counted from ``origin``; 0 if numbers are not used.
-        """
+        """Return the number of the first tick after ``now``, counted from ``origin``."""
         clock = self.clock
         if now == 0.0:
             return 0

@@ -120,10 +120,7 @@ class EdgelistGraph(GraphFile):
 
 
 def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
-    """Return the links of a networkx graph, which was read from the file ``path``.
-
-    Raises ScenarioError, at no key, for an edge that is no link, and for two values of one link.
-    """
+    """Return the links of a networkx graph, read from ``path``; raises ScenarioError."""
     ids = assign_ids(graph.nodes)
     twice = [name for name, count in Counter(map(str, ids)).items() if count > 1]
     if twice:

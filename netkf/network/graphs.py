@@ -169,9 +169,7 @@ class Topology:
         return self._ends(1)
 
     def _ends(self, end: int) -> dict[int, tuple[int, ...]]:
-        """Return for each node its peers: the other ends of the directions that have the node at
-        position ``end``, 0 for the sender and 1 for the receiver.
-        """
+        """Return the peers of each node at position ``end`` of the directions: 0 sender, 1 receiver."""
         peers: dict[int, list[int]] = {node: [] for node in self.nodes}
         for direction in self.directions:
             peers[direction[end]].append(direction[1 - end])
@@ -239,9 +237,7 @@ class Graph(Component):
 
 
 def _make_topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topology:
-    """Return the topology of ``nodes`` (ids) with undirected ``links`` between them, each given in
-    any order of its ends; ``more`` are other fields of Topology.
-    """
+    """Return the topology of ``nodes`` with undirected ``links``, in any order of their ends."""
     pairs = {(min(link), max(link)) for link in links}
     return Topology(tuple(sorted(nodes)), tuple(sorted(pairs)), **more)
 
@@ -351,10 +347,7 @@ class RandomGraph(Graph):
     def _draw(
         self, seed: int, make: Callable[[np.random.RandomState], networkx.Graph[Any]]
     ) -> networkx.Graph[Any]:
-        """Return the graph that ``make`` draws with the graph's own seed, or else with the root
-        seed ``seed``; if ``connected``, the first connected one of successive seeds. Raises
-        ScenarioError if none of the tries is.
-        """
+        """Return the graph drawn with its own seed or ``seed``; raises ScenarioError."""
         import networkx
 
         first_seed, tries, entries = seed if self.seed is None else self.seed, 0, 0
@@ -463,9 +456,7 @@ class Geometric(RandomGraph):
 
 
 def _probability_within(radius: float) -> float:
-    """Return the probability that two uniform points of the unit square are within ``radius`` <= 1
-    of each other, from which the expected number of links follows.
-    """
+    """Return the probability that two uniform points of the unit square are within ``radius``."""
     return math.pi * radius**2 - 8.0 / 3.0 * radius**3 + 0.5 * radius**4
 
 
@@ -651,18 +642,14 @@ class LinkTable:
         return next((name for name, k in self.names.items() if k == node), str(node))
 
     def _with_reverse_links(self) -> dict[Link, float]:
-        """Return the probabilities with the reverse of each row added, for a table that lists every
-        undirected link once; unchanged if links are directed or any is listed both ways.
-        """
+        """Return the table with each row reversed too, unless links are listed both ways."""
         probability = self.probability
         if self.directed or any((j, i) in probability for i, j in probability):
             return probability
         return probability | {(j, i): p for (i, j), p in probability.items()}
 
     def _links(self, delivery: dict[Link, float], minimum: float) -> set[Link]:
-        """Return the directions (sender, receiver) whose probability in ``delivery`` reaches the
-        minimum, in both directions if the graph is undirected.
-        """
+        """Return the directions whose probability reaches the minimum, both ways if undirected."""
         return {
             (i, j)
             for (i, j), p in delivery.items()
@@ -670,9 +657,7 @@ class LinkTable:
         }
 
     def _delivery(self, delivery: dict[Link, float], links: set[Link]) -> dict[Link, float]:
-        """Return the delivery probability of each direction (sender, receiver) of the ``links``, 0
-        where the table ``delivery`` does not list it.
-        """
+        """Return the delivery probability of each of ``links``, 0 where it is not listed."""
         pairs = links if self.directed else links | {(j, i) for i, j in links}
         return {pair: delivery.get(pair, 0.0) for pair in sorted(pairs)}
 
@@ -730,9 +715,7 @@ class CsvGraph(Graph):
 def _place_nodes(
     source: SourceFile | None, nodes: set[int], left_out: set[int], names: Mapping[str, int]
 ) -> tuple[dict[int, tuple[float, float]] | None, RowUse | None]:
-    """Return the coordinates (x, y) of ``nodes`` (ids) by node, and the use of the table's rows;
-    None for both without a file. Rows of nodes that are ``left_out`` count as used.
-    """
+    """Return the coordinates of ``nodes``, and the use of the table's rows; None without a file."""
     if source is None:
         return None, None
     try:
@@ -755,9 +738,7 @@ def _place_nodes(
 
 
 def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]], list[int]]:
-    """Return the coordinates (x, y) by node id of a table whose first three columns are node, x and
-    y, and the node of each row. Raises ScenarioError for a node at two places.
-    """
+    """Return the coordinates by node of a table, and its nodes; raises ScenarioError."""
     names = tuple(read_header(source)[:3])
     if len(names) < 3:
         rule = f"{source.name} must have the columns node, x, y"
@@ -770,9 +751,7 @@ def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]],
 
 
 def _isolated_note(nodes: Sequence[str], minimum: float) -> tuple[str, ...]:
-    """Return a note on ``nodes`` (names) that are left out because they have no link whose
-    probability reaches ``minimum``, none if there are no such nodes.
-    """
+    """Return a note on ``nodes`` left out because no link reaches ``minimum``, or none."""
     if not nodes:
         return ()
     plural = "" if len(nodes) == 1 else "s"

@@ -106,9 +106,7 @@ class Matching(SlotActivation):
         return draws[self.protocol](topology, random)
 
     def _one_edge(self, topology: Topology, random: np.random.Generator) -> list[Link]:
-        """Return one link, drawn uniformly, or no link with probability ``lazy``; both numbers are
-        drawn in any case, so that the stream goes on alike.
-        """
+        """Return one uniform link, or none with probability ``lazy``; both numbers are drawn."""
         lazy = random.random() < (self.lazy or 0.0)
         edge = topology.links[int(random.integers(len(topology.links)))]
         return [] if lazy else [edge]
@@ -137,9 +135,7 @@ class Matching(SlotActivation):
         return mean
 
     def _pairing_probabilities(self, topology: Topology) -> dict[Link, float]:
-        """Return the exact probability of each link to be paired in a slot, by link (i, j), i < j;
-        raises ScenarioError if the protocol needs all matchings and the graph has too many links.
-        """
+        """Return the exact probability that each link is paired; raises ScenarioError."""
         links, degrees = topology.links, topology.degrees
         if self.protocol == "one-edge":
             return dict.fromkeys(links, (1.0 - (self.lazy or 0.0)) / max(len(links), 1))
@@ -165,9 +161,7 @@ class Matching(SlotActivation):
 
 
 def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
-    """Draw a node uniformly and one of its neighbours uniformly; return their link [(i, j)], i < j,
-    or an empty list if the node has no neighbours.
-    """
+    """Return the link of a uniform node and a uniform neighbour; none without neighbours."""
     node = topology.nodes[int(random.integers(len(topology.nodes)))]
     uniform = random.random()
     peers = sorted({j if i == node else i for i, j in topology.links if node in (i, j)})
@@ -178,18 +172,14 @@ def _node_wakeup(topology: Topology, random: np.random.Generator) -> list[Link]:
 
 
 def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link]:
-    """Draw an order of all links and return the maximal matching that takes each link, in this
-    order, if both ends are free.
-    """
+    """Return the maximal matching that takes links in a random order."""
     links = topology.links
     order = random.permutation(len(links)).tolist()
     return _choose_greedily([links[k] for k in order])
 
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
-    """Draw one of all maximal matchings of the graph, each with equal probability, and return its
-    links.
-    """
+    """Return one of all maximal matchings, each with equal probability."""
     matchings = maximal_matchings(topology.links)
     return list(matchings[int(random.integers(len(matchings)))])
 
@@ -214,9 +204,7 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
     matchings: set[tuple[Link, ...]] = set()
 
     def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:
-        """Add all maximal matchings that consist of the ``chosen`` links and some of the ``free``
-        ones, which meet none of the chosen.
-        """
+        """Add all maximal matchings of the ``chosen`` links and some ``free`` ones."""
         if not free:
             matchings.add(tuple(sorted(chosen)))
             return
@@ -231,13 +219,7 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
 
 
 def _greedy_probabilities(links: tuple[Link, ...]) -> tuple[float, ...]:
-    """Return the probability (one for each of ``links``) that each link is in the greedy matching
-    in random order.
-
-    The first link a of a random order is uniform, and the links that do not meet it follow in a
-    random order again: ``p(free) = mean over a in free of (1 at a) + p(free without those that meet
-    a)``. This is a recursion over sets of links, as bit masks.
-    """
+    """Return the probability that each link is in the greedy matching in random order."""
     count = len(links)
     meets = [
         sum(1 << b for b in range(count) if set(links[a]) & set(links[b])) for a in range(count)
@@ -245,9 +227,7 @@ def _greedy_probabilities(links: tuple[Link, ...]) -> tuple[float, ...]:
 
     @cache
     def probabilities(free: int) -> tuple[float, ...]:
-        """Return the probability that each link is in the matching if those of ``free`` (a bit
-        mask) may still be chosen: the mean over the link that is chosen next.
-        """
+        """Return p(free) = mean over a in ``free`` (a bit mask) of (1 at a) + p(free without a)."""
         candidates = [a for a in range(count) if free >> a & 1]
         total = [0.0] * count
         for a in candidates:
@@ -328,9 +308,7 @@ class RecordedSlots(SlotActivation):
         return {key: sorted(listed) for key, listed in pairs.items()}
 
     def _demand_free(self, slot: int, link: Link, line: int, listed: dict[Link, int]) -> None:
-        """Raise ScenarioError if a node of ``link`` is in one of the pairs ``listed`` for the slot,
-        each with its line number, or if the link joins a node to itself.
-        """
+        """Raise ScenarioError if a node of ``link`` is already paired in the slot."""
         other = next((line for pair, line in listed.items() if set(pair) & set(link)), None)
         if other is None and link[0] != link[1]:
             return

@@ -207,10 +207,7 @@ class RecordedDelay(Delay):
 
 
 def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
-    """Return the value of message number ``message`` on ``link`` (sender, receiver) in the table,
-    None if it is not listed; ``after`` is the treatment of such messages. Errors name the ``key``
-    of the scenario that the table belongs to, as the message is asked for during a run.
-    """
+    """Return the value of ``message`` on ``link`` in the table, or None; errors name ``key``."""
     # Asked for during a run, so the error must carry the whole path of its key.
     try:
         return table.value(link, message, after)

@@ -26,11 +26,7 @@ def largest_laplacian_eigenvalue(degrees: FloatArray, ends: np.ndarray) -> float
 
 
 def _largest_sparse(degrees: FloatArray, ends: np.ndarray) -> float:
-    """Return the largest eigenvalue of the Laplacian of an undirected graph, by Lanczos' method.
-
-    ``degrees`` (N,) are the numbers of links at each node, ``ends`` (L, 2) the indices of the two
-    nodes of each of L links.
-    """
+    """Return the largest eigenvalue of the Laplacian of an undirected graph, by Lanczos' method."""
     import scipy.sparse
     import scipy.sparse.linalg
 

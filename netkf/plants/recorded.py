@@ -113,7 +113,7 @@ class RecordedPlant(LinearPlant):
 
     @property
     def row_keys(self) -> list[int]:
-        """What each row is about, in the order of the table: its slot or, with ``interpolate``, its
+        """The subject of each row, in the order of the table: its slot or, with ``interpolate``, its
         place among the times of the table.
         """
         return self._slots if self.interpolate is None else _time_keys(self.row_times)

@@ -54,9 +54,7 @@ def fill_nees(
 
 
 def _is_regular(P: FloatArray) -> np.ndarray:
-    """Return a mask (K,) of the K matrices P (K, n, n) that are finite and of full rank up to
-    rounding: NEES is nan for the others.
-    """
+    """Return a mask (K,) of finite P (K, n, n) of full rank up to rounding."""
     regular = np.asarray(np.isfinite(P).all(axis=(1, 2)))
     regular[regular] = is_definite(P[regular])
     return regular

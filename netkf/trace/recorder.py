@@ -144,9 +144,7 @@ class Recorder:
                     thread.shutdown()
 
     def _flush_gathered(self) -> None:
-        """Pass the events gathered by ``append`` to all sinks, or only count them with
-        ``counts_only``.
-        """
+        """Pass the gathered events to all sinks, or only count them."""
         if not self._rows:
             return
         if self.counts_only:
@@ -182,9 +180,7 @@ class Recorder:
         self._counts += counts
 
     def _run_or_submit(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Call ``function`` now, or in the recorder's thread after earlier calls if it has one (it
-        starts with the first long block): sinks get everything in order.
-        """
+        """Call ``function`` now, or in order in the recorder's thread if it has one."""
         if self._thread is None:
             function(*arguments)
         else:

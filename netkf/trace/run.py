@@ -115,9 +115,7 @@ class Run(NotebookTable):
         return plot_by_name(self, figure)
 
     def _notebook_table(self) -> pd.DataFrame:
-        """Return averages over the samples after time 0, a row per node: the table that notebooks
-        display for a run.
-        """
+        """Return averages over the samples after time 0, a row per node."""
         import pandas as pd
 
         after = self.times > 0.0
@@ -273,9 +271,7 @@ def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None
 
 
 def _first_different_row(one: pd.DataFrame, other: pd.DataFrame, names: list[str]) -> int:
-    """Return the number of the first row in which the columns ``names`` of two tables of events
-    differ; the length of the shorter table if none does. nan equals nan.
-    """
+    """Return the first row in which the columns ``names`` differ; nan equals nan."""
     shorter = min(len(one), len(other))
     differs = np.zeros(shorter, dtype=bool)
     for name in names:

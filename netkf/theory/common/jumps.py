@@ -133,7 +133,7 @@ class ClockJumps:
 
     @cached_property
     def _chains(self) -> list[IntArray]:
-        """For each clock the indices of the bursty chains that make a step at its ticks."""
+        """The indices, by clock, of the bursty chains that make a step at its ticks."""
         assert self.directions is not None
         return [
             np.unique(self.directions.source[tick_directions]) for _, tick_directions in self.ticks
