@@ -82,7 +82,7 @@ class Contacts(LinkClock):
 
     @cached_property
     def _intervals(self) -> dict[Entity, tuple[FloatArray, FloatArray]]:
-        """Beginnings and ends (K,) of the contacts of each link, in seconds, joined if they overlap."""
+        """Beginnings and ends (K,) in seconds of the contacts of each link, joined on overlap."""
         intervals: dict[Entity, tuple[list[float], list[float]]] = {}
         for pair, begin, end in sorted(set(self.row_keys)):
             begins, ends = intervals.setdefault(pair, ([], []))

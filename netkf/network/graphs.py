@@ -169,7 +169,7 @@ class Topology:
         return self._ends(1)
 
     def _ends(self, end: int) -> dict[int, tuple[int, ...]]:
-        """Return the peers of each node at position ``end`` of the directions: 0 sender, 1 receiver."""
+        """Return the peers of each node as ``end`` of directions: 0 sender, 1 receiver."""
         peers: dict[int, list[int]] = {node: [] for node in self.nodes}
         for direction in self.directions:
             peers[direction[end]].append(direction[1 - end])
