@@ -113,8 +113,8 @@ class RecordedPlant(LinearPlant):
 
     @property
     def row_keys(self) -> list[int]:
-        """The subject of each row, in the order of the table: its slot or, with ``interpolate``, its
-        place among the times of the table.
+        """The subject of each row, in the order of the table: its slot or, with ``interpolate``,
+        its place among the times of the table.
         """
         return self._slots if self.interpolate is None else _time_keys(self.row_times)
 
