@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.gains import Gains, stack_gains
+from netkf.algorithms.kernels.gains import Gains, no_gains, stack_gains
 from netkf.algorithms.kernels.root_flow import flow_scratch, stack_tables
 from netkf.algorithms.kernels.run import (
     ClockRun,
@@ -29,6 +29,7 @@ from netkf.algorithms.records import Kernels, Records, make_records
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE
 
+_NO_READING: Any = (np.zeros(0), np.zeros((0, 0)))
 OWN = 0
 """The reading of ``update`` in the tables of a run; those of messages follow."""
 
@@ -99,7 +100,7 @@ class NodeState:
     def copied(self) -> NodeState:
         """Return a state with arrays of its own."""
         record, cls = self.record, type(self.record)
-        new = cls.__new__(cls)
+        new: Any = object.__new__(cls)
         memory = record.memory.copy()
         object.__setattr__(new, "memory", memory)
         object.__setattr__(new, "address", address_of(memory))
@@ -162,34 +163,42 @@ class Surroundings:
 
     def set_readings(self, readings: Sequence[tuple[FloatArray, FloatArray]]) -> None:
         """Make these whitened readings (y (p,), H (p, n)) the numbers 0, 1, ... of the run."""
-        n, p = len(self.struct.size), max(1, *(len(y) for y, _ in readings))
-        ys, Hs = np.zeros((len(readings), p, 1)), np.zeros((len(readings), p, n, 1))
+        run, most = self.struct, max((len(y) for y, _ in readings), default=0)
+        count, p = run.y.shape[:2]
+        if len(readings) > count or most > p:
+            count, p = max(count, len(readings)), max(p, most)
+            run.y, run.H = np.zeros((count, p, 1)), np.zeros((count, p, len(run.size), 1))
+            run.rows, run.matrix = np.zeros(count, dtype=np.int64), np.arange(count)
         for k, (y, H) in enumerate(readings):
-            ys[k, : len(y), 0], Hs[k, : len(y), :, 0] = y, H
-        self.struct.y, self.struct.H = ys, Hs
-        self.struct.rows = np.array([len(y) for y, _ in readings], dtype=np.int64)
-        self.struct.matrix = np.arange(len(readings))
+            if len(y):
+                run.y[k, : len(y), 0], run.H[k, : len(y), :, 0] = y, H
+            run.rows[k] = len(y)
 
     def set_inbox(self, messages: Sequence[Any], slotted: bool) -> None:
         """Make these messages the inbox of the run; their readings are numbered after the own."""
         run, count = self.struct, len(messages)
-        run.message, run.age = np.arange(max(1, count)), np.zeros(max(1, count))
-        run.link, run.heard = (np.full(max(1, count), value) for value in (0, -1))
-        run.message_weight = np.ones(max(1, count))
-        run.arrived = np.ones((max(1, count), 1), dtype=np.uint8)
+        if count > len(run.message):
+            run.message, run.age, run.message_weight = (
+                np.arange(count),
+                np.zeros(count),
+                np.ones(count),
+            )
+            run.link, run.heard = (np.zeros(count, dtype=np.int64) for _ in range(2))
+            run.arrived = np.ones((count, 1), dtype=np.uint8)
         run.count = count
-        readings: list[Any] = []
+        readings: list[Any] = [_NO_READING]
         for k, message in enumerate(messages):
             # A sender that was not announced gets the next link.
             run.link[k] = self.links.setdefault(message.sender, len(self.links))
             run.message_weight[k] = message.weight
             run.age[k] = 0.0 if slotted else message.age
             reading = getattr(message.payload, "reading", None)
+            run.heard[k] = -1
             if reading is not None:
-                readings.append(reading)
                 run.heard[k] = len(readings)
-        nothing = np.zeros(0), np.zeros((0, len(run.size)))
-        self.set_readings([nothing, *readings])
+                readings.append(reading)
+        if len(readings) > 1:
+            self.set_readings(readings)
 
     def prepare(self, record: Any, slot: int) -> None:
         """Let the filter set what it knows of a slot before the run."""
@@ -212,7 +221,7 @@ def clock_tables(model: FlowModel, unrolled: bool) -> ClockTables:
     """Return the model of one node under clocks as kernels take it."""
     table = stack_tables([model.flow, model.unobserved_flow])
     gains = _gains_of(model)
-    return clock_tables_class(len(model.A), unrolled)(
+    tables: ClockTables = clock_tables_class(len(model.A), unrolled)(
         table=table,
         models=np.zeros(1, dtype=np.int64),
         gains=gains,
@@ -223,12 +232,11 @@ def clock_tables(model: FlowModel, unrolled: bool) -> ClockTables:
         mean=np.zeros((1, len(model.A))),
         mean_root=np.zeros((1, len(model.A), len(model.A))),
     )
+    return tables
 
 
 def _gains_of(model: FlowModel) -> Gains:
     """Return the gains of a model, without any if its node reads no increments."""
-    from netkf.algorithms.kernels.gains import no_gains
-
     return stack_gains([model.gains if len(model.H) else no_gains(len(model.A))])
 
 

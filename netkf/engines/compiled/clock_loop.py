@@ -12,6 +12,7 @@ from typing import Any
 
 from netkf.algorithms.kernels.run import ClockRun, interval_end
 from netkf.algorithms.records import Kernels
+from netkf.core.instants import snapped
 from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.batch_loop import BatchArrays, begin, finish, reset_messages
 from netkf.engines.compiled.event_loop import (
@@ -217,7 +218,7 @@ def ticking_of(kernels: Kernels, predict_node: Any) -> Any:  # noqa: ARG001
         used = False
         for k in range(first, after):
             w = state.outgoing[k]
-            delay = ticks.delay[outcome + k - first]
+            delay = snapped(ticks.delay[outcome + k - first], state.per_second)
             if is_sent(state, w, delay, now):
                 copy = m
                 if used:
@@ -266,7 +267,7 @@ def absorption_of(kernels: Kernels) -> Any:
         m = node.inbox
         while m != -1:
             message = pool[m]
-            age = now - message.sent
+            age = snapped(now - message.sent, state.per_second)
             oldest = max(oldest, age)
             w = message.direction
             run.message[count], run.link[count] = m, state.incoming[w]
@@ -335,7 +336,8 @@ def is_sent(state: Simulation, w: int, delay: float, now: float) -> bool:
         record_event(state, now, LOST, sender_id, receiver_id, number)
         return False
     # The horizon is half open: a message that arrives after it leaves no event.
-    return not (delay > 0.0 and not now + delay < state.horizon)
+    arrival = snapped(now + delay, state.per_second)
+    return not (delay > 0.0 and not arrival < state.horizon)
 
 
 @kernel
@@ -350,7 +352,8 @@ def dispatch(state: Simulation, w: int, m: int, tag: int, delay: float, now: flo
         arrive(state, m, now)
         return
     # ``order`` breaks ties between messages of one link that arrive at the same time.
-    message.arrival, message.order = now + delay, state.order
+    message.arrival = snapped(now + delay, state.per_second)
+    message.order = state.order
     state.order += 1
     push(state.pool, state.heap, state.in_flight, m)
     state.in_flight += 1

@@ -17,6 +17,7 @@ from netkf.engines.compiled.slot_loop import (
     slot_loop,
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned
 
 _KINDS = {"predict": PREDICT, "sense": SENSE, "exchange": EXCHANGE}
@@ -73,8 +74,12 @@ class SlotFilters:
             **scratch_of(n, LANES),
         )
         # L entries are copied at a time, so that the last copy may go beyond the last entry.
-        sizes = H * n + LANES, H * n + LANES, H * n * n + LANES
-        self.sample_scratch = [aligned((size, LANES)) for size in sizes]
+        means, covariances = H * n + LANES, H * n * n + LANES
+        self.sample_scratch: tuple[FloatArray, FloatArray, FloatArray] = (
+            aligned((means, LANES)),
+            aligned((means, LANES)),
+            aligned((covariances, LANES)),
+        )
         algorithm = setup.algorithm
         stages = [
             kind for kind in algorithm.schedule or () if algorithm.talks or kind != "exchange"

@@ -245,7 +245,12 @@ class SlotRuns:
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
         if self._filters is not None:
-            self._simulate(times, messages, readings, (x, xhat, P, error), local, absolute)
+            runs = np.zeros(LANES, dtype=np.int64)
+            kernel_output = loop.SlotSamples(
+                x, xhat, P, error, absolute, local, setup.frame > 0, self._total,
+                *self._filters.sample_scratch, runs,
+            )  # fmt: skip
+            self._simulate(times, messages, readings, kernel_output)
             return SlotBlock(sampled, samples, times, messages)
         kernel_samples = SlotSamples(
             x=x,
@@ -295,24 +300,13 @@ class SlotRuns:
         times: SlotTimes,
         messages: SlotMessages,
         readings: ReadingBlock,
-        flat: tuple[FloatArray, ...],
-        local: FloatArray,
-        absolute: FloatArray,
+        samples: loop.SlotSamples,
     ) -> None:
-        """Simulate the filters in the slots of ``times`` and write their samples into ``flat``, and
-        which nodes send into ``messages``.
+        """Simulate the filters in the slots of ``times``, write ``samples``, and which nodes send
+        into ``messages``.
         """
         filters, count = self._filters, len(times.start)
         assert filters is not None
-        samples = loop.SlotSamples(
-            *flat,
-            absolute,
-            local,
-            self.setup.frame > 0,
-            self._total,
-            *filters.sample_scratch,
-            np.zeros(LANES, dtype=np.int64),
-        )
         drawn: dict[str, Any] = {
             "first": self._slot,
             "sensed": times.sensed,
