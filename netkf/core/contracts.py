@@ -143,9 +143,7 @@ def _watched(cls: type, own: FunctionType, contract: FunctionType) -> Any:
 
 
 def _count(inner: str) -> int:
-    """Return the number of entries of a tuple type by the text ``inner`` of its brackets, 0 if any
-    number may be there.
-    """
+    """Return the number of entries of a tuple type by the text ``inner`` of its brackets."""
     if inner.endswith("..."):
         return 0
     depth, count = 0, 1

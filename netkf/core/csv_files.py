@@ -221,9 +221,7 @@ class _Entries:
         return self._limited(column, value)
 
     def _with_point(self, text: str) -> str:
-        """Return a number with a decimal point for a decimal comma, if the columns are not
-        separated by commas; raises ScenarioError if the table mixes both.
-        """
+        """Return a number with a decimal point for a decimal comma."""
         if self._separator == "," or ":" in text:
             return text
         for sign in ",.":
@@ -349,10 +347,7 @@ def read_content(source: SourceFile) -> bytes:
 
 @contextmanager
 def _open_table(source: SourceFile) -> Iterator[_Sheet]:
-    """Open a table for a block.
-
-    Raises ScenarioError if the file, also while its rows are iterated, cannot be read as a table.
-    """
+    """Open a table for a block; raises ScenarioError if it cannot be read as one."""
     start = b""
     try:
         with source.full.open("rb") as packed:

@@ -132,9 +132,7 @@ class Component:
 
 
 def _check_settings(cls: type, values: Sequence[Any], named: Mapping[str, Any]) -> None:
-    """Raise ScenarioError if settings of a component's class cannot be given so: ``values`` without
-    names, and those that are ``named``.
-    """
+    """Raise ScenarioError for too many ``values`` without names, and unknown ``named`` ones."""
     fields = [f for f in dataclasses.fields(cls) if f.init]
     unnamed = [f.name for f in fields if not f.kw_only]
     listed = ", ".join(f"{f.name}=..." for f in fields)
@@ -179,9 +177,7 @@ def number(
     ]
 
     def convert(value: Any) -> float:
-        """Return the value as a finite float within the limits, else raise TypeError or ValueError
-        (see Rule).
-        """
+        """Return the value as a finite float within the limits."""
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise TypeError
         result = float(value)
@@ -244,9 +240,7 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
     """Return the rule for an integer from ``low`` to ``high``; None means no limit."""
 
     def convert(value: Any) -> int:
-        """Return the value as an int within the limits, else raise TypeError or ValueError (see
-        Rule).
-        """
+        """Return the value as an int within the limits."""
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise TypeError
         if (low is not None and value < low) or (high is not None and value > high):
@@ -566,11 +560,7 @@ class SourceFile:
 
 
 def _convert_source_file(value: Any) -> SourceFile:
-    """Return the value as an existing SourceFile inside its folder.
-
-    A path from Python is relative to the current folder; the folder of an absolute path is the one
-    that the file is in.
-    """
+    """Return the value as an existing SourceFile inside its folder."""
     if isinstance(value, SourceFile):
         source = value
     elif isinstance(value, (str, Path)) and str(value):

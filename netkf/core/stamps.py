@@ -57,9 +57,7 @@ class TimeBase:
 
     @lru_cache(maxsize=64)  # noqa: B019 - bases are few and small
     def _half_digit(self, exponent: int) -> float:
-        """Return half of the last digit of a stamp that is 10 to this ``exponent``, with that of
-        the origin.
-        """
+        """Return half of the last digit of a stamp that is 10 to this ``exponent``."""
         own = 0.5 * 10.0**exponent
         return own + 0.5 * 10.0 ** min(exponent, _last_digit(self.origin)) if self.origin else own
 

@@ -115,9 +115,7 @@ def pack_scenario(scenario: Scenario) -> PackedScenario:
 
 
 def _plugged_in_modules(scenario: Scenario) -> set[tuple[str, str]]:
-    """Return (module name, folder to import it from) for each class of the scenario that a user
-    wrote, so that workers can import it too; not for classes in the script itself (__main__).
-    """
+    """Return (module, folder) of each class of the scenario that a user wrote."""
     modules = set()
     for part in user_components(scenario):
         name = type(part).__module__
@@ -147,9 +145,7 @@ def unpack_scenario(packed: PackedScenario) -> Scenario:
 
 
 def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
-    """Raise EngineError unless this worker has the ``required_versions`` of packages, (name,
-    version) each, that the command has: with others, results could differ in the last bits.
-    """
+    """Raise EngineError unless this worker has the ``required_versions`` (name, version)."""
     installed = versions()
     differences = [
         (name, installed.get(name, "none"), required)
@@ -163,9 +159,7 @@ def _check_versions(required_versions: tuple[tuple[str, str], ...]) -> None:
 
 
 def _unpickle(packed: PackedScenario) -> Scenario:
-    """Return the scenario of ``packed`` in a worker, after the folders of its plugged-in classes
-    have been made importable there; raises EngineError if one cannot be imported.
-    """
+    """Return the scenario of ``packed`` in a worker."""
     if packed.versions:
         _check_versions(packed.versions)
     for name, folder in packed.modules:

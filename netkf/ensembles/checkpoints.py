@@ -168,9 +168,7 @@ class BlockCheckpoints:
         return self._folder / f"{number:06d}.npz"
 
     def _check(self, file: Path, identity: dict[str, Any]) -> None:
-        """Raise DamagedError unless a block's file is intact, its stored identity has the values of
-        ``identity``, and its arrays fit the scenario.
-        """
+        """Raise DamagedError unless a block's file is intact."""
         with _open_block(file, verified=False) as arrays:
             stored = _read_texts(arrays).get("identity")
             for key, value in identity.items():
@@ -183,9 +181,7 @@ class BlockCheckpoints:
                 raise DamagedError("lacks numbers that every run has")
 
     def _has_form(self, statistics: RunStatistics) -> bool:
-        """Return True if all arrays of ``statistics``, read from a file, have the shapes and types
-        that those of this scenario have.
-        """
+        """Return True if the arrays of ``statistics`` have the shapes and types they should."""
         count, n = len(self._scenario.nodes), self._scenario.plant.n
         # Columns and rows of moments; those that are not listed have one row.
         columns = {"samples": count * (n * (n + 1) + 1), "averages": 3 * (count + 1)}
@@ -202,9 +198,7 @@ class BlockCheckpoints:
         )
 
     def _has_numbers(self, statistics: RunStatistics) -> bool:
-        """Return True if ``statistics`` of the right form have no nan or impossible count where
-        runs of this scenario have numbers.
-        """
+        """Return True if ``statistics`` of the right form have no nan or impossible count."""
         n, u = self._scenario.plant.n, self._scenario.plant.n * (self._scenario.plant.n + 1) // 2
         moments = [getattr(statistics, name) for name in PARTS]
         moments += [sums for sums, _ in statistics.conserved.values()]
@@ -229,9 +223,7 @@ class BlockCheckpoints:
         )
 
     def _restore_trace(self, arrays: Any, k: int) -> Trace:
-        """Return the k-th trace (events and samples of one run) of a block from its stored
-        ``arrays``; raises DamagedError if it does not fit the scenario.
-        """
+        """Return the k-th trace of a block from its stored ``arrays``."""
         trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
         # replica, log, times, x, xhat, P, error
@@ -243,9 +235,7 @@ class BlockCheckpoints:
 
     @contextlib.contextmanager
     def _expect_block(self, number: int) -> Iterator[None]:
-        """Turn a DamagedError about block ``number``, which was readable before, into an
-        EngineError, and remove the block.
-        """
+        """Turn a DamagedError about block ``number`` into an EngineError, and remove it."""
         try:
             yield
         except DamagedError as error:
@@ -262,9 +252,7 @@ def is_block_size(value: object) -> bool:
 
 
 def _block_number(file: Path, identity: RunIdentity) -> int:
-    """Return the number of the block in a file, from the name of the file; raises DamagedError if
-    runs with this ``identity`` have no such block.
-    """
+    """Return the number of the block in a file, by the file's name."""
     number = int(file.stem[:12])
     if file.name != f"{number:06d}.npz" or number >= identity.blocks:
         raise DamagedError("has a number that no block has")
@@ -272,9 +260,7 @@ def _block_number(file: Path, identity: RunIdentity) -> int:
 
 
 def _describe(bad: list[tuple[str, str]]) -> list[str]:
-    """Return a line for the user about ``bad`` files of blocks (name, reason), whose runs are
-    simulated again; an empty list if there are none.
-    """
+    """Return a line for the user about ``bad`` files of blocks, whose runs are simulated again."""
     if not bad:
         return []
     listed = ", ".join(f"{name} {reason}" for name, reason in bad[:3])
@@ -283,9 +269,7 @@ def _describe(bad: list[tuple[str, str]]) -> list[str]:
 
 
 def _verify(file: Path) -> None:
-    """Raise DamagedError unless the file of a block ends with a line that has the digest of all
-    bytes before it.
-    """
+    """Raise DamagedError unless the file ends with the digest of all bytes before it."""
     with reading_file(file), file.open("rb") as opened:
         length = max(0, opened.seek(0, os.SEEK_END) - SEAL_BYTES)
         opened.seek(length)
@@ -307,9 +291,7 @@ def _digest(file: BinaryIO, length: int) -> bytes:
 
 @contextlib.contextmanager
 def _open_block(file: Path, verified: bool = True) -> Iterator[Any]:
-    """Yield the arrays, by name, of a block's npz file; raises DamagedError for anything wrong with
-    it. The digest at its end is checked unless the file was ``verified`` before.
-    """
+    """Yield the arrays, by name, of a block's npz file."""
     try:
         if not verified:
             _verify(file)
@@ -322,9 +304,7 @@ def _open_block(file: Path, verified: bool = True) -> Iterator[Any]:
 
 
 def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str, Any]:
-    """Return the statistics of a block and its ``identity`` as arrays by name, for one npz file;
-    ``_restore_statistics`` reads them.
-    """
+    """Return the statistics of a block and its ``identity`` as arrays by name, for one npz file."""
     arrays: dict[str, Any] = {"totals": statistics.totals}
     moments = {name: getattr(statistics, name) for name in PARTS}
     moments |= {

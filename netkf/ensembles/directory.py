@@ -138,12 +138,7 @@ def _open_directory(
     engine: str,
     width: int,
 ) -> _DirectoryWriter | None:
-    """Return the writer of a new directory for the results of ``runs`` runs, or of the directory
-    ``out`` whose runs are to be resumed; None if that is complete.
-
-    ``engine`` is the name of the engine, ``width`` the number of blocks (parts of the replicas)
-    that are simulated at a time.
-    """
+    """Return the writer of a new directory for the results of ``runs`` runs."""
     size = block_size(runs, width)
     if options.trace == "full":
         size = min(size, MAX_TRACED_BLOCK)  # events of all runs of a block are in memory
@@ -170,12 +165,7 @@ def _open_directory(
 def _write_files(
     writer: _DirectoryWriter, statistics: RunStatistics
 ) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
-    """Write ensemble.parquet, summary.json and the events and states of traced runs: all files but
-    the manifest, which comes last.
-
-    Returns the first fields of FinishedEnsemble: the directory, the status ("complete" or
-    "diverged"), the summary, the ensemble, and the traces of covariances that theory promises.
-    """
+    """Write all files but the manifest; return the first fields of FinishedEnsemble."""
     directory, scenario, plan = writer.directory, writer.scenario, writer.plan
     ensemble = ensemble_of(scenario, statistics, plan.seed, plan.engine)
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))

@@ -60,9 +60,7 @@ def merge_moments(a: Moments, b: Moments) -> Moments:
 
 
 def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``np.stack([a, b])`` (2, ...) of two arrays of one shape, several times faster than
-    numpy for small arrays.
-    """
+    """Return ``np.stack([a, b])`` (2, ...) of two arrays of one shape."""
     stacked = np.empty((2, *a.shape))
     stacked[0] = a
     stacked[1] = b

@@ -85,9 +85,7 @@ class Ensemble(NotebookTable):
         return plot_by_name(self, figure)
 
     def _notebook_table(self) -> pd.DataFrame:
-        """Return the table that notebooks show for the ensemble: averages over the samples after
-        time 0, a row per node and one for all.
-        """
+        """Return the table that notebooks show for the ensemble."""
         import pandas as pd
 
         mean, error = self.average, self.se_average
@@ -197,12 +195,7 @@ def _upper_indices(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return means of P and of e e' (T, N, n, n) and of NEES (T, N) from ``values``
-    (T, N, 2 u + 1).
-
-    The u = n (n + 1) / 2 entries of an upper triangle are stored row by row, first of P, then of e
-    e'.
-    """
+    """Return means of P and of e e' (T, N, n, n) and of NEES (T, N) from ``values``."""
     i, j = _upper_indices(n)
     matrices = np.empty((2, *values.shape[:2], n, n))
     for matrix, upper in zip(matrices, np.split(values[..., :-1], 2, axis=-1), strict=True):
@@ -220,9 +213,7 @@ def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
     i, j = np.triu_indices(n)
 
     def upper(values: FloatArray) -> list[FloatArray]:
-        """Return the columns (T N,) of the upper triangle of the matrices ``values`` (T, N, n, n),
-        row by row.
-        """
+        """Return the upper triangles (T N,) of the matrices ``values`` (T, N, n, n), row by row."""
         return list(values[:, :, i, j].reshape(rows, -1).T)
 
     columns = [

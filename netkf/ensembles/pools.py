@@ -103,9 +103,7 @@ class LocalPool(Pool):
         return self._size
 
     def _note_duration(self, job: Job, seconds: float) -> None:
-        """Double the size of the next blocks if ``job``, of full size, took less than
-        QUICK_SECONDS; ``seconds`` are without compilation.
-        """
+        """Double the size of the next blocks if ``job``, of full size, was quick."""
         # The caller may have made the block larger than asked, as a full set of SIMD lanes.
         if seconds < QUICK_SECONDS and len(job.replicas) >= self._size:
             self._size = min(2 * job.size, MAX_BLOCK_HERE)
@@ -148,10 +146,7 @@ class AdaptivePool(LocalPool):
         return block_size(left, self.width)
 
     def _note_duration(self, job: Job, seconds: float) -> None:
-        """Add the ``seconds`` of a block, without compilation, to the estimate of seconds for each
-        run; not those of the first block of a scenario, which mostly fills caches, unless it took
-        more than 1 s.
-        """
+        """Add the ``seconds`` of a block to the estimate for a run; not those that fill caches."""
         super()._note_duration(job, seconds)
         self._spent += seconds
         if self._begun or seconds > 1.0:
@@ -160,9 +155,7 @@ class AdaptivePool(LocalPool):
         self._begun = True
 
     def _worth_processes(self, job: Job) -> bool:
-        """Return True if worker processes would save more time in the runs that are left, those of
-        ``job`` and after it, than they take to start.
-        """
+        """Return True if worker processes would save more time in the runs that are left."""
         expected = 0.0  # seconds that the runs left take in this process
         if self._seconds > WARM:
             expected = self._seconds / self._runs * (job.stop - job.start)
@@ -206,9 +199,7 @@ class RemotePool(Pool):
 
     @abstractmethod
     def _send(self, job: Job) -> Future[Any]:
-        """Submit a block whose scenario is packed (pickled) to the pool's workers; return the
-        future of its result. Subclasses say how.
-        """
+        """Submit a block whose scenario is packed (pickled) to the pool's workers."""
 
 
 class ExecutorPool(RemotePool):
@@ -297,9 +288,7 @@ def _check_address(address: object) -> None:
 
 
 def _unreachable(address: str, reason: str) -> ScenarioError:
-    """Return the error for a scheduler at this ``address`` that does not answer, for this
-    ``reason``.
-    """
+    """Return the error for a scheduler at this ``address`` that does not answer."""
     remedy = 'start one with "dask scheduler" and give its address, tcp://HOST:PORT'
     return ScenarioError("scheduler", f"cannot be reached ({reason})", address, remedy)
 

@@ -158,9 +158,7 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
     nodes, rows = (depth, wide, columns), (LANES, wide, columns)
 
     def in_lanes(numbers: int) -> FloatArray:
-        """Return aligned scratch (wide ``numbers`` + L, L) with L lanes, for ``numbers`` numbers of
-        each of ``wide`` sample times.
-        """
+        """Return aligned scratch (wide ``numbers`` + L, L) for ``wide`` sample times."""
         return np.asarray(aligned((wide * numbers + LANES, LANES)))
 
     return ReductionScratch(
@@ -254,9 +252,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
 
 
 def _batch_arrays(batch: RunBatch) -> Batch:
-    """Return the arrays of a batch of R runs with F filters, as contiguous arrays for kernels; no
-    NEES is known yet, so that the kernels compute all of them.
-    """
+    """Return the arrays of a batch of R runs with F filters, as contiguous arrays for kernels."""
     runs = len(batch)
     x, P, error = (np.ascontiguousarray(part) for part in (batch.x, batch.P, batch.error))
     return Batch(
@@ -278,9 +274,7 @@ def _batch_arrays(batch: RunBatch) -> Batch:
 
 
 def _nees_of_irregular(batch: Batch, regular: np.ndarray) -> FloatArray:
-    """Return NEES (R, T, F) of the runs that are not ``regular`` (R,), in which some P is singular;
-    it is nan where P is, or nearly is. Other runs are not set.
-    """
+    """Return NEES (R, T, F) of the runs that are not ``regular`` (R,)."""
     nees = np.empty(batch.error.shape[:3])
     for r in np.flatnonzero(~regular):
         count = batch.sample_counts[r]

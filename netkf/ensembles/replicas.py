@@ -132,16 +132,7 @@ def _gather(
     blocks: NumberedBlocks,
     progress: Progress,
 ) -> Any:
-    """Return the merged result of all blocks of replicas: known ones (of a resumed command) are
-    loaded, others run on the pool, and all are merged in the binary tree over replicas as they
-    complete.
-
-    job      : all the work as one job, whose ``size`` is that of numbered blocks, 0 without such
-    together : smallest number of replicas in a block run in this process, None for the default
-    merge    : joins the results of neighbours
-    blocks   : which numbered blocks are known
-    progress : called with the numbers of runs done and of all runs after each block
-    """
+    """Return the merged result of all blocks of replicas."""
     tree, runs_done, known = MergeTree(merge), 0, blocks.known
 
     def take(block: Job, result: Any) -> None:
@@ -162,13 +153,7 @@ def _gather(
 def _make_blocks(
     pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
 ) -> Iterator[Job]:
-    """Yield the blocks of replicas of ``job`` that are to be simulated, in order, each as a Job.
-
-    Blocks have the job's block size, and those in ``known`` (number of a block -> function that
-    loads its result) are left out; if that size is 0, the pool chooses a size, a power of two, each
-    time a block is submitted. ``together`` is the smallest size of a block in this process, a power
-    of two, None for the default.
-    """
+    """Yield the blocks of replicas of ``job`` that are to be simulated, in order, each as a Job."""
     if job.size:
         for number in range(-(-job.stop // job.size)):
             if number not in known:
@@ -190,11 +175,7 @@ def _make_blocks(
 
 
 def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
-    """Submit ``blocks`` of replicas to the pool, as many at a time as it allows, and yield each
-    with its result as it completes.
-
-    Raises EngineError if workers die again and again, or are lost.
-    """
+    """Submit ``blocks`` of replicas to the pool, as many at a time as it allows."""
     waiting: dict[Future[Any], Job] = {}
     try:
         while True:

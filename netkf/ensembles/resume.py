@@ -102,9 +102,7 @@ def find_stored_blocks(
 
 
 def _describe_difference(stored: Any, planned: Any) -> Any:
-    """Return what an error message shows of a value of the manifest that differs from the planned
-    one: of a table (versions, machine) the stored entries that differ, else the stored value.
-    """
+    """Return what an error shows of a stored value that differs: of a table, what differs."""
     if isinstance(stored, dict) and isinstance(planned, dict):
         return {
             key: stored.get(key)
@@ -162,9 +160,7 @@ def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str
 
 
 def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
-    """Raise ScenarioError if the scenario reads tables or Python modules that lie in ``directory``,
-    whose files are to be removed: they may be the only copies.
-    """
+    """Raise ScenarioError if the scenario reads files of ``directory``, to be removed."""
     files = [source.full for source in source_files(scenario)]
     files += [file for file in find_module_files(scenario).values() if file is not None]
     for file in files:
@@ -175,11 +171,7 @@ def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
 
 
 def _has_own_files(directory: Path, scenario: Scenario) -> bool:
-    """Return True if a directory without a manifest has files, all with names that a run of the
-    scenario writes: a run was stopped there before it wrote its manifest.
-
-    Raises ScenarioError if it has other files.
-    """
+    """Return True if a directory without a manifest has files, all of a stopped run."""
     if not directory.is_dir() or not any(directory.iterdir()):
         return False
     if not holds_only(directory, run_file_names(scenario)):
@@ -189,9 +181,7 @@ def _has_own_files(directory: Path, scenario: Scenario) -> bool:
 
 
 def _check_scenario(directory: Path, scenario: Scenario) -> None:
-    """Raise ScenarioError if a directory has a scenario.toml that is not the ``scenario`` to run as
-    netkf writes it, with all defaults.
-    """
+    """Raise ScenarioError if the directory's scenario.toml is not that of ``scenario``."""
     path, text = directory / "scenario.toml", to_toml(resolve_defaults(scenario))
     if not path.exists():
         return
@@ -204,9 +194,7 @@ def _check_scenario(directory: Path, scenario: Scenario) -> None:
 
 
 def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
-    """Call ``check``, of the file or directory ``path``; a DamagedError that it raises becomes a
-    ScenarioError, which tells the user what is wrong and the ``remedy``.
-    """
+    """Call ``check`` of ``path``; its DamagedError becomes a ScenarioError with ``remedy``."""
     try:
         check()
     except DamagedError as error:

@@ -112,11 +112,7 @@ def block_statistics(
 def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
 ) -> Iterator[tuple[RunBatch, tuple[Trace, ...]]]:
-    """Yield batches of the runs of ``replicas``, simulated with ``seed``, with their traces.
-
-    A run with a trace (all its events and samples; one of the first ``traces`` of the ensemble) is
-    a batch of its own; the batch of replica 0 has a fingerprint, the digest of that run's events.
-    """
+    """Yield batches of the runs of ``replicas``, simulated with ``seed``, with their traces."""
     for replica in range(replicas.start, min(traces, replicas.stop)):
         yield _traced_run(scenario, seed, replica, engine)
     untraced = range(max(replicas.start, traces), replicas.stop)
@@ -128,9 +124,7 @@ def _batches(
 def _traced_run(
     scenario: Scenario, seed: int, replica: int, engine: Engine
 ) -> tuple[RunBatch, tuple[Trace, ...]]:
-    """Simulate one ``replica`` of the runs of ``seed``; return it as a batch of one run, and its
-    trace: all its events and samples.
-    """
+    """Simulate one ``replica`` of the runs of ``seed``."""
     sink, memory = batch_sink(scenario, range(replica, replica + 1)), MemorySink()
     recorder = Recorder([sink, memory])
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)
@@ -201,9 +195,7 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
 
 
 def _mean_of_nodes(averages: FloatArray) -> FloatArray:
-    """Return the means (R, 1, 3) over the N nodes of the ``averages`` (R, N, 3) of R runs, for the
-    row of summaries about all nodes; they are added in the order of nodes.
-    """
+    """Return the means (R, 1, 3) over the N nodes of the ``averages`` (R, N, 3) of R runs."""
     # accumulate() adds in order; sum() may add in another one, and would give other bits.
     total = np.add.accumulate(averages, axis=1)[:, -1:]
     return np.asarray(total / averages.shape[1])

@@ -110,9 +110,7 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
 
 
 def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> Ensemble:
-    """Return the ensemble of the runs in the blocks (files with the statistics of some consecutive
-    replicas) that an interrupted ensemble has finished; raises DamagedError if there are none.
-    """
+    """Return the ensemble of the runs in the blocks that an interrupted ensemble has finished."""
     blocks = BlockCheckpoints(directory, scenario)
     blocks_statistics = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
     if not blocks_statistics:
@@ -124,14 +122,10 @@ def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) ->
 
 
 def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
-    """Return means (N + 1, 3) of square error, trace of P and NEES over time and runs, and their
-    standard errors (N + 1, 3), from ``rows`` of summary.json: one for each node and one for all.
-    """
+    """Return means (N + 1, 3) of square error, trace of P and NEES over time and runs."""
 
     def column(name: str) -> FloatArray:
-        """Return one quantity (N + 1,) of all nodes and, last, of all together; nan where a row
-        lacks it.
-        """
+        """Return one quantity (N + 1,) of all nodes and, last, of all together, or nan."""
         return np.array([row.get(name) for row in rows], dtype=np.float64)
 
     # The summary has the root of the mean square error; the standard error of its square is 2 rms
@@ -144,12 +138,7 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
 
 
 def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
-    """Return the arrays of an ensemble in ensemble.parquet, by the names of Ensemble's attributes.
-
-    For T times and N nodes: ``runs`` (T,) the runs that reached each time, means and standard
-    errors of P and of e e' (T, N, n, n), those of NEES (T, N). Raises DamagedError if the table
-    does not have the columns and rows of the scenario.
-    """
+    """Return the arrays of an ensemble in ensemble.parquet."""
     n, N = scenario.plant.n, len(scenario.nodes)
     i, j = np.triu_indices(n)
     names = ensemble_columns(n)
@@ -184,9 +173,7 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
 
 
 def _select_columns(table: pd.DataFrame, names: list[str], shape: tuple[int, int]) -> FloatArray:
-    """Return the columns ``names`` of a ``table`` with T N rows, sorted by time and node, as an
-    array (T, N, columns); ``shape`` is (T, N), and columns that the table lacks are nan.
-    """
+    """Return the columns ``names`` of a ``table`` with T N rows, sorted by time and node."""
     return np.asarray(
         table.reindex(columns=names).to_numpy(dtype=np.float64).reshape(*shape, len(names))
     )

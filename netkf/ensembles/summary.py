@@ -61,13 +61,7 @@ def summarise_ensemble(
 
 
 def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, float]:
-    """Return chi-square bounds on the mean NEES over the runs, and the share of means inside them.
-
-    If P is exact, the sum of NEES over the runs is chi-square with n runs degrees of freedom, so
-    that the mean lies within the bounds with probability ``confidence``; divided by n they bound
-    the ANEES (Bar-Shalom, Li and Kirubarajan 2001, section 5.4). The key ``inside`` is over the
-    samples after time 0 that every run has and that rounding does not blur.
-    """
+    """Return chi-square bounds on the mean NEES over the runs."""
     n, runs = scenario.plant.n, statistics.runs
     low, high = nees_bounds(n, runs)
     clear = (scenario.times > 0.0) & (scenario.times < statistics.rounding_from)
@@ -79,9 +73,7 @@ def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, floa
 
 
 def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
-    """Return averages over the samples after time 0 of the bound that theory promises on the trace
-    of P, of each node and of all together; None for each if there is no bound.
-    """
+    """Return averages over the samples after time 0."""
     if promised.bound is None:
         return [None] * (len(scenario.nodes) + 1)
     after_start: FloatArray = promised.bound[scenario.times > 0.0]
@@ -90,11 +82,7 @@ def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | N
 
 
 def _make_row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
-    """Return the summary of a node, or of all nodes together, by the names in summary.json.
-
-    ``mean`` (3,) and its standard errors ``error`` (3,) are those of squared error, trace of P and
-    NEES; ``bound`` is the mean bound on the trace, if there is one.
-    """
+    """Return the summary of a node, or of all nodes together, by the names in summary.json."""
     rms = float(np.sqrt(mean[0]))
     return {
         "rms_error": rms,

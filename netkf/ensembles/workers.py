@@ -179,9 +179,7 @@ class WorkerProcesses:
                 self._discard_worker(worker)
 
     def _receive_result(self, worker: _Worker) -> None:
-        """Take the answer of a worker, and set the future of its task to the result or error; a
-        dead worker is removed and its task queued again.
-        """
+        """Take the answer of a worker, and set the future of its task to the result or error."""
         assert worker.task is not None
         future = worker.task.future
         try:
@@ -202,9 +200,7 @@ class WorkerProcesses:
             future.set_result(result)
 
     def _discard_worker(self, worker: _Worker) -> None:
-        """Remove a dead worker and queue its task again; after MAX_ATTEMPTS deaths, which the task
-        may cause, let its future fail.
-        """
+        """Remove a dead worker and queue its task again."""
         self._workers.remove(worker)
         worker.end()
         worker.join(0.0)
@@ -217,9 +213,7 @@ class WorkerProcesses:
 
 
 def _may_hide_main(job: Job) -> bool:
-    """Return True if workers need not import the user's script (__main__), which would run it
-    again: no class of the job's scenario is defined there.
-    """
+    """Return True if workers need not import the user's script (__main__)."""
     return isinstance(job.scenario, PackedScenario) and b"__main__" not in job.scenario.payload
 
 
@@ -233,9 +227,7 @@ def _serve(jobs: Connection, results: Connection) -> None:
 
 
 def _run_job(message: bytes) -> bytes:
-    """Run a pickled job in a worker; return its answer, the pickle of (pickled result, pickled
-    exception, text of the traceback), of which the result or the exception is None.
-    """
+    """Run a pickled job in a worker."""
     try:
         answer: tuple[bytes | None, bytes | None, str]
         answer = pickle.dumps(work(pickle.loads(message)), pickle.HIGHEST_PROTOCOL), None, ""
@@ -245,9 +237,7 @@ def _run_job(message: bytes) -> bytes:
 
 
 def _pickled_error(error: Exception) -> bytes:
-    """Return the pickle of an exception that a worker sends to its parent, or of an EngineError
-    with its text if it cannot be pickled or read back.
-    """
+    """Return the pickle of an exception that a worker sends to its parent."""
     try:
         payload = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
         pickle.loads(payload)

@@ -44,11 +44,7 @@ def lock_directory(directory: Path | None, must_be_empty: bool = False) -> Itera
 
 @contextlib.contextmanager
 def _hold_lock(directory: Path) -> Iterator[None]:
-    """Hold the lock of a directory during the body of the ``with`` statement, so that no other
-    netkf command writes into it.
-
-    If the file system does not support locks, print a note and run the body without a lock.
-    """
+    """Hold the lock of a directory during the body of the ``with`` statement."""
     descriptor = None
     try:
         descriptor = _open_lock_file(directory)
@@ -65,9 +61,7 @@ def _hold_lock(directory: Path) -> Iterator[None]:
 
 
 def _lock_or_refuse(descriptor: int, directory: Path) -> None:
-    """Lock the open file ``descriptor`` that stands for ``directory``, without waiting; raises
-    ScenarioError and closes it if another process holds the lock.
-    """
+    """Lock the open file ``descriptor`` that stands for ``directory``, without waiting."""
     try:
         _lock_file(descriptor)
     except (BlockingIOError, PermissionError):  # the latter on Windows
@@ -89,9 +83,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def _open_lock_file(directory: Path) -> int:
-        """Open and return a temporary file named after the directory: Windows cannot open a
-        directory itself.
-        """
+        """Open and return a temporary file named after the directory."""
         name = sha256(str(directory.resolve()).casefold().encode()).hexdigest()[:32]
         return os.open(Path(tempfile.gettempdir()) / f"netkf-{name}.lock", os.O_RDWR | os.O_CREAT)
 

@@ -278,10 +278,7 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy the file ``source`` to ``target`` atomically, unless ``target`` has the same contents.
-
-    They are even the same file if the scenario was loaded from the run directory.
-    """
+    """Copy the file ``source`` to ``target`` atomically."""
     if target.is_file() and target.read_bytes() == source.read_bytes():
         return
     with writing_file(target):

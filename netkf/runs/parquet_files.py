@@ -108,12 +108,7 @@ def _open_arrow_file(path: Path, mode: str) -> Any:
 def _read_columns(
     file: Any, source: Any, name: str, columns: Sequence[str], run: int | None
 ) -> Any:
-    """Return an Arrow table with the ``columns`` of a Parquet file, only the rows of one ``run``
-    unless that is None.
-
-    ``file`` is the ParquetFile of ``source``. Raises DamagedError, which begins with the ``name``
-    of the file, if it has more than MAX_READ_ROWS rows.
-    """
+    """Return an Arrow table with the ``columns`` of a Parquet file."""
     if file.metadata.num_rows > MAX_READ_ROWS:
         raise DamagedError(f"{name} has more than {MAX_READ_ROWS:,} rows")
     if run is None:
@@ -182,9 +177,7 @@ class ParquetSink(Sink):
                 self._flush()
 
     def _flush(self) -> None:
-        """Write the samples that have been collected as a row group (a part of the file that is
-        read as a whole) of states.parquet.
-        """
+        """Write the samples that have been collected as a row group of states.parquet."""
         if self._states is None or not self._samples:
             return
         columns = zip(*self._samples, strict=True)
@@ -247,9 +240,7 @@ class TraceTables:
             self._flush()
 
     def _flush(self) -> None:
-        """Write the events and samples of the runs that have been collected, as a row group (a part
-        of a file that is read as a whole) of each table.
-        """
+        """Write the events and samples of the runs that have been collected."""
         for pending, table in (
             (self._pending_events, self._events),
             (self._pending_states, self._states),

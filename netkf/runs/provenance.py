@@ -36,9 +36,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def _cached_versions() -> dict[str, str]:
-    """Return the versions of netkf, Python, packages and BLAS, on which the last bits of results
-    depend; the same dictionary every time.
-    """
+    """Return the versions of netkf, Python, packages and BLAS; always the same dictionary."""
     result = {"netkf": __version__, "source": source_digest(), "python": platform.python_version()}
     for package in PACKAGES:
         try:

@@ -211,13 +211,7 @@ class _Output:
 def _create_output(
     scenario: Scenario, out: Path | None, seed: int, replica: int, engine: str, tables: bool
 ) -> _Output:
-    """Create the run directory with scenario.toml and a manifest, and return it with its sinks,
-    which take the events and samples of the run.
-
-    The run is number ``replica`` of the runs of ``seed``, by the ``engine`` of that name;
-    ``tables`` says whether Parquet tables are written. Raises ScenarioError if the directory is not
-    empty or cannot hold a copy of the scenario, and WriteError.
-    """
+    """Create the run directory with scenario.toml and a manifest, and return it with its sinks."""
     check_sources(scenario)
     directory = create_output_directory(out, scenario.name)
     channel = scenario.network.channel
@@ -247,11 +241,7 @@ def _create_output(
 def _simulate(
     engine: Engine, scenario: Scenario, replica: int, recorder: Recorder, progress: Progress
 ) -> tuple[str, float]:
-    """Simulate run number ``replica`` of the scenario's seed; return its status ("complete" or
-    "diverged") and its wall-clock seconds without those in which kernels were compiled.
-
-    ``recorder`` takes events and states; ``progress`` is called as the run goes on.
-    """
+    """Simulate run number ``replica`` of the scenario's seed."""
     start, compiled_before = time.perf_counter(), compiling.seconds_spent()
     status = engine.run(scenario, Streams(scenario.seed, replica), recorder, progress)
     compile_seconds = compiling.seconds_spent() - compiled_before
@@ -261,11 +251,7 @@ def _simulate(
 def _keep_partial_results(
     output: _Output, recorder: Recorder, is_complete: bool, error: BaseException
 ) -> None:
-    """Finish the files of a run that stopped with ``error``, so that its results until then can be
-    read, and write the error to its manifest.
-
-    ``is_complete`` says whether the simulation itself was complete, so that only writing failed.
-    """
+    """Finish the files of a run that stopped with ``error``."""
     status = "failed" if isinstance(error, Exception) else "interrupted"
     for finish in (recorder.flush, output.tables.close):
         with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so

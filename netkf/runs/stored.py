@@ -184,11 +184,7 @@ def _status_of_log(log: np.ndarray) -> str:
 
 
 def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:
-    """Return (exact value, last total) of each sum over all nodes that exchanges should conserve,
-    by name.
-
-    ``conserved`` is the entry of summary.json. Raises DamagedError if it has another form.
-    """
+    """Return (exact value, last total) of each conserved sum by name, from summary.json."""
     form = {"exact": NUMBER, "total": NUMBER}
     require_form(conserved, {}, "conserved")
     for name, entry in conserved.items():
@@ -199,11 +195,7 @@ def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:
 def _read_states(
     path: Path, scenario: Scenario, replica: int
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Return the table of state samples of a replica, and the arrays of a Run that it holds.
-
-    The arrays, by name, are times (T,), x (T, n), xhat and error (T, N, n) and P (T, N, n, n).
-    Without the file T is 0. Raises DamagedError if the file does not fit the scenario.
-    """
+    """Return the table of state samples of a replica, and the arrays of a Run that it holds."""
     import pandas as pd
 
     n, N = scenario.plant.n, len(scenario.nodes)
@@ -236,11 +228,7 @@ def _read_states(
 
 
 def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:
-    """Return the E events of a replica as EVENT rows (E,), in order of time; no rows without the
-    file.
-
-    Raises DamagedError if the file does not fit the scenario.
-    """
+    """Return the E events of a replica as EVENT rows (E,), in order of time."""
     if not path.exists():
         return np.empty(0, dtype=EVENT)
     columns = [name for name in EVENT.names or () if name != "kind"]

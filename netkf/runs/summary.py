@@ -219,11 +219,7 @@ def summarise(
 def _average_rows(
     scenario: Scenario, sink: SummarySink, promised: PromisedTraces
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return a row of averages over time for each node, and one for all nodes together, as
-    summary.json has them; ``promised`` has the bound on the trace of P, if theory gives one.
-
-    A row is a dictionary: the averages by their names in summary.json, of nodes also ``node``.
-    """
+    """Return a row of averages over time for each node, and one for all nodes together."""
     rounding_from = np.inf if sink.rounding_from is None else sink.rounding_from
     indices = select_averaged_samples(np.array(sink.times), rounding_from, bool(sink.diverged))
     mean_square = _mean_or_nan(sink.sq_error, indices.errors, scenario)
@@ -244,9 +240,7 @@ def _average_rows(
 
 
 def _mean_or_nan(values: list[FloatArray], indices: np.ndarray, scenario: Scenario) -> FloatArray:
-    """Return the mean (N,) of those of T arrays ``values`` (N,) at ``indices``; nan if there are
-    none.
-    """
+    """Return the mean (N,) of those of T arrays ``values`` (N,) at ``indices``."""
     if not len(indices):
         return np.full(len(scenario.nodes), np.nan)
     with np.errstate(all="ignore"):
@@ -286,11 +280,7 @@ def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
 def _averages(
     mean_square: FloatArray, trace: FloatArray, nees: FloatArray, bound: FloatArray | None = None
 ) -> dict[str, list[Any]]:
-    """Return the averages of summary.json by name, a list of N numbers each, from arrays (N,) of
-    mean squared error, mean trace of P, mean NEES and mean ``bound`` of N nodes.
-
-    Without a ``bound``, the lists of the bound and of the ratio to it hold None.
-    """
+    """Return the averages (N,) of summary.json by name, as lists; None without a ``bound``."""
     missing = [None] * len(trace)
     return {
         "rms_error": np.sqrt(mean_square).tolist(),

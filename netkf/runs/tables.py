@@ -99,9 +99,7 @@ def columns_of(summary: dict[str, Any]) -> dict[str, str]:
 
 
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table of averages by node: the table, what it omits, and an empty
-    line; of large networks only the nodes with the largest and smallest errors, the largest first.
-    """
+    """Yield the lines of the table of averages by node."""
     columns = columns_of(summary)
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     names = [str(row["node"]) for row in nodes]
@@ -135,9 +133,7 @@ def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[s
 
 
 def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
-    """Return the line on what theory gives to compare traces of P with: the limit of the bound on
-    them (called ``limit``) and a centralised filter; no line if none is known.
-    """
+    """Return the line on what theory gives to compare traces of P with."""
     traces = {limit: summary["limit"], "centralised filter": summary["central"]}
     limits = [
         f"{label} {format_number(value)}"
@@ -148,9 +144,7 @@ def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
 
 
 def _nees_lines(nees: dict[str, Any]) -> list[str]:
-    """Return the line on how many mean NEES of an ensemble lie in the interval that holds if P is
-    exact; no line for a single run.
-    """
+    """Return the line on how many mean NEES lie in their interval; none for a single run."""
     if not math.isfinite(nees.get("inside", math.nan)):
         return []
     return [
@@ -177,9 +171,7 @@ def _message_line(messages: dict[str, Any]) -> str:
 
 
 def _describe_conserved(sums: dict[str, dict[str, float]]) -> str:
-    """Return text on the sums over all nodes that exchanges should conserve (push-sum masses), from
-    summary.json, with their relative drift.
-    """
+    """Return text on the sums that exchanges should conserve, with their relative drift."""
     totals = [
         f"{name} {format_number(entry['total'])} of {format_number(entry['exact'])} "
         f"({entry['drift']:+.1e})"

@@ -48,12 +48,7 @@ class Transmissions:
         self._add_slot_messages(sends[in_slots])
 
     def _add_slot_messages(self, sends: np.ndarray) -> None:
-        """Count the transmissions in ``sends`` (K,), the ``send`` rows of slots: one for each
-        distinct sender in each step (time, phase) of an exchange.
-
-        The first step of a block may continue the last one of the block before: its senders are
-        counted once.
-        """
+        """Count the transmissions in ``sends`` (K,), the ``send`` rows of slots."""
         if not len(sends):
             return
         t, phase = sends["t"], sends["phase"]

@@ -66,10 +66,7 @@ def check_scenario(scenario: DerivedScenario) -> None:
 
 
 def _check_times(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if there are too many slots or state samples, or samples after the end.
-
-    ``probe`` is the period of the state samples or an array (T,) of their times, in seconds.
-    """
+    """Raise ScenarioError for too many slots or samples, or for samples after the end."""
     probe, horizon = scenario.probe, scenario.horizon
     if scenario.slotted and horizon / scenario.slot_plant.period > MAX_STEPS:
         raise ScenarioError(
@@ -164,12 +161,7 @@ def _check_sensors(scenario: DerivedScenario) -> None:
 
 
 def _check_speed(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the plant or a filter is too fast for the horizon, in continuous time.
-
-    The rate of the plant is at most the norm ||A||_1. That of a Kalman-Bucy filter in steady state
-    is near sqrt(max|G| max|Q|), where G = H' R^-1 H. More time constants than the limit suggest a
-    wrong unit of time.
-    """
+    """Raise ScenarioError if the plant or a filter is too fast for the horizon."""
     delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.diffusion.A
     # A message with a fixed delay is predicted over the delay, which may exceed the horizon.
     longest = max(scenario.horizon, delay)
@@ -203,11 +195,7 @@ def _list_ids(nodes: tuple[int, ...]) -> str:
 
 
 def _check_network(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if graph, activation, channel and filter do not fit.
-
-    The activation decides when nodes send: clocks in continuous time, matchings or broadcasts in
-    slots. A filter that does not talk sends nothing and needs none.
-    """
+    """Raise ScenarioError if graph, activation, channel and filter do not fit."""
     network, topology, node_filter = scenario.network, scenario.topology, scenario.node_filter
     for key, part in (
         ("network.activation", network.activation),
@@ -342,9 +330,7 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
 
 
 def _check_degrees(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a node has more links than the filter allows: it gives the weight
-    epsilon to each neighbour, and its own weight, the rest of 1, must not be negative.
-    """
+    """Raise ScenarioError if a node has more links than the filter allows."""
     algorithm = scenario.filter.algorithm
     if not algorithm.talks or not scenario.topology.links:
         return
@@ -359,11 +345,7 @@ def _check_degrees(scenario: DerivedScenario) -> None:
 
 
 def _check_sensing_period(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the sensing period, the step in seconds over which sensors read
-    increments dy, is too short or too long.
-
-    The limits follow from the horizon, the plant, and the filter of the most precise node.
-    """
+    """Raise ScenarioError if the step of increments is too short or too long."""
     period, horizon = scenario.diffusion.sensing_period, scenario.horizon
     assert period is not None
     if horizon / period > MAX_STEPS:
@@ -403,22 +385,13 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
 
 
 def _longest_step(scenario: DerivedScenario, model: FlowModel) -> float:
-    """Return the longest step in seconds of which a filter can use the increment, the integral of
-    dy = H x dt + dv over that step, with H (p, n) and R (p, p) of its ``model``.
-
-    Beyond it the series for the filter's gain loses digits. It depends on the A and B B' that the
-    filters assume, ``scenario.belief``, which may differ from those of the plant.
-    """
+    """Return the longest step in seconds of which a filter can use the increment."""
     A, Q = scenario.belief
     return longest_interval(A, Q, model.H, model.R)
 
 
 def _check_slots(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if state samples are off the slots, or if the activation or the length of
-    an exchange phase does not fit the filter or the slots.
-
-    A filter's ``schedule`` lists the phases of a slot; nodes send in those named "exchange".
-    """
+    """Raise ScenarioError if state samples are off the slots."""
     plant, node_filter = scenario.slot_plant, scenario.node_filter
     times_off_slots = [
         t

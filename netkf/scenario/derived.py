@@ -76,9 +76,7 @@ class DerivedScenario(ScenarioModel):
         )
 
     def _slot_model(self, H_and_R: tuple[FloatArray, FloatArray]) -> SlotModel:
-        """Return the believed model in slots of a node with the stacked H (p, n) and R (p, p) of
-        its readings, the pair ``H_and_R``.
-        """
+        """Return the believed model in slots of a node with stacked H (p, n) and R (p, p)."""
         return SlotModel(*self.slot_belief, *H_and_R, self.slot_plant.period)
 
     @cached_property
@@ -113,9 +111,7 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def _network_info(self) -> NetworkInfo | None:
-        """The believed information (N, n, n) of each node's sensors, and for each node the sorted
-        indices of the nodes it can hear; None unless the filter ``needs_network``.
-        """
+        """The information (N, n, n) of each node's sensors, and indices of who hears whom."""
         if not self.node_filter.needs_network:
             return None
         senders: dict[int, list[int]] = {node: [] for node in self.nodes}
@@ -273,18 +269,14 @@ class DerivedScenario(ScenarioModel):
     def _stack_sensors(
         self, placed_sensors: tuple[PlacedSensor, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the stacked H (p, n) and block diagonal R (p, p) of sensors of any nodes; R is the
-        one that filters assume if ``believed``, else the true one.
-        """
+        """Return the stacked H (p, n) and block diagonal R (p, p) of sensors of any nodes."""
         entries = tuple(placed_sensor.entry for placed_sensor in placed_sensors)
         return self._stack_entries(entries, believed)
 
     def _stack_entries(
         self, entries: tuple[int, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the stacked H (p, n) and block diagonal R (p, p) of ``[[sensors]]`` entries, given
-        by their indices; R is the one that filters assume if ``believed``, else the true one.
-        """
+        """Return the stacked H (p, n) and block diagonal R (p, p) of ``[[sensors]]`` entries."""
         # Cached, because thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
             H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]
@@ -295,9 +287,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _stacks(self) -> dict[tuple[tuple[int, ...], bool], tuple[FloatArray, FloatArray]]:
-        """Cache of stacked H (p, n) and R (p, p) by ``[[sensors]]`` entries and by whether R is the
-        believed one.
-        """
+        """Cache of stacked H (p, n) and R (p, p) by entries and by whether R is believed."""
         return {}
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
@@ -365,21 +355,14 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def _pooled_sensors(self) -> tuple[PlacedSensor, ...]:
-        """The sensors of all nodes, those of one node after those of another.
-
-        Over a diffusion only the sensors that give increments: their readings enter the model.
-        """
+        """The sensors of all nodes, those of one node after those of another."""
         sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
         return tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
 
     def _model(
         self, H_and_R: tuple[FloatArray, FloatArray], models: dict[bytes, FlowModel]
     ) -> FlowModel:
-        """Return the believed model in continuous time of a node with the stacked H (p, n) and R
-        (p, p) of its increments, the pair ``H_and_R``.
-
-        ``models`` holds the models made so far, by the bytes of H and R, and is added to.
-        """
+        """Return the believed model of a node with stacked H (p, n), R (p, p), from ``models``."""
         H, R = H_and_R
         key = b"".join((H.tobytes(), b"|", R.tobytes()))
         if key not in models:
@@ -449,10 +432,7 @@ class DerivedScenario(ScenarioModel):
         }
 
     def _send_rate(self, clock: LinkClock, direction: Link) -> float:
-        """Return the mean rate of messages sent on a directed link, per second, lost ones included.
-
-        ``clock.at`` names the owner of a clock: a node's samples, a link, a directed link, a node.
-        """
+        """Return the mean rate of messages sent on a directed link, per second."""
         sender, receiver = direction
         if clock.at == "readings":
             return sample_rate(self, sender)

@@ -186,12 +186,7 @@ def _is_namesake(module: ModuleType | None, module_name: str, folder: Path) -> b
 
 
 def _installed_path(folder: Path) -> list[str]:
-    """Return the import path without ``folder``, that of a scenario, and the current folder, unless
-    packages are installed there.
-
-    Of PYTHONPATH absolute folders count as such, since Python itself would import any module from
-    them; relative ones depend on the current folder and do not count.
-    """
+    """Return the import path without ``folder``, that of a scenario, and the current folder."""
     text = "" if sys.flags.ignore_environment else os.environ.get("PYTHONPATH", "")
     entries = [entry for entry in text.split(os.pathsep) if entry]
     relative = {Path(entry).resolve() for entry in entries if not os.path.isabs(entry)}

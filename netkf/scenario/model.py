@@ -325,10 +325,7 @@ class ScenarioModel(Component):
         return self._find_diffusion_sensors(sampled=True)
 
     def _find_diffusion_sensors(self, sampled: bool) -> dict[int, tuple[PlacedSensor, ...]]:
-        """Return the sensors by node that take samples (``sampled``) or that give increments.
-
-        Nodes without any are left out.
-        """
+        """Return the sensors by node that take samples (``sampled``) or that give increments."""
         if self.slotted:
             return {}
         sensors_of_nodes = {

@@ -74,9 +74,7 @@ def _check_fixed_sensors(scenario: DerivedScenario) -> None:
 
 
 def _check_every_reading(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a recorded sensor has no row, or a part of one, for a slot in which
-    filters read.
-    """
+    """Raise ScenarioError if a recorded sensor has no row, or a part of one."""
     nowhere = np.full(scenario.plant.n, np.nan)
     for node, placed_sensors in scenario.placed_sensors.items():
         for placed in placed_sensors:
@@ -115,12 +113,7 @@ def _check_common_start(scenario: DerivedScenario) -> None:
 
 
 def _check_invertible(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a filter's covariance P may be singular.
-
-    P is nonsingular if noise reaches every state (in slots: Q has full rank; in continuous time:
-    (A, Q) is controllable), or if all initial P are nonsingular and prediction keeps them so (in
-    slots: F has full rank).
-    """
+    """Raise ScenarioError if a filter's covariance P may be singular."""
     n = scenario.plant.n
     initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
     singular = next((node for node, P in initial.items() if not bool(is_definite(P))), None)
@@ -173,9 +166,7 @@ def _check_ways(scenario: DerivedScenario) -> None:
 
 
 def _check_heard(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if no node hears one that has a sensor: its readings would not be used,
-    not even by itself.
-    """
+    """Raise ScenarioError if no node hears one that has a sensor."""
     heard = {sender for sender, _ in scenario.topology.directions}
     for k, sensor in enumerate(scenario.sensors):
         for node in sensor.nodes:

@@ -48,10 +48,7 @@ def _check_under(key: str, check: Callable[[], object]) -> None:
 
 
 def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
-    """Raise ScenarioError if recorded readings do not fit the nodes of the graph, or the slots.
-
-    ``key`` is the key path of the sensor.
-    """
+    """Raise ScenarioError if recorded readings do not fit the nodes of the graph, or the slots."""
     record = sensor.record
     assert record is not None
     # Anchors at given positions need not be nodes.
@@ -89,10 +86,7 @@ def sensed_slots(scenario: DerivedScenario) -> range:
 
 
 def _check_exchanges(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if recorded broadcasts name an exchange that the filter does not have.
-
-    A filter has one or more exchange phases in a slot, each of one or more steps.
-    """
+    """Raise ScenarioError if recorded broadcasts name an exchange that the filter does not have."""
     activation, node_filter = scenario.network.activation, scenario.node_filter
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
@@ -132,9 +126,7 @@ def count_state_rows(scenario: DerivedScenario) -> RowUse | None:
 
 
 def _state_times(scenario: DerivedScenario) -> FloatArray:
-    """Return the times (K,) at which replica 0 needs states of a recorded diffusion: the probe
-    times and, if a sensor draws its readings, the sample times.
-    """
+    """Return the times (K,) at which replica 0 needs states of a recorded diffusion."""
     times = [scenario.times]
     if any(sensor.is_random for sensor in scenario.sensors):
         times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))

@@ -197,10 +197,7 @@ def find_kind(
 
 
 def _choose_name(choices: Mapping[str, Mapping[str, str]], table: Mapping[str, Any]) -> str:
-    """Return the first name in ``choices`` whose keys and values are all in ``table``.
-
-    Raises ScenarioError if the table has none of them.
-    """
+    """Return the first name in ``choices`` whose keys and values are all in ``table``."""
     for name, choice in choices.items():
         if all(table.get(key) == value for key, value in choice.items()):
             return name
@@ -213,10 +210,7 @@ def _choose_name(choices: Mapping[str, Mapping[str, str]], table: Mapping[str, A
 
 
 def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
-    """Return the class ``cls`` that ``kind`` names, or None if it is None: not imported yet.
-
-    Raises ScenarioError if it is not a class of the family or lacks a method that it must define.
-    """
+    """Return the class ``cls`` that ``kind`` names, or None if it is None: not imported yet."""
     if cls is None:
         return None
     base = FAMILIES[family]

@@ -61,9 +61,7 @@ def _iterate_sampled_sensors(scenario: ScenarioModel) -> Iterator[tuple[int, Pla
 def _make_generator(
     streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Callable[[str], np.random.Generator]:
-    """Return a function that returns the random generator for a purpose that belongs to one sensor
-    of ``node`` (its id) alone.
-    """
+    """Return a function from a purpose to the random generator of one sensor of ``node``."""
     return lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
 
 
@@ -144,10 +142,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
 
 
 def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:
-    """Raise ScenarioError if a sensor's sampling clock does not fit it, the plant or the graph.
-
-    ``key`` is the key path of the sensor.
-    """
+    """Raise ScenarioError if a sensor's sampling clock does not fit it, the plant or the graph."""
     clock = sensor.sampling
     assert clock is not None
     if scenario.slotted:

@@ -136,10 +136,7 @@ def _nested_table_schema(cls: type[Component], key: str) -> Schema | None:
 def _table_schema(
     keys: Sequence[TableKey], constants: Mapping[str, Schema] = MappingProxyType({})
 ) -> Schema:
-    """Return the schema of a table with these keys and no others.
-
-    ``constants`` are schemas of further keys, not required, which come first.
-    """
+    """Return the schema of a table with these keys and no others."""
     return {
         "type": "object",
         "properties": {**constants, **{key.name: _value_schema(key) for key in keys}},
@@ -161,10 +158,7 @@ def _value_schema(key: TableKey) -> Schema:
 
 
 def _family_schema(name: str, families: Sequence[str]) -> Schema:
-    """Return the schema of a table whose ``kind`` decides which keys it has.
-
-    ``name`` is that of the table, ``families`` are those of its kinds in registry.KINDS.
-    """
+    """Return the schema of a table whose ``kind`` decides which keys it has."""
     shared_keys: list[TableKey] = []
     if name == "filter":  # the table also has the initial estimate and the model
         shared_keys = [key for key in list_keys(Filtering) if key.name != "algorithm"]
@@ -182,11 +176,7 @@ def _family_schema(name: str, families: Sequence[str]) -> Schema:
 def _kind_schema(
     name: str, cls: type[Component], shared_keys: Sequence[TableKey], is_default: bool
 ) -> Schema:
-    """Return the schema of a table of one name in registry.KINDS, read as an object of ``cls``.
-
-    Its key ``kind`` may be missing if ``is_default``; ``shared_keys`` are keys that tables of all
-    kinds have besides the fields of ``cls``.
-    """
+    """Return the schema of a table of one name in registry.KINDS, read as an object of ``cls``."""
     kind, choice = split_choice(name)
     constants = {key: {"const": value} for key, value in {"kind": kind, **choice}.items()}
     schema = _table_schema([*list_keys(cls), *shared_keys], constants=constants)
@@ -196,9 +186,7 @@ def _kind_schema(
 
 
 def _time_model_rules() -> list[Schema]:
-    """Return two if-then schemas: a plant in slots, and one in continuous time, limits the kinds of
-    activation and filter.
-    """
+    """Return two if-then schemas: the plant's time limits the kinds of activation and filter."""
     # Plants of these kinds are in slots if they have F, and in continuous time if they have A.
     recorded = {"enum": ["recorded", "unknown"]}
 

@@ -98,12 +98,7 @@ def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
 
 
 def _set_key(target: Any, keys: list[str], value: Any, path: str) -> Any:
-    """Return a copy of ``target``, a table, list or component, in which one inner value is replaced
-    or added; that of a component is a table.
-
-    ``keys`` lead to that value; a missing table on the way is added. ``path`` names the key path
-    in errors.
-    """
+    """Return a copy of ``target`` with one inner value, where ``keys`` lead, replaced or added."""
     if not keys:
         return value
     if isinstance(target, Component):
@@ -143,9 +138,7 @@ def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
 
 
 def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
-    """Return a scenario of class ``cls`` from the tables of a file, or NOT_IMPORTED if ``origin``
-    forbids to import a user's class in it; then all that needs no import has been checked.
-    """
+    """Return a scenario of class ``cls`` from the tables of a file."""
     values = dict(table)
     version = values.pop("format", None)
     if version is None:
@@ -187,12 +180,7 @@ def _call_under(key: str, builder: Callable[[Any], Any], value: Any) -> Any:
 def _build_object(
     cls: type[Any], values: dict[str, Any], origin: Origin, other_keys: tuple[str, ...] = ()
 ) -> Any:
-    """Return an object of class ``cls`` with fields ``values``, or NOT_IMPORTED if one of them is:
-    it stands for an object whose class must not be imported yet.
-
-    ``other_keys`` are keys of the same table in the file that were taken out of ``values``; an
-    error about an unknown key lists them too.
-    """
+    """Return an object of class ``cls`` with fields ``values``."""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     _check_keys(fields, values, other_keys)
     rules = {name: fields[name].metadata.get("rule") for name in values}
@@ -216,9 +204,7 @@ def _build_object(
 def _check_keys(
     fields: dict[str, dataclasses.Field[Any]], values: dict[str, Any], other_keys: tuple[str, ...]
 ) -> None:
-    """Raise ScenarioError for a key of ``values`` that is not in ``fields`` (by name), and for a
-    missing field without default; ``other_keys`` are listed among the allowed ones.
-    """
+    """Raise ScenarioError for a key of ``values`` that is not in ``fields`` (by name)."""
     for key, value in values.items():
         if key not in fields:
             allowed_keys = [*other_keys, *fields]
@@ -271,15 +257,7 @@ def _build_component(
     default_kind: str | None = None,
     is_inner: bool = False,
 ) -> Any:
-    """Return the component of a table with the key ``kind``, or NOT_IMPORTED if its class must not
-    be imported yet.
-
-    family       : one of registry.KINDS
-    origin       : says from where a user's class may be imported
-    value        : the table, or a component to build again
-    default_kind : kind of a table without the key; None if the key is required
-    is_inner     : the table is the key ``inner`` of another filter, without keys of ``Filtering``
-    """
+    """Return the component of a table with the key ``kind``."""
     table = _as_dict(value)
     kind = table.pop("kind", default_kind)
     if kind is None:
@@ -309,9 +287,7 @@ def _as_dict(value: Any) -> dict[str, Any]:
 
 
 def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
-    """Return the sensors of a list of tables; NOT_IMPORTED stands for those whose class must not be
-    imported yet.
-    """
+    """Return the sensors of a list of tables."""
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     builder = partial(_build_sensor, origin)
@@ -319,9 +295,7 @@ def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
 
 
 def _build_sensor(origin: Origin, value: Any) -> Any:
-    """Return the sensor of a table with its sampling clock, or NOT_IMPORTED if the class of one of
-    them must not be imported yet.
-    """
+    """Return the sensor of a table with its sampling clock."""
     table = _as_dict(value)
     if isinstance(table.get("sampling"), (Mapping, Component)):
         builder = partial(_build_component, "sampling", origin)
@@ -330,10 +304,7 @@ def _build_sensor(origin: Origin, value: Any) -> Any:
 
 
 def _build_network(origin: Origin, time: str, value: Any) -> Any:
-    """Return the network of a table, or NOT_IMPORTED if a class in it must not be imported yet.
-
-    ``time`` is the plant's model of time: "slot ", "" for continuous time, or "unknown".
-    """
+    """Return the network of a table, or NOT_IMPORTED if a class in it must not be imported yet."""
     table = _as_dict(value)
     builders: dict[str, Callable[[Any], Any]] = {
         "graph": lambda graph: _build_component("graph", origin, as_graph(graph)),
@@ -347,12 +318,7 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
 
 
 def _build_activation(origin: Origin, time: str, value: Any) -> Any:
-    """Return the activation (clocks or matchings) of a table, or NOT_IMPORTED if its class must not
-    be imported yet.
-
-    ``time`` is the plant's model of time as the prefix of the family "activation": "slot ", "" for
-    continuous time, or "unknown" if the plant is NOT_IMPORTED.
-    """
+    """Return the activation of a table, or NOT_IMPORTED if its class must not be imported yet."""
     if time == "unknown":
         # Build it if its kind exists for one model of time only.
         kind = _as_dict(value).get("kind")
@@ -372,9 +338,7 @@ def _build_activation(origin: Origin, time: str, value: Any) -> Any:
 
 
 def _build_channel(origin: Origin, value: Any) -> Any:
-    """Return the channel of a table, or NOT_IMPORTED if the class of its loss or delay must not be
-    imported yet.
-    """
+    """Return the channel of a table."""
     table = _as_dict(value)
     for family in ("loss", "delay"):
         if family in table:
@@ -384,11 +348,7 @@ def _build_channel(origin: Origin, value: Any) -> Any:
 
 
 def _build_filtering(origin: Origin, value: Any) -> Any:
-    """Return the filter of a table with its initial estimate and model, or NOT_IMPORTED if its
-    class must not be imported yet.
-
-    The keys of ``Filtering`` and those of the algorithm are in one table of the file.
-    """
+    """Return the filter of a table with its initial estimate and model."""
     table = _as_dict(value)
     values = {key: table.pop(key) for key in FILTERING_KEYS if key in table}
     if "model" in values:

@@ -159,10 +159,7 @@ def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
 
 
 def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:
-    """Return the uses of tables of sampling times and of readings, by key path.
-
-    Sensors with the same file share one entry.
-    """
+    """Return the uses of tables of sampling times and of readings, by key path."""
     nodes: dict[tuple[str, Any], set[int]] = {}
     components: dict[tuple[str, Any], tuple[str, RecordedSampling | ReadingTable]] = {}
     for k, sensor in enumerate(scenario.sensors):

@@ -83,10 +83,7 @@ def _scenario_table(
     filtering: Filtering,
     style: _Style,
 ) -> dict[str, Any]:
-    """Return the tables of a scenario file, with these components instead of the scenario's own.
-
-    By ``style`` keys at their defaults are written too.
-    """
+    """Return the tables of a scenario file, with these components instead of the scenario's own."""
     table = _field_values(scenario, style)
     table.pop("time", None)
     # A run's own copy says its grid.
@@ -167,11 +164,7 @@ def _kind_table(family: str, part: Component, style: _Style) -> dict[str, Any]:
 
 
 def _field_values(part: Component, style: _Style) -> dict[str, Any]:
-    """Return the fields of a component as TOML values by name.
-
-    Fields that are None are left out, and unless the ``style`` is with defaults those equal to
-    them.
-    """
+    """Return the fields of a component as TOML values by name."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(part):
         if not field.init:
