@@ -61,7 +61,7 @@ def censored_ranks(
     # A cut of at most half of the run leaves waiting times to look at.
     known = np.floor(CELLS * law.cdf(np.broadcast_to(0.5 * horizon, begin.shape)) + 1e-9)
     known = np.clip(known, 0.0, CELLS - 1.0)
-    cut = law.quantile(known / CELLS)
+    cut = law.quantile(np.arange(CELLS) / CELLS)[np.nan_to_num(known).astype(np.int64)]
     short = duration <= cut
     rank = np.where(short, law.cdf(np.where(short, duration, 0.0)), 1.0)
     # Rounding must not move a rank over the cut.

@@ -8,8 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from netkf.checks.exact import _length_interval
-from netkf.checks.laws import find
 from netkf.checks.parts.events import loss_law
 from netkf.checks.parts.network_rows import (
     BURSTS,
@@ -20,8 +18,8 @@ from netkf.checks.parts.network_rows import (
 from netkf.checks.parts.samples import PartSamples
 from netkf.laws.intervals import correlation_interval, deviation_interval, probability_interval
 from netkf.laws.losses import PairCounts, count_outcomes, mean_correlation
-from netkf.laws.noise import _between, _in_size, _in_time, compare_cells
-from netkf.laws.ticks import count_interval, largest_correlation
+from netkf.laws.noise import _between, _in_size, _in_time
+from netkf.laws.ticks import largest_correlation
 from netkf.laws.waiting import CELLS, Ranks, correlate_neighbours
 from netkf.scenario.reading import from_table
 from tests.checks.parts.test_parts import SLOTS
@@ -111,28 +109,6 @@ def _clocks_together(folder):
     return draw
 
 
-def _renewal_clock(folder):
-    mean, shape = 20.0, 4.0
-
-    def draw(size, random):
-        gaps = random.gamma(shape, 1.0 / shape / (1.0 + size), (RUNS, 60))
-        ticks = (np.cumsum(gaps, axis=1) < mean).sum(axis=1)
-        return _interval(count_interval(ticks, mean, LEVEL, False, 1.0))
-
-    return draw
-
-
-def _law_of_gaps(folder):
-    # The share of one of the cells, at the cost of all others.
-    def draw(size, random):
-        shares = np.full(CELLS, (1.0 - 1.0 / CELLS - size) / (CELLS - 1))
-        shares[3] = 1.0 / CELLS + size
-        u = (random.choice(CELLS, 5000, p=shares) + 0.5) / CELLS
-        return _of(find(compare_cells(u[None, :, None], ["all"], LEVEL, "gaps"), 0.02))
-
-    return draw
-
-
 def _gaps_in_time(folder):
     def draw(size, random):
         u = random.random(2000)
@@ -146,25 +122,12 @@ def _gaps_in_time(folder):
     return draw
 
 
-def _bias_of_errors(folder):
-    spread = np.array([[0.1, 0.02], [0.0, 0.04]])
-    worst = np.linalg.svd(spread)[2][0] / np.linalg.svd(spread)[1][0]
-
-    def draw(size, random):
-        return _interval(_length_interval(spread, random.standard_normal(2) + size * worst, LEVEL))
-
-    return draw
-
-
 STUDIES = {
     "losses of two links": _losses_between_links,
     "losses in bursts": _bursts_of_losses,
     "pairs in a slot": _matchings_of_slots,
     "two clocks": _clocks_together,
-    "rate of a renewal clock": _renewal_clock,
-    "law of gaps and delays": _law_of_gaps,
     "gaps and delays in time": _gaps_in_time,
-    "bias of errors": _bias_of_errors,
 }
 
 

@@ -428,13 +428,3 @@ def test_the_detectable_scale_is_found_nine_times_of_ten(freedom):
     lower = law.ppf(level / 2.0)
     up, down = law.sf(upper / (1.0 + size)), law.cdf(lower / (1.0 - size)) if size < 1.0 else 1.0
     assert min(up, down) == pytest.approx(0.9, abs=1e-6)
-
-
-def test_probabilities_find_what_they_say():
-    n, p, level = 5000, 0.3, 1e-3
-    size = probability_interval(int(n * p), n, level).detectable
-    for shifted in (p + size, p - size):
-        lost = np.random.default_rng(4).binomial(n, shifted, 2000)
-        out = [probability_interval(int(k), n, level) for k in lost]
-        found = np.mean([not one.low <= p <= one.high for one in out])
-        assert found == pytest.approx(0.9, abs=0.04)
