@@ -111,8 +111,10 @@ def _numba() -> Any:
         word_types,
     )
 
+    typeof: Any = numba.typeof
+
     def type_of(value: Kernel, _: Any) -> Any:
-        return numba.typeof(value._kernel_dispatcher)
+        return typeof(value._kernel_dispatcher)
 
     numba.extending.typeof_impl.register(Kernel)(type_of)
     return numba
