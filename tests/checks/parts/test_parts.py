@@ -203,7 +203,7 @@ WRONG = {
 
 
 SUBTLE = {"Biased", "Louder", "Lossier", "OneWay", "Lazier", "LateFirst", "LongerBursts", "Slow",
-          "EarlyJitter"}  # fmt: skip
+          "EarlyJitter", "Noisier", "Rarely"}  # fmt: skip
 """Which take 60 runs to be found, the others less than 20."""
 
 

@@ -72,7 +72,7 @@ class Biased(LinearSensor):
 class Louder(LinearSensor):
     def slot_path(self, node, period, generator):
         return Wrong(
-            self.H, self.R, generator("noise"), change=lambda y, seen: seen + 1.05 * (y - seen)
+            self.H, self.R, generator("noise"), change=lambda y, seen: seen + 1.1 * (y - seen)
         )
 
 
@@ -139,11 +139,11 @@ class Preferring(Matching):
 
 @dataclass(frozen=True, eq=False)
 class Lazier(Matching):
-    """Drops one pair of twenty."""
+    """Drops one pair of ten."""
 
     def draw(self, topology, random):
         pairs = super().draw(topology, random)
-        return pairs if random.random() > 0.05 else []
+        return pairs if random.random() > 0.1 else []
 
 
 @dataclass(frozen=True, eq=False)
