@@ -26,12 +26,16 @@ _KINDS = {"predict": PREDICT, "sense": SENSE, "exchange": EXCHANGE}
 class SlotFilters:
     """H filters in B blocks of L runs, whose verbs are kernels."""
 
-    def __init__(self, setup: SlotSetup, kernels: Kernels, blocks: int) -> None:
+    def __init__(
+        self, setup: SlotSetup, kernels: Kernels, blocks: int, with_means: bool = True
+    ) -> None:
+        """Make the filters at time 0; unless ``with_means`` all estimates are zero."""
         self._setup, self._kernels = setup, kernels
         H, W, n = setup.estimators, len(setup.links.sender), setup.n
+        means = setup.xhat if with_means else np.zeros(setup.xhat.shape)
         self.records = make_records(
             setup.algorithm,
-            list(zip(setup.xhat, setup.root, strict=True)),
+            list(zip(means, setup.root, strict=True)),
             setup.infos,
             setup.models,
             links=W,
@@ -95,11 +99,10 @@ class SlotFilters:
             dtype=np.int64,
         )
 
-    def simulate(self, readings: Any, samples: SlotSamples, **drawn: Any) -> None:
+    def simulate(self, y: FloatArray, H: FloatArray, samples: SlotSamples, **drawn: Any) -> None:
         """Simulate the slots of a plan, whose drawn parts are given by name, with whitened
-        ``readings``.
+        readings ``y`` (B, S, H, p, L) and their ``H``.
         """
-        y, H = readings.y, readings.H
         self._run.y = y.reshape(-1, *y.shape[3:])
         self._run.H = H.reshape(-1, *H.shape[3:])
         plan = SlotPlan(

@@ -322,11 +322,11 @@ class SlotRuns:
         # Filters decide who sends, and Python makes the messages: the loop runs in two parts, up to
         # the sending, and from the arrivals on.
         if self._events is not None and self.setup.decides:
-            filters.simulate(readings, samples, **drawn, part=loop.SENDING)
+            filters.simulate(readings.y, readings.H, samples, **drawn, part=loop.SENDING)
             messages.sent[:, unread] = 0
             _, up = self._events.following(self._max_events, messages.sent[0, 0, :, :, 0])
             messages.up[..., 0], part = up, loop.ARRIVING
-        filters.simulate(readings, samples, **drawn, part=part)
+        filters.simulate(readings.y, readings.H, samples, **drawn, part=part)
         if len(messages.sent):
             # Only now, since the kernel decides for all nodes that are asked, readings or not.
             messages.sent[:, unread] = 0

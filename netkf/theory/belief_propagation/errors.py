@@ -22,7 +22,7 @@ from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_fram
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
+from netkf.theory.common.arrivals import arrivals_by_step
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
@@ -251,6 +251,4 @@ def error_rule(
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).
     """
-    if scenario.slotted:
-        require_traced_exchanges(scenario, run)
     return BeliefRule(scenario, errors, run)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
-from netkf.core.errors import TheoryError
+from netkf.core.errors import EngineError, ScenarioError, TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
@@ -40,12 +43,24 @@ def arrivals_by_step(scenario: Scenario, run: Run) -> ArrivalsByStep:
     return {(t, phase, k): arrived[n] for n, (t, phase, k) in enumerate(keys.T.tolist())}
 
 
-def require_traced_exchanges(scenario: Scenario, run: Run) -> None:
-    """Raise TheoryError if a filtered estimate is sampled at the horizon: the exchanges of the slot
-    that begins there are not in the trace.
+def with_last_exchanges(scenario: Scenario, run: Run) -> Run:
+    """Return the run with the exchanges of the slot at the horizon, if its state there is that
+    after them, as samples of filtered estimates are: the trace ends before that slot. They are
+    those of the same run over a longer horizon.
+
+    Raises TheoryError if there is no such run.
     """
-    plant = scenario.slot_plant
+    algorithm, plant, horizon = scenario.node_filter, scenario.slot_plant, scenario.horizon
     slots = plant.slots_of(run.times).tolist()
-    if slots and plant.over(slots[-1], scenario.horizon):
-        message = "the exchanges of the slot at the horizon are not in the trace: sample before it"
-        raise TheoryError(message)
+    last = slots[-1] if slots else 0
+    if algorithm.predicts or not algorithm.talks or not plant.over(last, horizon):
+        return run
+    try:
+        longer = scenario.replace({"horizon": plant.slot_time(last + 1), "probe": [horizon]})
+        repeated = simulate(longer, seed=run.seed, replica=run.replica)
+    except (ScenarioError, EngineError) as error:
+        raise TheoryError(
+            "the exchanges of the slot at the horizon are not in the trace, and the run cannot be "
+            f"repeated over a longer horizon ({error}): sample before it"
+        ) from None
+    return dataclasses.replace(run, log=repeated.log)

@@ -15,6 +15,8 @@ from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import with_last_exchanges
+from netkf.theory.common.columns import SlotColumns, has_columns
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.evidence import NONLINEAR
 from netkf.theory.common.observations import (
@@ -38,10 +40,10 @@ def replay_covariances(scenario: Scenario, run: Run, about_mean: bool = True) ->
     An estimator is a node's filter, or (M = 1) the pooled one that all nodes share. Raises
     TheoryError for a filter whose equations are not known here.
     """
-    errors = _stacked_errors(scenario)
+    errors, replay = _begin_replay(scenario, run)
     # The generator stops at each sample, when the errors have their values of that time.
     joint = errors.covariance if about_mean else errors.second_moments
-    covariances = [joint() for _ in _replay(scenario, run, errors)]
+    covariances = [joint() for _ in replay]
     size = errors.estimators * errors.n
     return np.array(covariances).reshape(-1, size, size)
 
@@ -64,25 +66,31 @@ def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
     Raises TheoryError for a filter whose equations are not known here.
     """
-    errors, P = _stacked_errors(scenario), []
-    for _ in _replay(scenario, run, errors):
+    (errors, replay), P = _begin_replay(scenario, run), []
+    for _ in replay:
         errors.keep()
         P.append(errors.covariances())
     return ErrorLaw(*errors.law(), np.array(P))
 
 
-def _stacked_errors(scenario: Scenario) -> StackedErrors:
+def _begin_replay(
+    scenario: Scenario, run: Run
+) -> tuple[SlotColumns | StackedErrors, Iterator[None]]:
     """Return the errors at time 0 of all estimators of a scenario (the filters of its nodes, or one
-    pooled filter), on which a run is replayed; raises TheoryError for a filter whose equations are
-    not known here.
+    pooled filter), and the replay of a run on them, which stops at each of ``run.times``; raises
+    TheoryError for a filter whose equations are not known here.
     """
+    if not scenario.is_linear:
+        raise TheoryError(NONLINEAR)
+    if scenario.slotted:
+        run = with_last_exchanges(scenario, run)
+        if has_columns(scenario):
+            columns = SlotColumns(scenario, run)
+            return columns, columns.replay()
     require_known_filter(scenario)
-    return StackedErrors(scenario, len(nodes_by_estimator(scenario)))
-
-
-def _replay(scenario: Scenario, run: Run, errors: StackedErrors) -> Iterator[None]:
-    """Replay a run's events on ``errors``, which it changes; yield at each of ``run.times``."""
-    return (_replay_slots if scenario.slotted else _replay_instants)(scenario, run, errors)
+    errors = StackedErrors(scenario, len(nodes_by_estimator(scenario)))
+    replay = _replay_slots if scenario.slotted else _replay_instants
+    return errors, replay(scenario, run, errors)
 
 
 def require_known_filter(scenario: Scenario) -> None:

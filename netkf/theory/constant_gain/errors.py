@@ -10,7 +10,6 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
@@ -63,9 +62,6 @@ def error_rule(
     All filters' rules are made by a function with these arguments; ``messages``, those of the run
     that arrived, are not used here.
     """
-    # Without a trace nothing says which messages of a slot arrived.
-    if scenario.slotted:
-        require_traced_exchanges(scenario, run)
-    elif any(scenario.increment_sensors.values()):
+    if not scenario.slotted and any(scenario.increment_sensors.values()):
         raise TheoryError("the exact errors with constant gains are known for sampled sensors")
     return ConstantGainRule(scenario, errors)

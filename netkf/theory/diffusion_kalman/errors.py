@@ -9,7 +9,6 @@ import numpy as np
 from netkf.algorithms.diffusion_kalman import READINGS
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors, Term
@@ -71,5 +70,4 @@ def error_rule(
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).
     """
-    require_traced_exchanges(scenario, run)
     return DiffusionKalmanRule(scenario, errors)

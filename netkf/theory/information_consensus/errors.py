@@ -14,7 +14,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
+from netkf.theory.common.arrivals import arrivals_by_step
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors, Term
@@ -117,5 +117,4 @@ def error_rule(
     """
     if not scenario.slotted:
         return ResetRule(scenario, errors)
-    require_traced_exchanges(scenario, run)
     return ConsensusRule(scenario, errors, run)

@@ -13,7 +13,6 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
@@ -145,6 +144,4 @@ def error_rule(
     ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
     slot).
     """
-    if scenario.slotted:
-        require_traced_exchanges(scenario, run)
     return KcfRule(scenario, errors)

@@ -25,7 +25,7 @@ from netkf.algorithms.modes import rate_groups
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import arrivals_by_step, require_traced_exchanges
+from netkf.theory.common.arrivals import arrivals_by_step
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
@@ -51,7 +51,6 @@ def require_known_errors(scenario: Scenario, run: Run) -> None:
         raise TheoryError("the exact errors are known for filters that have the plant's F")
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError("the exact errors are known for sensors whose H is fixed")
-    require_traced_exchanges(scenario, run)
 
 
 class AveragingRule(ErrorRule):

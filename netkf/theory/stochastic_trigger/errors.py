@@ -17,7 +17,6 @@ from netkf.algorithms.stochastic_trigger import silence_noise
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.random_links import all_messages_arrive
@@ -112,7 +111,6 @@ def error_rule(
     Raises TheoryError where silence may be a loss, or the filters do not know the law of
     innovations.
     """
-    require_traced_exchanges(scenario, run)
     if not all_hear_all(scenario):
         raise TheoryError(UNHEARD)
     if not scenario.filters_know_the_truth:

@@ -17,7 +17,6 @@ from netkf.algorithms.track_fusion import (
 )
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import require_traced_exchanges
 from netkf.theory.common.error_rules import ErrorRule, EstimateExchangeRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors, Term
@@ -149,8 +148,6 @@ def error_rule(
     and messages of a run. The replay of the run, which computes its exact errors from its events,
     calls the rule at each event; it changes ``errors``, the stacked errors of all nodes.
     """
-    if scenario.slotted:
-        require_traced_exchanges(scenario, run)
     if scenario.node_filter.combination == "tracks":
         return TrackRule(scenario, errors)
     return PairRule(scenario, errors)

@@ -1,0 +1,271 @@
+"""Exact errors of affine filters in slots, from their own verbs.
+
+Given the events of a run, estimates are linear in the first state and in all noises: one *column*
+for each. The filter's own kernels run on the columns side by side, as on so many runs, in each of
+which one noise is 1 and all others are 0; the covariance of all errors is the sum of the products
+of the columns. A filter needs no rule of its own for that. After each slot the columns are turned
+into as few as their rank allows, which leaves the sum of products as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from netkf.algorithms.filter import commutes, compiled_kernels
+from netkf.algorithms.records import make_records
+from netkf.engines.compiled.slot_filters import SlotFilters
+from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
+from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.lanes import LANES, blocks_of
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.observations import slot_observations
+from netkf.theory.numerics.updates import Observation
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+ZERO, MEAN, NOISE = range(3)
+"""The first columns: no noise at all, whose entries are those that do not depend on noise; the
+means; from NOISE on the noises.
+"""
+
+
+def has_columns(scenario: Scenario) -> bool:
+    """Return True if the filter of a scenario is affine and its verbs are kernels: then its errors
+    follow from the verbs. A filter that commutes with a shift of the truth says that it is affine.
+    """
+    kernels = compiled_kernels(scenario.node_filter, clocked=False)
+    return kernels is not None and not kernels.decides and commutes(scenario.node_filter)
+
+
+class SlotColumns:
+    """The errors of M estimators in slots, as columns."""
+
+    def __init__(self, scenario: Scenario, run: Run) -> None:
+        kernels = compiled_kernels(scenario.node_filter, clocked=False)
+        assert kernels is not None
+        self._scenario, self._run = scenario, run
+        self._setup: SlotSetup = slot_setup(scenario)
+        self.estimators, self.n = self._setup.estimators, self._setup.n
+        plant = scenario.slot_plant
+        self._F, self._noise = plant.F, square_root(plant.Q)
+        self._kernels = replace(kernels, decides=False)
+        self._kept: list[FloatArray] = []
+        # The true state (n, columns).
+        self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
+        self._filters = self._begin()
+
+    def _begin(self) -> SlotFilters:
+        """Return the filters at time 0: those of the column of means have theirs."""
+        setup = self._setup
+        columns = self._x.shape[1]
+        filters = SlotFilters(setup, self._kernels, blocks_of(columns), with_means=False)
+        starts = list(zip(setup.xhat, setup.root, strict=True))
+        means = make_records(
+            setup.algorithm, starts, setup.infos, setup.models, len(setup.links.sender), 1
+        )
+        for name, array in filters.records.arrays.items():
+            array[0, ..., MEAN] = means.arrays[name][0, ..., 0]
+        return filters
+
+    def replay(self) -> Iterator[None]:
+        """Replay the events of the run; yield at each of ``run.times``."""
+        scenario, run, setup = self._scenario, self._run, self._setup
+        observe, arrivals = slot_observations(scenario, run), _arrivals(scenario, run, setup)
+        predicts, processed = scenario.node_filter.predicts, 0
+        for until in scenario.slot_plant.slots_of(run.times).tolist():
+            while processed < until:
+                slot = processed if predicts else processed + 1
+                if predicts:
+                    self._simulate(slot, observe(slot), arrivals)
+                    self._move_truth()
+                else:
+                    self._move_truth()
+                    self._simulate(slot, observe(slot), arrivals)
+                self._compress()
+                processed += 1
+            yield
+
+    def _move_truth(self) -> None:
+        """Move the true state by one slot, with a column for each noise of the plant."""
+        self._x = np.column_stack([self._F @ self._x, self._noise])
+        self._fit(self._x.shape[1])
+
+    def _fit(self, columns: int) -> None:
+        """Give the filters so many columns; new ones are as the column without noise."""
+        arrays = self._filters.records.arrays
+        old, blocks = len(arrays["xhat"]), blocks_of(columns)
+        if blocks == old:
+            return
+        former = self._filters
+        self._filters = SlotFilters(self._setup, self._kernels, blocks, with_means=False)
+        for name, array in self._filters.records.arrays.items():
+            array[:] = arrays[name][:1, ..., ZERO : ZERO + 1]
+            kept = min(old, blocks)
+            array[:kept] = former.records.arrays[name][:kept]
+
+    def _simulate(
+        self, slot: int, observations: dict[int, Observation], arrivals: dict[int, np.ndarray]
+    ) -> None:
+        """Simulate a slot: each reading has a column for its noise."""
+        setup, n = self._setup, self.n
+        first = self._x.shape[1]
+        columns = first + sum(o.root.shape[1] for o in observations.values())
+        self._x = np.column_stack([self._x, np.zeros((n, columns - first))])
+        self._fit(columns)
+        blocks = len(self._filters.records.arrays["xhat"])
+        width = blocks * LANES
+        y = np.zeros((setup.estimators, setup.p, width))
+        H = np.zeros((1, 1, setup.estimators, setup.p, n, LANES))
+        for h, observation in observations.items():
+            rows, noises = observation.root.shape
+            whitened = np.linalg.solve(
+                np.linalg.cholesky(observation.R),
+                np.column_stack([observation.H, observation.root]),
+            )
+            y[h, :rows, :columns] = whitened[:, :n] @ self._x
+            y[h, :rows, first : first + noises] += whitened[:, n:]
+            H[0, 0, h, :rows] = whitened[:, :n, None]
+            first += noises
+        y = np.moveaxis(y.reshape(*y.shape[:2], blocks, LANES), 2, 0)[:, None]
+        algorithm, steps = setup.algorithm, len(setup.fresh)
+        up = arrivals.get(slot, np.zeros((steps, len(setup.directions)), dtype=np.uint8))
+        shape = (blocks, 1, *up.shape, LANES)
+        nothing = np.zeros(1, dtype=bool)
+        self._filters.simulate(
+            np.ascontiguousarray(y),
+            H,
+            _no_samples(setup, blocks, self._filters),
+            first=slot,
+            sensed=~nothing,
+            exchanged=np.array([algorithm.talks and slot >= algorithm.first_slot]),
+            sample=np.full(1, -1),
+            rebased=nothing,
+            up=np.ascontiguousarray(np.broadcast_to(up[None, None, :, :, None], shape)),
+            sent=np.zeros((0,) * 5, dtype=np.uint8),
+            uniform=np.zeros((0,) * 5),
+            part=WHOLE,
+        )
+
+    def _compress(self) -> None:
+        """Turn the columns of noises into as few as their rank allows."""
+        arrays = self._filters.records.arrays
+        blocks, columns = len(arrays["xhat"]), self._x.shape[1]
+        linear = {}
+        for name, array in arrays.items():
+            if array.dtype == np.float64:
+                matrix = np.moveaxis(array, 0, -2).reshape(-1, blocks * LANES)[:, :columns]
+                rows = (matrix[:, NOISE:] != matrix[:, ZERO : ZERO + 1]).any(axis=1)
+                if rows.any():
+                    linear[name] = matrix, rows
+        parts = [matrix[rows, NOISE:] - matrix[rows, ZERO : ZERO + 1]
+                 for matrix, rows in linear.values()]  # fmt: skip
+        stack = np.concatenate([self._x[:, NOISE:], *parts, *(form[:, 1:] for form in self._kept)])
+        if len(stack) < stack.shape[1]:
+            # stack' = Q R, and stack Q = R' has the same products.
+            stack = np.linalg.qr(stack.T, mode="r").T
+        count = stack.shape[1]
+        sizes = np.cumsum([self.n, *map(len, parts), *map(len, self._kept)])[:-1]
+        x, *others = np.split(stack, sizes)
+        self._x = np.column_stack([self._x[:, :NOISE], x])
+        compressed, kept = others[: len(parts)], others[len(parts) :]
+        self._kept = [
+            np.column_stack([form[:, :1], part])
+            for form, part in zip(self._kept, kept, strict=True)
+        ]
+        values = {}
+        for (name, (matrix, rows)), part in zip(linear.items(), compressed, strict=True):
+            whole = np.repeat(matrix[:, ZERO : ZERO + 1], NOISE + count, axis=1)
+            whole[:, MEAN] = matrix[:, MEAN]
+            whole[rows, NOISE:] += part
+            values[name] = whole
+        self._restore(values, NOISE + count)
+
+    def _restore(self, values: dict[str, FloatArray], columns: int) -> None:
+        """Write so many columns of the arrays that depend on noise back into the records."""
+        self._fit(columns)
+        arrays = self._filters.records.arrays
+        width = len(arrays["xhat"]) * LANES
+        for name, whole in values.items():
+            array = arrays[name]
+            full = np.repeat(whole[:, ZERO : ZERO + 1], width, axis=1)
+            full[:, :columns] = whole
+            shape = (*array.shape[1:-1], len(array), LANES)
+            array[:] = np.moveaxis(full.reshape(shape), -2, 0)
+
+    def _forms(self) -> FloatArray:
+        """Return the errors (M n, 1 + C): the mean, and the columns of noises."""
+        xhat = self._filters.records.arrays["xhat"]
+        blocks, columns = len(xhat), self._x.shape[1]
+        estimates = np.moveaxis(xhat, 0, -2).reshape(-1, blocks * LANES)[:, :columns]
+        return np.asarray(np.tile(self._x, (self.estimators, 1)) - estimates)[:, MEAN:]
+
+    def covariance(self) -> FloatArray:
+        """Return the joint covariance (M n, M n) of the errors of the estimators."""
+        noises = self._forms()[:, 1:]
+        return np.asarray(noises @ noises.T)
+
+    def second_moments(self) -> FloatArray:
+        """Return the joint second moments (M n, M n): covariances and products of means."""
+        forms = self._forms()
+        return np.asarray(forms @ forms.T)
+
+    def covariances(self) -> FloatArray:
+        """Return P (M, n, n) of the estimators."""
+        S = np.tril(self._filters.records.arrays["root"][0, ..., ZERO])
+        return np.asarray(S @ np.swapaxes(S, 1, 2))
+
+    def keep(self) -> None:
+        """Store the present errors for ``law``."""
+        self._kept.append(self._forms())
+
+    def law(self) -> tuple[FloatArray, FloatArray]:
+        """Return the mean (K M n,) and the covariance (K M n, K M n) of the errors at the K times
+        at which ``keep`` was called.
+        """
+        width = max(form.shape[1] for form in self._kept)
+        # Columns that came after a time are zero there.
+        forms = np.concatenate([
+            np.pad(form, ((0, 0), (0, width - form.shape[1]))) for form in self._kept
+        ])  # fmt: skip
+        noises = forms[:, 1:]
+        return forms[:, 0], np.asarray(noises @ noises.T)
+
+
+def _no_samples(setup: SlotSetup, blocks: int, filters: SlotFilters) -> SlotSamples:
+    """Return room for no sample."""
+    nothing, states = np.zeros((1, 0, 1)), np.zeros((blocks, 1, setup.n, LANES))
+    return SlotSamples(
+        nothing, nothing, nothing, nothing, states, states, False, np.zeros((blocks, LANES)),
+        *filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
+    )  # fmt: skip
+
+
+def _arrivals(scenario: Scenario, run: Run, setup: SlotSetup) -> dict[int, np.ndarray]:
+    """Return by slot which messages were used, (E, W) in the order of exchanges of a slot and of
+    the directed links.
+    """
+    log, index = run.log, setup.index_of_direction
+    sends, delivers = (log[log["kind"] == CODES[kind]] for kind in ("send", "deliver"))
+    slots, phases = scenario.slot_plant.slots_of(sends["t"]), np.maximum(sends["phase"], 0)
+    first_step = {phase: setup.phases.index(phase) for phase in set(setup.phases)}
+    counts: dict[tuple[int, int, int], int] = {}
+    places: dict[tuple[int, int], tuple[int, int]] = {}
+    columns = (slots, phases, *(sends[name] for name in ("node", "peer", "message")))
+    for slot, phase, node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
+        w = index[node, peer]
+        # A link sends once in each repetition of an exchange.
+        step = counts.get((slot, phase, w), 0)
+        counts[slot, phase, w] = step + 1
+        places[w, number] = slot, first_step[phase] + step
+    shape = len(setup.fresh), len(setup.directions)
+    arrivals: dict[int, np.ndarray] = {}
+    columns = tuple(delivers[name] for name in ("node", "peer", "message"))
+    for node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
+        w = index[peer, node]
+        slot, step = places[w, number]
+        arrivals.setdefault(slot, np.zeros(shape, dtype=np.uint8))[step, w] = 1
+    return arrivals
