@@ -248,12 +248,12 @@ class Renewal(LinkClock):
             raise ScenarioError("mean", rule, names, "keep or add one")
         if self.low is not None and self.high is not None and self.high < self.low:
             raise ScenarioError("high", "must be at least low", self.high, "swap the two")
-        if self._mean < MIN_GAP:
+        if self.mean_gap < MIN_GAP:
             rule = f"gaps must be at least {MIN_GAP:g} s on average"
-            raise ScenarioError("high" if not one_of else names[0], rule, self._mean, "lengthen")
+            raise ScenarioError("high" if not one_of else names[0], rule, self.mean_gap, "lengthen")
 
     @property
-    def _mean(self) -> float:
+    def mean_gap(self) -> float:
         """Mean gap in seconds."""
         if self.low is not None and self.high is not None:
             return 0.5 * (self.low + self.high)
@@ -265,7 +265,7 @@ class Renewal(LinkClock):
 
     def mean_rate(self, entity: Entity) -> float:
         """Return one over the mean gap, in ticks per second."""
-        return 1.0 / self._mean
+        return 1.0 / self.mean_gap
 
     @property
     def memoryless(self) -> bool:
@@ -280,8 +280,8 @@ class Renewal(LinkClock):
         if self.shape is not None:
             return (gamma_law if self.distribution == "gamma" else weibull_law)(self.shape)
         if self.low is not None and self.high is not None and self.low < self.high:
-            return uniform_law(self.low / self._mean, self.high / self._mean)
-        return Lattice(self._mean, self._mean)  # the first tick is one gap after time 0
+            return uniform_law(self.low / self.mean_gap, self.high / self.mean_gap)
+        return Lattice(self.mean_gap, self.mean_gap)  # the first tick is one gap after time 0
 
     def ticks(
         self,
@@ -301,9 +301,9 @@ class Renewal(LinkClock):
         shape = self.shape or 1.0
         if self.distribution == "gamma":
             gaps = random.standard_gamma(shape, count)
-            gaps = gaps / (shape * self.rate) if self.rate else gaps * (self._mean / shape)
+            gaps = gaps / (shape * self.rate) if self.rate else gaps * (self.mean_gap / shape)
         elif self.distribution == "weibull":
-            scale = self._mean / math.gamma(1.0 + 1.0 / shape)
+            scale = self.mean_gap / math.gamma(1.0 + 1.0 / shape)
             gaps = random.standard_exponential(count) ** (1.0 / shape) * scale
         elif self.distribution == "uniform":
             assert self.low is not None
@@ -312,7 +312,7 @@ class Renewal(LinkClock):
         else:
             # Tick number 0 is at one gap after time 0, as nothing is sent at time 0. From its
             # number and not from the tick before: rounding does not add up.
-            return self._mean * np.arange(index + 1, index + 1 + count)
+            return self.mean_gap * np.arange(index + 1, index + 1 + count)
         return _accumulate(now, gaps)
 
 

@@ -21,10 +21,10 @@ from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_samples
 from netkf.engines.compiled.per_scenario import once_per_scenario
-from netkf.engines.compiled.poisson import all_ticks, window_of
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.state import SPECIAL, Filters, PathBlock, Sensing
+from netkf.engines.compiled.ticks import all_ticks, window_of
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES

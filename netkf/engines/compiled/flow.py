@@ -35,7 +35,6 @@ from netkf.engines.compiled.evidence import enlarge_evidence
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.late_readings import History, add_past, empty_history
 from netkf.engines.compiled.origins import move_origin
-from netkf.engines.compiled.poisson import schedule
 from netkf.engines.compiled.running_totals import Totals, empty_totals
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.samples import record_samples
@@ -59,6 +58,7 @@ from netkf.engines.compiled.state import (
     filters_at_start,
     scratch_arrays,
 )
+from netkf.engines.compiled.ticks import schedule
 from netkf.engines.compiled.truth import CompleteStates, PathStates, States
 from netkf.engines.compiled.visits import Visits, empty_visits
 from netkf.linalg.arrays import FloatArray
@@ -188,7 +188,7 @@ def _make_windows(scenario: Scenario, streams: Streams, instants: Instants) -> W
     senders = senders_of(scenario)
     if senders.at == "readings":
         return ReadingsSchedule(scenario, streams, senders, instants.t, instants.index)
-    return schedule(scenario, streams, senders)
+    return schedule(scenario, streams)
 
 
 class Workspace:

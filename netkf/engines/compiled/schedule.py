@@ -25,7 +25,7 @@ from netkf.network.channels import (
     delivery_probabilities,
     identical_per_link,
 )
-from netkf.network.clocks import LinkClock, Poisson
+from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.rng.draws import StreamBatch
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -97,9 +97,8 @@ class TickSource:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
     ) -> None:
-        """Make the random streams of all E entities (links, directions or nodes with a clock), or,
-        for clocks that are not Poisson, generators and the origins from which their ticks are
-        counted.
+        """Make the generators of all E entities (links, directions or nodes with a clock), and the
+        origins from which their ticks are counted.
         """
         clock, runs, entities = (
             scenario.network.activation,
@@ -111,14 +110,7 @@ class TickSource:
         self._snap = scenario.time_grid.snap
         count = len(self._entities)
         self.last, self.drawn = np.zeros(count), np.zeros(count, dtype=np.int64)
-        # Poisson clocks are drawn for all entities at once; others one by one in Python.
-        self._all_poisson = type(clock) is Poisson
-        self._rates = self._origins = np.empty(0)
-        if isinstance(clock, LinkClock) and self._all_poisson:
-            self._draws = StreamBatch(streams, "clock", entities)
-            # Entities of several runs follow one another, run by run.
-            self._rates = np.tile([clock.mean_rate(entity) for entity in entities], runs)
-        elif isinstance(clock, LinkClock):
+        if isinstance(clock, LinkClock):
             self._random = [
                 one.generator("clock", *entity)
                 for one in streams.per_replica
@@ -138,15 +130,12 @@ class TickSource:
         horizon, entity by entity, and how many each entity has, (M,). Advances ``last`` and
         ``drawn``.
         """
-        if self._all_poisson:
-            times, sizes = self._exponential(indices, counts), counts
-        else:
-            blocks = [self._ticks(k, count) for k, count in zip(indices, counts, strict=True)]
-            sizes = np.array([len(t) for t in blocks])
-            # Rows of different lengths are padded with infinity.
-            times = np.full((len(indices), max(sizes.max(), 1)), np.inf)
-            for row, t in zip(times, blocks, strict=True):
-                row[: len(t)] = t
+        blocks = [self._ticks(k, count) for k, count in zip(indices, counts, strict=True)]
+        sizes = np.array([len(t) for t in blocks])
+        # Rows of different lengths are padded with infinity.
+        times = np.full((len(indices), max(sizes.max(), 1)), np.inf)
+        for row, t in zip(times, blocks, strict=True):
+            row[: len(t)] = t
         # Clocks go on from their own times, and the ticks are the instants nearest to them. The
         # horizon is half open.
         instants = self._snap(times)
@@ -157,19 +146,6 @@ class TickSource:
         ended = (sizes == 0) | (numbers < sizes)
         self.last[indices] = np.where(ended, np.inf, times[np.arange(len(indices)), sizes - 1])
         return instants[before_horizon], numbers
-
-    def _exponential(self, indices: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return the times (M, max(counts)) in seconds of the next ``counts`` (M,) ticks of the
-        Poisson clocks of the entities ``indices`` (M,), infinite beyond the counts: sums of
-        exponential gaps, as ``Poisson.ticks`` draws them for one clock.
-        """
-        times = np.full((len(indices), counts.max() + 1), np.inf)
-        times[:, 0] = self.last[indices]
-        # Exponential gaps over the rate, one batch for all streams.
-        gaps = self._draws.exponentials(indices, counts) / np.repeat(self._rates[indices], counts)
-        times[:, 1:][np.arange(times.shape[1] - 1) < counts[:, None]] = gaps
-        # Accumulated from the last tick, in the same order of additions as tick by tick.
-        return np.asarray(np.add.accumulate(times, axis=1)[:, 1:])
 
     def _ticks(self, k: int, count: int) -> FloatArray:
         """Return the times (count,) in seconds of the next ``count`` ticks of entity ``k``, fewer

@@ -1,0 +1,673 @@
+"""Schedules of the built-in clocks and channels, drawn and sorted in compiled code.
+
+Ticks are drawn entity by entity, each from its own stream, for a window of time after another, and
+then sorted. Those of random gaps are about evenly spread over a window, so that they are sorted by
+counting: a window is divided into as many bins as it has ticks, of about one tick each. Those of
+lattices may crowd, and are merged.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.core.instants import snapped
+from netkf.engines.compiled.per_scenario import once_per_scenario
+from netkf.engines.compiled.schedule import (
+    LOST,
+    MAX_WINDOW_TICKS,
+    Schedule,
+    Window,
+    all_windows,
+)
+from netkf.engines.compiled.senders import Senders, senders_of
+from netkf.engines.compiled.slot_messages import next_state
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.network.channels import (
+    Bernoulli,
+    ConstantDelay,
+    ExponentialDelay,
+    GilbertElliott,
+    LognormalDelay,
+    NoDelay,
+    NoLoss,
+    PerLink,
+    UniformDelay,
+)
+from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
+from netkf.rng.draws import StreamBatch, Ziggurat, next_exponential, next_unit, ziggurat
+from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
+from netkf.scenario.scenario import Scenario
+
+TICKS, MIN_TICKS_PER_ENTITY = 1 << 15, 4
+"""Ticks in a window: TICKS, whose arrays fit the processor's cache, or, if these are more,
+MIN_TICKS_PER_ENTITY for each entity, since each has a fixed cost in a window; at most
+MAX_WINDOW_TICKS.
+"""
+EXPONENTIAL_GAPS, UNIFORM_GAPS, LATTICE = range(3)
+"""Kinds of clocks: random gaps, and times that follow from the number of the tick, but for a
+jitter.
+"""
+LOSSES = (NoLoss, Bernoulli, PerLink, GilbertElliott)
+DELAYS = (NoDelay, ConstantDelay, ExponentialDelay, UniformDelay, LognormalDelay)
+FIXED, EXPONENTIAL, UNIFORM, LOGNORMAL = range(4)
+"""Laws of delays."""
+
+
+class Clocks(NamedTuple):
+    """The clocks of R runs, E entities in all; ``first`` and ``outgoing`` are those of a run.
+
+    kind : EXPONENTIAL_GAPS, UNIFORM_GAPS or LATTICE
+    next_tick, number : (E,), time of the next tick, seconds, not on the grid yet, and its number
+    scale : (E,), ticks per second of random gaps, or the time from which a lattice is counted
+    low, width : uniform gaps and jitters are ``low + width u``; ``low`` is the period of a lattice
+    streams : (E, WIDTH), states of the random streams
+    first, outgoing : entity e of a run sends on the directions ``outgoing[first[e]:first[e + 1]]``
+    per_second : ticks of the time grid in a second (core.instants)
+    """
+
+    kind: int
+    next_tick: FloatArray
+    number: IntArray
+    scale: FloatArray
+    low: float
+    width: float
+    streams: np.ndarray
+    first: IntArray
+    outgoing: IntArray
+    per_second: float
+
+
+class ChannelStreams(NamedTuple):
+    """The losses and delays of the messages of R runs, on W directions, from S streams a run.
+
+    source : (W,), stream of each direction, within a run
+    count : S
+    delivery : (2, W), delivery probabilities in the good and the bad state of the link
+    loss, state, delay : (R S, WIDTH), states of the random streams; (0, WIDTH): nothing is drawn
+    bad : (R S,), state of each link (1: bad), -1 at first
+    to_bad, to_good : transition probabilities of that state
+    law, scale, width : law of the delays (FIXED, ...) and its parameters
+    bits : whether outcomes are stored as arrival bits, see TickBuffer
+    """
+
+    source: IntArray
+    count: int
+    delivery: FloatArray
+    loss: np.ndarray
+    state: np.ndarray
+    delay: np.ndarray
+    bad: IntArray
+    to_bad: float
+    to_good: float
+    law: int
+    scale: float
+    width: float
+    bits: bool
+    exponential: Ziggurat
+    normal: NormalZiggurat
+
+
+class TickBuffer(NamedTuple):
+    """Space for K ticks.
+
+    t, entity : (K,), time in seconds, and index of the entity whose clock ticks
+    first_outcome : (K,), the outcomes of tick k begin at ``delay[first_outcome[k]]``; with ``bits``
+                    this number itself has a bit for each message that arrives
+    delay : (D,), outcomes of all messages, tick after tick: seconds, or LOST; empty with ``bits``
+    """
+
+    t: FloatArray
+    entity: np.ndarray
+    first_outcome: np.ndarray
+    delay: FloatArray
+
+
+@kernel
+def draw_ticks(
+    clocks: Clocks,
+    channels: ChannelStreams,
+    run: int,
+    end: float,
+    buffer: TickBuffer,
+    counts: IntArray,
+) -> bool:
+    """Append the ticks before ``end`` (seconds) of all entities (links, directions or nodes with a
+    clock) of run number ``run`` to ``buffer``, with their outcomes. ``counts`` (2,) are the numbers
+    of ticks and outcomes in the buffer; advances these, the clocks and the streams. Return False if
+    the buffer is full before; a call with a larger one then goes on.
+    """
+    for e in range(len(clocks.first) - 1):
+        first, after = clocks.first[e], clocks.first[e + 1]
+        k, max_outcomes = run * (len(clocks.first) - 1) + e, len(buffer.delay) - (after - first)
+        now, m = clocks.next_tick[k], counts[0]
+        instant = snapped(now, clocks.per_second)
+        while instant < end:
+            # Check the space before a tick is drawn: after an enlargement drawing goes on with
+            # this tick.
+            if m == len(buffer.t) or counts[1] > max_outcomes:
+                clocks.next_tick[k], counts[0] = now, m
+                return False
+            buffer.t[m], buffer.entity[m] = instant, e
+            buffer.first_outcome[m] = draw_outcomes(
+                channels, run, clocks.outgoing, first, after, buffer.delay, counts
+            )
+            m += 1
+            # The next tick is drawn now: it may lie in the next window.
+            now = tick_after(clocks, k, now, channels.exponential)
+            instant = snapped(now, clocks.per_second)
+        clocks.next_tick[k], counts[0] = now, m
+    return True
+
+
+@kernel(inlined=True)
+def tick_after(clocks: Clocks, k: int, now: float, exponential: Ziggurat) -> float:
+    """Return the time of the tick of entity ``k`` after that at ``now`` (seconds), off the grid."""
+    if clocks.kind == EXPONENTIAL_GAPS:
+        return now + next_exponential(clocks.streams, k, exponential) / clocks.scale[k]
+    if clocks.kind == UNIFORM_GAPS:
+        return now + (clocks.low + clocks.width * next_unit(clocks.streams, k))
+    number = clocks.number[k]
+    clocks.number[k] = number + 1
+    time: float = clocks.scale[k] + clocks.low * number
+    return time + clocks.width * next_unit(clocks.streams, k) if clocks.width > 0.0 else time
+
+
+@kernel
+def start_clocks(clocks: Clocks, exponential: Ziggurat) -> None:
+    """Draw the first tick of each entity."""
+    for k in range(len(clocks.next_tick)):
+        clocks.next_tick[k] = tick_after(clocks, k, 0.0, exponential)
+
+
+@kernel(inlined=True)
+def draw_outcomes(
+    channels: ChannelStreams,
+    run: int,
+    outgoing: IntArray,
+    first: int,
+    after: int,
+    out: FloatArray,
+    counts: IntArray,
+) -> int:
+    """Draw which messages of a tick arrive in run number ``run``, on the directed links
+    ``outgoing[first:after]``, and append their delays (seconds or LOST) to ``out`` at
+    ``counts[1]``, which advances. Return the ``first_outcome`` of the tick: where its outcomes
+    begin, or, with ``channels.bits``, a bit for each message that arrives instead of outcomes.
+    """
+    outcome, uniform, bad, last = 0 if channels.bits else counts[1], 0.0, 0, -1
+    delay = channels.scale
+    # One draw for each stream: directions that share a stream are neighbours.
+    for m in range(first, after):
+        w = outgoing[m]
+        if channels.source[w] != last:
+            last = channels.source[w]
+            k = run * channels.count + last
+            if len(channels.loss) > 0:
+                # Below 1, so that a link with probability 1 loses nothing.
+                uniform = next_unit(channels.loss, k)
+            if len(channels.state) > 0:
+                u = next_unit(channels.state, k)
+                bad = next_state(channels.bad[k], u, channels.to_bad, channels.to_good)
+                channels.bad[k] = bad
+            if channels.law != FIXED:
+                delay = draw_delay(channels, k)
+        arrives = uniform < channels.delivery[bad, w]
+        if channels.bits:
+            outcome |= np.int64(arrives) << (m - first)
+        else:
+            out[counts[1]] = delay if arrives else LOST
+            counts[1] += 1
+    return outcome
+
+
+@kernel
+def draw_delay(channels: ChannelStreams, k: int) -> float:
+    """Return the next random delay (seconds) of stream ``k``."""
+    if channels.law == EXPONENTIAL:
+        return channels.scale * next_exponential(channels.delay, k, channels.exponential)
+    if channels.law == UNIFORM:
+        return channels.scale + channels.width * next_unit(channels.delay, k)
+    sigma = channels.width
+    z = next_normal(channels.delay, k, channels.normal)
+    return channels.scale * math.exp(sigma * (z - 0.5 * sigma))
+
+
+class Sorting(NamedTuple):
+    """Scratch to sort K ticks: position of the next tick of each bin, ``place`` (K + 1,), and the
+    index of the tick at each position, ``source`` (K,). Int32 halves their size in the cache.
+    """
+
+    place: np.ndarray
+    source: np.ndarray
+
+
+def _sorting(ticks: int) -> Sorting:
+    """Return scratch to sort K = ``ticks`` ticks."""
+    return Sorting(np.empty(ticks + 1, dtype=np.int32), np.empty(ticks, dtype=np.int32))
+
+
+@kernel
+def merge_in_time_order(
+    count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
+) -> None:
+    """Sort the first ``count`` ticks of ``buffer`` by (time, entity) into ``ordered``, as
+    ``put_in_time_order``: merge neighbouring runs of increasing times, at first those of entities.
+    """
+    t, source, merged = buffer.t, sorting.source, sorting.place
+    for k in range(count):
+        source[k] = k
+    runs = count
+    while runs > 1:
+        runs, begin = 0, 0
+        while begin < count:
+            middle = end_of_run(t, source, begin, count)
+            end = end_of_run(t, source, middle, count)
+            i, j = begin, middle
+            for k in range(begin, end):
+                # At equal times the earlier run, that of smaller entities, comes first.
+                if j == end or (i < middle and t[source[i]] <= t[source[j]]):
+                    merged[k], i = source[i], i + 1
+                else:
+                    merged[k], j = source[j], j + 1
+            runs, begin = runs + 1, end
+        for k in range(count):
+            source[k] = merged[k]
+    for k in range(count):
+        m = source[k]
+        ordered.t[k], ordered.entity[k] = t[m], buffer.entity[m]
+        ordered.first_outcome[k] = buffer.first_outcome[m]
+
+
+@kernel(inlined=True)
+def end_of_run(t: FloatArray, source: IntArray, begin: int, count: int) -> int:
+    """Return where the run of times that do not decrease ends that begins at ``begin``."""
+    k = min(begin + 1, count)
+    while k < count and t[source[k - 1]] <= t[source[k]]:
+        k += 1
+    return k
+
+
+@kernel
+def put_in_time_order(
+    begin: float, end: float, count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
+) -> None:
+    """Sort the first ``count`` ticks of ``buffer``, which lie in [begin, end) seconds and were
+    drawn entity by entity, by (time, entity), the order in which they happen: write them into
+    ``ordered``. Outcomes stay where they are. ``sorting`` is scratch.
+    """
+    # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
+    place, source, scale = sorting.place, sorting.source, count / (end - begin)
+    # Counting sort by bin: count, sum up, and place.
+    for m in range(count + 1):
+        place[m] = 0
+    for m in range(count):
+        place[bin_of(buffer.t[m], begin, scale, count) + 1] += 1
+    for m in range(count):
+        place[m + 1] += place[m]
+    for m in range(count):
+        # place[k] is where the next tick of bin k goes.
+        k = bin_of(buffer.t[m], begin, scale, count)
+        source[place[k]] = m
+        place[k] += 1
+    # Insertion sort orders ticks inside bins, in linear time on average, since few share one.
+    # It is by (time, entity): ties keep the order of entities.
+    t, entity, outcome = ordered.t, ordered.entity, ordered.first_outcome
+    for position in range(count):
+        m, k = source[position], position
+        time, e = buffer.t[m], buffer.entity[m]
+        while k > 0 and (t[k - 1] > time or (t[k - 1] == time and entity[k - 1] > e)):
+            t[k], entity[k], outcome[k] = t[k - 1], entity[k - 1], outcome[k - 1]
+            k -= 1
+        t[k], entity[k], outcome[k] = time, e, buffer.first_outcome[m]
+
+
+@kernel(inlined=True)
+def bin_of(time: float, begin: float, scale: float, count: int) -> int:
+    """Return the index (0 to ``count`` - 1) of the bin that ``time`` lies in, of ``count`` bins
+    from ``begin`` (seconds) on, ``scale`` of them per second.
+    """
+    return min(int((time - begin) * scale), count - 1)
+
+
+class AllTicks(NamedTuple):
+    """The K ticks of R runs, one run after the other, as in a TickBuffer.
+
+    t, entity, first_outcome : (K,); ticks ``first[r]`` to ``first[r + 1]`` - 1 are those of run r,
+                               whose ``first_outcome`` counts from ``first_delay[r]``
+    delay : (D,), outcomes of all runs: seconds, or LOST
+    first, first_delay : (R + 1,)
+    bits : whether ``first_outcome`` holds arrival bits instead
+    """
+
+    t: FloatArray
+    entity: np.ndarray
+    first_outcome: np.ndarray
+    delay: FloatArray
+    first: np.ndarray
+    first_delay: np.ndarray
+    bits: bool = False
+
+
+@kernel
+def draw_all_ticks(
+    clocks: Clocks,
+    channels: ChannelStreams,
+    horizon: float,
+    buffer: TickBuffer,
+    counts: IntArray,
+    sorting: Sorting,
+    ticks: AllTicks,
+) -> bool:
+    """Draw the ticks of all R runs up to the ``horizon`` (seconds) into ``ticks``, run after run,
+    sorted by (time, entity) in each run. ``buffer``, ``counts`` (2,) and ``sorting`` are scratch.
+    Advances the clocks and streams. Return False if an array is too small: the caller restores
+    these and starts again with more space.
+    """
+    for run in range(len(ticks.first) - 1):
+        counts[0] = counts[1] = 0
+        if not draw_ticks(clocks, channels, run, horizon, buffer, counts):
+            return False
+        first, begin = ticks.first[run], ticks.first_delay[run]
+        last, end = first + counts[0], begin + counts[1]
+        # The arrays are too small for this run: the caller starts again with more space.
+        if last > len(ticks.t) or end > len(ticks.delay):
+            return False
+        ordered = TickBuffer(
+            ticks.t[first:last],
+            ticks.entity[first:last],
+            ticks.first_outcome[first:last],
+            buffer.delay,
+        )
+        if clocks.kind == LATTICE:
+            merge_in_time_order(counts[0], buffer, ordered, sorting)
+        else:
+            put_in_time_order(0.0, horizon, counts[0], buffer, ordered, sorting)
+        # ``first_outcome`` counts within the run, so that outcomes are copied as they are.
+        for k in range(counts[1]):
+            ticks.delay[begin + k] = buffer.delay[k]
+        ticks.first[run + 1], ticks.first_delay[run + 1] = last, end
+    return True
+
+
+def is_kernel_clock(clock: object) -> bool:
+    """Return True if kernels can draw the ticks of a clock."""
+    # By exact type: a subclass may override the law.
+    if type(clock) is Renewal:
+        return clock.distribution in ("uniform", "constant")
+    return type(clock) in (Poisson, Periodic)
+
+
+def is_drawn_in_kernels(scenario: Scenario) -> bool:
+    """Return True if kernels can draw the ticks and the outcomes of a scenario."""
+    network, talks = scenario.network, scenario.node_filter.talks
+    return (
+        talks
+        and bool(scenario.topology.links)
+        and is_kernel_clock(network.activation)
+        and type(network.channel.loss) in LOSSES
+        and type(network.channel.delay) in DELAYS
+    )
+
+
+def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders) -> Clocks:
+    """Return the clocks of all runs, before their first ticks."""
+    clock, runs, entities = scenario.network.activation, streams.runs, senders.entities
+    assert isinstance(clock, LinkClock)
+    count = len(entities) * runs
+    kind, low, width, number = EXPONENTIAL_GAPS, 0.0, 0.0, np.zeros(count, dtype=np.int64)
+    scale = np.tile(_rates(scenario), runs)
+    if isinstance(clock, Periodic):
+        kind, low, width = LATTICE, clock.period, clock.jitter
+        if isinstance(clock.phase, str):
+            units = StreamBatch(streams, "phase", entities).units(np.arange(count), number + 1)
+            scale = clock.period * units
+        else:
+            scale = np.full(count, clock.phase)
+        # With phase 0 the lattice point at time 0 is no tick.
+        number = (scale == 0.0).astype(np.int64)
+    elif isinstance(clock, Renewal) and clock.distribution == "uniform":
+        assert clock.low is not None
+        assert clock.high is not None
+        kind, low, width = UNIFORM_GAPS, clock.low, clock.high - clock.low
+    elif isinstance(clock, Renewal):
+        kind, low, number, scale = LATTICE, clock.mean_gap, number + 1, np.zeros(count)
+    return Clocks(
+        kind=kind,
+        next_tick=np.zeros(count),
+        number=number,
+        scale=scale,
+        low=low,
+        width=width,
+        streams=streams.states("clock", entities),
+        first=senders.first,
+        outgoing=senders.outgoing,
+        per_second=scenario.time_grid.per_second,
+    )
+
+
+def _channel_streams(
+    scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders, bits: bool
+) -> ChannelStreams:
+    """Return the losses and delays of all runs, before anything is drawn."""
+    channel = scenario.network.channel
+    none: np.ndarray = np.empty((0, WIDTH), dtype=np.uint64)
+    loss, delay = channel.loss, channel.delay
+    to_bad, to_good = loss.transitions if isinstance(loss, GilbertElliott) else (0.0, 1.0)
+    law, scale, width = FIXED, float(delay.fixed or 0.0), 0.0
+    if isinstance(delay, ExponentialDelay):
+        law, scale = EXPONENTIAL, delay.mean
+    elif isinstance(delay, UniformDelay):
+        law, scale, width = UNIFORM, delay.low, delay.high - delay.low
+    elif isinstance(delay, LognormalDelay):
+        law, scale, width = LOGNORMAL, delay.mean, delay.sigma
+    sources = senders.sources
+    return ChannelStreams(
+        source=senders.source,
+        count=len(sources),
+        delivery=_delivery_table(scenario),
+        loss=none if loss.deterministic else streams.states("loss", sources),
+        state=streams.states("weather", sources) if loss.stateful else none,
+        delay=streams.states("delay", sources) if delay.is_random else none,
+        bad=np.full(len(sources) * streams.runs, -1, dtype=np.int64),
+        to_bad=to_bad,
+        to_good=to_good,
+        law=law,
+        scale=scale,
+        width=width,
+        bits=bits,
+        exponential=ziggurat(),
+        normal=normal_ziggurat(),
+    )
+
+
+@once_per_scenario
+def _rates(scenario: Scenario) -> FloatArray:
+    """Return the ticks per second (E,) of each entity: link, direction or node with a clock."""
+    clock, senders = scenario.network.activation, senders_of(scenario)
+    assert isinstance(clock, LinkClock)
+    return np.array([clock.mean_rate(entity) for entity in senders.entities])
+
+
+@once_per_scenario
+def _delivery_table(scenario: Scenario) -> FloatArray:
+    """Return the delivery probabilities (2, W) of each direction in a good and a bad state."""
+    loss = scenario.network.channel.loss
+    table = [
+        [
+            loss.delivery_probability(direction, 0, bad, scenario.table_probability(direction))
+            for direction in senders_of(scenario).directions
+        ]
+        for bad in (False, True)
+    ]
+    return np.array(table)
+
+
+class KernelSchedules:
+    """The ticks of some runs of a scenario with built-in clocks and channels, and which of their
+    messages arrive: window by window, or all at once.
+    """
+
+    def __init__(
+        self, scenario: Scenario, streams: Streams | ReplicaStreams, bits: bool = False
+    ) -> None:
+        """Draw the first tick of each entity (a node, link or direction that has a clock) in each
+        run of ``streams``. ``bits``: the outcomes of a tick are one integer with a bit for each of
+        its messages, 1 if it arrives, instead of a delay for each; only if no message takes time.
+        """
+        senders = senders_of(scenario)
+        self._clocks = _clocks(scenario, streams, senders)
+        self._channels = _channel_streams(scenario, streams, senders, bits)
+        start_clocks(self._clocks, ziggurat())
+        rates = _rates(scenario)
+        self._runs, self._rate = streams.runs, float(rates.sum())
+        # Mean number of messages for each tick.
+        self._sends = float(rates @ np.diff(senders.first)) / self._rate
+        self._max_sends = int(np.diff(senders.first).max())
+        self._horizon, self._length = scenario.horizon, math.inf
+        self._instant = scenario.time_grid.instant
+        if self._rate > 0.0:
+            entities = len(senders.entities)
+            # A window of some thousand ticks, more of them where there are many links.
+            self._length = (
+                max(TICKS, min(MIN_TICKS_PER_ENTITY * entities, MAX_WINDOW_TICKS)) / self._rate
+            )
+        self._end, self._buffer = 0.0, _empty_buffer(0, 0)
+
+    def following(self) -> Window:
+        """Return the next window of the ticks of one run; the last one ends at infinity."""
+        begin, end = self._end, self._instant(self._end + self._length)
+        # The last window has no end, so that the loop asks for no other.
+        if not begin < end < self._horizon:
+            end = math.inf
+        self._end = end
+        return self._window(0, begin, end)
+
+    def all(self) -> AllTicks:
+        """Return all ticks of all R runs up to the horizon, one run after the other, for batches of
+        runs.
+        """
+        clocks, channels = self._clocks, self._channels
+        states = clocks.next_tick, clocks.number, clocks.streams, channels.loss, channels.state
+        states += (channels.delay, channels.bad)
+        # Copies of the streams: an attempt that runs out of space starts again from them.
+        copies = [state.copy() for state in states]
+        # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
+        # more ticks the loop tries again with more space.
+        expected, spread = self._rate * self._horizon, 8.0
+        while True:
+            max_ticks = _space_for_count(expected, spread)
+            total = _space_for_count(self._runs * expected, spread) + max_ticks
+            buffer, ticks = self._space(max_ticks), self._space_for_all(total)
+            scratch = buffer, np.zeros(2, dtype=np.int64), _sorting(max_ticks)
+            if draw_all_ticks(clocks, channels, self._horizon, *scratch, ticks):
+                return ticks
+            spread *= 2.0
+            for state, copy in zip(states, copies, strict=True):
+                state[:] = copy
+
+    def _space(self, ticks: int) -> TickBuffer:
+        """Return space for ``ticks`` ticks and the outcomes of about as many messages as they
+        send.
+        """
+        sends = 0.0 if self._channels.bits else self._sends
+        return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
+
+    def _space_for_all(self, ticks: int) -> AllTicks:
+        """Return space for ``ticks`` ticks of all R runs together, and the outcomes of their
+        messages.
+        """
+        t, entity, first_outcome, delay = self._space(ticks)
+        first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
+        return AllTicks(t, entity, first_outcome, delay, first, first_delay, self._channels.bits)
+
+    def _window(self, run: int, begin: float, end: float) -> Window:
+        """Draw and return the ticks of run number ``run`` in [begin, end) seconds, in the order of
+        time. The buffer into which they are drawn is enlarged until all of them fit.
+        """
+        last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
+        # Space for the mean plus eight standard deviations of a Poisson count is nearly always
+        # enough.
+        expected = self._rate * (last - begin)
+        ticks = _space_for_count(expected, 8.0)
+        sends = int(self._sends * ticks) + self._max_sends
+        while True:
+            self._enlarge_buffer(ticks, sends)
+            if draw_ticks(self._clocks, self._channels, run, last, self._buffer, counts):
+                break
+            # The ticks so far stay in the buffer: the kernel continues where it stopped.
+            ticks, sends = 2 * ticks, 2 * sends
+        count = int(counts[0])
+        ordered = _empty_buffer(count, 0)._replace(delay=self._buffer.delay[: counts[1]].copy())
+        if self._clocks.kind == LATTICE:
+            merge_in_time_order(count, self._buffer, ordered, _sorting(count))
+        else:
+            put_in_time_order(begin, last, count, self._buffer, ordered, _sorting(count))
+        return Window(end, *ordered)
+
+    def _enlarge_buffer(self, ticks: int, sends: int) -> None:
+        """Make the buffer large enough for ``ticks`` ticks and ``sends`` outcomes, keeping its
+        contents; it never shrinks.
+        """
+        if len(self._buffer.t) >= ticks and len(self._buffer.delay) >= sends:
+            return
+        larger = _empty_buffer(ticks, sends)
+        for target, source in zip(larger, self._buffer, strict=True):
+            size = min(len(source), len(target))
+            target[:size] = source[:size]
+        self._buffer = larger
+
+
+def _space_for_count(expected: float, deviations: float) -> int:
+    """Return a number that a Poisson count with the mean ``expected`` hardly ever exceeds: so many
+    standard ``deviations`` above the mean, and some more for small means.
+    """
+    return int(expected + deviations * math.sqrt(expected)) + 8
+
+
+def _empty_buffer(ticks: int, sends: int) -> TickBuffer:
+    """Return space for ``ticks`` ticks and ``sends`` outcomes."""
+    entity, first_outcome = (np.empty(ticks, dtype=np.int64) for _ in range(2))
+    return TickBuffer(np.empty(ticks), entity, first_outcome, np.empty(sends))
+
+
+def all_ticks(scenario: Scenario, streams: ReplicaStreams, bits: bool = False) -> AllTicks:
+    """Return all ticks of R runs up to the horizon, with their outcomes: the delay of each message,
+    or LOST. ``bits``: with arrival bits (bit m is 1 if message m of a tick arrives) instead of
+    outcomes, which is possible if clocks are Poisson and no message takes time.
+    """
+    if is_drawn_in_kernels(scenario):
+        return KernelSchedules(scenario, streams, bits).all()
+    # Any other clock or channel: windows drawn in Python, joined run after run.
+    windows = all_windows(scenario, streams)
+    first, first_delay = (
+        np.cumsum([0, *(len(getattr(window, name)) for window in windows)])
+        for name in ("t", "delay")
+    )
+    t, entity, first_outcome, delay = (
+        np.concatenate([getattr(window, name) for window in windows])
+        for name in ("t", "entity", "first_outcome", "delay")
+    )
+    return AllTicks(t, entity, first_outcome, delay, first, first_delay)
+
+
+def window_of(ticks: AllTicks, run: int) -> Window:
+    """Return all ticks of run number ``run`` (0 to R - 1) as a window without an end."""
+    own, outcomes = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
+    return Window(
+        end=math.inf,
+        t=ticks.t[own],
+        entity=ticks.entity[own],
+        first_outcome=ticks.first_outcome[own],
+        delay=ticks.delay[outcomes],
+    )
+
+
+def schedule(scenario: Scenario, streams: Streams) -> KernelSchedules | Schedule:
+    """Return the source of the windows of ticks of one run, drawn in compiled code if possible."""
+    cls = KernelSchedules if is_drawn_in_kernels(scenario) else Schedule
+    return cls(scenario, streams)

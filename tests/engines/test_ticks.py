@@ -1,0 +1,157 @@
+"""Ticks and outcomes drawn in compiled code are those that clocks and channels draw in Python."""
+
+import math
+
+import numpy as np
+import pytest
+
+from netkf.engines.compiled import ticks as ticks_module
+from netkf.engines.compiled.schedule import Schedule, all_windows
+from netkf.engines.compiled.ticks import KernelSchedules, is_drawn_in_kernels, schedule
+from netkf.rng.streams import ReplicaStreams, Streams
+
+CHANNELS = {
+    "shared": {"symmetric": True, "loss": {"kind": "bernoulli", "delivery": 0.7}},
+    "each way": {"symmetric": False, "loss": {"kind": "bernoulli", "delivery": 0.7}},
+    "late": {"symmetric": False, "delay": {"kind": "constant", "seconds": 0.25}},
+    "never": {"loss": {"kind": "bernoulli", "delivery": 0.0}},
+    "bursts": {
+        "symmetric": False,
+        "loss": {"kind": "gilbert-elliott", "to_bad": 0.2, "to_good": 0.4, "deliver_good": 0.9},
+        "delay": {"kind": "exponential", "mean": 0.1},
+    },
+    "shared bursts": {
+        "loss": {"kind": "gilbert-elliott", "mean_loss": 0.4, "mean_burst": 3.0},
+        "delay": {"kind": "uniform", "low": 0.1, "high": 0.3},
+    },
+    "lognormal": {"symmetric": False, "delay": {"kind": "lognormal", "mean": 0.1, "sigma": 0.7}},
+}
+CLOCKS = {
+    "poisson": {"kind": "poisson", "rate": 3.0},
+    "directions": {"kind": "poisson", "rate": 3.0, "at": "directions"},
+    "nodes": {"kind": "periodic", "period": 0.3, "phase": "random", "at": "nodes"},
+    "together": {"kind": "periodic", "period": 0.25},
+    "late": {"kind": "periodic", "period": 0.25, "phase": 0.1, "jitter": 0.01, "at": "nodes"},
+    "uniform": {"kind": "renewal", "distribution": "uniform", "low": 0.1, "high": 0.4},
+    "constant": {"kind": "renewal", "distribution": "constant", "rate": 3.0, "at": "directions"},
+}
+
+
+def all_of(windows):
+    """Every tick of a run."""
+    parts = []
+    while not parts or parts[-1].end < math.inf:
+        parts.append(windows.following())
+    told = [ticks_of(part) for part in parts]
+    return parts, [np.concatenate(column) for column in zip(*told, strict=True)]
+
+
+def ticks_of(window):
+    """Times, entities and the outcomes forth and back of each tick."""
+    # Outcomes in the order of their ticks: windows may keep them in another.
+    ends = np.append(window.first_outcome, len(window.delay))
+    sizes = np.array([np.min(ends[ends > first], initial=first) - first for first in ends[:-1]])
+    outcomes = [window.delay[f : f + n] for f, n in zip(ends, sizes, strict=False)]
+    return window.t, window.entity, np.concatenate([np.empty(0), *outcomes])
+
+
+@pytest.fixture
+def busy(ring):
+    rates = [[0, 1, 7.0], [2, 3, 0.1]]
+    return lambda channel: ring.replace(
+        {
+            "horizon": 50.0,
+            "network.activation": {"kind": "poisson", "rate": 3.0, "rates": rates},
+            "network.channel": channel,
+        }
+    )
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_ticks_and_fates_are_those_drawn_link_by_link(busy, monkeypatch, name):
+    case = busy(CHANNELS[name])
+    assert is_drawn_in_kernels(case)
+    monkeypatch.setattr(ticks_module, "TICKS", 40)
+    parts, made = all_of(schedule(case, Streams(3)))
+    _, plain = all_of(Schedule(case, Streams(3)))
+    assert len(parts) > 5
+    assert len(made[0]) > 500
+    for one, other in zip(made, plain, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("channel", ["shared", "bursts", "shared bursts", "lognormal"])
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_all_clocks_and_channels(ring, monkeypatch, clock, channel):
+    case = ring.replace(
+        {
+            "horizon": 20.0,
+            "network.activation": CLOCKS[clock],
+            "network.channel": CHANNELS[channel],
+        }
+    )
+    assert is_drawn_in_kernels(case)
+    monkeypatch.setattr(ticks_module, "TICKS", 40)
+    (_, made), (_, plain) = all_of(schedule(case, Streams(3))), all_of(Schedule(case, Streams(3)))
+    assert len(made[0]) > 300
+    for one, other in zip(made, plain, strict=True):
+        np.testing.assert_array_equal(one, other)
+    batch = KernelSchedules(case, ReplicaStreams(2, 1, 2)).all()
+    for run, window in enumerate(all_windows(case, ReplicaStreams(2, 1, 2))):
+        for one, other in zip(
+            ticks_of(ticks_module.window_of(batch, run)), ticks_of(window), strict=True
+        ):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_room_grows_where_there_are_more_ticks_than_expected(busy):
+    case = busy(CHANNELS["each way"])
+    windows = KernelSchedules(case, Streams(3))
+    windows._rate *= 1e-3
+    _, made = all_of(windows)
+    _, plain = all_of(Schedule(case, Streams(3)))
+    for one, other in zip(made, plain, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_several_runs_are_what_each_is_alone(busy):
+    case = busy(CHANNELS["shared"])
+    few = KernelSchedules(case, ReplicaStreams(3, 5, 3))
+    few._rate *= 1e-3  # many more ticks than expected: the arrays grow
+    for schedules in (few, KernelSchedules(case, ReplicaStreams(3, 5, 3))):
+        ticks = schedules.all()
+        for run, plain in enumerate(all_windows(case, ReplicaStreams(3, 5, 3))):
+            found = ticks_of(ticks_module.window_of(ticks, run))
+            for one, other in zip(found, ticks_of(plain), strict=True):
+                np.testing.assert_array_equal(one, other)
+
+
+def test_ticks_that_crowd_are_put_in_order():
+    """Even where the clocks are not as even in time as they should be, and at one instant."""
+    random = np.random.default_rng(1)
+    t = np.concatenate([random.random(200) ** 8, np.full(20, 0.5)])
+    link = random.permutation(len(t))
+    found = ticks_module.TickBuffer(t, link, 2 * link, np.empty(0))
+    ordered = ticks_module._empty_buffer(len(t), 0)
+    ticks_module.put_in_time_order(0.0, 1.0, len(t), found, ordered, ticks_module._sorting(len(t)))
+    order = np.lexsort((link, t))
+    for one, other in zip(ordered[:3], found[:3], strict=True):
+        np.testing.assert_array_equal(one, other[order])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {
+            "network.activation": {
+                "kind": "renewal",
+                "distribution": "gamma",
+                "rate": 3.0,
+                "shape": 2.0,
+            }
+        },
+        {"filter": {"kind": "local"}},
+    ],
+)
+def test_others_are_drawn_as_before(ring, changes):
+    assert not is_drawn_in_kernels(ring.replace(changes))
