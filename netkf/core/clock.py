@@ -127,7 +127,10 @@ def generate_ticks(
     is called only if the clock draws one. Raises ScenarioError at ``key``, see ``next_ticks``.
     """
     position = ClockPosition(clock.origin(entity, make_origin_random))
-    blocks, count = [np.empty(0)], FIRST_BLOCK
+    # All at once if the clock has a rate: each call has a fixed cost.
+    expected = 1.1 * clock.mean_rate(entity) * horizon
+    blocks = [np.empty(0)]
+    count = FIRST_BLOCK if math.isnan(expected) else int(min(expected + FIRST_BLOCK, MAX_BLOCK))
     while position.now < horizon:
         block = next_ticks(clock, entity, position, random, count, key)
         if not len(block):

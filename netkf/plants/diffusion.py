@@ -137,8 +137,8 @@ class Diffusion(Plant):
         if all sensors take samples, so that nothing needs the grid.
         """
         stream, tree = state_of(random), self._tree(horizon)
-        frame_times = multiples(frame_period(self.A), horizon, self.time_grid)
         start = self.start(random)
+        frame_times = multiples(tree.frame, horizon, self.time_grid)
         return SampledTruth(self.moves, tree, start, stream, times, frame_times, frames)
 
     def _tree(self, horizon: float) -> Tree:

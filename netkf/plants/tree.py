@@ -85,6 +85,7 @@ class Tree:
     """
 
     def __init__(self, moves: Transitions, horizon: float, frame: float | None) -> None:
+        self.frame = frame
         digits = math.floor(math.log10(MAX_TICKS / horizon))
         top = max(KNOTS, math.ceil(math.log10(horizon)) - 6)
         if frame is not None:

@@ -167,29 +167,32 @@ class DerivedScenario(ScenarioModel):
         H, R = self._stack_entries(entries, believed=False)
         return np.asarray(H.T @ np.linalg.solve(R, H))
 
-    def continuous_truth(self, streams: Streams, frames: bool | None = None) -> Any:
+    def continuous_truth(
+        self, streams: Streams, frames: bool | None = None, sampled: FloatArray | None = None
+    ) -> Any:
         """Return the true state of one run in continuous time, a plants.truth.ContinuousTruth.
 
         It can be asked, in increasing order, for the states at sample times, probe times and frame
         times. Its class is ``DiffusionPath`` if sensors give increments, else ``SampledTruth`` or
         ``RecordedTruth``. ``frames``, by default ``exact_errors``, says whether local states are
-        relative to an origin that moves. Raises ScenarioError if a recorded truth has no row for
-        one of the times.
+        relative to an origin that moves. ``sampled`` (K,) are the sample times in seconds, if they
+        have been drawn already. Raises ScenarioError if a recorded truth has no row for one of the
+        times.
         """
         frames = self.exact_errors if frames is None else frames
-        times_of_sensors = sample_times(self, streams)
         plant, horizon = self.diffusion, self.horizon
         if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
-            require_states(self, times_of_sensors)
+            require_states(self, sample_times(self, streams))
             return plant.recorded_truth
-        instants = all_sample_times(times_of_sensors)
+        if sampled is None:
+            sampled = all_sample_times(sample_times(self, streams))
         random, probes = streams.generator("plant"), self.times
         if not uses_grid(self):
-            instants = np.concatenate([instants, probes])
-            return plant.sampled_truth(random, instants, horizon, frames)
+            times = np.concatenate([sampled, probes])
+            return plant.sampled_truth(random, times, horizon, frames)
         probe_random = streams.generator("probe")
-        sample_random = streams.generator("samples") if len(instants) else None
-        return plant.path(random, probe_random, probes, sample_random, instants, horizon, frames)
+        sample_random = streams.generator("samples") if len(sampled) else None
+        return plant.path(random, probe_random, probes, sample_random, sampled, horizon, frames)
 
     def slot_truth(self, streams: Streams) -> Any:
         """Return the true state of one run in slots, a plants.linear.Truth; if ``exact_errors``,

@@ -147,7 +147,7 @@ class Source:
             self._paths = Paths(scenario, streams, blocks, sampled)
             self.states = PathStates(scenario, self._paths.frame_times)
         else:
-            self.states = states = CompleteStates(scenario, streams)
+            self.states = states = CompleteStates(scenario, streams, sampled)
             # The truth is complete, so that all samples are read at once.
             samples.read(states.truth.states(sampled)[0], sampled, -math.inf, math.inf)
 

@@ -35,8 +35,9 @@ class States(Protocol):
 class CompleteStates:
     """States of a truth that is drawn up to the horizon, or recorded, before the run."""
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        self.truth = scenario.continuous_truth(streams)
+    def __init__(self, scenario: Scenario, streams: Streams, sampled: FloatArray) -> None:
+        """Draw the states; ``sampled`` (K,) are the sample times of all sensors, in seconds."""
+        self.truth = scenario.continuous_truth(streams, sampled=sampled)
         self.frame_times = np.array(self.truth.frame_times, dtype=np.float64)
 
     def offset(self, k: int, path: PathBlock, piece: int) -> FloatArray:
