@@ -94,7 +94,10 @@ def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
         if interruption.received:
             return _report_interrupt(message or "")
         if message is None:
-            return _Outcome(BAD_USAGE, _print_traceback(error))
+            import traceback
+
+            traceback.print_exception(error)
+            return _Outcome(BAD_USAGE, f"failed with {type(error).__name__}, see above")
         return _Outcome(BAD_USAGE, message)
     return _Outcome(status)
 
@@ -119,14 +122,6 @@ def _describe_error(error: Exception) -> str | None:
 def _error_reason(error: BaseException | None) -> str:
     """Return the operating system's text for an error, else its class and message."""
     return getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
-
-
-def _print_traceback(error: Exception) -> str:
-    """Print the traceback of an unexpected error; return the message that ends the command."""
-    import traceback
-
-    traceback.print_exception(error)
-    return f"failed with {type(error).__name__}, see above"
 
 
 def make_parser() -> argparse.ArgumentParser:

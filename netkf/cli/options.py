@@ -169,10 +169,7 @@ SHARED: dict[str, dict[str, Any]] = {
 
 
 def parse_changes(settings: Sequence[str]) -> dict[str, Any]:
-    """Return the values of texts ``key.path=value`` by key; values are TOML, or unquoted strings.
-
-    Raises ScenarioError for a text without ``=`` or a value that is not TOML.
-    """
+    """Return the values of texts ``key.path=value`` by key; raises ScenarioError."""
     from netkf.scenario.values import parse_value, split_setting
 
     pairs = [split_setting("--set", setting) for setting in settings]

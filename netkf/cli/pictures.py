@@ -34,9 +34,7 @@ def load_drawing(name: tuple[str, str]) -> Callable[..., Any] | None:
 
 
 def draw_picture(name: tuple[str, str], *results: Any) -> None:
-    """Call the drawing function ``name`` = (module, function) with ``results``, for the picture of
-    a finished command; print a note with the reason if there is no picture.
-    """
+    """Draw the picture of a finished command by ``name``; print a note if there is none."""
     draw = load_drawing(name)
     if draw is None:
         print_notes(["no picture: matplotlib is missing (pip install matplotlib)"])

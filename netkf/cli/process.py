@@ -103,9 +103,7 @@ class Interruption:
 
 
 def end_later(status: int, seconds: float, message: str = "") -> None:
-    """Start a thread that writes ``message`` to standard error after some ``seconds`` and ends the
-    process with ``status``, even if the main thread is blocked; return at once.
-    """
+    """Start a thread that prints ``message`` and ends the process after ``seconds``."""
 
     def end() -> None:
         """Wait, write the message and end the process."""

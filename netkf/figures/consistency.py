@@ -135,11 +135,7 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
 
 
 def whiteness_figure(data: FigureData) -> Picture:
-    """Draw the autocorrelations of the whitened innovations over the lag: mean and range of the
-    nodes, and the node with the largest one.
-
-    Raises UnavailableError if there are no innovations, or too few.
-    """
+    """Draw the autocorrelations of whitened innovations; raises UnavailableError."""
     curves, counts = autocorrelations(require_innovations(data))
     if not curves:
         raise UnavailableError(f"No node has {MIN_READINGS} readings of one kind.")

@@ -46,20 +46,15 @@ def error_figure(data: FigureData) -> Picture:
     if data.shows_errors:
         draw_covariances(lower, data)
         upper.set_xlabel("")
-        sentences = _interval_notes(data)
+        sentences = ["Lines of nodes are single runs; the bound holds for the mean over runs."]
+        if data.runs > 1:
+            sentences = ["Bands: 95% intervals of the means (1.96 standard errors)."]
+        elif data.promised.bound is None:
+            sentences = [f"No bound: {data.promised.reason}."]
     else:
         sentences = _draw_innovations(lower, data)
     finish_figure(figure, data.title(bound_headline(data)), data.caption(*sentences, notes="bound"))
     return figure
-
-
-def _interval_notes(data: FigureData) -> list[str]:
-    """Return the sentences of the caption on intervals and the bound."""
-    if data.runs > 1:
-        return ["Bands: 95% intervals of the means (1.96 standard errors)."]
-    if data.promised.bound is None:
-        return [f"No bound: {data.promised.reason}."]
-    return ["Lines of nodes are single runs; the bound holds for the mean over runs."]
 
 
 def _draw_innovations(axes: Any, data: FigureData) -> list[str]:
@@ -74,9 +69,7 @@ def _draw_innovations(axes: Any, data: FigureData) -> list[str]:
 
 
 def bound_headline(data: FigureData) -> str:
-    """Return the headline of a figure: a sentence on how many nodes have a trace P below the bound
-    that theory gives, or without a bound on the range of the errors.
-    """
+    """Return the headline on traces of P and their bound, or on the range of the errors."""
     rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
     if rows:
         return (_mean_headline if data.runs > 1 else _one_run_headline)(rows)
@@ -128,11 +121,7 @@ def _known_or_zero(value: Any) -> float:
 
 
 def quantiles_figure(data: FigureData) -> Picture:
-    """Draw quantiles over the nodes of the errors at each time, and mark the largest errors;
-    without ground truth of the roots of trace P.
-
-    Raises UnavailableError without samples or finite values.
-    """
+    """Draw quantiles of errors (or roots of trace P) over nodes; raises UnavailableError."""
     data.require_samples()
     if data.shows_errors:
         values, label = np.sqrt(data.sq_error), "error |x - xhat|"
@@ -201,11 +190,7 @@ def _mark_worst(
 
 
 def ratios_figure(data: FigureData) -> Picture:
-    """Draw for each node its mean trace of P divided by the bound that theory gives; without a
-    bound its mean NEES divided by n, the number of states.
-
-    Raises UnavailableError if neither is known.
-    """
+    """Draw mean trace P over its bound, or NEES / n, of each node; raises UnavailableError."""
     rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
     key, label, reference_label = "ratio", "mean trace P / Tanwani's bound H(12)", "the bound"
     scale = 1.0

@@ -175,10 +175,7 @@ class FigureData:
 
 
 def reduce_result(result: Any) -> FigureData:
-    """Return the data to draw of a ``netkf.Run`` or a ``netkf.Ensemble``.
-
-    Raises ScenarioError for anything else, and if the result has no scenario.
-    """
+    """Return the data to draw of a run or an ensemble; raises ScenarioError."""
     if not isinstance(result, (Run, Ensemble)):
         raise ScenarioError("", "plot takes a run, an ensemble or a sweep", result, SIMULATE)
     if result.scenario is None:

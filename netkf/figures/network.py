@@ -117,9 +117,7 @@ def draw_network(
     label: str,
     positions: Positions | None = None,
 ) -> None:
-    """Draw the links, as wide as the messages they delivered, and the nodes, coloured by their
-    ``values``, with a colour bar of this ``label``: squares with a sensor, circles without.
-    """
+    """Draw links by what they delivered, and nodes by ``values`` (squares: with a sensor)."""
     if positions is None:
         positions = get_positions(data.scenario.topology)
     _draw_links(axes, data, positions)

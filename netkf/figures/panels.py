@@ -89,7 +89,12 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
     With ``bound`` the root of the bound that theory gives on trace P is drawn too.
     """
     if not data.shows_errors:
-        _draw_estimates(axes, data)
+        if data.first_component is None:
+            draw_message(axes, NO_TRUTH)
+            return
+        draw_nodes(axes, data, data.first_component, se=None)
+        axes.set(ylabel="estimate, first component", xlabel=SECONDS)
+        draw_legend(axes)
         return
     error = np.sqrt(data.sq_error)
     draw_nodes(axes, data, error, data.se_error)
@@ -104,16 +109,6 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
         _draw_bound(axes, data.times, roots)
     set_scale(axes, np.concatenate(curves))
     axes.set(ylabel="error |x - xhat|" if data.runs == 1 else RMS_ERROR, xlabel=SECONDS)
-    draw_legend(axes)
-
-
-def _draw_estimates(axes: Any, data: FigureData) -> None:
-    """Draw the first component of each node's estimate over time, or a message if it is unknown."""
-    if data.first_component is None:
-        draw_message(axes, NO_TRUTH)
-        return
-    draw_nodes(axes, data, data.first_component, se=None)
-    axes.set(ylabel="estimate, first component", xlabel=SECONDS)
     draw_legend(axes)
 
 
@@ -156,9 +151,7 @@ def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
 
 
 def draw_nees(axes: Any, data: FigureData) -> None:
-    """Draw the NEES of each node over time, of an ensemble its mean, and the interval that contains
-    it with probability CONFIDENCE if P is exact; or a message if NEES is unknown.
-    """
+    """Draw NEES over time with its interval if P is exact, or a message if it is unknown."""
     values, n, runs = data.nees, data.scenario.plant.n, data.runs
     if not np.isfinite(values).any():
         draw_message(axes, "NEES is unavailable: it needs an error and a regular P")

@@ -110,9 +110,7 @@ def new_figure(width: float = 7.4, height: float = 4.4) -> Picture:
 
 
 def finish_figure(figure: Figure, headline: str, caption: Sequence[str]) -> None:
-    """Put the headline (what the figure shows, as a sentence) above a figure and the paragraphs of
-    its caption below, broken into lines that fit its width.
-    """
+    """Put the headline above a figure and the caption below, in lines that fit its width."""
     width = 0.94 * float(figure.get_size_inches()[0]) * POINTS_PER_INCH
     title = break_lines(headline, width, TITLE_SIZE, "bold")
     figure.suptitle(title, x=0.01, ha="left", fontsize=TITLE_SIZE, color=INK, fontweight="bold")
@@ -217,10 +215,7 @@ def message_figure(headline: str, message: str, caption: Sequence[str]) -> Pictu
 
 
 def set_scale(axes: Any, values: FloatArray) -> None:
-    """Set the scale and the limits of the y axis for ``values`` (any shape): logarithmic if the
-    largest one is more than LOG_MEDIANS times their median. Values above MAX_DRAWN, of runs that
-    grow without bound, lie outside the axes.
-    """
+    """Set the y axis for ``values``: logarithmic above LOG_MEDIANS times their median."""
     positive = np.minimum(values[np.isfinite(values) & (values > 0.0)], MAX_DRAWN)
     if positive.size and positive.max() > LOG_MEDIANS * np.median(positive):
         # Limits first: a new scale would compute its own, which can overflow.

@@ -40,11 +40,7 @@ TIME_BINS = 30  # of time: each has enough messages for an interval
 
 
 def newest_arrivals(log: np.ndarray, node: int) -> tuple[FloatArray, FloatArray]:
-    """Return the times (K,) at which K messages arrived at a ``node`` (id), and for each the time
-    (K,) at which the newest message so far was sent, in seconds.
-
-    ``log`` (E,) are the EVENT rows of a run. The age of information follows from these.
-    """
+    """Return arrivals (K,) at ``node`` and when the newest message so far was sent, in seconds."""
     arrivals = log[(log["kind"] == CODES["deliver"]) & (log["node"] == node)]
     # A message that overtakes others makes them old before they arrive.
     sent = np.maximum.accumulate(arrivals["t"] - np.nan_to_num(arrivals["age"]))
@@ -113,11 +109,7 @@ def age_of_information(log: np.ndarray, node: int, end: float) -> AgeSawtooth:
 
 
 def age_figure(data: FigureData) -> Picture:
-    """Draw the age of information (time since the newest message that a node has received was sent)
-    over time, median and largest over the nodes, and its distribution.
-
-    Raises UnavailableError without events, or if no node can receive messages.
-    """
+    """Draw the age of information over time and its distribution; raises UnavailableError."""
     end = _last_time(data)
     degrees = data.scenario.topology.degrees
     receivers = [node for node in data.nodes if degrees.get(node, 0)]
@@ -235,12 +227,7 @@ def _times_by_direction(
 
 
 def links_figure(data: FigureData) -> Picture:
-    """Draw the messages of each direction (from one node to another) at their times: ticks for
-    delivered ones, crosses for lost ones. Of long runs and large networks an interval and a
-    selection of directions are drawn.
-
-    Raises UnavailableError without messages.
-    """
+    """Draw delivered and lost messages of directions over time; raises UnavailableError."""
     directions = _require_messages(data)
     rows = select_evenly(np.arange(len(directions)), MAX_DIRECTIONS)
     selection = [directions[k] for k in rows.tolist()]
@@ -301,11 +288,7 @@ def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
 
 
 def delivery_figure(data: FigureData) -> Picture:
-    """Draw the share of messages delivered in each direction (from one node to another) with its
-    interval, and the share lost over time.
-
-    Raises UnavailableError without messages.
-    """
+    """Draw the delivered shares of directions and losses over time; raises UnavailableError."""
     directions = _require_messages(data)
     delivered = np.array([len(direction.delivered) for direction in directions])
     totals = delivered + np.array([len(direction.lost) for direction in directions])

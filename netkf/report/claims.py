@@ -82,12 +82,7 @@ def describe_source(
 def describe_differences(
     comparison: Comparison | str, first: ReportSource, second: ReportSource
 ) -> list[str]:
-    """Return sentences on how two sources (contents of directories) differ, the ``first`` called A
-    and the ``second`` B.
-
-    They are the statistically certain differences of all nodes together and the first event in
-    which the recorded runs differ, or only ``comparison`` if it is the reason why there is none.
-    """
+    """Return sentences on how two sources differ, or ``comparison``, the reason why not known."""
     if isinstance(comparison, str):
         return [comparison]
     sentences = []

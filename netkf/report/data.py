@@ -93,7 +93,11 @@ def run_data(
         "axes": _state_axes(source, run, worst),
         "links": [list(pair) for pair in source.scenario.topology.directions[:MAX_LINKS]],
         "worst": None if worst is None else worst._asdict(),
-        "scale": _interval_scales(),
+        # Half axes of probability ELLIPSE_LEVEL, in standard deviations.
+        "scale": {
+            "ellipse": math.sqrt(float(scipy.special.chdtri(2, 1.0 - ELLIPSE_LEVEL))),
+            "interval": float(scipy.special.ndtri(0.5 + 0.5 * ELLIPSE_LEVEL)),
+        },
         "samples": _sample_columns(source, run, rows, messages, packer),
         "messages": _message_columns(thinned, run, packer),
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
@@ -111,9 +115,7 @@ def run_data(
 
 
 def thinning_rules(data: dict[str, Any]) -> list[str]:
-    """Return sentences for the reader of the page on what ``run_data`` left out of the ``data`` of
-    a long run; an empty list if nothing.
-    """
+    """Return sentences on what ``run_data`` left out of a long run."""
     rules = []
     messages, totals = data["messages"], data["totals"]
     if messages["step"] > 1:
@@ -174,10 +176,7 @@ def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarra
 
 
 def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
-    """Return the position [x, y] at which the page draws each node, between 0 and 1, y downwards.
-
-    They are the positions of the scenario to scale or, if a node has none, a layout by the links.
-    """
+    """Return the [x, y] of each node on the page, in 0 .. 1: the scenario's, or a layout."""
     coordinates: Mapping[int, Any] | None = source.scenario.topology.positions
     if coordinates is None or any(node not in coordinates for node in run.nodes):
         coordinates = _make_layout(source, run)
@@ -230,14 +229,6 @@ def _is_broadcast(run: StoredRun) -> bool:
     # Messages in slots have a phase of 0 or more.
     in_slots = bool((run.log["phase"][run.log["kind"] == CODES["send"]] >= 0).any())
     return in_slots or run.count("transmit") > 0
-
-
-def _interval_scales() -> dict[str, float]:
-    """Return half axes of ellipses of probability ELLIPSE_LEVEL, in standard deviations."""
-    return {
-        "ellipse": math.sqrt(float(scipy.special.chdtri(2, 1.0 - ELLIPSE_LEVEL))),
-        "interval": float(scipy.special.ndtri(0.5 + 0.5 * ELLIPSE_LEVEL)),
-    }
 
 
 def _drawing_limits(source: ReportSource) -> dict[str, Any]:

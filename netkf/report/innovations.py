@@ -40,9 +40,7 @@ class NodeMeans(NamedTuple):
 
 
 def read_innovations(source: ReportSource) -> Innovations | str | None:
-    """Return the innovations of the run of a source (the contents of one directory), for which the
-    run is replayed, or the reason why there are none; None without a run that has samples.
-    """
+    """Return the innovations of a source's run, by a replay, the reason for none, or None."""
     if source.run is None or not len(source.run.times):
         return None
     if source.status in ("interrupted", "failed"):
@@ -69,9 +67,7 @@ def node_means(readings: Innovations) -> NodeMeans:
 
 
 def describe_innovations(readings: Innovations) -> str:
-    """Return a sentence on the mean NIS of the nodes (squared innovations in units of their
-    covariances), and on how many of them contradict P; ``readings`` are the innovations of a run.
-    """
+    """Return a sentence on the nodes' mean NIS, and on how many contradict P."""
     nodes, means, low, high = node_means(readings)
     count = int(np.isfinite(readings.nis).sum())
     sentence = f"Over {count:,} readings"

@@ -32,11 +32,7 @@ REPLAYED_EVENTS, MIN_REPLAYS, MAX_REPLAYS = 300_000, 5, 60
 
 
 def explain_worst(source: ReportSource) -> Explanation | str | None:
-    """Return the explanation of ``netkf why``, from replays with missing messages delivered, for
-    the worst sample of a single run after the start-up, or the reason why there is none.
-
-    It is None without a single recorded run in which nodes send messages.
-    """
+    """Explain the worst sample after the start-up, or return the reason for none, or None."""
     run = source.run
     if source.worst is None or run is None or source.kind != "run":
         return None

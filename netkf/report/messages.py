@@ -141,10 +141,7 @@ def information_age(
 
 
 def bin_messages(messages: np.ndarray, horizon: float, bins: int) -> dict[str, list[int]]:
-    """Return for each outcome (delivered, lost, ...) the numbers (bins,) of messages sent in each
-    of ``bins`` equal intervals of a run of ``horizon`` seconds, for a chart on the page;
-    ``messages`` are its MESSAGE rows (M,), one for each message sent.
-    """
+    """Return by outcome the numbers (bins,) of messages sent in equal parts of ``horizon`` s."""
     edges = np.linspace(0.0, max(horizon, 1e-300), bins + 1)
     names = {"delivered": DELIVERED, "lost": LOST, "late": LATE, "under way": UNDER_WAY}
     return {

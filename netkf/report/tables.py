@@ -225,9 +225,7 @@ def versions_table(source: ReportSource) -> str:
 
 
 def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
-    """Return curves of an ensemble with their intervals as JSON values: for each node the mean of
-    trace P, the mean squared error and the mean NEES, as lists over times; None for single runs.
-    """
+    """Return an ensemble's curves with intervals as JSON values; None for single runs."""
     ensemble = source.ensemble
     if ensemble is None:
         return None

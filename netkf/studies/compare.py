@@ -164,11 +164,7 @@ class RunDirectory:
 
 
 def read_directory(directory: Path) -> RunDirectory:
-    """Read manifest.json and summary.json of the directory of a finished run or ensemble.
-
-    Raises ScenarioError if it is not such a directory, or if the manifest, the summary or the
-    scenario was changed since the run ended.
-    """
+    """Read the directory of a finished, unchanged run or ensemble; raises ScenarioError."""
     where = shorten(directory)
     if not directory.is_dir():
         raise ScenarioError(where, "is not a directory", None, "name run directories")

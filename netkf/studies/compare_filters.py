@@ -364,10 +364,7 @@ class CompletedComparison:
 def write_comparison(
     scenario: Scenario, comparison: FilterComparison, out: Path | None = None
 ) -> CompletedComparison:
-    """Write filters.parquet, filters.csv, scenario.toml and manifest.json into a new directory.
-
-    Raises ScenarioError if ``out`` cannot be created or is not empty.
-    """
+    """Write the files of a comparison into a new directory; raises ScenarioError."""
     check_sources(scenario)
     directory = create_output_directory(out, f"{scenario.name}-filters")
     write_scenario(directory, scenario)

@@ -164,7 +164,11 @@ class _Innovations:
             if slots[k] - slots[k - self._steps] == self._steps and run.times[k] > 0.0
         ]
         self._slots = [slots[k] for k in self._samples]
-        self._noise = _plant_noise(scenario, self._streams, self._slots)
+        # With F = 0 the state is the noise of the last step, with the same draws.
+        plant = scenario.slot_plant
+        memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
+        path = memoryless.truth(self._streams.generator("plant"))
+        self._noise = [path.state(slot) for slot in self._slots]
 
     def of_node(self, i: int) -> Iterator[tuple[float, float]]:
         """Yield NIS of the i-th node's linear readings and its expected value (nan: unknown)."""
@@ -214,15 +218,6 @@ class _Innovations:
         if not model_is_true:
             predicted = predicted + (plant.F - F) @ run.xhat[k, i]
         return predicted, F @ P @ F.T + Q, Sigma
-
-
-def _plant_noise(scenario: Scenario, streams: Streams, slots: list[int]) -> list[FloatArray]:
-    """Return the plant's noise w (n,) of the steps x(k + 1) = F x(k) + w that end in ``slots``."""
-    plant = scenario.slot_plant
-    # With F = 0 the state is the noise of the last step, with the same draws.
-    memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
-    path = memoryless.truth(streams.generator("plant"))
-    return [path.state(slot) for slot in slots]
 
 
 @dataclass(frozen=True)
@@ -331,9 +326,7 @@ def _without_horizon(scenario: Scenario) -> Scenario:
 def judge_consistency(
     scenario: Scenario, runs: Sequence[RunConsistency], confidence: float
 ) -> Consistency:
-    """Return for each node whether its NEES over several ``runs`` is as expected; all intervals of
-    the nodes hold together with probability ``confidence``.
-    """
+    """Return the consistency of each node over ``runs``, together at ``confidence``."""
     # ``level`` is the probability that some interval misses.
     n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
     low, high = nees_bounds(n, count, confidence)

@@ -80,9 +80,7 @@ class Traffic(NamedTuple):
 
 
 def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
-    """Simulate replica 0 of the runs of ``seed`` and return what its nodes send: the number of
-    transmissions (a broadcast counts once) and bytes, 8 for each number of a message.
-    """
+    """Simulate replica 0 and return what its nodes send: transmissions and bytes."""
     log, slotted = simulate(scenario, seed, 0, engine).log, scenario.slotted
     sent = log[log["kind"] == CODES["send"]]
     if slotted:

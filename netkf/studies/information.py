@@ -315,10 +315,7 @@ class Reach:
         return path
 
     def needed(self, message: int) -> int | None:
-        """Return how many messages that the run did not use (those of cost 1) must be used,
-        ``message`` (its index) included, for its information to reach the node of the search; None
-        if they are more than the search allowed.
-        """
+        """Return the unused messages that ``message`` needs, with itself, or None."""
         # ``deadline`` is the row before which information has to be in a segment to reach the node.
         used, cost = self.flow.messages.used_row[message], int(self.flow.cost[message])
         for budget in range(len(self.deadline) - cost):
@@ -428,11 +425,7 @@ class Newest(NamedTuple):
 def newest_information(
     reach: Reach, log: IntArray, readings: KeptReadings, budget: int
 ) -> dict[int, Newest]:
-    """Return for each node, by id, the newest information of it that can have reached the node of
-    the search ``reach``, with at most ``budget`` messages that the run did not use (cost 1).
-
-    ``log`` (E,) are the EVENT rows of the run, ``readings`` those that its nodes took.
-    """
+    """Return the newest information of each node that can have reached that of ``reach``."""
     flow, newest = reach.flow, dict[int, Newest]()
     # Information that was in a segment (an interval of rows in which that of one node accumulates)
     # before the row ``deadline`` reaches the node; NEVER if none does.
@@ -458,10 +451,7 @@ def _age_key(reading: float, known: float) -> tuple[float, float]:
 
 
 def route(reach: Reach, segment: int, budget: int) -> tuple[int, ...]:
-    """Return the ids of the nodes through which information of ``segment`` (an interval of the log,
-    by its index) reaches the node of the search, from its own node to that one, using at most
-    ``budget`` messages that the run did not use.
-    """
+    """Return the ids of the nodes on the way of information of ``segment`` to the node."""
     path: Iterable[int] = reach.messages_from(segment, budget)
     receivers = [int(reach.flow.messages.receiver[m]) for m in path]
     return (int(reach.flow.node[segment]), *receivers)

@@ -77,11 +77,7 @@ def find_smallest_set(
     most: int,
     replays: int,
 ) -> SmallestSet:
-    """Return the smallest set of candidates (messages that the run did not use) whose delivery
-    brings the trace of P at the node of the ``replayer`` to at most ``limit``.
-
-    Sets of at most ``most`` messages are tried, with at most ``replays`` replays of the run.
-    """
+    """Return the smallest set (up to ``most``) that brings trace P to ``limit``, by replays."""
     search = _Search(replayer, limit)
     first, base = replayer.count, search.trace(())  # replays before; trace of the run as it was
     if base <= limit:

@@ -101,12 +101,7 @@ def _expected_squares(scenario: Scenario, run: Run) -> FloatArray:
 
 
 def expected_errors_known(scenario: Scenario) -> bool:
-    """Return True if ``expected_metrics``, the exact expected squared errors given the events of a
-    run, exist and take about the time of a few runs to compute.
-
-    In continuous time they do for the hybrid filter with continuous readings (increments) and
-    messages without delay.
-    """
+    """Return True if ``expected_metrics`` take about as long as a few runs."""
     errors = len(scenario.nodes) * scenario.plant.n
     if not scenario.is_random or errors > (MAX_ERRORS if scenario.slotted else MAX_COUPLED):
         return False

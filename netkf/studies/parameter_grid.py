@@ -21,10 +21,7 @@ _RANGE = re.compile(r"^([^:,\[{\"']+):([^:,]+):(\d+)$")
 
 
 def parse_grid(settings: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the values of each key of ``key.path=v1,v2,...`` texts.
-
-    ``start:stop:count`` stands for ``count`` evenly spaced values. Raises ScenarioError at --vary.
-    """
+    """Return the values of ``key.path=v1,v2,...`` or ``start:stop:count``; raises ScenarioError."""
     grid: dict[str, list[Any]] = {}
     for setting in settings:
         key, text = split_setting("--vary", setting)
@@ -90,12 +87,7 @@ class GridPoint(NamedTuple):
 
 
 def expand_grid(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[GridPoint]:
-    """Return all points of a grid, each with its values of the keys and the scenario that has them,
-    the last key running fastest; raises ScenarioError for a bad value.
-
-    ``grid`` has the values of each key that is varied, by the key's path such as
-    ``network.activation.rate``.
-    """
+    """Return all points of a grid, the last key fastest; raises ScenarioError."""
     values = check_grid(grid)
     points = [
         dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*values.values())
@@ -130,11 +122,7 @@ def parse_interval(setting: str) -> tuple[str, float | int, float | int]:
 
 
 def is_integer_key(scenario: Scenario, key: str) -> bool:
-    """Return True if the value of a ``key`` (a path such as ``network.activation.rate``) is an
-    integer in the scenario, so that a search tries integers only; False for another number.
-
-    Raises ScenarioError, which names --vary, if it is neither.
-    """
+    """Return True if ``key`` has an integer value; raises ScenarioError for no number."""
     value: Any = resolve_defaults(scenario)
     # Follow the path, such as sensors[0].R, through tables and lists.
     for name in key.replace("[", ".").replace("]", "").split("."):

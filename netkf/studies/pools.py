@@ -37,9 +37,7 @@ class _OpenPool(Pool):
 
 @contextmanager
 def shared_pool(runs: int, options: PoolOptions) -> Iterator[Pool]:
-    """Yield one pool of workers for several scenarios of ``runs`` runs each, so that processes that
-    were started for one serve the next; it is closed at the end of the ``with`` statement.
-    """
+    """Yield one pool of workers for several scenarios of ``runs`` runs each."""
     pool = make_pool(runs, options, open_ended=True)
     done = False
     try:

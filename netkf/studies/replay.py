@@ -85,9 +85,7 @@ class Replayer:
 
     @cached_property
     def delayed(self) -> Chosen:
-        """The messages that were not lost but not used by ``at`` because of their delay: late,
-        refused or under way. Replays deliver them without delay.
-        """
+        """Messages not lost but unused because of their delay; replays deliver them at once."""
         scenario = self.scenario
         swaps = scenario.node_filter.combination == "swap"
         messages = match_messages(self.log, swaps, scenario.slotted)

@@ -175,9 +175,7 @@ def decide_by_both(problem: SizingProblem, plan: SimulationPlan, value: float) -
 
 
 def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the result (probe) of trying a ``value`` of the key by simulations as planned: the
-    number of runs is doubled until the interval of the quantity is on one side of the limit.
-    """
+    """Return the probe of a ``value``: runs are doubled until its interval decides."""
     scenario, target = problem.at(value), problem.target
     # This target divides by the trace of P of a filter with all readings.
     central = central_trace(scenario) if target.quantity == "within_central" else None
@@ -237,7 +235,10 @@ class Search:
         quantity.
         """
         first, last = self._probe(low), self._probe(high)
-        grows = self._detect_growth(first, last)
+        ends = [first, last]
+        if BOUND in (first.by, last.by) and first.by != last.by:  # compare bounds with bounds
+            ends = [decide_by_theory(self._problem, end.value) for end in ends]
+        grows = ends[1].quantity > ends[0].quantity
         # The end at which the quantity is smaller should reach the target, the other may not.
         good, bad = (first, last) if grows else (last, first)
         value: float | None = None
@@ -265,12 +266,6 @@ class Search:
             sure=_describe_certainty(probes, confidence, grows, value is None),
             advice=advise(problem, probes, value, misses, grows),
         )
-
-    def _detect_growth(self, first: Probe, last: Probe) -> bool:
-        """Return True if the quantity grows with the key; bounds are compared with bounds only."""
-        if BOUND in (first.by, last.by) and first.by != last.by:
-            first, last = (decide_by_theory(self._problem, end.value) for end in (first, last))
-        return last.quantity > first.quantity
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
         """Return neighbouring values between ``value``, which meets the target, and ``misses``."""

@@ -156,12 +156,7 @@ class StoredVerdict(NotebookTable):
 
 
 def read_verdict(directory: Path, trust: bool = False) -> StoredVerdict:
-    """Return the verdict that ``netkf check`` left in a directory: whether runs kept what theory
-    promises. Raises DamagedError, or ScenarioError for its scenario.
-
-    With ``trust`` classes that the scenario names are also imported from that directory and the
-    current folder.
-    """
+    """Return the verdict in a directory; raises DamagedError or ScenarioError."""
     document = read_checked_document(directory, "verdict.json", VERDICT)
     _require_confidence(document)
     check_files(directory, document, ["scenario.toml"])

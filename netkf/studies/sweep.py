@@ -112,10 +112,7 @@ def plan_sweep(
     seed: int | None = None,
     engine: str = "auto",
 ) -> SweepPlan:
-    """Return a plan of ``runs`` runs, with ``seed`` (None: the scenario's), at each point of the
-    grid ``vary`` (values by key path), all of which can be run; raises ScenarioError or
-    EngineError.
-    """
+    """Return the plan of a sweep, all points of which can run; raises ScenarioError."""
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "sweep takes a netkf.Scenario", scenario, LOAD)
     integer(low=1)("runs", runs)

@@ -24,10 +24,7 @@ MAX_LENGTH = 30  # characters of a cell
 
 
 def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
-    """Return the table of a sweep (``lines``, one for each point of the grid) for a terminal, with
-    the values of the varied ``keys``; of long tables the first and last rows. What theory gives for
-    no point has no column.
-    """
+    """Return the table of a sweep; what theory gives for no point has no column."""
     columns = [name for name in COLUMNS if name not in PROMISED or lines[name].notna().any()]
     header = [*keys, *(name.replace("_", " ") for name in columns), "messages", "status"]
     rows = [

@@ -101,7 +101,12 @@ def why(
     Raises ScenarioError for a node, time or run that does not exist, and for a run without events.
     """
     run, run_scenario = _check_run(run, scenario, replica, trust)
-    node = _check_node(run_scenario, node)
+    found = run_scenario.topology.find(str(node))
+    if found is None:
+        listed = ", ".join(map(str, run_scenario.nodes[:8]))
+        listed += ", ..." if len(run_scenario.nodes) > 8 else ""
+        raise ScenarioError("node", "must be a node of the scenario", node, f"nodes: {listed}")
+    node = found
     at = _check_instant(run, run_scenario, at)
     # Keyword names are those of the command line: --most, --below, --replays.
     most = integer(low=1, high=MAX_MISSING)("most", most)
@@ -174,16 +179,6 @@ def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
 def _default_replays(events: int) -> int:
     """Return the default number of replays: fewer for long logs, to bound the time they take."""
     return min(MAX_REPLAYS, max(MIN_REPLAYS, MAX_EVENTS // max(1, events)))
-
-
-def _check_node(scenario: Scenario, node: int | str) -> int:
-    """Return the id of the ``node`` with this id or name; raises ScenarioError if there is none."""
-    found = scenario.topology.find(str(node))
-    if found is None:
-        listed = ", ".join(map(str, scenario.nodes[:8]))
-        listed += ", ..." if len(scenario.nodes) > 8 else ""
-        raise ScenarioError("node", "must be a node of the scenario", node, f"nodes: {listed}")
-    return found
 
 
 def _check_instant(run: Run, scenario: Scenario, at: float) -> float:

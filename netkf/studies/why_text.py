@@ -21,9 +21,7 @@ COUNT_WORDS = ("no", "one", "two", "three")
 
 
 def source_table(explanation: Explanation) -> pd.DataFrame:
-    """Return a row for each source of an explanation (a node whose information could reach the
-    node that is asked about): times and ages in seconds, nan if unknown.
-    """
+    """Return a row for each source: times and ages in seconds, nan if unknown."""
     import pandas as pd
 
     # Ages are also known for 1, 2, ... ``budget`` more messages delivered.
