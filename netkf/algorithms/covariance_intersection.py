@@ -6,11 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from netkf.algorithms.filter import Exchange, Filter, Message, State
+from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.kernels.root_update import intersect_roots
+from netkf.algorithms.records import Record
 from netkf.algorithms.registry import built_in
 
 
@@ -28,12 +29,10 @@ class CovarianceIntersection(Hybrid):
     combination: ClassVar[str] = "intersection"
     inverts: ClassVar[bool] = True
 
-    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Return the state after covariance intersection, paper D (8) and (9), of the node's
-        estimate with those of all messages, with values from before the reset.
-        """
-        weights, means, roots = self._pairs(state, messages)
-        xhat, root = intersect_roots(weights, means, roots)
-        return state._replace(xhat=xhat, root=root)
+    kernels = DiffusionFilter.kernels
+
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return the record of the diffusion filter with ``on_loss = "keep-own"``."""
+        return DiffusionFilter(on_loss="keep-own").record(infos, models)
 
     shift = Filter.shift  # affine: the weights sum to one

@@ -5,16 +5,14 @@ Between messages a node runs the Kalman-Bucy filter (4); messages reset estimate
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from netkf.algorithms.filter import Exchange, Filter, Message, State
-from netkf.algorithms.kernels.root_update import combine_roots
-from netkf.algorithms.pairs import weighted_pairs
+from netkf.algorithms.filter import Filter
+from netkf.algorithms.kernels.neighbours import combine_convex
+from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import field, number
-from netkf.linalg.arrays import FloatArray
 
 
 @built_in("hybrid")
@@ -34,22 +32,7 @@ class Hybrid(Filter):
     combination: ClassVar[str] = "convex"
     P_by_design: ClassVar[tuple[str, str]] = ("", "larger")
     schedule: ClassVar[tuple[str, ...] | None] = None  # continuous time only
-
-    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Return the state after a reset by paper H (7) and (9): the convex combination of the
-        node's estimate and covariance with those of all messages, all values from before the reset.
-        """
-        weights, means, roots = self._pairs(state, messages)
-        xhat, root = combine_roots(weights, means, roots)
-        return state._replace(xhat=xhat, root=root)
-
-    def _pairs(
-        self, state: State, messages: Sequence[Message]
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return weights (k,), estimates (k, n) and roots (k, n, n) of the node itself, first, and
-        of its k - 1 messages, predicted to now. Derived classes may override it.
-        """
-        return weighted_pairs(state, messages)
+    kernels = Kernels(absorb=combine_convex)
 
     def weight(self, degree: int, peer_degree: int) -> float:
         """Return ``epsilon``, the weight of every link, whatever the degrees of the nodes at its

@@ -282,13 +282,10 @@ class Arithmetic(DiffusionFilter):
     """Averages covariances in place of their inverses."""
 
     def absorb(self, state, messages, exchange):
-        own, heard = self.share(state.own, [message.weight for message in messages])
-        P = own * state.root @ state.root.T
-        xhat = own * state.xhat
-        for weight, message in zip(heard, messages, strict=True):
-            pair = message.payload
-            P = P + weight * pair.root @ pair.root.T
-            xhat = xhat + weight * pair.xhat
+        pairs = [(state.own, state), *((m.weight, m.payload) for m in messages)]
+        total = sum(weight for weight, _ in pairs)
+        P = sum(weight / total * pair.root @ pair.root.T for weight, pair in pairs)
+        xhat = sum(weight / total * pair.xhat for weight, pair in pairs)
         return state._replace(xhat=xhat, root=np.linalg.cholesky(P))
 
 
@@ -296,8 +293,11 @@ class Arithmetic(DiffusionFilter):
 class DropsWeight(DiffusionFilter):
     """Leaves the weight of lost messages out."""
 
-    def share(self, own, arrived):
-        return own, arrived
+    def absorb(self, state, messages, exchange):
+        pairs = [(state.own, state), *((m.weight, m.payload) for m in messages)]
+        P = np.linalg.inv(sum(weight * np.linalg.inv(pair.P) for weight, pair in pairs))
+        xhat = P @ sum(weight * np.linalg.solve(pair.P, pair.xhat) for weight, pair in pairs)
+        return state._replace(xhat=xhat, root=np.linalg.cholesky(P))
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,12 +30,12 @@ class Heavier(parts.Hybrid):
         return 1.02 * super().weight(degree, peer_degree)
 
 
-@keep(ADJUSTED, "Averse._pairs: must have the numbers of Hybrid", epsilon=0.3)
+@keep(ADJUSTED, "Averse.begin: must have the numbers of Hybrid", epsilon=0.3)
 class Averse(parts.Hybrid):
-    """A private helper that makes messages count less."""
+    """A first covariance that is too large."""
 
-    def _pairs(self, state, messages):
-        return super()._pairs(state, [m._replace(weight=0.9 * m.weight) for m in messages])
+    def begin(self, node, info, model):
+        node["root"][:] *= 1.1
 
 
 @keep(ADJUSTED, "LateStart.first_slot: must have the numbers of Gossip")
@@ -48,11 +48,10 @@ class Everyone(parts.Gossip):
     pairwise = False
 
 
-@keep(ADJUSTED, "Unfair.share: must have the numbers of DiffusionFilter")
+@keep(ADJUSTED, "Unfair.begin: must have the numbers of DiffusionFilter")
 class Unfair(parts.DiffusionFilter):
-    def share(self, own, arrived):
-        own, given = super().share(own, arrived)
-        return own + 0.1 * sum(given), [0.9 * weight for weight in given]
+    def begin(self, node, info, model):
+        node["own"][...] = 1.2 * info.own_weight
 
 
 @keep(ADJUSTED, "Forgetful._learn_network: must have the numbers of PushSum", gamma=3, delta=4.0)
@@ -167,5 +166,5 @@ def test_check_filter_compares_with_the_parent():
 
 def test_attributes_of_its_own_are_listed_without_fields_and_new_names():
     assert own_attributes(OneClock(epsilon=0.3)) == ["clocks", "scenario_notes"]
-    assert own_attributes(Averse(epsilon=0.3)) == ["_pairs"]
+    assert own_attributes(Averse(epsilon=0.3)) == ["begin"]
     assert own_attributes(Renamed(epsilon=0.3)) == []

@@ -19,6 +19,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from netkf.algorithms.kernels.estimates import triangularise
+from netkf.algorithms.kernels.run import carry
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
     SlotLinks,
@@ -217,3 +219,48 @@ def combine_convex_roots(
             write_root_column(
                 lanes, scratch.size, nodes.root, b, h, i, scratch.moved, scratch.noise
             )
+
+
+@kernel(inlined=True)
+def received_weight(run: Any) -> Any:
+    """Return the sum (L,) of the weights of all messages in the inbox that have arrived."""
+    total = spread(run.lanes, 0.0)
+    for k in range(run.count):
+        arrived = load_flags(run.lanes, run.arrived, k)
+        total += select(arrived, run.message_weight[k], 0.0)
+    return total
+
+
+@kernel
+def combine_convex(record: Any, h: int, run: Any) -> None:
+    """Replace the estimate of node ``h`` by the convex combination with those heard, paper H (7)
+    and (9), with the weights of messages that do not arrive in its own: ``x = sum w_j x_j`` and
+    ``P = sum w_j P_j``.
+    """
+    lanes, n, root, payload = run.lanes, len(run.size), record.root, record.payload
+    # Rounding may leave the own weight a little below 0, which has no root.
+    own = 1.0 - received_weight(run)
+    factor = root_of(select(own > 0.0, own, 0.0))
+    for i in range(n):
+        store(lanes, run.moved_mean, i, 0.0)
+        for j in range(i + 1):
+            store(lanes, root, h, i, j, factor * load(lanes, root, h, i, j))
+    for k in range(run.count):
+        m = run.message[k]
+        carry(run.model, run, payload.xhat, payload.root, m, run.age[k])
+        arrived = load_flags(lanes, run.arrived, k)
+        weight = select(arrived, run.message_weight[k], 0.0)
+        factor = root_of(weight)
+        # P + w P_j = A A' with A = [S, sqrt(w) S_j], made triangular by reflections.
+        for i in range(n):
+            for j in range(n):
+                store(lanes, run.moved, i, j, 0.0)
+            for j in range(i + 1):
+                store(lanes, run.moved, i, j, load(lanes, root, h, i, j))
+                store(lanes, run.noise, i, j, factor * load(lanes, payload.root, m, i, j))
+            difference = load(lanes, payload.xhat, m, i) - load(lanes, record.xhat, h, i)
+            store(lanes, run.moved_mean, i, load(lanes, run.moved_mean, i) + weight * difference)
+        triangularise(lanes, run.size, root, h, run.moved, run.noise)
+    for i in range(n):
+        mean = load(lanes, record.xhat, h, i) + load(lanes, run.moved_mean, i)
+        store(lanes, record.xhat, h, i, mean)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,8 +28,11 @@ class DiffusionRule(EstimateExchangeRule):
         so that the weights sum to 1. Called by the replay for every receiver at every arrival.
         """
         algorithm: Any = self.scenario.filter.algorithm
-        own_weight, heard_weights = algorithm.share(self.scenario.own_weights[node], weights)
-        return intersect_covariances([own_weight, *heard_weights], roots)
+        own, received = self.scenario.own_weights[node], math.fsum(weights)
+        # "keep-own", or weights that are all 0: the own weight is 1 minus the others.
+        if algorithm.on_loss == "keep-own" or own + received == 0.0:
+            own = max(0.0, 1.0 - received)
+        return intersect_covariances([w / (own + received) for w in (own, *weights)], roots)
 
 
 def error_rule(
