@@ -337,7 +337,7 @@ class Filter(Component):
         messages. Payloads must not be changed.
         """
         if self.kernels is None:
-            raise NotImplementedError(f"{type(self).__name__} has no absorb")
+            raise NotImplementedError(f"{type(self).__name__} must define absorb")
         return single.absorb(state, messages, exchange)
 
     def estimate(self, state: Any) -> tuple[FloatArray, FloatArray | None]:

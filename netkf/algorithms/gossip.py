@@ -1,8 +1,4 @@
-"""The gossip interactive Kalman filter of Kar and Moura, paper G (10).
-
-``gossip_slots`` simulates many runs in the compiled engine, in place of the methods of ``Gossip``;
-the types of its arguments are described in ``kernels.slots``.
-"""
+"""The gossip interactive Kalman filter of Kar and Moura, paper G (10)."""
 
 from __future__ import annotations
 

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.gains import Gains, no_gains, stack_gains
-from netkf.algorithms.kernels.root_flow import flow_scratch, stack_tables
+from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
     ClockRun,
     ClockTables,
     SingleSlotRun,
     SlotTables,
-    clock_tables_class,
+    clock_tables,
     scratch_of,
     size_of,
 )
@@ -28,6 +28,7 @@ from netkf.algorithms.models import FlowModel, first_root
 from netkf.algorithms.records import Kernels, Records, make_records
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE
+from netkf.linalg.structs import Size
 
 _NO_READING: Any = (np.zeros(0), np.zeros((0, 0)))
 OWN = 0
@@ -48,6 +49,11 @@ class Payload:
             return self.__dict__["fields"][name][0, ..., 0]
         except KeyError:
             raise AttributeError(name) from None
+
+    @property
+    def _fields(self) -> tuple[str, ...]:
+        """The names of all fields, as of a NamedTuple."""
+        return (*self.fields, "reading")
 
     @property
     def P(self) -> FloatArray:
@@ -86,6 +92,16 @@ class NodeState:
         return root @ root.T
 
     @property
+    def _fields(self) -> tuple[str, ...]:
+        """The names of all fields, as of a NamedTuple."""
+        return (*self.changing, "reading")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what pickle needs to make the state again."""
+        run, values = self.run, {name: getattr(self.record, name) for name in self.changing}
+        return _restored, (run.filtering, run.model, run.info, values, self.reading)
+
+    @property
     def model(self) -> Any:
         """The model of the plant and the node's sensors."""
         return self.run.model
@@ -119,22 +135,19 @@ class NodeState:
 class Surroundings:
     """The run of one node: the struct that kernels take, and how Python fills it."""
 
-    def __init__(
-        self, filtering: Any, model: Any, info: Any, unrolled: bool, node_fields: tuple[str, ...]
-    ) -> None:
+    def __init__(self, filtering: Any, model: Any, info: Any, node_fields: tuple[str, ...]) -> None:
         self.filtering = filtering
         n, self.info, self.node_fields = len(model.information), info, node_fields
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
-        size = size_of(n, unrolled)
-        base = ClockRun if self.clocked else SingleSlotRun
-        cls = base.of_size(n) if isinstance(size, tuple) else base
+        # Not unrolled: one compiled kernel serves all n.
+        size, cls = size_of(n, unrolled=False), ClockRun if self.clocked else SingleSlotRun
         degree = max(1, info.degree, len(info.senders))
         self.links = {sender: k for k, sender in enumerate(info.senders)}
         self.struct = cls(
             size=size,
             lanes=ONE,
-            model=clock_tables(model, unrolled) if self.clocked else slot_tables(model),
+            model=_clock_tables(model, size) if self.clocked else slot_tables(model),
             first=np.array([0, info.degree]),
             sender=np.arange(degree),
             weight=np.zeros(degree),
@@ -217,22 +230,10 @@ def slot_tables(model: Any) -> SlotTables:
     return SlotTables(F=np.ascontiguousarray(model.F), root_Q=np.ascontiguousarray(model.root_Q))
 
 
-def clock_tables(model: FlowModel, unrolled: bool) -> ClockTables:
+def _clock_tables(model: FlowModel, size: Size) -> ClockTables:
     """Return the model of one node under clocks as kernels take it."""
     table = stack_tables([model.flow, model.unobserved_flow])
-    gains = _gains_of(model)
-    tables: ClockTables = clock_tables_class(len(model.A), unrolled)(
-        table=table,
-        models=np.zeros(1, dtype=np.int64),
-        gains=gains,
-        moments=np.zeros(2 * len(model.H)),
-        increments=0,
-        scratch=flow_scratch(table, unrolled),
-        values=np.zeros(max(1, gains.series.shape[2])),
-        mean=np.zeros((1, len(model.A))),
-        mean_root=np.zeros((1, len(model.A), len(model.A))),
-    )
-    return tables
+    return clock_tables(size, table, np.zeros(1, dtype=np.int64), _gains_of(model))
 
 
 def _gains_of(model: FlowModel) -> Gains:
@@ -248,8 +249,18 @@ def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: A
     fields = tuple(records.arrays)
     nodes = tuple(name for name in fields if name not in records.links)
     kernels = filtering.kernels.of(isinstance(model, FlowModel))
-    run = Surroundings(filtering, model, info, kernels.unrolled, nodes)
+    run = Surroundings(filtering, model, info, nodes)
     return NodeState(kernels, records.struct, fields, run)
+
+
+def _restored(filtering: Any, model: Any, info: Any, values: dict[str, Any], reading: Any) -> Any:
+    """Return a state that was pickled."""
+    n = values["xhat"].shape[1]
+    state = begin(filtering, model, np.zeros(n), np.eye(n), info)
+    for name, array in values.items():
+        setattr(state.record, name, array)
+    state.reading = reading
+    return state
 
 
 def predict(state: NodeState, gap: float) -> NodeState:

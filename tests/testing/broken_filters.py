@@ -169,7 +169,8 @@ class Opened(NamedTuple):
 @says("OpenState.init: states must be picklable", epsilon=0.3)
 class OpenState(Hybrid):
     def init(self, model, mean, cov, node):
-        return Opened(*super().init(model, mean, cov, node), lambda: None)
+        state = super().init(model, mean, cov, node)
+        return Opened(state.xhat, state.root, state.model, lambda: None)
 
 
 @says("Counting.predict: must compose over gaps", epsilon=0.3)
@@ -201,7 +202,7 @@ class NanP(Hybrid):
         return state.xhat, np.full((len(state.xhat),) * 2, np.nan)
 
 
-@says("Unfinished: must define absorb")
+@says("Unfinished must define absorb")
 class Unfinished(Filter):
     pass
 

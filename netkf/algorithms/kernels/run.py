@@ -34,6 +34,7 @@ from netkf.algorithms.kernels.gains import Gains
 from netkf.algorithms.kernels.root_flow import (
     FlowScratch,
     FlowTable,
+    flow_scratch,
     gain_root,
     information_rate,
     propagate_root,
@@ -141,11 +142,6 @@ class ClockTables(Struct):
     mean_root: FloatArray
 
 
-def clock_tables_class(n: int, unrolled: bool) -> Any:
-    """Return the class of ClockTables whose scratch knows n, if kernels are compiled for it."""
-    return ClockTables.of_size(n) if unrolled else ClockTables
-
-
 class ClockRun(Struct):
     """The surroundings of H nodes of one run under clocks: a SlotRun with ClockTables, in which
     ``slot``, ``phase`` and ``step`` are -1.
@@ -170,6 +166,27 @@ def size_of(n: int, unrolled: bool) -> Size:
     """
     # Loops over one state need no unrolling.
     return sized(n) if unrolled and n > 1 else np.zeros(n)
+
+
+def clock_tables(size: Size, table: FlowTable, models: IntArray, gains: Gains) -> ClockTables:
+    """Return the models of H nodes under clocks for a run of this ``size``, with scratch: the
+    ``table`` of M models and the ``gains`` of theirs, and the index ``models`` (H,) of each node's.
+    """
+    n, unrolled = len(size), isinstance(size, tuple)
+    # The types of structs in it depend on a size that is known when kernels are compiled.
+    cls = ClockTables.of_size(n) if unrolled else ClockTables
+    made: ClockTables = cls(
+        table=table,
+        models=models,
+        gains=gains,
+        moments=np.zeros(max(1, int(gains.moments.max()))),
+        increments=0,
+        scratch=flow_scratch(table, unrolled),
+        values=np.zeros(max(1, gains.series.shape[2])),
+        mean=np.zeros((1, n)),
+        mean_root=np.zeros((1, n, n)),
+    )
+    return made
 
 
 @generic

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.root_flow import flow_scratch
-from netkf.algorithms.kernels.run import ClockRun, clock_tables_class, scratch_of, size_of
+from netkf.algorithms.kernels.run import ClockRun, clock_tables, scratch_of, size_of
 from netkf.algorithms.records import Kernels, make_records, resized
 from netkf.engines.compiled.batch_loop import BatchArrays
 from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
@@ -45,16 +44,8 @@ class ClockFilters:
         self.run = cls(
             size=size,
             lanes=ONE,
-            model=clock_tables_class(n, kernels.unrolled)(
-                table=start.table,
-                models=np.ascontiguousarray(start.nodes["model"]),
-                gains=start.gains,
-                moments=np.zeros(max(1, int(start.gains.moments.max()))),
-                increments=0,
-                scratch=flow_scratch(start.table, kernels.unrolled),
-                values=np.zeros(max(1, start.gains.series.shape[2])),
-                mean=np.zeros((1, n)),
-                mean_root=np.zeros((1, n, n)),
+            model=clock_tables(
+                size, start.table, np.ascontiguousarray(start.nodes["model"]), start.gains
             ),
             **links,
             **self._inbox(messages, n),
