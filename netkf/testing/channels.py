@@ -175,13 +175,10 @@ def _check_delivery_probabilities(
             )
             rule = f"must be a number from 0 to 1 for message {message}"
             demand(is_probability, where, rule, probability)
-            demand(
-                not part.deterministic or probability in (0.0, 1.0),
-                where,
-                "must be 0 or 1 where the loss is deterministic",
-                probability,
-                "let deterministic be False",
-            )
+            rule = "must be 0 or 1 where the loss is deterministic"
+            got = probability
+            remedy = "let deterministic be False"
+            demand(not part.deterministic or probability in (0.0, 1.0), where, rule, got, remedy)
     mean = watched.call("mean_delivery", link, table_probability)
     is_mean = math.isnan(mean) or 0.0 <= mean <= 1.0
     demand(is_mean, f"{watched.name}.mean_delivery", "must be a number from 0 to 1, or nan", mean)
@@ -199,13 +196,8 @@ def _check_channel_state(watched: WatchedPart) -> None:
             calls = random.take_calls()
             history.append((bad, calls))
             if not part.stateful:
-                demand(
-                    not calls,
-                    where,
-                    "must draw nothing where stateful is False",
-                    describe_calls(calls),
-                    "let stateful be True",
-                )
+                rule = "must draw nothing where stateful is False"
+                demand(not calls, where, rule, describe_calls(calls), "let stateful be True")
             elif calls != history[0][1]:
                 fail(
                     where,
@@ -215,12 +207,8 @@ def _check_channel_state(watched: WatchedPart) -> None:
                     "draw first, then decide",
                 )
         histories.append(history)
-    demand(
-        histories[0] == histories[1],
-        where,
-        "must use no generator but the one it is given",
-        "another outcome from an equal generator",
-    )
+    rule = "must use no generator but the one it is given"
+    demand(histories[0] == histories[1], where, rule, "another outcome from an equal generator")
 
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
@@ -285,12 +273,8 @@ def _check_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
     """Check a delay: the delays of messages on all ``links``, its draws and its law."""
     _check_message_delays(watched, links)
     delays, repeated = (_draw_delays(watched) for _ in range(2))
-    demand(
-        delays == repeated,
-        f"{watched.name}.draw",
-        "must use no generator but the one it is given",
-        "other delays from an equal generator",
-    )
+    rule = "must use no generator but the one it is given"
+    demand(delays == repeated, f"{watched.name}.draw", rule, "other delays from an equal generator")
     if watched.part.is_random:
         _check_draws(watched)
     _check_delay_law(watched, links)

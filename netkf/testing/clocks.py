@@ -111,12 +111,9 @@ def _check_entity(watched: WatchedPart, entity: Entity) -> None:
     in_one_block = _read_ticks(watched, entity, BLOCKS[0])
     _check_increasing(watched, in_one_block)
     repeated = _read_ticks(watched, entity, BLOCKS[0])
-    demand(
-        np.array_equal(in_one_block, repeated),
-        f"{watched.name}.ticks",
-        "must use no generator but the one it is given",
-        "other times from an equal generator",
-    )
+    rule = "must use no generator but the one it is given"
+    got = "other times from an equal generator"
+    demand(np.array_equal(in_one_block, repeated), f"{watched.name}.ticks", rule, got)
     for blocks in BLOCKS[1:]:
         in_blocks = _read_ticks(watched, entity, blocks)
         if not np.array_equal(in_one_block, in_blocks):
@@ -144,13 +141,10 @@ def _check_interleaved(watched: WatchedPart, entities: tuple[Entity, ...]) -> No
                 if tick is not None:
                     ticks.append(tick)
     for k, entity in enumerate(entities):
-        demand(
-            interleaved[k] == alone[k],
-            where,
-            "ticks of a link must not depend on those of others",
-            f"other times of {list(entity)} when other links tick in between",
-            "use the generator given, and no memory of earlier calls",
-        )
+        rule = "ticks of a link must not depend on those of others"
+        got = f"other times of {list(entity)} when other links tick in between"
+        remedy = "use the generator given, and no memory of earlier calls"
+        demand(interleaved[k] == alone[k], where, rule, got, remedy)
 
 
 def _iterate_ticks(part: Any, entity: Entity, stream: int) -> Iterator[float]:
@@ -192,12 +186,8 @@ def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -
         is_vector = block.ndim == 1 and block.dtype == np.float64
         demand(is_vector, where, "must be a vector of float64", f"{block.dtype} {block.shape}")
         demand(len(block) <= count, where, f"must be at most {count} times", len(block))
-        demand(
-            not (has_stopped and len(block)),
-            where,
-            "an empty block means stopped for good",
-            f"{len(block)} more ticks after it",
-        )
+        rule = "an empty block means stopped for good"
+        demand(not (has_stopped and len(block)), where, rule, f"{len(block)} more ticks after it")
         has_stopped = not len(block)
         times.append(block)
         now = float(block[-1]) if len(block) else now
@@ -207,13 +197,8 @@ def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -
 def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
     """Check that the ticks ``times`` (K,), in seconds, are finite, positive and increasing."""
     where = f"{watched.name}.ticks"
-    demand(
-        np.isfinite(times).all(),
-        where,
-        "must be finite",
-        "nan or inf",
-        "return fewer times when the clock stops",
-    )
+    rule, remedy = "must be finite", "return fewer times when the clock stops"
+    demand(np.isfinite(times).all(), where, rule, "nan or inf", remedy)
     gaps = np.diff(times, prepend=0.0)
     k = int(np.argmin(gaps)) if len(gaps) else 0
     demand(

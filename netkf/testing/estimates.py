@@ -47,21 +47,13 @@ def _check_covariance(where: str, P: FloatArray) -> None:
     """Check that ``P`` (n, n) is symmetric and positive semidefinite up to rounding."""
     size = max(float(np.abs(P).max()), np.finfo(float).tiny)
     asymmetry = float(np.abs(P - P.T).max())
-    demand(
-        asymmetry <= SYMMETRY_TOLERANCE * size,
-        where,
-        "P must be symmetric",
-        f"P - P' of up to {asymmetry:.3g}",
-        "return 0.5 * (P + P.T)",
-    )
+    rule, got = "P must be symmetric", f"P - P' of up to {asymmetry:.3g}"
+    demand(asymmetry <= SYMMETRY_TOLERANCE * size, where, rule, got, "return 0.5 * (P + P.T)")
     smallest = float(np.linalg.eigvalsh(P)[0])
-    demand(
-        smallest >= -EIGENVALUE_TOLERANCE * size,
-        where,
-        "P must be positive semidefinite",
-        f"least eigenvalue {smallest:.4g}",
-        "look for a sign, or for weights that sum to more than 1",
-    )
+    rule = "P must be positive semidefinite"
+    got = f"least eigenvalue {smallest:.4g}"
+    remedy = "look for a sign, or for weights that sum to more than 1"
+    demand(smallest >= -EIGENVALUE_TOLERANCE * size, where, rule, got, remedy)
 
 
 def check_state_pickles(watched: WatchedPart, state: Any) -> None:

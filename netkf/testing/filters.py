@@ -95,13 +95,8 @@ def _check_schedule(watched: WatchedPart) -> None:
         is_count = isinstance(steps, int) and steps >= 1
         demand(is_count, f"{watched.name}.steps", "must be a whole number of at least 1", steps)
         redraws = watched.call("redraws_links", phase, 0)
-        demand(
-            redraws is True,
-            f"{watched.name}.redraws_links",
-            "must be True in step 0",
-            redraws,
-            "links have no outcome yet",
-        )
+        rule, remedy = "must be True in step 0", "links have no outcome yet"
+        demand(redraws is True, f"{watched.name}.redraws_links", rule, redraws, remedy)
 
 
 def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
@@ -109,25 +104,18 @@ def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
     if not {"predict", "sense"} <= set(schedule):
         return
     predicts = schedule.index("sense") < schedule.index("predict")
-    demand(
-        watched.part.predicts is predicts,
-        f"{watched.name}.predicts",
-        'must be True where the schedule has "predict" after "sense", and False where before',
-        watched.part.predicts,
-        "else estimates are compared with the state of another slot",
-    )
+    rule = 'must be True where the schedule has "predict" after "sense", and False where before'
+    got = watched.part.predicts
+    remedy = "else estimates are compared with the state of another slot"
+    demand(watched.part.predicts is predicts, f"{watched.name}.predicts", rule, got, remedy)
 
 
 def _check_weights(watched: WatchedPart) -> None:
     """Check the weights of messages."""
     part, where = watched.part, f"{watched.name}.weight"
     largest_degree = watched.call("largest_degree")
-    demand(
-        largest_degree >= 1.0,
-        f"{watched.name}.largest_degree",
-        "must be at least 1",
-        largest_degree,
-    )
+    got = largest_degree
+    demand(largest_degree >= 1.0, f"{watched.name}.largest_degree", "must be at least 1", got)
     if part.pair_weights is not None:
         _check_pair_weights(watched, np.asarray(part.pair_weights))
         return
@@ -138,13 +126,10 @@ def _check_weights(watched: WatchedPart) -> None:
             is_weight = isinstance(weight, (int, float, np.floating)) and 0.0 <= weight <= 1.0
             rule = f"must be a number from 0 to 1 for {degree} and {peer_degree} links"
             demand(is_weight, where, rule, weight)
-        demand(
-            degree * max(weights) <= 1.0 + 1e-9,
-            where,
-            "the weights of all messages that may arrive together must sum to at most 1",
-            f"{degree * max(weights):.4g} at a node of {degree} links",
-            "give smaller weights, or let largest_degree say how many links are allowed",
-        )
+        rule = "the weights of all messages that may arrive together must sum to at most 1"
+        got = f"{degree * max(weights):.4g} at a node of {degree} links"
+        remedy = "give smaller weights, or let largest_degree say how many links are allowed"
+        demand(degree * max(weights) <= 1.0 + 1e-9, where, rule, got, remedy)
 
 
 def _check_pair_weights(watched: WatchedPart, weights: FloatArray) -> None:
@@ -154,10 +139,6 @@ def _check_pair_weights(watched: WatchedPart, weights: FloatArray) -> None:
     demand(is_square, where, "must be a square matrix", str(weights.shape))
     demand((weights >= 0.0).all(), where, "must not be negative", float(weights.min()))
     sums = weights.sum(axis=0)
-    demand(
-        (sums <= 1.0 + 1e-9).all(),
-        where,
-        "columns, the weights that a node gives, must sum to at most 1",
-        sums,
-        "entry [l, i] is the weight node i gives to what node l sends",
-    )
+    rule = "columns, the weights that a node gives, must sum to at most 1"
+    remedy = "entry [l, i] is the weight node i gives to what node l sends"
+    demand((sums <= 1.0 + 1e-9).all(), where, rule, sums, remedy)

@@ -70,12 +70,9 @@ def check_matching_object(part: Any, topology: Topology | None, seed: int) -> No
     demand(accepted, f"{watched.name}.check", "must accept one of the networks", "none accepted")
     if isinstance(part, Broadcast):
         return
-    demand(
-        isinstance(part, Matching),
-        watched.name,
-        "must be derived from Matching, RecordedSlots or Broadcast",
-        remedy="derive it from netkf.parts.Matching and define draw and mean",
-    )
+    rule = "must be derived from Matching, RecordedSlots or Broadcast"
+    remedy = "derive it from netkf.parts.Matching and define draw and mean"
+    demand(isinstance(part, Matching), watched.name, rule, remedy=remedy)
     before = watched.attributes()
     for network in accepted:
         with guard_user_code(f"{watched.name}.draw"):

@@ -148,13 +148,10 @@ def _demand_moved(
     expected = Phi @ offset
     error = np.abs(moved - x - expected)
     worst = int(error.max(axis=1).argmax())
-    demand(
-        float(error.max() / (1.0 + np.abs(moved).max())) <= ROUNDING,
-        where,
-        f"a start that is moved must move the path by {law}, and the noise not at all",
-        f"{moved[worst] - x[worst]} instead of {expected[worst]}",
-        "let the noise not depend on x, and use the matrix that the filters are told",
-    )
+    rule = f"a start that is moved must move the path by {law}, and the noise not at all"
+    got = f"{moved[worst] - x[worst]} instead of {expected[worst]}"
+    remedy = "let the noise not depend on x, and use the matrix that the filters are told"
+    demand(float(error.max() / (1.0 + np.abs(moved).max())) <= ROUNDING, where, rule, got, remedy)
 
 
 def _check_starts(

@@ -188,13 +188,9 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
     demand_close(series.H, other.H, reader.where, "H must not depend on the state")
     expected = np.einsum("kpn,kn->kp", series.H, other_x - x)
     error = np.abs(other.y - series.y - expected).max() / (1.0 + np.abs(expected).max())
-    demand(
-        error <= ROUNDING,
-        reader.where,
-        "another state must change a reading by H times the difference, and the noise not at all",
-        f"{error:.3g} of the change left over",
-        "return H @ x plus noise that does not depend on x",
-    )
+    rule = "another state must change a reading by H times the difference, and the noise not at all"
+    remedy = "return H @ x plus noise that does not depend on x"
+    demand(error <= ROUNDING, reader.where, rule, f"{error:.3g} of the change left over", remedy)
     if not reader.sensor.varying:
         own = np.broadcast_to(reader.sensor.H, series.H.shape)
         rule = "H must be the sensor's own unless varying is True"

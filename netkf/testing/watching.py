@@ -64,11 +64,8 @@ def make_part(
     cls = part if isinstance(part, type) else type(part)
     name = cls.__name__
     listed = " or ".join(contract.__name__ for contract in contracts)
-    demand(
-        issubclass(cls, contracts),
-        name,
-        f"must be derived from {listed} of netkf.parts, or be an object of such a class",
-    )
+    rule = f"must be derived from {listed} of netkf.parts, or be an object of such a class"
+    demand(issubclass(cls, contracts), name, rule)
     missing = [
         attribute
         for attribute in sorted(dir(cls))
@@ -233,27 +230,17 @@ class WatchedPart:
             if path is not None:
                 name = self._parameter_names(method, len(arguments))[k]
                 remedy = "return a new one; work on copies"
-                fail(
-                    where,
-                    f"must not change its arguments, but changed {name}{path}",
-                    remedy=remedy,
-                )
+                rule = f"must not change its arguments, but changed {name}{path}"
+                fail(where, rule, remedy=remedy)
         path = differing_path(attributes, self.attributes())
-        demand(
-            path is None,
-            where,
-            f"must not change its own object, but changed {path}",
-            remedy="keep what changes in the state that is handed in and returned",
-        )
+        rule = f"must not change its own object, but changed {path}"
+        remedy = "keep what changes in the state that is handed in and returned"
+        demand(path is None, where, rule, remedy=remedy)
         result_leaves = [collect_leaves(result) for result in results]
         path = differing_path(result_leaves[0], result_leaves[-1])
-        demand(
-            path is None,
-            where,
-            "must return the same for the same arguments",
-            f"another {(path or '').lstrip('.') or 'value'} at the second call",
-            "use no randomness, clock or memory of earlier calls",
-        )
+        got = f"another {(path or '').lstrip('.') or 'value'} at the second call"
+        remedy = "use no randomness, clock or memory of earlier calls"
+        demand(path is None, where, "must return the same for the same arguments", got, remedy)
         self._results.append((where, results[0], result_leaves[0]))
         return results[0]
 
@@ -285,12 +272,9 @@ class WatchedPart:
             remedy = "; set inverts = True where covariances must not be singular"
             text = f"{where}: {describe_failure(error)}{remedy if singular else ''}"
             raise AssertionError(text) from error
-        demand(
-            global_generator_states() == before,
-            where,
-            "must not use or seed global generators (numpy.random.*, random.*)",
-            remedy="draw from the generator that is handed in",
-        )
+        rule = "must not use or seed global generators (numpy.random.*, random.*)"
+        remedy = "draw from the generator that is handed in"
+        demand(global_generator_states() == before, where, rule, remedy=remedy)
         return result
 
     def _parameter_names(self, method: str, count: int) -> list[str]:
@@ -302,24 +286,17 @@ class WatchedPart:
         """Check that no result of a call was changed by a later one."""
         for where, result, leaves in self._results:
             path = differing_path(leaves, collect_leaves(result))
-            demand(
-                path is None,
-                where,
-                f"returned something that a later call changed ({(path or '').lstrip('.')})",
-                remedy="return copies, share no buffers",
-            )
+            rule = f"returned something that a later call changed ({(path or '').lstrip('.')})"
+            demand(path is None, where, rule, remedy="return copies, share no buffers")
 
     def demand_unchanged(self, before: Leaves) -> None:
         """Check that the attributes of the component are still those of ``before``, an earlier
         result of :meth:`attributes`.
         """
         path = differing_path(before, self.attributes())
-        demand(
-            path is None,
-            self.name,
-            f"must not change its own object, but changed {path}",
-            remedy="keep what changes in the paths and states that its methods return",
-        )
+        rule = f"must not change its own object, but changed {path}"
+        remedy = "keep what changes in the paths and states that its methods return"
+        demand(path is None, self.name, rule, remedy=remedy)
 
     def pickle_copy(self) -> Any:
         """Return a copy of the user's object made by pickle, as for worker processes; check that it
@@ -359,12 +336,9 @@ def guard_user_code(where: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise AssertionError(f"{where}: {describe_failure(error)}") from error
-    demand(
-        global_generator_states() == before,
-        where,
-        "must not use or seed global generators (numpy.random.*, random.*)",
-        remedy="draw from the generator that is handed in",
-    )
+    rule = "must not use or seed global generators (numpy.random.*, random.*)"
+    remedy = "draw from the generator that is handed in"
+    demand(global_generator_states() == before, where, rule, remedy=remedy)
 
 
 def call_user_function(where: str, function: Callable[..., Any], *arguments: Any) -> Any:
