@@ -51,6 +51,7 @@ from netkf.core.fields import (
     text,
     vector,
 )
+from netkf.core.laws import Chain, Lattice, WaitingLaw
 from netkf.network.channels import (
     Bernoulli,
     Channel,
@@ -129,6 +130,7 @@ __all__ = [
     "Bernoulli",
     "Broadcast",
     "Central",
+    "Chain",
     "Channel",
     "Clock",
     "Complete",
@@ -167,6 +169,7 @@ __all__ = [
     "Intermittent",
     "InverseIntersection",
     "Kcf",
+    "Lattice",
     "LinearPlant",
     "LinearSensor",
     "LinkClock",
@@ -216,6 +219,7 @@ __all__ = [
     "UniformDelay",
     "UnknownDiffusion",
     "UnknownPlant",
+    "WaitingLaw",
     "boolean",
     "choice",
     "covariance",

@@ -30,13 +30,7 @@ from netkf.checks.evidence import (
     judge,
 )
 from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
-from netkf.checks.looks import (
-    MAX_LOOKED_RUNS,
-    is_decided,
-    keep_decisions,
-    level_of_look,
-    next_runs,
-)
+from netkf.checks.looks import MAX_LOOKED_RUNS, is_decided, keep_decisions, level_of_look, next_runs
 from netkf.checks.nonlinear import CHECKS as WITHOUT_PAPER
 from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.rows import gaussian_noises, part_assumptions, part_promises

@@ -73,17 +73,9 @@ PROMISES = (
         check_error_covariance,
     ),
     Promise(
-        "errors have no bias that the equations do not give them",
-        "derived",
-        (REACH,),
-        check_bias,
+        "errors have no bias that the equations do not give them", "derived", (REACH,), check_bias
     ),
-    Promise(
-        "NEES has the mean that exact errors say",
-        "derived",
-        (REACH,),
-        check_expected_nees,
-    ),
+    Promise("NEES has the mean that exact errors say", "derived", (REACH,), check_expected_nees),
 )
 MASS_CONSERVED = Promise("mass is conserved", "P (67), derived", (), _mass_conserved, exact=True)
 UPPER_BOUND = Promise(

@@ -23,13 +23,7 @@ from netkf.checks.evidence import (
     find_unknown,
     gaussian_test,
 )
-from netkf.checks.laws import (
-    EVERYTHING,
-    NEES_TOLERANCE,
-    compare_chi_square,
-    find_largest,
-    pool,
-)
+from netkf.checks.laws import EVERYTHING, NEES_TOLERANCE, compare_chi_square, find_largest, pool
 from netkf.checks.points import (
     check_slots,
     checked_samples,
@@ -363,10 +357,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
         return find_nothing(NEES_TOLERANCE)
     # Each node and time by itself: N = 1. Directions without variance have no degree of freedom.
     single = whiten_errors(
-        e.reshape(-1, 1, n),
-        Sigma.reshape(-1, n, n),
-        MIN_VARIANCE,
-        _variance_floor(scenario),
+        e.reshape(-1, 1, n), Sigma.reshape(-1, n, n), MIN_VARIANCE, _variance_floor(scenario)
     ).reshape(len(e), -1, 2)
     squares = np.concatenate([single, all_nodes], axis=1)
     freedom = np.nan_to_num(squares[..., 1]).sum(axis=0)

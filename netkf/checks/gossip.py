@@ -419,10 +419,7 @@ PROMISES = (
         _each_sensor,
     ),
     Promise(
-        "every token has the same law in the end",
-        "G Theorem 10 [ii], (25)",
-        ERGODIC,
-        _check_tokens,
+        "every token has the same law in the end", "G Theorem 10 [ii], (25)", ERGODIC, _check_tokens
     ),
     Promise(
         "covariances are stochastically bounded: their laws do not grow any more",

@@ -387,10 +387,7 @@ def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
     """Compare averages over the slots of one run with those of simulated arrivals."""
     averages, expected = samples.runs.averages, samples.reference.averages
     intervals = [
-        (
-            law_distance(averages[:, i], expected[i], level / len(samples.nodes)),
-            f"at node {node}",
-        )
+        (law_distance(averages[:, i], expected[i], level / len(samples.nodes)), f"at node {node}")
         for i, node in enumerate(samples.nodes)
     ]
     message = (

@@ -192,9 +192,7 @@ def growth_intervals(earlier: FloatArray, later: FloatArray, level: float) -> li
 
 
 def compare_growth(
-    pairs: Sequence[Pair],
-    expected: Sequence[tuple[FloatArray, FloatArray] | None],
-    level: float,
+    pairs: Sequence[Pair], expected: Sequence[tuple[FloatArray, FloatArray] | None], level: float
 ) -> Finding:
     """Test the null hypothesis that covariances stay stochastically bounded, by samples at half of
     the horizon and at its end.

@@ -314,7 +314,9 @@ def _check_gaps(
 ) -> None:
     """Check gaps against their stated law, and neighbouring ones for independence."""
     law, part, where = group.gaps[0], watched.part, f"{watched.name}.ticks"
-    parent = f"{type(stated_part(part, 'activation')).__name__}, from which it derives"
+    stated = stated_part(part, "activation")
+    derives = type(stated) is not type(part)
+    parent = f"{type(stated).__name__}, from which it derives" if derives else "its `gaps`"
     rule, remedy = f"gaps must have the law of {parent}", STATE_IT
     if part.memoryless:
         where, remedy = f"{watched.name}.memoryless", "return False: theory relies on it"

@@ -14,13 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.laws.noise import (
-    MIN_VARIANCE_SHARE,
-    NoiseDraws,
-    noise_draws,
-    transition_law,
-    whiten,
-)
+from netkf.laws.noise import MIN_VARIANCE_SHARE, NoiseDraws, noise_draws, transition_law, whiten
 from netkf.laws.stating import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.diffusion import Diffusion

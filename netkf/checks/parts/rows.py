@@ -8,15 +8,7 @@ from functools import lru_cache, partial
 import numpy as np
 import scipy.special
 
-from netkf.checks.evidence import (
-    GAUSSIAN,
-    PLANT,
-    SENSORS,
-    START,
-    Assumption,
-    Finding,
-    Promise,
-)
+from netkf.checks.evidence import GAUSSIAN, PLANT, SENSORS, START, Assumption, Finding, Promise
 from netkf.checks.laws import find
 from netkf.checks.parts.network_rows import loss_assumptions, network_promises
 from netkf.checks.parts.noises import path_law, reading_labels, start_states, whitened_starts

@@ -20,7 +20,7 @@ from netkf.trace.run import Run
 
 
 class PartSummary(NamedTuple):
-    """Counts and sums of one run for each part; None where the scenario has no such part.
+    """Counts and draws of one run for each part; None where the scenario has no such part.
 
     ticks, sampling : ticks of the clocks of the network and of sampled sensors
     fates, delays   : losses and delays of messages
@@ -37,22 +37,20 @@ class PartSummary(NamedTuple):
     sampling: TickCounts | None
 
 
-PART_TYPES: dict[str, type[Any]] = {
-    "ticks": TickCounts,
-    "fates": LossCounts,
-    "pairs": PairCounts,
-    "steps": NoiseDraws,
-    "readings": NoiseDraws,
-    "delays": DelayCounts,
-    "sampling": TickCounts,
-}
+PART_TYPES: dict[str, type[Any]] = dict(
+    zip(
+        PartSummary._fields,
+        (TickCounts, LossCounts, PairCounts, NoiseDraws, NoiseDraws, DelayCounts, TickCounts),
+        strict=True,
+    )
+)
 """The classes of the fields of :class:`PartSummary`."""
 
 
 def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
-    """Return counts and sums of a run, by which the parts of the scenario (clocks, losses,
-    matchings, plant, sensors) are compared with the laws that they state; called for every
-    replica, in the process that simulated it. Noises are drawn again from the run's streams.
+    """Return counts and draws of a run, by which the parts of the scenario are compared with the
+    laws that they state; called for every replica, in the process that simulated it. Noises are
+    drawn again from the run's streams.
     """
     streams = Streams(run.seed, run.replica)
     return PartSummary(
@@ -68,31 +66,26 @@ def summarise_parts(scenario: Scenario, run: Run) -> PartSummary:
 
 @dataclass(frozen=True)
 class PartSamples:
-    """The summaries of R runs of one seed, which all tests of parts get; the arrays in them have a
-    first axis of length R.
-
-    See :class:`PartSummary` for the fields; a part that the scenario lacks is None.
+    """The summaries of R runs of one seed, which all tests of parts get, with the fields of
+    :class:`PartSummary`; the arrays in them have a first axis of length R.
     """
 
     scenario: Scenario
     seed: int
-    ticks: Any
-    fates: Any
-    pairs: Any
-    steps: Any
-    readings: Any
-    delays: Any
-    sampling: Any
+    ticks: Any = None
+    fates: Any = None
+    pairs: Any = None
+    steps: Any = None
+    readings: Any = None
+    delays: Any = None
+    sampling: Any = None
 
 
 def stack_parts(scenario: Scenario, seed: int, summaries: Sequence[PartSummary]) -> PartSamples:
-    """Return the ``summaries`` of R runs of ``seed`` as one object for the tests, whose arrays have
-    a first axis of length R; None for a part (clocks, losses, ...) that no run has.
-    """
-    columns: dict[str, Any] = dict.fromkeys(PartSummary._fields)
+    """Return the ``summaries`` of R runs of ``seed`` as one object for the tests."""
+    columns: dict[str, Any] = {}
     for name in PartSummary._fields:
-        parts = [getattr(summary, name) for summary in summaries]
-        present = [part for part in parts if part is not None]
+        present = [part for summary in summaries if (part := getattr(summary, name)) is not None]
         if present:
             arrays = (np.array(column) for column in zip(*present, strict=True))
             columns[name] = type(present[0])(*arrays)

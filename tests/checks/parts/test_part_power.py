@@ -37,7 +37,7 @@ def _scenario(folder, loss, activation=None):
 
 
 def _samples(scenario, fates=None, pairs=None):
-    return PartSamples(scenario, 1, None, fates, pairs, None, None, None, None)
+    return PartSamples(scenario, 1, fates=fates, pairs=pairs)
 
 
 def _count(scenario, lost):
