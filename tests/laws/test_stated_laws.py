@@ -101,9 +101,9 @@ PARTS = {
     # Checker, class, what is wrong, what the checker says, and the row of `check`.
     "gaps": (check_clock, Erlang, {"stages": 2.0}, "Erlang.ticks: gaps must have the law of its `g",
              "ticks follow the law of their clocks"),
-    "lattice": (check_clock, Beat, {"late": 0.01}, "Beat.ticks: must tick at the times of its `gaps`",
+    "lattice": (check_clock, Beat, {"late": 0.01}, "Beat.ticks: must tick at the times of its",
                 "clocks tick at the times"),
-    "delay": (check_channel, Queue, {"stages": 1.0}, "Queue.message_delay: delays must have the law",
+    "delay": (check_channel, Queue, {"stages": 1.0}, "Queue.message_delay: delays must have",
               "delays of messages have the law"),
     "chain": (check_channel, Fading, {"longer": 4.0}, "Fading.next_state: losses must follow each",
               "losses follow each other"),
