@@ -15,7 +15,10 @@ def printable(text: str, keep: str = "\n\t") -> str:
     """
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in keep else _escape(c) for c in text)
+    return "".join(
+        c if c.isprintable() or c in keep else c.encode("unicode_escape").decode("ascii")
+        for c in text
+    )
 
 
 def one_line(text: object) -> str:
@@ -32,8 +35,3 @@ def cut_middle(text: str, max_length: int) -> str:
     """Return a text of at most ``max_length`` characters: " ... " replaces the middle if needed."""
     half = (max_length - 5) // 2
     return text if len(text) <= max_length else f"{text[:half]} ... {text[-half:]}"
-
-
-def _escape(character: str) -> str:
-    """Return the escape sequence of a character."""
-    return character.encode("unicode_escape").decode("ascii")

@@ -39,17 +39,13 @@ class MergeTree:
         """Return the merged result of all nodes that were added; nodes at the end that wait for a
         neighbour, which does not come, are merged from right to left.
         """
-        values = [value for _, value in sorted(self._waiting.items(), key=_first)]
+        # Of a node (level, k) the first block is k 2^level.
+        nodes = sorted(self._waiting, key=lambda node: node[1] << node[0])
+        values = [self._waiting[node] for node in nodes]
         total = values.pop()
         while values:
             total = self._merge(values.pop(), total)
         return total
-
-
-def _first(item: tuple[tuple[int, int], Any]) -> int:
-    """Return the index of the first block in a node of the tree, by which nodes are sorted."""
-    (level, k), _ = item
-    return k << level
 
 
 def aligned_pieces(first: int, stop: int) -> Iterator[tuple[int, int]]:

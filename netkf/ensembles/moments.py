@@ -54,17 +54,9 @@ def merge_moments(a: Moments, b: Moments) -> Moments:
     """Return the moments of the observations of ``a`` and ``b`` together; both have S rows and C
     columns.
     """
-    size, mean, M2 = (_stack_pair(*pair) for pair in zip(a, b, strict=True))
+    size, mean, M2 = (np.stack(pair) for pair in zip(a, b, strict=True))
     merge_two(size, mean, M2)
     return Moments(size[0], mean[0], M2[0])
-
-
-def _stack_pair(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``np.stack([a, b])`` (2, ...) of two arrays of one shape."""
-    stacked = np.empty((2, *a.shape))
-    stacked[0] = a
-    stacked[1] = b
-    return stacked
 
 
 @kernel(inlined=True)

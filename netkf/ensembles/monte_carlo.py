@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -187,16 +187,9 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
     )
 
 
-@cache
-def _upper_indices(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the upper triangle of a matrix (n, n), row by row."""
-    i, j = np.triu_indices(n)
-    return i, j
-
-
 def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return means of P and of e e' (T, N, n, n) and of NEES (T, N) from ``values``."""
-    i, j = _upper_indices(n)
+    i, j = np.triu_indices(n)
     matrices = np.empty((2, *values.shape[:2], n, n))
     for matrix, upper in zip(matrices, np.split(values[..., :-1], 2, axis=-1), strict=True):
         matrix[..., i, j] = upper

@@ -194,10 +194,10 @@ def _positions(attributes: Iterable[dict[str, Any]]) -> FloatArray | None:
 
 def as_graph(value: Any) -> Any:
     """Return a networkx graph as Edges, and other values as they are."""
-    # networkx takes a second to import: who has a graph of it has imported it.
-    networkx = sys.modules.get("networkx")
-    is_networkx = networkx is not None and isinstance(value, networkx.Graph)
-    return from_networkx(value) if is_networkx else value
+    # networkx takes a second to import: who has a graph of it has imported it. A thread may be at
+    # it just now: then the module has no Graph yet.
+    kind = getattr(sys.modules.get("networkx"), "Graph", None)
+    return from_networkx(value) if kind is not None and isinstance(value, kind) else value
 
 
 def _convert_graph(value: Any) -> Graph:

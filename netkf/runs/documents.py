@@ -166,14 +166,11 @@ def _is_number(value: Any) -> bool:
     return value is None or (isinstance(value, float) and math.isfinite(value))
 
 
-def _is_count(value: Any) -> bool:
-    """Return True for integers from 0 to MAX_COUNT."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
-
-
 _FORMS: dict[str, Callable[[Any], bool]] = {
     NUMBER: _is_number,
-    COUNT: _is_count,
+    COUNT: lambda value: (
+        isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
+    ),
     TEXT: lambda value: isinstance(value, str),
     TEXTS: lambda value: isinstance(value, list) and all(isinstance(item, str) for item in value),
 }

@@ -204,13 +204,9 @@ class ParquetSink(Sink):
                 # Without samples there is no states.parquet.
                 callbacks.callback(self._states.close, None)
             if self._events is not None:
-                callbacks.callback(self._events.close, _empty_event_columns)
+                empty = np.empty(0, dtype=EVENT)
+                callbacks.callback(self._events.close, lambda: event_columns(empty, 0, 0))
             callbacks.callback(self._flush)
-
-
-def _empty_event_columns() -> dict[str, Any]:
-    """Return the columns of a table of events without rows."""
-    return event_columns(np.empty(0, dtype=EVENT), 0, 0)
 
 
 class TraceTables:

@@ -158,6 +158,7 @@ def read_run(
     conserved = summary.get("conserved", {}) if is_single_run else {}
     # The fingerprint of an ensemble is that of its first run.
     has_fingerprint = is_single_run or replica == 0
+    ended = "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
     return StoredRun(
         **arrays,
         nodes=scenario.nodes,
@@ -165,7 +166,7 @@ def read_run(
         seed=int(manifest["seed"]),
         replica=replica,
         engine=str(manifest.get("engine", "")),
-        status=str(manifest["status"]) if is_single_run else _status_of_log(log),
+        status=str(manifest["status"]) if is_single_run else ended,
         fingerprint=str(manifest.get("fingerprint", "")) if has_fingerprint else "",
         sums=_read_sums(conserved),
         truth_known=scenario.plant.truth_known,
@@ -176,11 +177,6 @@ def read_run(
         summary=summary,
         stored=states,
     )
-
-
-def _status_of_log(log: np.ndarray) -> str:
-    """Return "diverged" if the EVENT rows ``log`` (E,) of a run say so, else "complete"."""
-    return "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
 
 
 def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.algorithms.kernels.gains import longest_interval
-from netkf.algorithms.models import FlowModel
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component
 from netkf.linalg.spectra import growth_rate
@@ -365,7 +364,9 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
     pooled = scenario.filter.algorithm.pooled
     models = [scenario.pooled_model] if pooled else scenario.models
     distinct_models = {id(model): model for model in models if len(model.H)}.values()
-    longest = min((_longest_step(scenario, model) for model in distinct_models), default=period)
+    A, Q = scenario.belief
+    steps = (longest_interval(A, Q, model.H, model.R) for model in distinct_models)
+    longest = min(steps, default=period)
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return
     if getattr(scenario.plant, "sensing_period", None) is not None:
@@ -382,12 +383,6 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
         None,
         f"set plant.sensing_period to at most {longest:.3g}",
     )
-
-
-def _longest_step(scenario: DerivedScenario, model: FlowModel) -> float:
-    """Return the longest step in seconds of which a filter can use the increment."""
-    A, Q = scenario.belief
-    return longest_interval(A, Q, model.H, model.R)
 
 
 def _check_slots(scenario: DerivedScenario) -> None:

@@ -155,17 +155,13 @@ class DerivedScenario(ScenarioModel):
             tuple(placed_sensor.entry for placed_sensor in sensors)
             for sensors in self.increment_sensors.values()
         )
-        informations = [self._true_information(entries) for entries in counts]
+        stacks = [self._stack_entries(entries, believed=False) for entries in counts]
+        informations = [np.asarray(H.T @ np.linalg.solve(R, H)) for H, R in stacks]
         weighted = (k * G for k, G in zip(counts.values(), informations, strict=True))
         total_information = sum(weighted, 0.0 * plant.A)
         max_period = longest_interval_for(plant.A, plant.Q, total_information)
         period = default_sensing_period(plant, informations, max_period)
         return dataclasses.replace(plant, sensing_period=period).on_grid(self.time_grid)
-
-    def _true_information(self, entries: tuple[int, ...]) -> FloatArray:
-        """Return the true ``H' R^-1 H`` (n, n) of a node with these ``[[sensors]]`` entries."""
-        H, R = self._stack_entries(entries, believed=False)
-        return np.asarray(H.T @ np.linalg.solve(R, H))
 
     def continuous_truth(
         self, streams: Streams, frames: bool | None = None, sampled: FloatArray | None = None

@@ -12,7 +12,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import breadth_first_order
 
 from netkf.core.errors import ScenarioError
-from netkf.linalg.arrays import FloatArray, is_definite
+from netkf.linalg.arrays import is_definite
 from netkf.linalg.spectra import hidden_mode, outputs_of
 from netkf.rng.streams import Streams
 from netkf.scenario.compatibility import SAMPLING, filter_name
@@ -125,7 +125,10 @@ def _check_invertible(scenario: DerivedScenario) -> None:
         # (A, Q) is controllable if and only if (A', Q) is observable.
         nonsingular = singular is None or hidden_mode(A.T, outputs_of(Q)) is None
     if not nonsingular:
-        value = "a singular F" if singular is None else _describe_cov(initial[singular], singular)
+        value = "a singular F"
+        if singular is not None:
+            least = float(np.linalg.eigvalsh(initial[singular])[0])
+            value = f"a singular one at node {singular} (least eigenvalue {least:.3g})"
         noise = "a positive definite Q" if scenario.slotted else "a B that drives every state"
         raise ScenarioError(
             "filter.cov",
@@ -134,12 +137,6 @@ def _check_invertible(scenario: DerivedScenario) -> None:
             value,
             f"give filter.cov, or {noise}",
         )
-
-
-def _describe_cov(P: FloatArray, node: int) -> str:
-    """Return a singular covariance (n, n) of ``node`` as the value in a message."""
-    least = float(np.linalg.eigvalsh(P)[0])
-    return f"a singular one at node {node} (least eigenvalue {least:.3g})"
 
 
 def _check_ways(scenario: DerivedScenario) -> None:

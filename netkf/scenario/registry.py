@@ -221,18 +221,17 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
             kind,
             f"derive the class from {base.__module__}.{base.__name__}",
         )
-    missing = sorted(name for name in dir(cls) if _is_abstract(getattr(cls, name, None)))
+    missing = sorted(
+        name
+        for name in dir(cls)
+        if getattr(getattr(cls, name, None), "__isabstractmethod__", False)
+    )
     if missing:
         raise ScenarioError(
             "kind", f"must define {', '.join(missing)}", kind, "write what the contract asks for"
         )
     found: type[Component] = cls
     return found
-
-
-def _is_abstract(attribute: object) -> bool:
-    """Return True if a subclass must define the attribute."""
-    return bool(getattr(attribute, "__isabstractmethod__", False))
 
 
 def name_of(family: str, component: Component) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -245,10 +245,7 @@ def describe_field(docstring: str, name: str) -> str:
     if entry:
         line = " ".join(entry.group(1).split())
         return line if line.endswith(".") else f"{line}."
-    return " ".join(s for s in _iterate_sentences(docstring) if f"`{name}`" in s)
-
-
-def _iterate_sentences(docstring: str) -> Iterator[str]:
-    """Yield the sentences of a docstring, each on one line; a colon may end one too."""
-    for paragraph in docstring.split("\n\n"):
-        yield from re.split(r"(?<=[.:])\s+(?=[A-Z`])", " ".join(paragraph.split()))
+    paragraphs = (" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
+    # A colon may end a sentence too.
+    sentences = (s for p in paragraphs for s in re.split(r"(?<=[.:])\s+(?=[A-Z`])", p))
+    return " ".join(sentence for sentence in sentences if f"`{name}`" in sentence)

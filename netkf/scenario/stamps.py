@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import math
+import operator
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
@@ -104,13 +105,9 @@ class Time(Component):
     @property
     def stamps(self) -> TimeBase:
         """The unit and the origin as tables are read with."""
-        return TimeBase(self.unit, Decimal(0) if self.origin is None else self._seconds)
-
-    @property
-    def _seconds(self) -> Decimal:
-        """The origin in seconds, with all of its digits."""
-        assert self.origin is not None
-        return _origin_seconds(self.origin)
+        return TimeBase(
+            self.unit, Decimal(0) if self.origin is None else _origin_seconds(self.origin)
+        )
 
 
 def restamp(value: Any, stamps: TimeBase) -> Any:
@@ -121,18 +118,13 @@ def restamp(value: Any, stamps: TimeBase) -> Any:
         return value if value.stamps == stamps else dataclasses.replace(value, stamps=stamps)
     if isinstance(value, tuple) and value and isinstance(value[0], Component):
         items = tuple(_restamp_at(f"[{k}]", item, stamps) for k, item in enumerate(value))
-        return value if all(map(_is_same, items, value)) else items
+        return value if all(map(operator.is_, items, value)) else items
     if not isinstance(value, Component):
         return value
     fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
     changed = {name: _restamp_at(name, item, stamps) for name, item in fields.items()}
     changed = {name: item for name, item in changed.items() if item is not fields[name]}
     return dataclasses.replace(value, **changed) if changed else value
-
-
-def _is_same(a: object, b: object) -> bool:
-    """Return True if both are one object."""
-    return a is b
 
 
 def _restamp_at(key: str, value: Any, stamps: TimeBase) -> Any:

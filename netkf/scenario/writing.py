@@ -66,14 +66,9 @@ def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
         cov=plant.start_cov if filtering.cov is None else filtering.cov,
     )
     # A second Scenario of these parts would build and check the whole network again.
-    resolved_plant = _resolve_plant(scenario)
-    return _scenario_table(scenario, resolved_plant, network, filtering, _style_of(scenario, True))
-
-
-def _resolve_plant(scenario: DerivedScenario) -> Plant:
-    """Return the plant with the mean and covariance of x(0) and the sensing period filled in."""
     plant = scenario.plant if scenario.slotted else scenario.diffusion
-    return dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
+    resolved_plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
+    return _scenario_table(scenario, resolved_plant, network, filtering, _style_of(scenario, True))
 
 
 def _scenario_table(
