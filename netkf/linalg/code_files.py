@@ -135,9 +135,7 @@ class CodeFiles:
 
 
 def _describe(function: Callable[..., Any], path: str, state: str) -> bytes:
-    """Return what compiled code depends on beside its signature: the file of the function with its
-    contents, the ``state`` of netkf's sources, and the versions that made it; b"" without a file.
-    """
+    """Return what code depends on beside its signature; b"" without a file."""
     import llvmlite
     import numba
 
@@ -151,9 +149,7 @@ def _describe(function: Callable[..., Any], path: str, state: str) -> bytes:
 
 
 def _constants(function: Callable[..., Any]) -> list[Any]:
-    """Return the values that a function takes from the functions around it; of kernels their
-    names, contents, and what they take in turn, so that code made of other kernels is other code.
-    """
+    """Return what a function takes from those around it; of kernels what they are made of."""
     values: list[Any] = [cell.cell_contents for cell in function.__closure__ or ()]
     # Kernels that users' kernels name: their files are no part of the state of netkf's sources.
     if not function.__module__.startswith("netkf."):
@@ -233,9 +229,7 @@ def _is_own(status: os.stat_result) -> bool:
 
 
 def _is_private(group: int) -> bool:
-    """Return True if a group is that of this user alone, as many systems have one for each user,
-    who then makes files that it can write.
-    """
+    """Return True if a group is that of this user alone, as many systems have one for each."""
     if sys.platform == "win32":
         return False
     import grp

@@ -87,7 +87,7 @@ class SharedCache:
 if sys.platform == "win32":
 
     def _wait_for(opened: int) -> None:
-        """Windows has no lock that waits: each process compiles for itself."""
+        """Lock a file, or give up after MAX_WAIT seconds, or where the file system has no locks."""
 
     def _unlock(opened: int) -> None:
         """Nothing was locked."""
@@ -96,9 +96,7 @@ else:
     import fcntl
 
     def _wait_for(opened: int) -> None:
-        """Lock the file with the descriptor ``opened``, or give up after MAX_WAIT seconds (the
-        owner of its lock may be suspended) or if the file system has no locks.
-        """
+        """Lock a file, or give up after MAX_WAIT seconds, or where the file system has no locks."""
         end = time.monotonic() + MAX_WAIT
         while time.monotonic() < end:
             try:

@@ -131,18 +131,14 @@ def _unknown_options() -> set[str]:
 
 
 def _if_numba_can(step: Callable[..., None], *args: Any) -> None:
-    """Take a step that needs private names of numba, of which a release may lack one: it makes
-    kernels faster, or quicker to compile, and nothing else.
-    """
+    """Take a step that saves time and needs private names of numba, which may lack one."""
     with suppress(Exception):
         step(*args)
 
 
 @cache
 def _configure_numba() -> None:
-    """Import numba without the settings, such as the folder of compiled code, that a file in the
-    current folder may have: it may be anyone's.
-    """
+    """Import numba without the settings in the current folder, which may be anyone's."""
     is_told = "numba" not in sys.modules and os.path.isfile(".numba_config.yaml")
     yaml = sys.modules.get("yaml")
     if is_told:
@@ -227,15 +223,11 @@ def _widen_arguments(function: Any) -> None:
     kinds, template_for = cast(Any, types), function.get_call_template
 
     def widen(kind: Any) -> Any:
-        """Return the more general type of an argument."""
         general = kinds.unliteral(kind)
         # Fields of records may be int8 or int32.
         return kinds.int64 if isinstance(general, kinds.Integer) and general.signed else general
 
     def template_of_widened(args: Any, kws: Any) -> Any:
-        """Return numba's template of a call, given the types ``args`` and ``kws`` of its arguments,
-        each made more general.
-        """
         named = {name: widen(kind) for name, kind in kws.items()}
         return template_for(tuple(widen(kind) for kind in args), named)
 
@@ -290,9 +282,7 @@ def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """Disable the garbage collector: the compiler makes many objects that live long, and each
-    collection would visit all of them, a tenth of the time.
-    """
+    """Disable the garbage collector: visiting what the compiler makes is a tenth of its time."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -346,10 +336,7 @@ def _cache_folder(chosen: str) -> Path:
 
 
 def _first_writable(chosen: str, root: Path) -> Path:
-    """Return the first folder that can be written, and only by this user: ``chosen`` if it is not
-    empty, else ``__pycache__`` of ``root`` or the user's cache folder; else a temporary one of this
-    process.
-    """
+    """Return the first folder that only this user can write, ``chosen`` if it is not empty."""
     # ``chosen`` is NUMBA_CACHE_DIR. An installation may be read-only.
     places = [Path(chosen)] if chosen else [root / "__pycache__", *_user_folders()]
     # Never numba's own default folder, whose code may be out of date.
@@ -375,9 +362,7 @@ def _is_own_folder(folder: Path) -> bool:
 
 
 def _folder_of_process() -> Path:
-    """Return a new temporary folder, which is removed when the process ends, or one that there
-    cannot be if none can be made.
-    """
+    """Return a temporary folder that is removed in the end, or an impossible one."""
     # Cached code is executed: a fixed name in a shared folder could be another user's.
     try:
         folder = Path(tempfile.mkdtemp(prefix="netkf-"))
@@ -389,9 +374,7 @@ def _folder_of_process() -> Path:
 
 
 def _remove_old_folders(folder: Path) -> None:
-    """Remove from ``folder`` the compiled code of all but the newest states of the sources, so that
-    with the one that is made next MAX_CACHED_STATES remain.
-    """
+    """Remove all but the newest states: with the next there are MAX_CACHED_STATES."""
     # Others' folders may have similar names.
     folders = [path for path in folder.glob("netkf-*") if _holds_code_only(path)]
     # A few are kept, so that switching between branches does not compile anew.

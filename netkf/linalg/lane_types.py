@@ -235,10 +235,7 @@ class _Matrix:
 
 
 def _transpose(builder: Any, sources: list[Any], targets: list[Any]) -> None:
-    """Emit the transposition of L x L entries, L a power of 2, from addresses to addresses of rows.
-
-    Off-diagonal blocks of half the size are exchanged, then those of a quarter, down to entries.
-    """
+    """Emit the transposition of L rows at addresses, L a power of 2, to addresses."""
     rows = _transposed(builder, [builder.load(source, align=8) for source in sources])
     for value, target in zip(rows, targets, strict=True):
         builder.store(value, target, align=8)
@@ -255,9 +252,7 @@ def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
 
 
 def _exchange_blocks(builder: Any, a: Any, b: Any, half: int) -> tuple[Any, Any]:
-    """Emit the rows ``a`` and ``b`` of a matrix, vectors whose indices are ``half`` apart, with
-    their off-diagonal blocks exchanged.
-    """
+    """Emit rows ``half`` apart with their off-diagonal blocks exchanged."""
     count = a.type.count
     # Masks of LLVM's shufflevector: entry q < count is a[q], entry count + q is b[q].
     upper = [q if not q & half else count + q - half for q in range(count)]

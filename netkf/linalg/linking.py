@@ -56,9 +56,7 @@ def give_up() -> None:
 
 @contextmanager
 def _patched_numba() -> Iterator[None]:
-    """Replace the methods of numba that ``_patches`` lists within this context:
-    all of them, or none if this version of numba lacks one. They are restored at the end.
-    """
+    """Replace what ``_patches`` lists within this context, or nothing where a name is missing."""
     try:
         patches = [] if _given_up else _patches()
         # All originals are looked up before the first is replaced.
@@ -75,7 +73,6 @@ def _patched_numba() -> Iterator[None]:
 
 
 def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
-    """Return the replacements of numba's methods: class, name, method."""
     from numba.core.codegen import CPUCodeLibrary
     from numba.core.cpu import CPUContext
     from numba.core.dispatcher import Dispatcher
@@ -111,13 +108,12 @@ def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
 
 
 def _without_sign_test(fix: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a replacement of ``fix``, which emits an index from the start of an axis, that does
-    not ask whether a computed index is negative: a tenth of the time of the event loop.
-    """
+    """Return ``fix``, which corrects an index, without its test of the sign."""
     from llvmlite import ir
     from numba import types
 
     def fix_index(context: Any, builder: Any, index_type: Any, index: Any, size: Any) -> Any:
+        # Testing what kernels compute would take a tenth of the time of the event loop.
         if isinstance(_inserted_value(index), ir.Constant):
             return fix(context, builder, index_type, index, size)
         return context.cast(builder, index, index_type, types.intp)
@@ -138,12 +134,9 @@ def _inserted_value(entry: Any) -> Any:
 
 
 def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``original`` with a count of its nested calls in the attribute ``stage`` of _DEPTH.
-    ``stage`` is "compile", "load" or "finalize".
-    """
+    """Return ``original`` with a count of its nested calls in the attribute ``stage`` of _DEPTH."""
 
     def count_and_call(*args: Any, **kwargs: Any) -> Any:
-        """Call ``original`` with the count one higher, also if it raises."""
         setattr(_DEPTH, stage, getattr(_DEPTH, stage) + 1)
         try:
             return original(*args, **kwargs)
@@ -156,24 +149,16 @@ def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]
 def _only_outermost(
     stage: str, original: Callable[..., Any], inner: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Return a replacement of numba's method ``original``: it calls ``original`` for the outermost
-    compiled function, and ``inner``, which leaves out work that only this one needs (such as the
-    generation of machine code), for the functions that it calls, with the same arguments.
-    ``stage``, "compile" or "finalize", is the method of numba whose depth of nested calls tells the
-    outermost function from the others.
-    """
+    """Return ``original`` for the outermost compiled function and ``inner`` for those it calls."""
 
     def choose(*args: Any, **kwargs: Any) -> Any:
-        """Call ``inner`` for an inner function, else ``original``."""
         return (inner if _is_linked(stage) else original)(*args, **kwargs)
 
     return choose
 
 
 def _is_linked(stage: str) -> bool:
-    """Return True if the function that is now in ``stage`` ("compile" or "finalize") is an inner
-    one, which another compiled function calls.
-    """
+    """Return True if the function that is now in ``stage`` is one that another one calls."""
     # The outermost library is finalized inside get_executable; a finalize outside of it, or nested
     # in another one, is that of a callee. Code loaded from disk is not finalized again.
     depth: int = getattr(_DEPTH, stage)
@@ -195,13 +180,9 @@ def _skip(*_: Any, **__: Any) -> None:
 
 
 def _internalise(optimize: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap numba's method ``optimize`` so that linked inner functions have internal linkage.
-
-    LLVM may then drop a function after inlining it, and change its signature.
-    """
+    """Wrap ``optimize``: LLVM may drop linked inner functions, or change their signature."""
 
     def optimize_all(library: Any) -> Any:
-        """Mark the linked inner functions of a library, then optimise it."""
         for function in library._final_module.functions:
             if function.name in _INNER_NAMES and not function.is_declaration:
                 function.linkage = "internal"
@@ -228,20 +209,15 @@ class _OwnCode:
         return getattr(self._library, name)
 
     def _get_module_for_linking(self) -> Any:
-        """Return the LLVM module that numba links into a caller: own functions only."""
         # The method of the class: an inner library overrides it to include its callees.
         return type(self._library)._get_module_for_linking(self._library)
 
 
 def _link_once(finalize: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap numba's method ``finalize`` so that all direct and indirect callees are linked into the
-    outermost library at once, and none into inner libraries.
-
-    numba links callees at each level, so that inner functions are copied many times.
-    """
+    """Wrap ``finalize``: the outermost library links all callees, inner ones none."""
 
     def finalize_flat(library: Any) -> Any:
-        """Finalize with all callees if the library is the outermost one, else with none."""
+        # numba links at each level, so that inner functions would be copied many times.
         direct_callees = library._linking_libraries
         library._linking_libraries = [] if _is_linked("finalize") else _all_called(library)
         try:
@@ -253,15 +229,11 @@ def _link_once(finalize: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _all_called(library: Any) -> list[_OwnCode]:
-    """Return the libraries of all direct and indirect callees, each once.
-
-    Callers come before callees, because LLVM links a function only if the module already calls it.
-    """
+    """Return all direct and indirect callees, each once, callers first as LLVM needs them."""
     ordered: list[_OwnCode] = []
     visited: set[Any] = set()
 
     def visit(caller: Any) -> None:
-        """Append the callees of ``caller`` that were not visited, each after its own callees."""
         for callee in reversed(list(caller._linking_libraries)):
             if callee not in visited:
                 visited.add(callee)
@@ -275,9 +247,7 @@ def _all_called(library: Any) -> list[_OwnCode]:
 
 
 def _with_all_called(library: Any) -> Any:
-    """Return the module of an inner library with all its callees linked in, as numba's own linking
-    expects it.
-    """
+    """Return the module of an inner library with all its callees, for numba's own linking."""
     if library not in _LINKED_MODULES:
         module = _OwnCode(library)._get_module_for_linking().clone()
         for callee in _all_called(library):
@@ -287,7 +257,7 @@ def _with_all_called(library: Any) -> Any:
 
 
 def _finalize_without_code(library: Any) -> None:
-    """Finalize an inner library: like numba's method, but without optimising or machine code."""
+    """Finalize an inner library, without optimising it or making machine code."""
     defined = library._final_module.functions
     _INNER_NAMES.update(f.name for f in defined if not f.is_declaration)
     _UNLINKED.add(library)

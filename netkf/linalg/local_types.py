@@ -27,31 +27,19 @@ from netkf.linalg.structs import WORD
 
 
 def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> None:
-    """Register the typing and the two implementations of a function of ``local`` with numba.
-
-    The array has n in each of its first ``dimensions`` dimensions, followed by L with ``lanes``.
-    If n and L are given as lengths of tuples, they are part of the types: the array has a constant
-    shape and is on the stack. Otherwise the function returns ``scratch``, its last argument.
-    """
+    """Register a function of arrays with so many ``dimensions`` of n, and L with ``lanes``."""
 
     @type_callable(function)
     def _typer(_: Any) -> Callable[..., Any]:
-        """Return the function that numba calls for the type of a call; its parameters are those of
-        ``function``, so that keyword arguments work.
-        """
-
         def typed(size: Any, *others: Any) -> Any:
-            """Return the type of the array: that of ``scratch`` unless ``size`` is a tuple."""
             if isinstance(size, types.BaseTuple):
                 return types.Array(types.float64, dimensions + lanes, "C")
             return others[-1]
 
         def with_lanes(size: Any, lanes: Any, scratch: Any) -> Any:
-            """Return the type of a call of the functions for lanes."""
             return typed(size, lanes, scratch)
 
         def without(size: Any, scratch: Any) -> Any:
-            """Return the type of a call of the functions without lanes."""
             return typed(size, scratch)
 
         return with_lanes if lanes else without

@@ -118,9 +118,7 @@ class Fields(AttributeTemplate):
 
 
 def _field_pointer(builder: Any, address: Any, offset: int, llvm_type: Any) -> Any:
-    """Emit the address of a field, ``offset`` bytes after ``address``, as a pointer to
-    ``llvm_type``.
-    """
+    """Emit the address of a field, ``offset`` bytes after ``address``."""
     pointer = builder.gep(address, [ir.Constant(I64, offset)])
     return builder.bitcast(pointer, ir.PointerType(llvm_type))
 
@@ -185,12 +183,9 @@ def lower_class_constant(context: Any, *_: Any) -> Any:
 
 @intrinsic
 def _struct_from_memory(_: Any, memory: Any, cls: ClassType) -> Any:
-    """Return the numba type of the call, which is a struct of class ``cls``, and the function that
-    emits its code: the struct is the address of the first word of the array ``memory``.
-    """
+    """Type and emit the struct of a class at the first word of ``memory``."""
 
     def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Emit the address of the first word of the array ``memory``, as that of a struct."""
         array = context.make_array(sig.args[0])(context, builder, args[0])
         return builder.bitcast(array.data, cgutils.voidptr_t)
 

@@ -136,10 +136,7 @@ class Struct(metaclass=StructClass):
 
     @classmethod
     def _lay_out(cls, values: dict[str, Any]) -> None:
-        """Set ``struct_offsets``, in words of ``memory``, and ``struct_kinds`` from the annotations
-        and the first values. A kind is a type of numbers, the class of a struct, (dtype, ndim) of
-        an array, or the length of a tuple.
-        """
+        """Set ``struct_offsets``, in words, and ``struct_kinds`` from the first values."""
         word, offsets = 0, dict[str, int]()
         kinds = dict[str, Any]()
         for name in cls.struct_fields:
