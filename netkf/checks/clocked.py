@@ -93,25 +93,17 @@ class ClockedChecks(PaperChecks):
     summary_type = ClockedSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> ClockedSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
-        for every replica, in the process that simulated it.
-        """
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
         drift = [abs(total - start) / abs(start) for start, total in run.sums.values()]
         fields = vars(summarise_exactly(scenario, run))
         return ClockedSummary(**fields, drift=max(drift, default=0.0))
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests, each with whether it holds here: a promise is tested
-        only if those that it ``needs`` hold.
-        """
+        """Return the assumptions of the tests."""
         return [exact_start(scenario), few_errors(scenario)]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about a scenario's filter that are tested.
-
-        Push-sum conserves mass, but its P is no upper bound on the covariance of its error: a node
-        counts its own samples N times.
-        """
+        """Return the statements about a scenario's filter that are tested."""
         if with_promised_filter(scenario).node_filter.combination == "sums":
             return (MASS_CONSERVED, *PROMISES)
         return (*PROMISES[:1], UPPER_BOUND, *PROMISES[1:])

@@ -197,13 +197,7 @@ class DiffusionChecks(PaperChecks):
     summary_type = DiffusionSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> DiffusionSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
-        for every replica, in the process that simulated it.
-
-        Besides the values of ReplicaSummary these are the exact covariances ``alone`` (N, n, n) of
-        the errors at the end of the same run without cooperation: nan in all but the first ALONE
-        runs, and if the errors of all nodes together are too many for exact covariances.
-        """
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
         sampled = sampled_indices(scenario)
         alone = np.full(run.P[0, sampled].shape, np.nan)
         if run.replica < ALONE and few_errors(scenario).holds:
@@ -213,9 +207,7 @@ class DiffusionChecks(PaperChecks):
         return DiffusionSummary(**vars(summarise_exactly(scenario, run)), alone=alone)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the diffusion paper, each with
-        whether it holds here: a promise is tested only if those that it ``needs`` hold.
-        """
+        """Return the assumptions of the tests beyond those of the diffusion paper."""
         models_agree = scenario.filters_know_the_truth
         try:
             _require_few_regressors(scenario)
@@ -238,9 +230,7 @@ class DiffusionChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about a scenario's filter that are tested; that its sensors excite
-        every direction, paper D (19), only if the excitation can be computed in reasonable time.
-        """
+        """Return the statements about a scenario's filter that are tested."""
         try:
             _require_few_regressors(scenario)
             information_level(scenario, runs=2, seed=0)

@@ -462,21 +462,15 @@ class GossipChecks(PaperChecks):
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> GossipSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
-        for every replica, in the process that simulated it.
-        """
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
         return _summarise(scenario, run)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> GossipSamples:
-        """Return the object that every test of a promise gets, from the summaries of all runs of
-        ``seed`` stacked along a first axis R; called once, after the last run.
-        """
+        """Return the object that every test of a promise gets."""
         return GossipSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the gossip paper, each with whether
-        it holds here: a promise is tested only if those that it ``needs`` hold.
-        """
+        """Return the assumptions of the tests beyond those of the gossip paper."""
         try:
             effective_matching(scenario)
             is_known, evidence = (
@@ -494,9 +488,7 @@ class GossipChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about the gossip filter that are tested: the same for every
-        scenario.
-        """
+        """Return the statements about the gossip filter that are tested."""
         return PROMISES
 
 

@@ -313,15 +313,11 @@ class HybridChecks(PaperChecks):
     """Promises of H, Theorems 2, 3 and Proposition 4."""
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> HybridSamples:
-        """Return the object that every test of a promise gets, from the summaries of all runs of
-        ``seed`` stacked along a first axis R; called once, after the last run.
-        """
+        """Return the object that every test of a promise gets."""
         return HybridSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the hybrid paper, each with whether
-        it holds here: a promise is tested only if those that it ``needs`` hold.
-        """
+        """Return the assumptions of the tests beyond those of the hybrid paper."""
         promised = with_promised_filter(scenario)
         # H(12) are the coupled Riccati equations that bound the mean of P.
         reason = reason_without_bound(promised)
@@ -336,9 +332,7 @@ class HybridChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about a scenario's filter that are tested: those of all scenarios,
-        and each of LIMITS, on limits of the bound on the mean of P, whose subject exists here.
-        """
+        """Return the statements about a scenario's filter that are tested."""
         listed, promised = list(PROMISES), with_promised_filter(scenario)
         # One function for each of LIMITS raises TheoryError if its subject does not exist.
         requirements = _require_known_steadiness, _require_constant_gains, _require_limit

@@ -607,22 +607,15 @@ class IntermittentChecks(PaperChecks):
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> IntermittentSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
-        for every replica, in the process that simulated it.
-        """
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
         return _summarise(scenario, run)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> IntermittentSamples:
-        """Return the object that every test of a promise gets, from the summaries of all runs of
-        ``seed`` stacked along a first axis R; called once, after the last run.
-        """
+        """Return the object that every test of a promise gets."""
         return IntermittentSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the paper on intermittent
-        observations, each with whether it holds here: a promise is tested only if those that it
-        ``needs`` hold.
-        """
+        """Return the assumptions of the tests beyond those of the paper."""
         try:
             is_known, evidence = True, "a known probability for each direction"
             for direction in _heard_directions(scenario):
@@ -641,10 +634,7 @@ class IntermittentChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about a scenario's filter that are tested: those of all scenarios,
-        that E[P] diverges if losses are so frequent, and those on the exact law of a scalar P if it
-        is known for a node.
-        """
+        """Return the statements about a scenario's filter that are tested."""
         grows = not contracts(max(_outage_factors(scenario).values(), default=0.0))
         divergence = (DIVERGES,) if grows else ()
         return PROMISES + divergence + (SCALAR if _scalar_laws(scenario) else ())

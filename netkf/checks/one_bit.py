@@ -32,10 +32,7 @@ class BitChecks(PaperChecks):
     slots_only: ClassVar[bool] = True
 
     def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
-        """Return what the test needs of one ``run``: P at its K checked times and N sampled nodes,
-        and the same (K, N, n, n) computed by the equations from the bits that arrived
-        (``replayed``). Called for every replica, in the process that simulated it.
-        """
+        """Return what the test needs of one ``run``."""
         summary = summarise_exactly(scenario, run)
         if run.replica >= max_replayed(scenario):
             return summary

@@ -349,24 +349,18 @@ class PushSumChecks(PaperChecks):
     slots_only = True
 
     def summarise(self, scenario: Scenario, run: Run) -> PushSumSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
-        for every replica, in the process that simulated it.
-        """
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
         # ``sums`` are the totals of weight and number at the start (exact) and at the end.
         drift = np.array([(total - exact) / exact for exact, total in run.sums.values()])
         drift = drift if len(drift) else np.full(2, np.nan)
         return PushSumSummary(**vars(summarise_exactly(scenario, run)), drift=drift)
 
     def collect(self, scenario: Scenario, stacked: Any, seed: int) -> PushSumSamples:
-        """Return the object that every test of a promise gets, from the summaries of all runs of
-        ``seed`` stacked along a first axis R; called once, after the last run.
-        """
+        """Return the object that every test of a promise gets."""
         return PushSumSamples(scenario, stacked, seed)
 
     def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the push-sum paper, each with whether
-        it holds here: a promise is tested only if those that it ``needs`` hold.
-        """
+        """Return the assumptions of the tests beyond those of the push-sum paper."""
         try:
             # Errors have a steady mean square if the mean-square radius is below 1, and a fourth
             # moment, as a test of mean squares needs, if it is well below.
@@ -383,12 +377,7 @@ class PushSumChecks(PaperChecks):
         ]
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario.
-
-        Networks that are small enough for a search have two more, about the number gamma of
-        averaging steps in a slot, if their subject exists: the limit for ever more steps (P Theorem
-        4), and the gamma that paper P Theorem 6 certifies to keep mean squares bounded.
-        """
+        """Return the promises about a scenario."""
         promised = with_promised_filter(scenario)
         promises: tuple[Promise, ...] = PROMISES
         if getattr(promised.filter.algorithm, "running_sums", False):

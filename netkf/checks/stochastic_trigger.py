@@ -74,23 +74,14 @@ class TriggerChecks(EquationChecks):
     summary_type = TriggerSummary
 
     def summarise(self, scenario: Scenario, run: Run) -> TriggerSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``; called
-        for every replica, in the process that simulated it. ``sends`` is nan unless every node
-        hears every other without losses, so that silence is information.
-        """
+        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
         sends = np.full(2, np.nan)
         if all_hear_all(scenario):
             sends[:] = expected_sends(with_promised_filter(scenario), run)
         return TriggerSummary(**vars(summarise_exactly(scenario, run)), sends=sends)
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario, in the order of the report: those about the
-        equations, and after the first of them those about silent slots and the rate of messages.
-
-        All of them need the assumptions that every node hears all others, that the filters know
-        the models and that they start alike: otherwise silence would not be the same information
-        for its sender and its hearers.
-        """
+        """Return the promises about a scenario."""
         # ``needs`` are parts of the names of assumptions in the table of the report.
         equations = [
             dataclasses.replace(

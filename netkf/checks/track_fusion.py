@@ -92,12 +92,7 @@ class FusionChecks(EquationChecks):
     """Promises about the equations, and about P as bound or covariance of the error."""
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario: those about the filter's equations, which hold for
-        all combinations of tracks, and those about P as bound or covariance of the error.
-
-        Inverse covariance intersection has only the former: its authors claim that P is a bound for
-        one fusion of two tracks, not for a network.
-        """
+        """Return the promises about a scenario: those about the filter's equations."""
         about_errors = BY_COMBINATION.get(
             with_promised_filter(scenario).node_filter.combination, ()
         )

@@ -83,9 +83,7 @@ class LocalPool(Pool):
         self._size = 1
 
     def submit(self, job: Job) -> Future[Any]:
-        """Run the block of replicas at once, in this process; return its completed future, whose
-        result may be an exception of the block.
-        """
+        """Run the block at once, in this process; return its completed future."""
         future: Future[Any] = Future()
         started, compile_seconds = time.perf_counter(), seconds_spent()
         try:
@@ -125,9 +123,7 @@ class AdaptivePool(LocalPool):
         self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
 
     def submit(self, job: Job) -> Future[Any]:
-        """Run the block of replicas in this process, or, once starting worker processes would save
-        time, submit it to them; return the future of its result.
-        """
+        """Run the block in this process, or submit it to workers once that would save time."""
         if job.scenario is not self._scenario:
             # The times of another scenario say nothing about this one.
             self._scenario, self._size = job.scenario, 1
@@ -184,9 +180,7 @@ class RemotePool(Pool):
         self._packed: tuple[object, PackedScenario] | None = None
 
     def submit(self, job: Job) -> Future[Any]:
-        """Submit a block of replicas with the scenario in packed (pickled) form; return the future
-        of its result. Blocks of the same scenario share one pickle.
-        """
+        """Submit a block with the scenario pickled; blocks of one scenario share one pickle."""
         if isinstance(job.scenario, Scenario):
             if self._packed is None or self._packed[0] is not job.scenario:
                 self._packed = job.scenario, self._pack(job.scenario)
@@ -255,11 +249,7 @@ class DaskPool(RemotePool):
         return future
 
     def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
-        """Wait until one of the ``futures`` of submitted blocks is done; return all that are.
-
-        Raises EngineError if the scheduler does not answer for PATIENCE seconds, or has lost a
-        block.
-        """
+        """Wait until one of the ``futures`` of submitted blocks is done; return all that are."""
         answered = time.monotonic()
         while True:
             done = wait(futures, timeout=LOOK_SECONDS, return_when=FIRST_COMPLETED).done

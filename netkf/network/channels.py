@@ -200,10 +200,7 @@ class GilbertElliott(Loss):
         return True
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Return True if the chain is in its bad state after a step from ``bad``, drawn with one
-        number of ``random``; the first state, after None, is drawn from the stationary law. Engines
-        call it once per activation of a link.
-        """
+        """Return True if the chain is in its bad state after a step from ``bad``."""
         to_bad, to_good = self.transitions
         u = random.random()
         if bad is None:
@@ -213,17 +210,13 @@ class GilbertElliott(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return the delivery probability of any message in the state ``bad`` (True) or good of the
-        link.
-        """
+        """Return the delivery probability of any message in the ``bad`` or good state."""
         if bad:
             return 0.0 if self.deliver_bad is None else self.deliver_bad
         return 1.0 if self.deliver_good is None else self.deliver_good
 
     def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Return the mean delivery probability of any link under the stationary law of its two
-        states; ``table_probability`` is not used.
-        """
+        """Return the mean delivery probability under the stationary law of the two states."""
         to_bad, to_good = self.transitions
         bad = to_bad / (to_bad + to_good)
         # Of both states, in proportion to their probabilities; message and table do not matter.

@@ -79,9 +79,7 @@ class OnReadings(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return no ticks (0,), whatever ``entity``, ``origin``, ``index``, ``now`` and
-        ``count``.
-        """
+        """Return no ticks (0,)."""
         return np.empty(0)
 
 
@@ -168,11 +166,7 @@ class Poisson(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks (count,) of ``entity`` (link, direction or node) in
-        seconds, after the last one at ``now``, with exponential gaps of mean 1 / rate drawn from
-        ``random``: the ticks of clocks with equal generators are in proportion. ``origin`` and
-        ``index`` are not used. Engines call it for one block of ticks after another.
-        """
+        """Return the next ``count`` ticks (count,) of ``entity`` in seconds."""
         return _accumulate(now, random.standard_exponential(count) / self.mean_rate(entity))
 
     def check(self, topology: Topology) -> None:
@@ -292,11 +286,7 @@ class Renewal(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks (count,) in seconds, after the last one at ``now``, with
-        gaps drawn from the distribution by ``random``; with constant gaps, the ticks from number
-        ``index`` on, which nothing is drawn for. ``entity`` and ``origin`` are not used. Engines
-        call it for one block of ticks after another.
-        """
+        """Return the next ``count`` ticks (count,) in seconds, after the last one at ``now``."""
         # Gaps of unit scale, scaled to their mean.
         shape = self.shape or 1.0
         if self.distribution == "gamma":
@@ -339,10 +329,7 @@ class Periodic(LinkClock):
                 raise ScenarioError(name, "must be below the period", value, "give less")
 
     def origin(self, entity: Entity, random: Callable[[], np.random.Generator]) -> float:
-        """Return the phase in seconds, the time from which the ticks of ``entity`` are counted; a
-        random one is drawn from the generator that ``random`` returns. Engines call it once for
-        each entity and pass the result to ``ticks``.
-        """
+        """Return the phase in seconds, the time from which the ticks of ``entity`` are counted."""
         if isinstance(self.phase, str):
             return self.period * float(random().random())
         return self.phase
@@ -367,10 +354,7 @@ class Periodic(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the ticks (count,) of an entity in seconds from number ``index`` on: ``origin + k
-        period``, each plus a jitter drawn from ``random``. ``entity`` and ``now`` are not used.
-        Engines call it for one block of ticks after another.
-        """
+        """Return the ticks (count,) of an entity in seconds from number ``index`` on."""
         # With phase 0 the lattice point at time 0 is no tick.
         first = index + (origin == 0.0)
         times = origin + self.period * np.arange(first, first + count)
@@ -446,16 +430,11 @@ class RecordedClock(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return up to ``count`` recorded times (<= count,) of ``entity`` in seconds, from number
-        ``index`` on, fewer at the end of the table, which ends the clock; nothing is drawn, and
-        ``origin`` and ``now`` are not used.
-        """
+        """Return up to ``count`` recorded times (<= count,) of ``entity`` in seconds."""
         return self._instants.get(entity, np.empty(0))[index : index + count]
 
     def check(self, topology: Topology) -> None:
-        """Raise ScenarioError unless the graph has every link, direction or node that the table
-        lists.
-        """
+        """Raise ScenarioError unless the graph has every entity that the table lists."""
         if self.at == "nodes":
             demand_nodes(self.path, {node: k for (node,), k in self._rows[1].items()}, topology)
         else:

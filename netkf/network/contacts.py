@@ -148,10 +148,7 @@ class Contacts(LinkClock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return the next ``count`` ticks (<= count,) of ``entity`` in seconds, after the last one
-        at ``now``: those of ``clock``, drawn from ``random``, that lie in its intervals. After the
-        last interval there is one more, at infinity, which ends the clock. ``index`` is not used.
-        """
+        """Return the next ``count`` ticks (<= count,) of ``entity`` in seconds."""
         if entity not in self._intervals or math.isinf(now):
             return np.empty(0)
         end, number = float(self._intervals[entity][1][-1]), self._next_number(origin, now)

@@ -64,12 +64,7 @@ class DeliveringLoss(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1 for messages that the replay delivers whatever was drawn, ``deliveries.chosen``
-        (None: all), else the probability of the model ``given``, that of the run.
-
-        ``message`` is the number of the message on its ``link``, ``bad`` the state of the channel,
-        and ``table_probability`` the entry of the graph's table for the link.
-        """
+        """Return 1 for messages that the replay delivers, else the given probability."""
         chosen = self.deliveries.chosen
         if chosen is None or (*link, message) in chosen:
             return 1.0
@@ -118,13 +113,7 @@ class DelayUnlessWaived(Delay):
         return self.given.is_random
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the delay in seconds: 0 for a message in ``deliveries.without_delay``, else that
-        of the model ``given``.
-
-        ``message`` is the number of the message on its link, and ``drawn`` the delay that was drawn
-        for it. A message that is recorded as lost has no delay (nan): it takes no time if it is
-        among the chosen ones, which this replay delivers.
-        """
+        """Return the delay in seconds: 0 for a message in ``deliveries.without_delay``."""
         chosen, key = self.deliveries.chosen, (*link, message)
         if key in self.deliveries.without_delay:
             return 0.0

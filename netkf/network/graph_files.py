@@ -47,9 +47,7 @@ class GraphFile(Graph):
         """Return the graph in the ``content`` of a file; may raise whatever networkx raises."""
 
     def build(self, seed: int) -> Topology:
-        """Return the links of the file that reach the minimum, with their delivery probabilities;
-        raises ScenarioError if the file is wrong or no link is left. ``seed`` is not used.
-        """
+        """Return the links of the file that reach the minimum."""
         content = read_content(self.path)
         try:
             graph = self.read(content)

@@ -295,10 +295,7 @@ class Complete(Graph):
     nodes: int = field(_count)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology that links all pairs; ``seed`` is not used.
-
-        Raises ScenarioError beyond MAX_LINKS links.
-        """
+        """Return the topology that links all pairs; ``seed`` is not used."""
         _check_size(self.nodes, self.nodes * (self.nodes - 1) // 2)
         pairs = [(i, j) for i in range(self.nodes) for j in range(i + 1, self.nodes)]
         return _make_topology(range(self.nodes), pairs)
@@ -323,9 +320,7 @@ class Grid(Graph):
     columns: int = field(_count)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology that links neighbours in rows and columns, with positions (column,
-        -row) for plots; ``seed`` is not used.
-        """
+        """Return the topology that links neighbours in rows and columns."""
         _check_size(self.rows * self.columns, 2 * self.rows * self.columns)
         ids = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
         right = zip(ids[:, :-1].ravel().tolist(), ids[:, 1:].ravel().tolist(), strict=True)
@@ -375,11 +370,7 @@ class Regular(RandomGraph):
     degree: int = field(integer(low=0))
 
     def build(self, seed: int) -> Topology:
-        """Return a topology from ``networkx.random_regular_graph``, drawn with the graph's own seed
-        or else with the root seed ``seed``.
-
-        Raises ScenarioError if there is no graph with this degree.
-        """
+        """Return a topology from ``networkx.random_regular_graph``."""
         import networkx
 
         N, degree = self.nodes, self.degree
@@ -414,11 +405,7 @@ class ErdosRenyi(RandomGraph):
     p: float = field(probability)
 
     def build(self, seed: int) -> Topology:
-        """Return a topology from ``networkx.fast_gnp_random_graph``, drawn with the graph's own
-        seed or else with the root seed ``seed``.
-
-        Raises ScenarioError for a graph that is too large.
-        """
+        """Return a topology from ``networkx.fast_gnp_random_graph``."""
         import networkx
 
         # Refuse a graph whose expected number of links is too large before it is drawn.
@@ -436,9 +423,7 @@ class Geometric(RandomGraph):
     radius: float = field(positive)
 
     def build(self, seed: int) -> Topology:
-        """Return a topology from ``networkx.random_geometric_graph``, drawn with the graph's own
-        seed or else with the root seed ``seed``, with the positions of nodes.
-        """
+        """Return a topology from ``networkx.random_geometric_graph``."""
         import networkx
 
         # Refuse a graph whose expected number of links is too large before it is drawn.
@@ -483,9 +468,7 @@ class Edges(Graph):
     positions: FloatArray | None = field(matrix, default=None)
 
     def build(self, seed: int) -> Topology:
-        """Return the links as given; raises ScenarioError for a pair that is no link (equal ends,
-        or an unknown node), and for delivery or positions that do not fit. ``seed`` is not used.
-        """
+        """Return the links as given; raises ScenarioError for a pair that is no link."""
         listed: Iterable[Any] = self.nodes if isinstance(self.nodes, tuple) else ()
         named = [node for edge in self.edges for node in edge]
         ids = assign_ids([*listed, *named])
@@ -683,9 +666,7 @@ class CsvGraph(Graph):
     positions: SourceFile | None = field(source_file, default=None)
 
     def build(self, seed: int) -> Topology:
-        """Return the links of the table that reach the minimum, with their delivery probabilities;
-        raises ScenarioError if the table is wrong or no link is left. ``seed`` is not used.
-        """
+        """Return the links of the table that reach the minimum."""
         return self._read().topology(self.minimum, self.positions)
 
     def _read(self) -> LinkTable:

@@ -131,10 +131,7 @@ class RecordedLoss(Loss):
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
-        """Return 1 if the table says that message number ``message`` on ``link`` (sender, receiver)
-        arrives, else 0; ``after`` decides if the message is not listed. The other arguments are not
-        used. Engines call it for each message.
-        """
+        """Return 1 if the table says that message number ``message`` on ``link`` arrives."""
         value = _value_at("network.channel.loss", self.table, link, message, self.after)
         if value is None:
             return 0.0 if self.after == "lose" else 1.0
@@ -192,10 +189,7 @@ class RecordedDelay(Delay):
         return max(listed, default=0.0)
 
     def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the recorded seconds that message number ``message`` on ``link`` (sender,
-        receiver) takes; if it is not listed, 0, or nan (lost) with ``after`` "lose". ``drawn`` is
-        not used. Engines call it for each message that is not lost.
-        """
+        """Return the recorded seconds that message number ``message`` on ``link`` takes."""
         value = _value_at("network.channel.delay", self.table, link, message, self.after)
         if value is None:
             return math.nan if self.after == "lose" else 0.0

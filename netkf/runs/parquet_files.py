@@ -155,9 +155,7 @@ class ParquetSink(Sink):
         self._rows = 0
 
     def events(self, rows: np.ndarray) -> None:
-        """Write a block ``rows`` (E,) of EVENT rows as a row group of events.parquet; the recorder
-        of the run calls it with each block.
-        """
+        """Write a block ``rows`` (E,) of EVENT rows as a row group of events.parquet."""
         if self._events is not None:
             self._events.write(event_columns(rows, self._replica, self._event_count))
             self._event_count += len(rows)
@@ -165,11 +163,7 @@ class ParquetSink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Collect T samples of N nodes, and write them when they fill a row group; the recorder of
-        the run calls it with each block of samples.
-
-        ``t`` (T,) seconds, ``x`` (T, n), ``xhat`` and ``error`` (T, N, n), ``P`` (T, N, n, n).
-        """
+        """Collect T samples of N nodes, and write them when they fill a row group."""
         if self._states is not None:
             self._samples.append((t, x, xhat, P, error))
             self._rows += len(t) * len(self._nodes)

@@ -58,10 +58,7 @@ class SummarySink(Sink):
         self.transmissions = Transmissions()
 
     def events(self, rows: np.ndarray) -> None:
-        """Count the messages in a block ``rows`` (E,) of EVENT rows, and collect nodes that
-        diverged; changes ``transmissions``, ``delivered`` and ``diverged``. The recorder of the run
-        calls it with each block.
-        """
+        """Count the messages in a block ``rows`` (E,) of EVENT rows."""
         self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
         deliveries = rows[rows["kind"] == CODES["deliver"]]
@@ -73,13 +70,7 @@ class SummarySink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Reduce a block of T samples of N nodes, appended to ``times``, ``sq_error``, ``trace``,
-        ``nees`` and ``first_component``; P is not stored.
-
-        ``t`` (T,) seconds, ``x`` (T, n), ``xhat`` and ``error`` (T, N, n), ``P`` (T, N, n, n). Sets
-        ``rounding_from`` at the first sample whose errors are mostly rounding. The recorder of the
-        run calls it with each block.
-        """
+        """Reduce a block of T samples of N nodes to values by node; P is not stored."""
         if not len(t):
             return
         sq_error, nees = errors(error, P)

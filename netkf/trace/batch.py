@@ -92,10 +92,7 @@ class BatchSink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Append K samples to those of the present run; the recorder calls it. t (K,) in seconds, x
-        (K, n), xhat and error (K, N, n), P (K, N, n, n), of which the first F of the N filters are
-        kept.
-        """
+        """Append K samples to those of the present run."""
         run = len(self._status)
         first, last = self._lengths[run], self._lengths[run] + len(t)
         self._x[run, first:last] = x

@@ -68,9 +68,7 @@ class MemorySink(Sink):
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Append T samples to ``samples``, as a tuple of t (T,) in seconds, x (T, n), xhat
-        (T, N, n), P (T, N, n, n) and error (T, N, n).
-        """
+        """Append T samples to ``samples``: t (T,), x (T, n), xhat, P and error of N nodes."""
         self.samples.append((t, x, xhat, P, error))
 
 
