@@ -9,6 +9,7 @@ parts are then drawn anew, given the same whole.)
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Iterable
 from functools import cached_property
@@ -152,15 +153,16 @@ def _shorten(scenario: Scenario, at: float, to_horizon: bool) -> Scenario:
     # Earlier samples stay: they decide where continuous readings of an interval are split.
     probe = np.append(times[times < at], at)
     # Events at ``at`` itself, and in slots those of its slot, belong to the state: a replay ends a
-    # slot later, or by more seconds than times are rounded by.
-    margin = scenario.slot_plant.period if scenario.slotted else max(1e-9, 1e-12 * at)
-    end = scenario.horizon if to_horizon else min(scenario.horizon, at + margin)
+    # slot, a tick or 1e-9 s later.
+    grid = scenario.time_grid
+    later = scenario.slot_plant.period if scenario.slotted else max(1e-9, 1.0 / grid.per_second)
+    end = scenario.horizon if to_horizon else min(scenario.horizon, grid.instant(at + later))
     return _with(scenario, probe=probe, horizon=end)
 
 
 def _with(scenario: Scenario, **changes: Any) -> Scenario:
-    """Return the scenario with some fields changed and the same topology."""
-    changed = dataclasses.replace(scenario, **changes)
-    # A graph that is drawn or read from a file is neither drawn nor read again.
-    object.__setattr__(changed, "topology", scenario.topology)
+    """Return the scenario with some fields changed and the same topology and grid of time."""
+    changed = copy.copy(scenario)  # without derived values
+    for name, value in changes.items():
+        object.__setattr__(changed, name, value)
     return changed

@@ -183,7 +183,7 @@ def _default_replays(events: int) -> int:
 
 def _check_instant(run: Run, scenario: Scenario, at: float) -> float:
     """Return ``at`` (seconds), in slots the start of its slot; raises ScenarioError."""
-    time: float = number(low=0.0, high=scenario.horizon)("at", at)
+    time = scenario.time_grid.instant(number(low=0.0, high=scenario.horizon)("at", at))
     if run.status not in ("complete", "diverged") and not time <= max(run.times, default=-1.0):
         rule = f"lies beyond what was kept of a run that ended as {run.status}"
         raise ScenarioError("at", rule, time, "finish it with netkf run --resume")
