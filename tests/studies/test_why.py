@@ -272,7 +272,7 @@ def write(path, header, rows):
 
 @pytest.mark.parametrize(
     ("name", "node", "at"),
-    [("hybrid", 2, 8.0), ("intersection", 1, 7.0), ("gossip", 1, 7.0), ("late", 3, 8.0)],
+    [("hybrid", 2, 8.0), ("intersection", 0, 7.0), ("gossip", 1, 7.0), ("late", 3, 9.0)],
 )
 def test_what_ifs_are_those_of_a_run_from_recorded_losses(runs, name, node, at, tmp_path):
     scenario, run = runs[name]
