@@ -725,3 +725,182 @@ def hybrid(
                 )
             keep(size, path[int(t / STEP + 0.5)], m, S, r, probe, x, xhat, P)
     return ticks
+
+
+# Covariance intersection under clocks of nodes, with sampled sensors and messages under way
+
+
+@kernel
+def sift(heap, owner, k):
+    """Move entry k of a binary heap of times (K,) and their owners towards the first."""
+    t, e = heap[k], owner[k]
+    while k > 0:
+        up = (k - 1) // 2
+        if heap[up] <= t:
+            break
+        heap[k], owner[k] = heap[up], owner[up]
+        k = up
+    heap[k], owner[k] = t, e
+
+
+@kernel
+def sink(heap, owner, count):
+    """Move the first of ``count`` entries of a heap to its place."""
+    t, e, k = heap[0], owner[0], 0
+    while True:
+        down = 2 * k + 1
+        if down >= count:
+            break
+        if down + 1 < count and heap[down + 1] < heap[down]:
+            down += 1
+        if heap[down] >= t:
+            break
+        heap[k], owner[k] = heap[down], owner[down]
+        k = down
+    heap[k], owner[k] = t, e
+
+
+@kernel
+def move_to(size, table, t, k, now, m, S, law, work):
+    """Entry k from ``now[k]`` to time t, in steps of at most SPAN."""
+    while now[k] < t:
+        gap = min(t - now[k], SPAN)
+        laws(table, gap, len(law), law)
+        move(size, law, m, S, k, work)
+        now[k] = t if t - now[k] <= SPAN else now[k] + SPAN
+
+
+@kernel
+def draw_path(size, random, table, gap, truth, law, root, work):
+    """``truth[0]`` after a gap of at most SPAN."""
+    n = len(size)
+    laws(table, gap, len(law), law)
+    for i in range(n):
+        for j in range(i + 1):
+            s = law[n * n + i * (i + 1) // 2 + j]
+            for c in range(j):
+                s -= root[i, c] * root[j, c]
+            if i == j:
+                root[i, i] = np.sqrt(max(s, 0.0))
+            else:
+                root[i, j] = s / root[j, j] if root[j, j] > 0.0 else 0.0
+    for i in range(n):
+        s = 0.0
+        for j in range(n):
+            s += law[i * n + j] * truth[0, j]
+        work[0, i] = s
+    for j in range(n):
+        z = random.standard_normal()
+        for i in range(j, n):
+            work[0, i] += root[i, j] * z
+    for i in range(n):
+        truth[0, i] = work[0, i]
+
+
+@kernel
+def intersect(size, epsilon, k, other, m, S):
+    """Entry k, with the weight ``epsilon`` for the information of entry ``other``, overwritten."""
+    n = len(size)
+    invert(size, S, k)
+    invert(size, S, other)
+    for i in range(n):
+        for j in range(n):
+            S[other, i, j] *= epsilon
+            S[k, i, j] = (1.0 - epsilon) * S[k, i, j] + S[other, i, j]
+    for i in range(n):
+        m[other, i] -= m[k, i]
+    invert(size, S, k)
+    for i in range(n):
+        s = 0.0
+        for j in range(n):
+            g = 0.0
+            for c in range(n):
+                g += S[k, i, c] * S[other, c, j]
+            s += g * m[other, j]
+        m[k, i] += s
+
+
+@kernel
+def intersection(
+    size, random, times, table, start, sensors, sampling, clock, links, delay, epsilon, x, xhat, P
+):
+    """Nodes broadcast at ticks of periodic clocks, and intersect with what arrives later.
+
+    ``times`` (T,) of probes; ``table`` of laws F, Q; ``start`` mean, covariance and its root;
+    ``sensors`` H (S, 1, n), of variance 1, and their nodes (S,); ``sampling`` and ``clock``:
+    period and jitter, of random phases; ``links``: offsets (N + 1,), receivers and delivery
+    probabilities; ``delay``: uniform from its first to its second value. Returns the number of
+    ticks, samples and messages sent.
+    """
+    n, (runs, _, N, _) = len(size), xhat.shape
+    (H, owners), (first, receivers, delivery) = sensors, links
+    room = 64 * N
+    m, S = np.empty((N + room, n)), np.empty((N + room, n, n))
+    now, receiver, free = np.empty(N + room), np.empty(room, np.int64), np.empty(room, np.int64)
+    entities = N + len(owners)
+    heap, owner = np.empty(entities + room), np.empty(entities + room, np.int64)
+    phase, number = np.empty(entities), np.empty(entities, np.int64)
+    law, work = np.empty(table.shape[2]), np.empty((n + 1, n))
+    root, gain, truth, events = np.zeros((n, n)), np.empty(n), np.empty((1, n)), 0
+    for r in range(runs):
+        draw_state(size, random, start[0], start[2], truth[0])
+        start_filters(start[0], start[1], m[:N], S[:N])
+        now[:N], number[:], last, count, spare = 0.0, 0, 0.0, 0, room
+        for k in range(room):
+            free[k] = k
+        for e in range(entities):
+            period, jitter = clock if e < N else sampling
+            phase[e] = period * random.random()
+            heap[count], owner[count] = phase[e] + jitter * random.random(), e
+            count += 1
+            sift(heap, owner, count - 1)
+        for probe in range(len(times)):
+            while heap[0] <= times[probe]:
+                t, e, events = heap[0], owner[0], events + 1
+                if e < entities:
+                    period, jitter = clock if e < N else sampling
+                    number[e] += 1
+                    heap[0] = phase[e] + number[e] * period + jitter * random.random()
+                    sink(heap, owner, count)
+                else:
+                    count -= 1
+                    heap[0], owner[0] = heap[count], owner[count]
+                    sink(heap, owner, count)
+                if e < N:
+                    move_to(size, table, t, e, now, m, S, law, work)
+                    for k in range(first[e], first[e + 1]):
+                        events += 1
+                        if random.random() < delivery[k]:
+                            spare -= 1
+                            slot = free[spare]
+                            receiver[slot], own = receivers[k], N + slot
+                            now[own] = t
+                            for i in range(n):
+                                m[own, i] = m[e, i]
+                                for j in range(n):
+                                    S[own, i, j] = S[e, i, j]
+                            arrival = t + delay[0] + (delay[1] - delay[0]) * random.random()
+                            heap[count], owner[count] = arrival, entities + slot
+                            count += 1
+                            sift(heap, owner, count - 1)
+                elif e < entities:
+                    draw_path(size, random, table, t - last, truth, law, root, work)
+                    last, k = t, owners[e - N]
+                    y = read(size, random, H, e - N, 0, truth[0])
+                    move_to(size, table, t, k, now, m, S, law, work)
+                    update(size, y, H, e - N, 0, m, S, k, gain)
+                else:
+                    slot = e - entities
+                    k, own = receiver[slot], N + slot
+                    move_to(size, table, t, own, now, m, S, law, work)
+                    move_to(size, table, t, k, now, m, S, law, work)
+                    intersect(size, epsilon, k, own, m, S)
+                    free[spare] = slot
+                    spare += 1
+            if times[probe] > last:
+                draw_path(size, random, table, times[probe] - last, truth, law, root, work)
+                last = times[probe]
+            for k in range(N):
+                move_to(size, table, times[probe], k, now, m, S, law, work)
+            keep(size, truth[0], m[:N], S[:N], r, probe, x, xhat, P)
+    return events

@@ -43,6 +43,25 @@ def planar(nodes, horizon=10.0, degree=4):
     return hybrid(nodes, horizon, degree, **changes)
 
 
+def radio(nodes):
+    """intel_lab_radio on a random graph, two sensors of each axis for 30 nodes."""
+    load_radio = load("intel_lab_radio")
+    sensors = [
+        {
+            "nodes": list(range(k, nodes, 15)),
+            "H": [H],
+            "R": [[1.0]],
+            "sampling": {"kind": "periodic", "period": 0.2, "phase": "random", "jitter": 0.02},
+        }
+        for k, H in ((0, [1.0, 0.0, 0.0, 0.0]), (7, [0.0, 0.0, 1.0, 0.0]))
+    ]
+    graph = regular(nodes, 10)
+    channel = {"network.channel.loss": {"kind": "bernoulli", "delivery": 0.5}}
+    return load_radio.replace(
+        {"network.graph": graph, "sensors": sensors, "horizon": 10.0, **channel}
+    )
+
+
 def gossip(nodes):
     """gossip_ring with sensors in turn on a random graph."""
     sensors = [

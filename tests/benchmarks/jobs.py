@@ -189,7 +189,50 @@ def hybrid(case):
     return by_hand.hybrid, before, after
 
 
+def gap_laws(A, B):
+    """Coefficients (BINS, ORDER + 1, E) of F and the lower triangle of Q, as in ``laws``."""
+    n = len(A)
+    block = np.block([[-A, B @ B.T], [np.zeros_like(A), A.T]])
+
+    def entries(gap):
+        M = scipy.linalg.expm(block * gap)
+        F = M[n:, n:].T
+        return np.concatenate([F.ravel(), (F @ M[:n, n:])[np.tril_indices(n)]])
+
+    points = np.polynomial.chebyshev.chebpts1(ORDER + 1) * 0.5 * SPAN / BINS
+    middles = (np.arange(BINS) + 0.5) * SPAN / BINS
+    values = np.array([[entries(middle + point) for point in points] for middle in middles])
+    return np.linalg.solve(np.vander(points, increasing=True), values)
+
+
+def intersection(case):
+    places = {node: k for k, node in enumerate(case.nodes)}
+    placed = [(node, sensor) for sensor in case.sensors for node in sensor.nodes if node in places]
+    H = np.array([np.linalg.solve(np.linalg.cholesky(s.R), s.H) for _, s in placed])
+    owners = np.array([places[node] for node, _ in placed])
+    sampling, clock = case.sensors[0].sampling, case.network.activation
+    sent = sorted(
+        (places[i], places[j], case.table_probability((i, j))) for i, j in case.topology.directions
+    )
+    senders, receivers, table = (np.array(column) for column in zip(*sent, strict=True))
+    links = np.searchsorted(senders, np.arange(len(places) + 1)), receivers, table * delivery(case)
+    delay = case.network.channel.delay
+    after = (
+        np.array(case.times),
+        gap_laws(np.array(case.plant.A), np.array(case.plant.B)),
+        started(case),
+        (H, owners),
+        (sampling.period, sampling.jitter),
+        (clock.period, clock.jitter),
+        links,
+        (delay.low, delay.high),
+        case.filter.algorithm.epsilon,
+    )
+    return by_hand.intersection, (), after
+
+
 JOBS = {
+    "CovarianceIntersection": intersection,
     "Gossip": gossip,
     "Intermittent": intermittent,
     "PushSum": push_sum,

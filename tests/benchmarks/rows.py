@@ -116,6 +116,8 @@ ROWS = [
     kernel("diffusion, 3 nodes, 2000 slots", partial(cases.load, "diffusion_regression"), 3.0),
     kernel("diffusion, 20 nodes, n = 5, 500 slots", cases.diffusion, 3.0),
     kernel("intermittent, n = 1, 60 slots", partial(cases.load, "intermittent_scalar"), 3.0),
+    kernel("intersection, radio, 53 motes, n = 4", partial(cases.load, "intel_lab_radio"), 3.0),
+    kernel("intersection, radio, 300 nodes, n = 4", partial(cases.radio, 300), 3.0),
     Row("batched numpy: gossip, ring of 5", "run", batched_numpy, 5.0, False),
     Row(
         "filterpy: hybrid, 50 nodes, n = 4",

@@ -18,7 +18,7 @@ from netkf.linalg.linking import linked_once
 from tests.benchmarks import by_hand, cases, jobs, peers
 
 STANDARD_ERRORS, SHARE = 4.5, 1e-5
-JOBS = "hybrid", "gossip", "push_sum", "diffusion", "intermittent"
+JOBS = "hybrid", "intersection", "gossip", "push_sum", "diffusion", "intermittent"
 CODE = Path(__file__).parent / "__pycache__" / "slower"
 """Where benchmarks do not find it."""
 
@@ -80,7 +80,12 @@ def intermittent():
     return cases.load("intermittent_scalar").replace(changes), 400
 
 
-@pytest.mark.parametrize("make", [hybrid, gossip, push_sum, diffusion, intermittent])
+def intersection():
+    changes = {"probe": 0.5, "horizon": 4.0, "network.activation.period": 0.3}
+    return cases.radio(12).replace(changes), 100
+
+
+@pytest.mark.parametrize("make", [hybrid, intersection, gossip, push_sum, diffusion, intermittent])
 @pytest.mark.usefixtures("slower")
 def test_means_over_runs_agree(make):
     case, runs = make()
