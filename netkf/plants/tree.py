@@ -21,6 +21,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.portable import apply, norm, product
+from netkf.linalg.structs import Size, sized
 from netkf.plants.transitions import Transitions, noise_factors
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import BLOCK_WORDS, USED
@@ -51,7 +52,7 @@ class Cells(NamedTuple):
 
     length: IntArray
     before: IntArray
-    unit: IntArray
+    unit: FloatArray
     left: IntArray
     right: IntArray
     level: IntArray
@@ -109,26 +110,42 @@ class Tree:
         walk.x[0] = start
         ticks = np.rint(times * self._per_second).astype(np.int64)
         fill_states(
-            self._cells, ticks, stream.copy(), self._every, normal_ziggurat(), walk, states, offsets
+            sized(n),
+            self._cells,
+            ticks,
+            stream.copy(),
+            self._every,
+            normal_ziggurat(),
+            walk,
+            states,
+            offsets,
         )
         return states, offsets
 
 
 @kernel
 def draw_normals_of_point(
-    stream: np.ndarray, first: int, second: int, ziggurat: NormalZiggurat, out: FloatArray
+    size: Size,
+    stream: np.ndarray,
+    first: int,
+    second: int,
+    ziggurat: NormalZiggurat,
+    out: FloatArray,
+    begin: int,
 ) -> None:
-    """Write the first standard normals of the stream (``first``, ``second``) into ``out``; the
-    second id is -1 if there is none. ``stream`` (1, WIDTH) has the key and the purpose.
+    """Write the first n standard normals of the stream (``first``, ``second``) into ``out`` from
+    ``begin`` on; the second id is -1 if there is none. ``stream`` (1, WIDTH) has the key and the
+    purpose, and ``size`` the length n.
     """
     stream[0, 0], stream[0, USED] = _ZERO, _FULL
     stream[0, 1], stream[0, 2] = np.uint64(first) + _ONE, np.uint64(second + 1)
-    for i in range(len(out)):
-        out[i] = next_normal(stream, 0, ziggurat)
+    for i in range(len(size)):
+        out[begin + i] = next_normal(stream, 0, ziggurat)
 
 
 @kernel
 def fill_states(
+    size: Size,
     cells: Cells,
     ticks: IntArray,
     stream: np.ndarray,
@@ -142,14 +159,14 @@ def fill_states(
     each frame, of ``every`` cells between knots (0: none), into ``offsets`` (F, n). ``walk.x[0]``
     is the state at time 0.
     """
-    knot, depth, frame, n = 0, 0, 0, states.shape[1]
-    enter_knot(cells, stream, knot, ziggurat, walk)
+    knot, depth, frame, n = 0, 0, 0, len(size)
+    enter_knot(size, cells, stream, knot, ziggurat, walk)
     for k in range(len(ticks)):
         tick = ticks[k]
         while tick >= walk.end[0]:
             knot, depth = knot + 1, 0
-            move_to_knot(cells, walk)
-            enter_knot(cells, stream, knot, ziggurat, walk)
+            move_to_knot(size, cells, walk)
+            enter_knot(size, cells, stream, knot, ziggurat, walk)
             if every > 0 and knot % every == 0 and frame < len(offsets):
                 for i in range(n):
                     offsets[frame, i], walk.x[0, i] = walk.x[0, i], 0.0
@@ -157,7 +174,7 @@ def fill_states(
         while tick >= walk.end[depth]:
             depth -= 1
         while walk.start[depth] != tick:
-            divide_cell(cells, stream, ziggurat, walk, depth, tick)
+            divide_cell(size, cells, stream, ziggurat, walk, depth, tick)
             depth += 1
         for i in range(n):
             states[k, i] = walk.x[depth, i]
@@ -165,19 +182,19 @@ def fill_states(
 
 @kernel
 def enter_knot(
-    cells: Cells, stream: np.ndarray, knot: int, ziggurat: NormalZiggurat, walk: Walk
+    size: Size, cells: Cells, stream: np.ndarray, knot: int, ziggurat: NormalZiggurat, walk: Walk
 ) -> None:
     """Make the cell after number ``knot`` of the knots the first of the ``walk``."""
     kind = len(cells.length) - 1
     walk.kind[0], walk.start[0] = kind, knot * cells.length[kind]
     walk.end[0] = walk.start[0] + cells.length[kind]
-    draw_normals_of_point(stream, knot, -1, ziggurat, walk.z[0])
+    draw_normals_of_point(size, stream, knot, -1, ziggurat, walk.z[0], 0)
 
 
 @kernel
-def move_to_knot(cells: Cells, walk: Walk) -> None:
+def move_to_knot(size: Size, cells: Cells, walk: Walk) -> None:
     """Move the state ``walk.x[0]`` of the first cell to its end."""
-    n = len(cells.knot_L)
+    n = len(size)
     for i in range(n):
         walk.v[i], walk.v[n + i] = walk.x[0, i], walk.z[0, i]
         walk.x[0, i] = 0.0
@@ -191,6 +208,7 @@ def move_to_knot(cells: Cells, walk: Walk) -> None:
 
 @kernel
 def divide_cell(
+    size: Size,
     cells: Cells,
     stream: np.ndarray,
     ziggurat: NormalZiggurat,
@@ -201,12 +219,13 @@ def divide_cell(
     """Divide cell number ``depth`` of the ``walk`` and put that of its two parts after it in which
     ``tick`` lies.
     """
-    n, kind, v, inner = walk.x.shape[1], walk.kind[depth], walk.v, depth + 1
+    n, kind, v, inner = len(size), walk.kind[depth], walk.v, depth + 1
     point = walk.start[depth] + cells.before[kind]
     # v = [z; w]
-    draw_normals_of_point(stream, point // cells.unit[kind], cells.level[kind], ziggurat, v[n:])
+    first = int(point / cells.unit[kind])  # exact: both are below 2^53
+    draw_normals_of_point(size, stream, first, cells.level[kind], ziggurat, v, n)
     for i in range(n):
-        v[i], walk.z[inner, i] = walk.z[depth, i], 0.0
+        v[i] = walk.z[depth, i]
     if tick < point:
         walk.kind[inner], walk.start[inner], walk.end[inner] = (
             cells.left[kind],
@@ -214,10 +233,10 @@ def divide_cell(
             point,
         )
         for i in range(n):
-            walk.x[inner, i] = walk.x[depth, i]
-        for j in range(2 * n):
-            for i in range(n):
-                walk.z[inner, i] += cells.first[kind, j, i] * v[j]
+            walk.x[inner, i], total = walk.x[depth, i], 0.0
+            for j in range(2 * n):
+                total += cells.first[kind, j, i] * v[j]
+            walk.z[inner, i] = total
         return
     walk.kind[inner], walk.start[inner], walk.end[inner] = (
         cells.right[kind],
@@ -225,14 +244,13 @@ def divide_cell(
         walk.end[depth],
     )
     for i in range(n):
-        walk.x[inner, i] = 0.0
-    for j in range(n):
-        for i in range(n):
-            walk.x[inner, i] += cells.Phi[kind, j, i] * walk.x[depth, j]
-    for j in range(2 * n):
-        for i in range(n):
-            walk.x[inner, i] += cells.middle[kind, j, i] * v[j]
-            walk.z[inner, i] += cells.second[kind, j, i] * v[j]
+        x = z = 0.0
+        for j in range(n):
+            x += cells.Phi[kind, j, i] * walk.x[depth, j]
+        for j in range(2 * n):
+            x += cells.middle[kind, j, i] * v[j]
+            z += cells.second[kind, j, i] * v[j]
+        walk.x[inner, i], walk.z[inner, i] = x, z
 
 
 def _cells(moves: Transitions, digits: int, decades: int) -> Cells:
@@ -250,7 +268,7 @@ def _cells(moves: Transitions, digits: int, decades: int) -> Cells:
     return Cells(
         length=np.array(SHARES)[share] * unit,
         before=before,
-        unit=unit,
+        unit=unit.astype(np.float64),
         left=np.maximum(4 * exponent + left, -1),
         right=np.maximum(4 * exponent + right, -1),
         level=exponent - digits + LEVELS,

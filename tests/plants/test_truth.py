@@ -62,9 +62,9 @@ def linear_map(monkeypatch, plant, times, horizon):
     """
     used, place = {}, [-1]
 
-    def draw(stream, first, second, ziggurat, out):
-        here = used.setdefault((first, second), len(used) * len(out))
-        out[:] = [float(here + i == place[0]) for i in range(len(out))]
+    def draw(size, stream, first, second, ziggurat, out, begin):
+        here = used.setdefault((first, second), len(used) * len(size))
+        out[begin : begin + len(size)] = [float(here + i == place[0]) for i in range(len(size))]
 
     for name in ("fill_states", "enter_knot", "move_to_knot", "divide_cell"):
         monkeypatch.setattr(tree, name, getattr(tree, name).__wrapped__)
