@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -14,6 +13,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from netkf.algorithms.registry import LINK_WEIGHTS, own_attributes
+from netkf.checks import (
+    belief_propagation,
+    consensus_innovations,
+    constant_gain,
+    diffusion,
+    diffusion_kalman,
+    event_triggered,
+    gossip,
+    hybrid,
+    information_consensus,
+    intermittent,
+    kalman_consensus,
+    one_bit,
+    push_sum,
+    stochastic_trigger,
+    track_fusion,
+)
 from netkf.checks.clocked import CHECKS as UNDER_CLOCKS
 from netkf.checks.evidence import (
     BASE,
@@ -107,6 +123,29 @@ class Verdict(NotebookTable):
         return pd.DataFrame([dataclasses.astuple(row) for row in self.rows], columns=names)
 
 
+OF_PAPERS: dict[str, PaperChecks] = {
+    module.__name__.rpartition(".")[2]: module.CHECKS
+    for module in (
+        belief_propagation,
+        consensus_innovations,
+        constant_gain,
+        diffusion,
+        diffusion_kalman,
+        event_triggered,
+        gossip,
+        hybrid,
+        information_consensus,
+        intermittent,
+        kalman_consensus,
+        one_bit,
+        push_sum,
+        stochastic_trigger,
+        track_fusion,
+    )
+}
+"""The checks of each paper, by the name that filters give it (``Filter.paper``)."""
+
+
 def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
     if not scenario.is_linear:
@@ -115,10 +154,10 @@ def find_checks(scenario: Scenario) -> PaperChecks:
     # Without messages the equations of a Kalman filter are all that is promised.
     if promised.combination == "none":
         return UNDER_CLOCKS
-    if not promised.paper:
+    if promised.paper not in OF_PAPERS:
         name = kind_name(promised)
         raise TheoryError(f"nothing is promised of the {name} filter that could be checked")
-    checks: PaperChecks = importlib.import_module(f"netkf.checks.{promised.paper}").CHECKS
+    checks = OF_PAPERS[promised.paper]
     return UNDER_CLOCKS if checks.slots_only and not scenario.slotted else checks
 
 

@@ -97,12 +97,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
 
 
 def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
-    """Return the link rate, 1/s, from which on the steady bound on the mean of P is close to S, its
-    limit for ever faster links, as an entry of the promises.
-
-    ``value`` is the rate (None if links differ), ``factor`` the same as a multiple of the rates in
-    the scenario, and ``delta`` the distance from S, CLOSE_TO_S of its norm; None with a ``reason``.
-    """
+    """Return the link rate from which on the steady bound is close to S, or a reason."""
     try:
         if len(scenario.nodes) > MAX_RATE_NODES:
             raise TheoryError(
@@ -117,10 +112,7 @@ def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
 
 
 def _steady_error(scenario: Scenario) -> dict[str, Any]:
-    """Return the exact steady error covariances (N, n, n) of N nodes as an entry of the promises: a
-    dictionary with ``value``, ``trace`` and ``reason``, which says why there is no value, and
-    ``radius``, the spectral radius of the mean-square dynamics, below 1 if errors stay bounded.
-    """
+    """Return the steady error covariances (N, n, n) as an entry, and the ``radius``."""
 
     def covariance() -> FloatArray:
         """Return the steady error covariances (N, n, n); raises TheoryError if they take long."""
@@ -136,9 +128,7 @@ def _steady_error(scenario: Scenario) -> dict[str, Any]:
 
 
 def _slot_central_covariance(scenario: Scenario) -> FloatArray:
-    """Return P* (n, n), the steady prediction covariance of a Kalman filter with all readings in
-    every slot; raises TheoryError if H is not constant.
-    """
+    """Return P* (n, n) of all readings in every slot; raises TheoryError if H varies."""
     for node in scenario.sensing_nodes:
         scenario.observation_matrices(node)  # raises TheoryError if H is not constant
     model = scenario.pooled_slot_model
@@ -146,12 +136,7 @@ def _slot_central_covariance(scenario: Scenario) -> FloatArray:
 
 
 def _steady_bound(scenario: Scenario) -> dict[str, Any]:
-    """Return the steady-state bounds (N, n, n) on the mean of P of N nodes as an entry of the
-    promises: ``value`` and ``trace`` as lists, or None for both and the ``reason``.
-
-    Nodes that do not exchange messages may have one or not: then the value has nan for those
-    without, next to the reason.
-    """
+    """Return the steady bounds (N, n, n) on the mean of P as an entry, or the reason."""
     n = scenario.plant.n
     unknowns = len(scenario.nodes) * n * (n + 1) // 2
     degree = len(scenario.topology.directions) / len(scenario.nodes)
@@ -174,11 +159,7 @@ def _steady_bound(scenario: Scenario) -> dict[str, Any]:
 
 
 def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
-    """Return an entry of the promises: a dictionary with the ``value`` of a function, one matrix
-    (n, n) or a stack (N, n, n), as lists, its ``trace``, and ``reason`` None.
-
-    If the function raises TheoryError value and trace are None and ``reason`` is the message.
-    """
+    """Return an entry: ``value`` and ``trace`` of ``function()``, or its ``reason``."""
     try:
         value = function()
     except TheoryError as error:
@@ -210,9 +191,7 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
 
 
 def _steady_error_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the line of ``netkf theory`` on the exact steady error covariances of the nodes; no
-    line if they were not computed.
-    """
+    """Return the line of ``netkf theory`` on the exact steady error covariances of the nodes."""
     if "steady_error" not in promises:
         return []
     error, title = promises["steady_error"], "trace of the steady error covariance, exact"
@@ -228,9 +207,7 @@ def _steady_error_lines(scenario: Scenario, promises: dict[str, Any]) -> list[st
 
 
 def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines of ``netkf theory`` on the assumptions of the paper: for each whether it
-    holds, and below it the evidence, wrapped and indented.
-    """
+    """Return the lines of ``netkf theory`` on the assumptions of the paper."""
     lines = []
     for row in rows:
         lines.append(f"  {MARKS[row['holds']]:7}  {row['assumption']}  [{row['source']}]")
@@ -240,9 +217,7 @@ def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _bound_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the lines of ``netkf theory`` on the bounds on the mean of P at the horizon and in the
-    steady state: reasons why they do not exist, and a table of traces by node.
-    """
+    """Return the lines on the bounds at the horizon and in the steady state."""
     lines = ["", "trace of the bound on E[P_i]"]
     columns = {
         f"at {scenario.horizon:g} s": promises["bound_at_horizon"],
@@ -259,9 +234,7 @@ def _bound_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
 
 
 def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the lines of ``netkf theory`` on traces to compare P with: limits for ever faster
-    links, a centralised filter, and the link rate that comes close to the limit.
-    """
+    """Return the lines of ``netkf theory`` on traces to compare P with."""
     labels = {"central_covariance": "centralised filter with all readings"}
     if concerns_hybrid_paper(scenario):
         error_limit = "limit of the true error covariance (derived)" + delay_suffix(scenario)
@@ -278,9 +251,7 @@ def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
 
 
 def _link_rate_line(link_rate: dict[str, Any]) -> str:
-    """Return the line on the link rate from which on the steady bound is close to its limit S
-    (hybrid paper, H Theorem 3).
-    """
+    """Return the line on the link rate from which on the steady bound is close to its limit S."""
     rates = f"{format_number(link_rate['factor'])} times the rates given"
     if link_rate["value"] is not None:
         rates = f"links from {format_number(link_rate['value'])} per second on"
@@ -288,11 +259,7 @@ def _link_rate_line(link_rate: dict[str, Any]) -> str:
 
 
 def _bound_table(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
-    """Return a table of the traces of the bounds on the mean of P, with a row per node.
-
-    ``columns`` are the bounds at the horizon and in the steady state. Of more than MAX_NODES nodes
-    only those with the smallest, middle and largest bounds are listed.
-    """
+    """Return a table of the traces of the bounds on the mean of P, with a row per node."""
     rows = []
     for k, node in enumerate(scenario.nodes):
         traces = [column["trace"][k] if column["trace"] else None for column in columns]

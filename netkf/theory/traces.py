@@ -56,9 +56,7 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
 
 
 def _require_small_bound(scenario: Scenario, samples: int) -> None:
-    """Raise TheoryError if the bound on the mean of P (hybrid paper, H equation 12) at so many
-    ``samples`` takes more memory than MAX_BOUND_BYTES.
-    """
+    """Raise TheoryError if the bound at so many ``samples`` takes too much memory."""
     if reason_without_bound(scenario):
         return
     n = scenario.plant.n
@@ -73,9 +71,7 @@ def _require_small_bound(scenario: Scenario, samples: int) -> None:
 
 
 def _steady_note(scenario: Scenario) -> str:
-    """Return a note for users if the bound on P has no steady state, or if this is not known; else
-    an empty text.
-    """
+    """Return a note for users if the bound on P has no steady state, or if this is not known."""
     if scenario.slotted or reason_without_bound(scenario):
         return ""
     if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:
