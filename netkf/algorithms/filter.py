@@ -89,6 +89,7 @@ class NodeInfo(NamedTuple):
     place : its index in the order of ids, from 0
     senders : ids of the nodes that it can hear, sorted
     network : the whole network, if the filter ``needs_network``
+    rows : the most rows that a reading of any node has
     """
 
     node: int
@@ -101,6 +102,7 @@ class NodeInfo(NamedTuple):
     place: int = 0
     senders: tuple[int, ...] = ()
     network: NetworkInfo | None = None
+    rows: int = 1
 
 
 class Exchange(NamedTuple):
@@ -437,10 +439,8 @@ class Filter(Component):
         return True
 
     def decides_in_slots(self) -> bool:
-        """Return True if a node may decide to send nothing: the compiled ``slot_kernel`` then
-        writes which nodes send into ``SlotPlan.sent``.
-        """
-        return False
+        """Return True if a node may decide to send nothing."""
+        return self.kernels is not None and self.kernels.decides
 
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int

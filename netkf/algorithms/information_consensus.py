@@ -16,13 +16,6 @@ they combine and in how often they count it:
 A node holds K such pairs, ``parts``, and a ``Recipe`` says how the filters differ. A pair is stored
 as a root [Z, z] (n, n + 1), ``Omega = Z' Z`` and ``q = Omega c + Z' z``, relative to a centre c,
 the node's prediction, so that differences of near states lose no digits.
-
-Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
-``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
-noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
-``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
-(``rebase``, ``shift``), so that large states cost no digits. A kernel
-``*_single`` runs one node in one run, for the SimPy engine: both engines round alike.
 """
 
 from __future__ import annotations
@@ -34,34 +27,26 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Estimate, Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.information import begin_part, mix_parts, write_estimate
-from netkf.algorithms.kernels.intersection import invert_lanes
-from netkf.algorithms.kernels.root_update import intersect_roots
-from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    block_of_reading,
-    predict_all,
-    rebase,
-    slot_scratch,
-    star_of,
-    store_sample_of_slot,
-    whiten_reading,
+from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.information import (
+    add_reading_pair,
+    copy_parts,
+    store_part,
+    weigh_part,
+    write_information,
 )
-from netkf.algorithms.models import SlotModel, first_root
-from netkf.algorithms.pairs import weighted_pairs
+from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes
+from netkf.algorithms.kernels.neighbours import received_weight
+from netkf.algorithms.models import SlotModel
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of, positive
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, ONE, aligned, load, store
+from netkf.linalg.lanes import load, load_flags, select, spread, store
 
 MAX_STEPS = 10_000  # consensus has converged long before: a larger value is a mistake
 INFORMATION, MEASUREMENTS, HYBRID = "information", "measurements", "hybrid"
@@ -84,159 +69,58 @@ def recipe(shares: Sequence[Sequence[float]], counts: Sequence[float]) -> Recipe
     return Recipe(np.array(shares, dtype=np.float64), np.array(counts, dtype=np.float64))
 
 
-class ConsensusState(NamedTuple):
-    """The state of a node.
-
-    xhat, root : estimate (n,) and root (n, n) of its covariance; the prediction until the last step
-                 of a slot
-    model : of the plant and the node's sensors
-    recipe : of what pairs are made, and how often each counts
-    parts : roots (K, n, n + 1) of the node's pairs, from its reading to the last step of a slot,
-            else None
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    recipe: Recipe
-    parts: FloatArray | None = None
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-
-class Pairs(NamedTuple):
-    """A payload: roots ``parts`` (K, n, n + 1) of K pairs, relative to ``xhat`` (n,), the sender's
-    prediction.
-    """
-
-    xhat: FloatArray
-    parts: FloatArray
-
-
-class ConsensusArrays(NamedTuple):
-    """The ``steps`` of a slot, the ``Recipe`` as ``shares`` (K, 2) and ``counts`` (K + 1,), and two
-    copies of the K pairs of all H nodes of a block, ``parts`` (2, K, H, n, n + 1, L): each step
-    reads one and writes the other.
-    """
-
-    steps: int
-    shares: FloatArray
-    counts: FloatArray
-    parts: FloatArray
+@kernel
+def begin_pairs(record: Any, h: int, run: Any) -> None:
+    """Make the pairs with which node ``h`` begins a slot, of its prediction and its reading."""
+    lanes, shares = run.lanes, record.shares
+    invert_lanes(lanes, record.inverse, h, record.root, h)
+    for k in range(len(shares)):
+        write_information(lanes, run.total, shares[k, 0], record.inverse, h)
+        if shares[k, 1] > 0.0:
+            add_reading_pair(
+                run, run.total, shares[k, 1], run.reading, record.xhat, h, run.whitened
+            )
+        store_part(lanes, record.parts, h, k, run.total)
 
 
 @kernel
-def consensus_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: ConsensusArrays,
-) -> None:
-    """Simulate H filters by consensus on information over the S slots of a plan, in B blocks of L
-    runs: in each slot they predict, make information pairs of predictions and readings, mix these
-    with their neighbours' in ``arrays.steps`` steps, and compute estimates.
-
-    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
-    ``samples`` in the slots that have one; ``arrays.parts`` is overwritten.
-    """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            # Slot 0 has no reading and no exchange: it shows the start.
-            if plan.sensed[s]:
-                predict_all(nodes, scratch, b)
-                begin_all(nodes, readings, scratch, arrays, b, s)
-                for step in range(arrays.steps):
-                    for h in range(len(nodes.rows)):
-                        mix_parts(
-                            scratch.lanes, arrays.parts, step, h, links, plan.up, (b, s, step),
-                            scratch.xhat, scratch.total, scratch.whitened,
-                        )  # fmt: skip
-                for h in range(len(nodes.rows)):
-                    write_estimate(
-                        scratch.lanes, nodes.root, nodes.xhat, b, h, arrays.parts, arrays.steps % 2,
-                        arrays.counts, scratch.root, scratch.xhat, scratch.total, scratch.whitened,
-                    )  # fmt: skip
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            rebase(nodes, readings, scratch, b, s)
+def emit_pairs(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the pairs of node ``h``, and the prediction to which they are relative."""
+    for i in range(len(run.size)):
+        store(run.lanes, record.payload.xhat, m, i, load(run.lanes, record.xhat, h, i))
+    copy_parts(run.lanes, record.payload.parts, m, record.parts, h)
 
 
 @kernel
-def begin_all(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    scratch: SlotScratch,
-    arrays: ConsensusArrays,
-    b: int,
-    s: int,
-) -> None:
-    """Write the K initial information pairs of all H filters of block ``b``, from their predictions
-    and their readings of slot ``s``, as roots [Z, z] into copy 0 of ``arrays.parts``
-    (2, K, H, n, n + 1, L).
-
-    The predictions are copied to ``scratch.xhat`` (H, n, L) and the inverses of their roots to
-    ``scratch.root`` (H, n, n, L), where the steps of the slot read them. Axes: L runs side by side.
+def mix_pairs(record: Any, h: int, run: Any) -> None:
+    """Replace each pair of node ``h`` by the convex combination of it and those that arrive; after
+    the last step compute the estimate. Until then it is the prediction, to which all pairs are
+    relative.
     """
-    for h in range(len(nodes.rows)):
-        for i in range(nodes.xhat.shape[2]):
-            store(scratch.lanes, scratch.xhat, h, i, load(scratch.lanes, nodes.xhat, b, h, i))
-        invert_lanes(scratch.lanes, scratch.root, h, nodes.root[b], h)
-        for k in range(len(arrays.shares)):
-            begin_part(
-                scratch.lanes, arrays.parts, k, arrays.shares, scratch.root, readings.y, readings.H,
-                (b, s, h), nodes.rows[h], scratch.xhat, scratch.total, scratch.whitened,
-            )  # fmt: skip
-
-
-@kernel
-def begin_part_single(
-    nodes: SlotNodes, readings: ReadingBlock, scratch: SlotScratch, arrays: ConsensusArrays
-) -> None:
-    """Write the K initial information pairs of one filter in one run, from its prediction in
-    ``nodes`` and its reading, as roots [Z, z] into ``arrays.parts[0]`` of ``arrays.parts``
-    (2, K, 1, n, n + 1, 1).
-    """
-    begin_all(nodes, readings, scratch, arrays, 0, 0)
-
-
-@kernel
-def mix_parts_single(
-    parts: FloatArray, links: SlotLinks, up: Any, centre: FloatArray, work: Any
-) -> None:
-    """Do a consensus step of one node in one run, the first of H nodes in ``parts``
-    (2, K, H, n, n + 1, 1), the others its senders: read copy 0 of the K information pairs of all,
-    and write copy 1 of its own.
-
-    ``centre`` (H, n, 1) are the means that pairs are relative to, ``up`` (1, 1, 1, W, 1) flags the
-    messages of W senders, and ``work`` (2, n, n + 1, 1) is scratch.
-    """
-    mix_parts(ONE, parts, 0, 0, links, up, (0, 0, 0), centre, work[0], work[1])
-
-
-@kernel
-def write_estimate_single(
-    root: FloatArray,
-    x: FloatArray,
-    parts: FloatArray,
-    counts: FloatArray,
-    inverse: FloatArray,
-    centre: FloatArray,
-    work: FloatArray,
-) -> None:
-    """Write the estimate x (1, 1, n, 1) and its root (1, 1, n, n, 1) of one node in one run: its
-    information is the sum of ``counts[k]`` times pair k of ``parts[0]``, of ``parts``
-    (2, K, 1, n, n + 1, 1), and ``counts[K]`` times that of the prediction.
-
-    ``root`` and ``centre`` (1, n, 1) hold the prediction; ``inverse`` (1, n, n, 1) and ``work``
-    (2, n, n + 1, 1) are scratch.
-    """
-    invert_lanes(ONE, inverse, 0, root[0], 0)
-    write_estimate(ONE, root, x, 0, 0, parts, 0, counts, inverse, centre, work[0], work[1])
+    lanes, payload, total, work = run.lanes, record.payload, run.total, run.whitened
+    x, parts, own = record.xhat, record.parts, 1.0 - received_weight(run)
+    # Rounding may leave the own weight a little below 0, which has no root.
+    own = select(own > 0.0, own, 0.0)
+    for p in range(len(record.shares)):
+        weigh_part(lanes, total, own, parts, h, p, x, x, h)
+        for k in range(run.count):
+            # A weight of 0 adds no information.
+            if run.message_weight[k] > 0.0:
+                arrived = load_flags(lanes, run.arrived, k)
+                weight = select(arrived, run.message_weight[k], 0.0)
+                weigh_part(
+                    lanes, work, weight, payload.parts, run.message[k], p, payload.xhat, x, h
+                )
+                merge_lanes(lanes, total, work)
+        store_part(lanes, parts, h, p, total)
+    if run.step == record.steps - 1:
+        # The information of the estimate is the sum of the prediction's and that of the pairs.
+        counts, K = record.counts, len(record.shares)
+        write_information(lanes, total, counts[K], record.inverse, h)
+        for p in range(K):
+            weigh_part(lanes, work, spread(lanes, counts[p]), parts, h, p, x, x, h)
+            merge_lanes(lanes, total, work)
+        finish_lanes(lanes, record.root, x, h, x, total, work, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +139,13 @@ class InformationConsensus(Filter):
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
     inverts: ClassVar[bool] = True
-    slot_kernel = staticmethod(consensus_slots)
+    kernels = Kernels(
+        update=begin_pairs,
+        emit=emit_pairs,
+        absorb=mix_pairs,
+        unrolled=False,
+        under_clocks=DiffusionFilter.kernels,
+    )
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if rounding of information would take the first covariance of a
@@ -278,17 +168,20 @@ class InformationConsensus(Filter):
         """Return the setting ``steps``, the number of steps of the only exchange of a slot."""
         return self.steps
 
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[ConsensusArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for H nodes: steps, recipe, and scratch
-        (2, K, H, n, n + 1, L) for the K pairs of all nodes; ``runs`` does not matter, since blocks
-        of L runs use it one after the other.
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return in slots the pairs of nodes, the inverse roots of their predictions, and the
+        recipe; under clocks that of covariance intersection, one step of consensus on information.
         """
-        recipe = self.recipe(infos[0].nodes)
-        n, K = len(states[0].xhat), len(recipe.shares)
-        parts: FloatArray = aligned((2, K, len(states), n, n + 1, LANES))
-        return (ConsensusArrays(self.steps, *recipe, parts),)
+        if not isinstance(models[0], SlotModel):
+            return DiffusionFilter(on_loss="keep-own").record(infos, models)
+        n = len(models[0].information)
+        shares, counts = self.recipe(infos[0].nodes)
+        pairs = {"parts": (len(shares), n, n + 1)}
+        return Record(
+            node={**pairs, "inverse": (n, n)},
+            payload={"xhat": (n,), **pairs},
+            settings={"shares": shares, "counts": counts, "steps": self.steps},
+        )
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message in numbers of 64 bits: K pairs (Omega, q) of n states in
@@ -297,55 +190,7 @@ class InformationConsensus(Filter):
         pairs = 1 if phase < 0 else len(self.recipe(2).shares)
         return pairs * (n + n * (n + 1) // 2)
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ConsensusState:
-        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n), and the recipe for the number of nodes, which ``node`` tells.
-        """
-        return ConsensusState(mean, first_root(cov), model, self.recipe(node.nodes))
-
-    def update(self, state: ConsensusState, reading: Any) -> ConsensusState:
-        """Return the state with the pairs with which the slot begins, made of the prediction and
-        the ``reading``; under clocks the state after a Kalman update.
-        """
-        if not isinstance(state.model, SlotModel):
-            updated: ConsensusState = super().update(state, reading)
-            return updated
-        return state._replace(parts=first_parts(state, reading))
-
-    def emit(self, state: ConsensusState, exchange: Exchange) -> tuple[ConsensusState, Any]:
-        """Return the state, unchanged, and the payload: in slots the node's pairs of this step,
-        under clocks its estimate.
-        """
-        if exchange.slot < 0 or state.parts is None:
-            return state, Estimate(state.xhat, state.root)
-        return state, Pairs(state.xhat, state.parts)
-
-    def absorb(
-        self, state: ConsensusState, messages: Sequence[Message], exchange: Exchange
-    ) -> ConsensusState:
-        """Return the state after a consensus step on the node's information pairs and those in
-        ``messages``; after the last step of a slot with the new estimate.
-        """
-        if exchange.slot < 0:
-            return self._intersect(state, messages)
-        assert state.parts is not None
-        parts = mix_node_parts(state.xhat, state.parts, messages)
-        # The estimate stays the prediction, to which all pairs are relative, until the last step.
-        if exchange.step < self.steps - 1:
-            return state._replace(parts=parts)
-        xhat, root = estimate_of(state, parts)
-        return state._replace(xhat=xhat, root=root, parts=None)
-
-    def _intersect(self, state: ConsensusState, messages: Sequence[Message]) -> ConsensusState:
-        """Return the state after one step of consensus under clocks: the information pair of its
-        estimate becomes the weighted sum of it and those of ``messages``, predicted to now.
-        """
-        weights, means, roots = weighted_pairs(state, messages)
-        xhat, root = intersect_roots(weights, means, roots)
-        return state._replace(xhat=xhat, root=root)
-
     shift = Filter.shift  # affine: pairs are relative to the estimate
-    shift_payload = Filter.shift_payload
 
 
 @built_in("hcmci")
@@ -428,58 +273,3 @@ class Icf(InformationConsensus):
         which N times the average is the new P^-1.
         """
         return recipe([[1.0 / nodes, 1.0]], [float(nodes), 0.0])
-
-
-def first_parts(state: ConsensusState, reading: Reading) -> FloatArray:
-    """Return the roots (K, n, n + 1) of the K information pairs with which a node begins a slot,
-    from its prediction in ``state`` and its ``reading``.
-    """
-    n, (y, H, R) = len(state.xhat), reading[:3]
-    if len(y):
-        # The kernel takes readings whose noise has variance 1.
-        y, H = whiten_reading(y, H, R)
-    nodes = SlotNodes(
-        state.xhat.reshape(1, 1, n, 1),
-        np.ascontiguousarray(state.root).reshape(1, 1, n, n, 1),
-        state.model.F,
-        state.model.root_Q,
-        np.array([len(y)]),
-    )
-    readings = block_of_reading(y, H)
-    shares, counts = state.recipe
-    parts = np.zeros((2, len(shares), 1, n, n + 1, 1))
-    begin_part_single(
-        nodes, readings, slot_scratch(1, n, False, ONE), ConsensusArrays(1, shares, counts, parts)
-    )
-    return parts[0, :, 0, :, :, 0]
-
-
-def mix_node_parts(xhat: FloatArray, parts: FloatArray, messages: Sequence[Message]) -> FloatArray:
-    """Return the roots (K, n, n + 1) of a node's K information pairs after a consensus step, from
-    its own ``parts`` (K, n, n + 1), relative to ``xhat`` (n,), and those in the payloads of
-    ``messages``.
-    """
-    # The kernel of slots on a star: node 0 is this one, the others are its senders.
-    K, n, _ = parts.shape
-    stack = np.zeros((2, K, 1 + len(messages), n, n + 1, 1))
-    centre = np.stack([xhat, *(message.payload.xhat for message in messages)])[..., None]
-    stack[0, :, 0, :, :, 0] = parts
-    for m, message in enumerate(messages):
-        stack[0, :, 1 + m, :, :, 0] = message.payload.parts
-    links, up = star_of([message.weight for message in messages])
-    mix_parts_single(stack, links, up, np.ascontiguousarray(centre), np.empty((2, n, n + 1, 1)))
-    return stack[1, :, 0, :, :, 0]
-
-
-def estimate_of(state: ConsensusState, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return estimate (n,) and root (n, n) of a node from its K information pairs after the last
-    step, the roots ``parts`` (K, n, n + 1), and its prediction in ``state``, as its recipe says.
-    """
-    K, n, _ = parts.shape
-    stack = np.zeros((2, K, 1, n, n + 1, 1))
-    stack[0, :, 0, :, :, 0] = parts
-    x, root = state.xhat.reshape(1, 1, n, 1).copy(), state.root.reshape(1, 1, n, n, 1).copy()
-    inverse, work = np.zeros((1, n, n, 1)), np.empty((2, n, n + 1, 1))
-    centre = state.xhat.reshape(1, n, 1).copy()
-    write_estimate_single(root, x, stack, state.recipe.counts, inverse, centre, work)
-    return x.reshape(n), np.tril(root.reshape(n, n))

@@ -187,8 +187,10 @@ class Surroundings:
                 run.y[k, : len(y), 0], run.H[k, : len(y), :, 0] = y, H
             run.rows[k] = len(y)
 
-    def set_inbox(self, messages: Sequence[Any], slotted: bool) -> None:
-        """Make these messages the inbox of the run; their readings are numbered after the own."""
+    def set_inbox(self, own: Any, messages: Sequence[Any], slotted: bool) -> None:
+        """Make these messages the inbox of the run; their readings are numbered after the
+        ``own``, whitened or None.
+        """
         run, count = self.struct, len(messages)
         if count > len(run.message):
             run.message, run.age, run.message_weight = (
@@ -199,7 +201,7 @@ class Surroundings:
             run.link, run.heard = (np.zeros(count, dtype=np.int64) for _ in range(2))
             run.arrived = np.ones((count, 1), dtype=np.uint8)
         run.count = count
-        readings: list[Any] = [_NO_READING]
+        readings: list[Any] = [own or _NO_READING]
         for k, message in enumerate(messages):
             # A sender that was not announced gets the next link.
             run.link[k] = self.links.setdefault(message.sender, len(self.links))
@@ -210,8 +212,7 @@ class Surroundings:
             if reading is not None:
                 run.heard[k] = len(readings)
                 readings.append(reading)
-        if len(readings) > 1:
-            self.set_readings(readings)
+        self.set_readings(readings)
 
     def prepare(self, record: Any, slot: int) -> None:
         """Let the filter set what it knows of a slot before the run."""
@@ -286,8 +287,7 @@ def update(state: NodeState, reading: Any) -> NodeState:
         return new
     whitened = whiten_reading(reading.y, reading.H, reading.R) if len(reading.y) else None
     # In slots a node without a sensor gets readings without rows.
-    surroundings.set_readings([whitened or (np.zeros(0), reading.H[:0])])
-    run.reading = OWN
+    surroundings.set_readings([whitened or _NO_READING])
     state.kernels.update(new.record, 0, run)
     new.reading = whitened
     return new
@@ -299,6 +299,7 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     record, run = new.record, surroundings.struct
     surroundings.set_exchange(exchange)
     surroundings.prepare(record, exchange.slot)
+    surroundings.set_readings([new.reading or _NO_READING])
     payload = _payload_struct(record, 1)
     record.payload = payload
     state.kernels.emit(record, 0, 0, run)
@@ -314,7 +315,7 @@ def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeStat
     record, run = new.record, surroundings.struct
     surroundings.set_exchange(exchange)
     surroundings.prepare(record, exchange.slot)
-    surroundings.set_inbox(messages, exchange.slot >= 0)
+    surroundings.set_inbox(new.reading, messages, exchange.slot >= 0)
     if messages:
         names = type(record.payload).struct_fields
         fields = {

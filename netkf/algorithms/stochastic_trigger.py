@@ -9,50 +9,32 @@ reading. To receivers silence is as informative as a reading H xbar with noise R
 Two filters implement this. ``ScheduledReadings`` sends readings, and receivers use silence.
 ``TriggeredMessages`` wraps any other filter in slots, which takes silence for a lost message.
 ``StochasticTrigger``, the class of scenario files, chooses between them.
-
-Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
-``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
-noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
-``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
-(``rebase``, ``shift``), so that large states cost no digits. A kernel ``*_single`` runs one node
-in one run, so that the SimPy engine rounds like the compiled one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from netkf.algorithms.delegate import FORWARDED, Delegate, forwarded
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.kernels.slots import (
-    ARRIVING,
-    SENDING,
-    WHOLE,
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    block_of_reading,
-    drop_silent,
-    predict_all,
-    rebase,
-    rotate_lanes,
-    store_sample_of_slot,
-    transform_mean,
-    update_by_reading,
-    whiten_reading,
+from netkf.algorithms.filter import (
+    Exchange,
+    Filter,
+    Message,
+    NodeInfo,
+    Reading,
+    compiled_kernels,
 )
+from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.kernels.estimates import update_by_row
+from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
-from netkf.algorithms.models import first_root, sample_update
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in, built_in_filters
+from netkf.algorithms.triggered_slots import TriggeredSlots, trigger_arrays, trigger_plan
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -65,22 +47,7 @@ from netkf.core.fields import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    LANES,
-    ONE,
-    aligned,
-    any_lane,
-    blocks_of,
-    load,
-    load_flags,
-    select,
-    spread,
-    store,
-    store_flags,
-)
-
-NOWHERE = np.zeros(1, dtype=bool)
-"""Flags (1,) of a plan of one slot: what they flag does not happen in it."""
+from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store, store_flags
 
 
 def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
@@ -117,30 +84,14 @@ def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
     """Return the news ``z' Y z`` of a reading with p > 0 rows, for its innovation
     ``z = y - H xhat`` (p,); ``xhat`` is (n,), Y (p, p) or a number, that multiple of the identity.
     """
-    y, H = whiten_reading(*reading[:3])
-    p, n = H.shape
-    readings = block_of_reading(y, H)
-    trigger = np.ascontiguousarray(whitened_trigger(Y, reading.R))[None]
-    return weigh_news_single(
-        np.ascontiguousarray(xhat).reshape(1, 1, n, 1), readings, trigger, np.empty((p, 1))
-    )
+    z = reading.y - reading.H @ xhat
+    return max(0.0, float(z @ trigger_matrix(Y, len(z)) @ z))
 
 
-@kernel
-def weigh_news_single(x: FloatArray, readings: ReadingBlock, Y: FloatArray, z: FloatArray) -> float:
-    """Return the news ``z' Y z`` of one whitened reading in one run, for its innovation
-    z = y - H x and the estimate x (1, 1, n, 1); Y (1, p, p) is for whitened rows, ``z`` (p, 1) is
-    scratch.
-    """
-    news: float = weigh_news(ONE, x, readings, (0, 0, 0), len(z), Y, z)
-    return news
-
-
-def whitened_triggers(models: Sequence[Any], Y: float | FloatArray) -> FloatArray:
+def whitened_triggers(models: Sequence[Any], p: int, Y: float | FloatArray) -> FloatArray:
     """Return ``L' Y L`` (H, p, p) with ``L L' = R`` for the readings of H nodes with these
-    ``models``, zeros beyond their rows; p is the largest number of rows.
+    ``models``, zeros beyond their rows, of which there are at most p.
     """
-    p = max(1, *(len(model.R) for model in models))
     weights = np.zeros((len(models), p, p))
     for k, model in enumerate(models):
         rows = len(model.R)
@@ -163,238 +114,102 @@ def silence_whitening(weight: FloatArray) -> FloatArray:
     return inverse
 
 
-class ScheduledArrays(NamedTuple):
-    """What ``scheduled_slots`` keeps for B blocks of L runs of H nodes, among it tables of W + H
-    sensors: that of the sender of each of W directed links, as its receiver knows it from
-    messages, then each node's own.
-
-    trigger : (H, p, p), Y for whitened rows
-    silence : (H, p, p), see ``silence_whitening``
-    H : whitened rows (B, W + H, p, n, L) of the last reading of each sensor
-    known : (B, W + H, L), 1 once a reading of the sensor has arrived
-    prior : predictions (B, H, n, L) of the slot, to which news and silence refer
-    z, row : (p, L) and (n, L), scratch
-    """
-
-    trigger: FloatArray
-    silence: FloatArray
-    H: FloatArray
-    known: np.ndarray
-    prior: FloatArray
-    z: FloatArray
-    row: FloatArray
+@kernel
+def predict_prior(record: Any, h: int, run: Any) -> None:
+    """Predict node ``h``, and keep the prediction, to which news and silence refer."""
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    for i in range(len(run.size)):
+        store(run.lanes, record.prior, h, i, load(run.lanes, record.xhat, h, i))
+    store_flags(run.lanes, record.sent, h, spread(run.lanes, 0.0) > 0.0)
 
 
 @kernel
-def scheduled_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: ScheduledArrays,
-) -> None:
-    """Simulate H filters that broadcast readings over the S slots of a plan, Han et al. (2015), in
-    B blocks of L runs: in each slot they predict, decide whether to send, and use readings and
-    silence.
-
-    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the known sensors in
-    ``arrays`` in place, writes 0 into ``plan.sent`` and ``plan.up`` for messages that are not sent,
-    and writes ``samples``. ``plan.part`` says which part of a slot is simulated: up to the
-    decisions to send (SENDING), from the arrivals on (ARRIVING), or both.
-    """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            if plan.part != ARRIVING and plan.sensed[s]:
-                predict_all(nodes, scratch, b)
-                # Silence is about the prediction, which readings replace in ``nodes``.
-                for h in range(len(nodes.rows)):
-                    for i in range(nodes.xhat.shape[2]):
-                        x = load(scratch.lanes, nodes.xhat, b, h, i)
-                        store(scratch.lanes, arrays.prior, b, h, i, x)
-            if plan.part != ARRIVING and plan.exchanged[s]:
-                for h in range(len(nodes.rows)):
-                    schedule_reading(nodes, readings, plan, links, scratch, arrays, b, s, h)
-                drop_silent(plan, links, b, s, 0)
-            if plan.part != SENDING:
-                if plan.exchanged[s]:
-                    for h in range(len(nodes.rows)):
-                        update_by_sensors(nodes, readings, plan, links, scratch, arrays, b, s, h)
-                store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-                rebase(nodes, readings, scratch, b, s)
+def keep_reading(record: Any, h: int, run: Any) -> None:
+    """Do nothing: a reading is used in the exchange of its slot, if it is sent."""
 
 
 @kernel
-def schedule_reading(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: ScheduledArrays,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Decide whether node ``h`` of block ``b`` sends its reading of slot ``s``, in each of L runs:
-    with probability 1 - exp(-z' Y z / 2), where z is its innovation with respect to the prediction
-    in ``arrays.prior``. Writes 0 into ``plan.sent[b, s, 0, h]`` (L,) where it is silent or has no
-    reading.
+def emit_reading(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the reading of node ``h`` with probability 1 - exp(-z' Y z / 2), and with it the rows by
+    which later silence counts.
     """
-    lanes = scratch.lanes
-    news = weigh_news(
-        lanes, arrays.prior, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
-    )
-    # Through memory, since each lane (run) decides by itself.
-    store(lanes, scratch.row, 0, news)
-    for q in range(len(lanes)):
-        # The first reading is always sent: receivers learn H from it, and know the sensor then.
-        probability = silence_probability(scratch.row[0, q])
-        known = arrays.known[b, len(links.sender) + h, q] == 1
-        silent = known and plan.uniform[b, s, 0, h, q] < probability
-        if scratch.row[0, q] == NO_READING or silent:
-            plan.sent[b, s, 0, h, q] = 0
-
-
-@kernel
-def update_by_sensors(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: ScheduledArrays,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Update filter ``h`` of block ``b`` with the readings that arrive in slot ``s``, its own
-    first, and with the silence of the other sensors that it knows: changes ``nodes.xhat[b, h]``
-    (n, L) and ``nodes.root[b, h]`` (n, n, L), and marks the sensors of these readings as known in
-    ``arrays``.
-
-    Axes: L runs side by side.
-    """
-    # The own reading counts only if it was sent: else all nodes would not hold one estimate.
-    sent = load_flags(scratch.lanes, plan.sent, b, s, 0, h)
-    own = len(links.sender) + h
-    update_by_sensor(nodes, readings, scratch, arrays, b, s, h, h, own, sent)
-    for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.direction[m])
-        update_by_sensor(nodes, readings, scratch, arrays, b, s, h, links.sender[m], m, arrived)
-
-
-@kernel
-def update_by_sensor(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    scratch: SlotScratch,
-    arrays: ScheduledArrays,
-    b: int,
-    s: int,
-    h: int,
-    sender: int,
-    index: int,
-    arrived: Any,
-) -> None:
-    """Update filter ``h`` of block ``b`` by the sensor of filter ``sender``: with its reading of
-    slot ``s`` in the lanes where that has ``arrived`` (flags (L,)), else with its silence.
-
-    ``index`` is the entry of the sensor among the W + H known ones: those of the senders of W
-    directions, then the own ones of H filters. Changes ``nodes.xhat[b, h]`` (n, L) and
-    ``nodes.root[b, h]`` (n, n, L), and where a reading arrived ``arrays.H`` and ``arrays.known`` of
-    this sensor.
-    """
-    lanes, rows = scratch.lanes, nodes.rows[sender]
-    known = load_flags(lanes, arrays.known, b, index)
-    if any_lane(arrived):
-        # A fixed H has one block and one slot.
-        d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
-        # Store H: later silence is equivalent to a reading with it.
-        for k in range(rows):
-            for i in range(nodes.xhat.shape[2]):
-                former = load(lanes, arrays.H, b, index, k, i)
-                present = load(lanes, readings.H, d, t, sender, k, i)
-                store(lanes, arrays.H, b, index, k, i, select(arrived, present, former))
-        update_by_reading(nodes, readings, scratch, b, s, h, sender, arrived)
-    # Silence: lanes without an arrival in which the sensor is known. One without any reading so far
-    # may not exist, and its silence has no meaning.
-    silent = select(arrived, 0.0, select(known, 1.0, 0.0)) > 0.0
-    if any_lane(silent):
-        use_silence(nodes, scratch, arrays, b, h, sender, index, silent)
-    store_flags(lanes, arrays.known, b, index, select(arrived, 1.0, select(known, 1.0, 0.0)) > 0.0)
-
-
-@kernel
-def use_silence(
-    nodes: SlotNodes,
-    scratch: SlotScratch,
-    arrays: ScheduledArrays,
-    b: int,
-    h: int,
-    sender: int,
-    index: int,
-    silent: Any,
-) -> None:
-    """Update filter ``h`` of block ``b`` with a reading ``H xbar`` of noise ``R + Y^-1``, to which
-    the silence of filter ``sender`` is equivalent, in the lanes flagged in ``silent`` (L,): changes
-    ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L).
-
-    ``arrays.H[b, index]`` (p, n, L) is the sender's whitened H, and ``arrays.prior[b, h]`` (n, L)
-    the prediction xbar.
-    """
-    lanes, n = scratch.lanes, nodes.xhat.shape[2]
-    for k in range(nodes.rows[sender]):
-        innovation = spread(lanes, 0.0)
-        for i in range(n):
-            # Row k of C^-1 H, which has noise of variance 1, see silence_whitening.
+    lanes, rows, matrix = run.lanes, run.rows[run.reading], run.first_H + run.matrix[run.reading]
+    for k in range(rows):
+        for i in range(len(run.size)):
             total = spread(lanes, 0.0)
             for j in range(k + 1):
-                total += arrays.silence[sender, k, j] * load(lanes, arrays.H, b, index, j, i)
-            store(lanes, arrays.row, i, total)
-            # The innovation H xbar - H xhat: zero until other readings of the slot move xhat.
-            difference = load(lanes, arrays.prior, b, h, i) - load(lanes, nodes.xhat, b, h, i)
-            innovation += total * difference
-        # Row k of C^-1 H S with the root S of P: zeros, which change nothing, in other lanes.
-        for j in range(n):
-            total = spread(lanes, 0.0)
-            for i in range(j, n):
-                total += load(lanes, arrays.row, i) * load(lanes, nodes.root, b, h, i, j)
-            store(lanes, scratch.row, j, select(silent, total, 0.0))
-        # Kalman update by this row; the gain is ``gains`` times the factor that is returned.
-        gains = scratch.gains
-        step = innovation * rotate_lanes(lanes, scratch.size, nodes.root, b, h, scratch.row, gains)
-        for i in range(n):
-            x = load(lanes, nodes.xhat, b, h, i)
-            store(lanes, nodes.xhat, b, h, i, x + load(lanes, gains, i) * step)
+                total += record.whitening[h, k, j] * load(lanes, run.H, matrix, j, i)
+            store(lanes, record.payload.rows, m, k, i, total)
+            store(lanes, record.own, h, k, i, total)
+    weigh_news(run, record.prior, h, record.trigger, record.innovation, record.news, 0)
+    for q in range(len(lanes)):
+        # The first reading is always sent: receivers know the sensor then.
+        probability = silence_probability(record.news[0, q])
+        silent = record.known[h, q] == 1 and run.uniform[q] < probability
+        if record.news[0, q] == NO_READING or silent:
+            run.sends[q] = 0
+    store_flags(lanes, record.sent, h, load_flags(lanes, run.sends))
 
 
-class ScheduledState(NamedTuple):
-    """The state of a node of ``ScheduledReadings``.
-
-    xhat, root : estimate (n,) and root (n, n) of its covariance
-    model : of the plant and the node's sensors
-    prior : prediction (n,) of this slot
-    reading : own reading of this slot, or None
-    sent : whether it was sent in this slot
-    senders, sensors : ids of the nodes whose sensors are known from a reading that arrived (-1:
-                       the node itself), and (H, R) of each
+@kernel
+def use_silence(record: Any, h: int, run: Any, rows: FloatArray, k: int, silent: Any) -> None:
+    """Update node ``h`` with a reading ``H xbar`` of noise ``R + Y^-1`` in the lanes that are
+    ``silent``; ``rows[k]`` (p, n, L) is that H, whitened.
     """
+    lanes = run.lanes
+    for j in range(rows.shape[1]):
+        # What would be read: the prediction.
+        total = spread(lanes, 0.0)
+        for i in range(len(run.size)):
+            total += load(lanes, rows, k, j, i) * load(lanes, record.prior, h, i)
+        store(lanes, record.innovation, 0, j, total)
+        place, scratch = (0, k, j), (run.row, run.gains)
+        update_by_row(
+            lanes, run.size, record.xhat, record.root, h, record.innovation, rows, place, silent,
+            scratch,
+        )  # fmt: skip
 
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    prior: FloatArray
-    reading: Reading | None = None
-    sent: bool = False
-    senders: tuple[int, ...] = ()
-    sensors: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
+@kernel
+def absorb_readings(record: Any, h: int, run: Any) -> None:
+    """Use the readings that were sent, the own one too, and the silence of all other sensors that
+    node ``h`` knows.
+    """
+    lanes, payload = run.lanes, record.payload
+    # The own reading counts only if it was sent: else all nodes would not hold one estimate.
+    sent = load_flags(lanes, record.sent, h)
+    use_reading(run, record.xhat, record.root, h, run.reading, sent)
+    known = load_flags(lanes, record.known, h)
+    silent = select(sent, 0.0, select(known, 1.0, 0.0)) > 0.0
+    if any_lane(silent):
+        use_silence(record, h, run, record.own, h, silent)
+    store_flags(lanes, record.known, h, select(sent, 1.0, select(known, 1.0, 0.0)) > 0.0)
+    first, stop = run.first[h], run.first[h + 1]
+    for w in range(first, stop):
+        store_flags(lanes, record.silent, w, load_flags(lanes, record.heard, w))
+    for k in range(run.count):
+        w, arrived = run.link[k], load_flags(lanes, run.arrived, k)
+        use_reading(run, record.xhat, record.root, h, run.heard[k], arrived)
+        for j in range(payload.rows.shape[1]):
+            for i in range(len(run.size)):
+                new = load(lanes, payload.rows, run.message[k], j, i)
+                old = load(lanes, record.rows, w, j, i)
+                store(lanes, record.rows, w, j, i, select(arrived, new, old))
+        for q in range(len(lanes)):
+            if run.arrived[k, q] == 1:
+                record.heard[w, q], record.silent[w, q] = 1, 0
+    # A sensor without any reading so far may not exist, and its silence has no meaning.
+    for w in range(first, stop):
+        silent = load_flags(lanes, record.silent, w)
+        if any_lane(silent):
+            use_silence(record, h, run, record.rows, w, silent)
+
+
+@kernel
+def shift_prior(record: Any, h: int, run: Any) -> None:
+    """Move estimate and prediction: innovations do not change."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.prior, h)
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,36 +231,37 @@ class ScheduledReadings(Filter):
     fixed_sensors: ClassVar[bool] = True
     every_reading: ClassVar[bool] = True
     reads_what_it_sends: ClassVar[bool] = True
-    slot_kernel = staticmethod(scheduled_slots)
+    kernels = Kernels(
+        predict=predict_prior,
+        update=keep_reading,
+        emit=emit_reading,
+        absorb=absorb_readings,
+        shift=shift_prior,
+        positions=(),
+        decides=True,
+    )
 
-    def decides_in_slots(self) -> bool:
-        """Return True: a node may keep its reading to itself, and the compiled ``slot_kernel``
-        writes which nodes send.
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return predictions, what was sent, and the sensors that nodes know: their own, and those
+        of the senders of each link.
         """
-        return True
-
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[ScheduledArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
-        in these ``states``, with W directed links, counted from ``infos``: triggers, and empty
-        tables of the W + H sensors that nodes know of each other and of themselves.
-        """
-        models, blocks = [state.model for state in states], blocks_of(runs)
-        (H, n), W = (len(models), len(states[0].xhat)), sum(info.degree for info in infos)
-        weights = whitened_triggers(models, self.Y)
-        p, entries = weights.shape[1], W + H
-        return (
-            ScheduledArrays(
-                trigger=weights,
-                silence=np.stack([silence_whitening(one) for one in weights]),
-                H=aligned((blocks, entries, p, n, LANES)),
-                known=np.zeros((blocks, entries, LANES), dtype=np.uint8),
-                prior=aligned((blocks, H, n, LANES)),
-                z=aligned((p, LANES)),
-                row=aligned((n, LANES)),
-            ),
+        n, p = len(models[0].information), infos[0].rows
+        trigger = whitened_triggers(models, p, self.Y)
+        flag = ((), np.uint8)
+        return Record(
+            node={"prior": (n,), "own": (p, n), "sent": flag, "known": flag},
+            link={"rows": (p, n), "heard": flag, "silent": flag},
+            payload={"rows": (p, n)},
+            scratch={"innovation": (1, p), "news": (1,)},
+            settings={
+                "trigger": trigger,
+                "whitening": np.stack([silence_whitening(one) for one in trigger]),
+            },
         )
+
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Take the first estimate for a prediction."""
+        node["prior"][:] = node["xhat"]
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, which
@@ -464,355 +280,24 @@ class ScheduledReadings(Filter):
         """
         return rows
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ScheduledState:
-        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n), which knows no sensor yet, not even its own.
-        """
-        return ScheduledState(mean, first_root(cov), model, mean)
-
-    def predict(self, state: ScheduledState, gap: float) -> ScheduledState:
-        """Return the state ``gap`` seconds later; the prediction is kept as ``prior``, to which all
-        decisions of the slot refer.
-        """
-        xhat, root = state.model.predict(state.xhat, state.root, gap)
-        return state._replace(xhat=xhat, root=root, prior=xhat, reading=None, sent=False)
-
-    def update(self, state: ScheduledState, reading: Reading) -> ScheduledState:
-        """Return the state with the reading stored for the exchange of the slot."""
-        return state._replace(reading=reading if len(reading.y) else None)
-
-    def emit(
-        self, state: ScheduledState, exchange: Exchange
-    ) -> tuple[ScheduledState, Reading | None]:
-        """Return the state and the payload: the reading, or with probability exp(-z' Y z / 2)
-        None, nothing is sent.
-        """
-        reading = state.reading
-        if reading is None:
-            return state, None
-        # -1, the node itself, is among the known sensors once it has sent its first reading.
-        if -1 in state.senders:
-            probability = silence_probability(news_of(reading, state.prior, self.Y))
-            if exchange.uniform < probability:
-                return state, None
-        return state._replace(sent=True), reading
-
-    def absorb(
-        self, state: ScheduledState, messages: Sequence[Message], exchange: Exchange
-    ) -> ScheduledState:
-        """Return the state after the readings that were sent, and after the silence of all other
-        known sensors.
-        """
-        arrived = {message.sender: message.payload for message in messages}
-        if state.sent and state.reading is not None:
-            arrived[-1] = state.reading
-        sensors = dict(zip(state.senders, state.sensors, strict=True))
-        sensors.update({j: (reading.H, reading.R) for j, reading in arrived.items()})
-        xhat, root = state.xhat, state.root
-        for sender, (H, R) in sorted(sensors.items()):
-            if sender in arrived:
-                xhat, root = sample_update(xhat, root, arrived[sender].y, H, R)
-            else:
-                # Silence: a reading that equals its prediction, of larger noise.
-                noise = silence_noise(R, self.Y)
-                xhat, root = sample_update(xhat, root, H @ state.prior, H, noise)
-        senders = tuple(sorted(sensors))
-        return state._replace(
-            xhat=xhat, root=root, senders=senders, sensors=tuple(sensors[j] for j in senders)
-        )
-
-    def shift(self, state: ScheduledState, offset: FloatArray) -> ScheduledState:
-        """Return the state with ``offset`` (n,) added to estimate and prediction, for a move of the
-        origin, and ``H offset`` to the reading: innovations do not change.
-        """
-        reading = state.reading
-        if reading is not None:
-            reading = reading._replace(y=reading.y + reading.H @ offset)
-        return state._replace(xhat=state.xhat + offset, prior=state.prior + offset, reading=reading)
-
-    def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Return the reading under way with ``H offset`` added, for a move of the origin by which
-        estimates change by ``offset`` (n,).
-        """
-        return payload._replace(y=payload.y + payload.H @ offset)
+    shift = Filter.shift  # innovations do not depend on the origin
 
 
-class TriggerArrays(NamedTuple):
-    """Decisions of H nodes of ``TriggeredMessages`` for B blocks of L runs.
+F = TypeVar("F", bound=type[Filter])
 
-    trigger : (H, p, p), Y for whitened rows
-    news : (B, H, L), z' Y z of the last reading
-    undecided : (B, H, L), 1 until it is decided whether the node sends after this reading
-    silent : (B, H, L), 1 if it sends nothing until the next reading
-    has_sent : (B, H, L), 1 once the node has sent after a reading
-    x, z : scratch, predictions (B, H, n, L) and an innovation (p, L)
+
+def forwarding(cls: F) -> F:
+    """Make all that a filter says of itself, but for what ``cls`` defines, what the filter
+    ``wrapped`` says.
     """
 
-    trigger: FloatArray
-    news: FloatArray
-    undecided: np.ndarray
-    silent: np.ndarray
-    has_sent: np.ndarray
-    x: FloatArray
-    z: FloatArray
+    def forwarded(name: str) -> property:
+        return property(lambda self: getattr(self.wrapped, name))
 
-
-def trigger_arrays(models: Sequence[Any], Y: float | FloatArray, runs: int) -> TriggerArrays:
-    """Return the arrays of H nodes with these ``models`` in ``runs`` runs, before they have read
-    anything; the trigger Y is (p, p) or a number, that multiple of the identity.
-    """
-    trigger, shape = whitened_triggers(models, Y), (blocks_of(runs), len(models))
-    return TriggerArrays(
-        trigger,
-        np.full((*shape, LANES), NO_READING),
-        undecided=np.ones((*shape, LANES), dtype=np.uint8),
-        silent=np.zeros((*shape, LANES), dtype=np.uint8),
-        has_sent=np.zeros((*shape, LANES), dtype=np.uint8),
-        x=aligned((*shape, len(models[0].F), LANES)),
-        z=aligned((trigger.shape[1], LANES)),
-    )
-
-
-class TriggerPlan(NamedTuple):
-    """The order of events in the slots of a wrapped filter: news are computed outside of its
-    kernel, and need the prediction that the kernel will have at the reading.
-
-    first : index of the first exchange step after the reading
-    predict_first : whether estimates are predicted before the reading
-    rebase_first : whether the origin of estimates moves (``rebase``) before the reading, as in
-                   filters that sample their predictions; else it moves at the end of the slot
-    split : whether an exchange before the reading changes estimates; the kernel is then called
-            twice a slot, up to the reading and from it on
-    """
-
-    first: int
-    predict_first: bool
-    rebase_first: bool
-    split: bool
-
-
-def trigger_plan(inner: Filter) -> TriggerPlan | None:
-    """Return the order of events in the slots of the filter ``inner``; None if its innovations
-    cannot be computed outside of its kernel.
-    """
-    schedule = inner.schedule or ()
-    before = schedule[: schedule.index("sense")]
-    # The number of exchanges before the reading, and whether they change estimates.
-    early = before.count("exchange")
-    moves = any(inner.moves_estimates(phase) for phase in range(early))
-    # If exchanges change estimates before the reading, the kernel is called twice a slot: for the
-    # exchanges alone, then for the rest. Its plan cannot leave out only the exchanges before the
-    # reading, nor separate a prediction from the reading.
-    if moves and (early < schedule.count("exchange") or "predict" in before):
-        return None
-    first = sum(inner.exchange_steps(phase) for phase in range(early))
-    return TriggerPlan(first, "predict" in before, inner.predicts, moves)
-
-
-@kernel
-def decide_senders(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: TriggerArrays,
-    order: TriggerPlan,
-    s: int,
-) -> None:
-    """Decide which nodes send in slot ``s``, in all B blocks: in exchange steps before the reading
-    by the news of the slot before, then by those of this one; ``order`` says which come before.
-
-    Writes 0 into ``plan.sent[:, s]`` (B, E, H, L) and ``plan.up[:, s]`` (B, E, W, L) for messages
-    that are not sent, and stores news and decisions in ``arrays``. Axes: E exchange steps, W
-    directed links, H filters, L runs side by side.
-    """
-    for b in range(plan.sent.shape[0]):
-        # Exchanges before the reading: the decisions after the reading of the slot before hold.
-        for e in range(order.first):
-            decide_step(plan, arrays, b, s, e)
-        if plan.sensed[s] and not order.split:
-            store_news(
-                nodes, readings, arrays, scratch, b, s, order.predict_first, order.rebase_first
-            )
-        for e in range(order.first, plan.sent.shape[2]):
-            decide_step(plan, arrays, b, s, e)
-        for e in range(plan.sent.shape[2]):
-            drop_silent(plan, links, b, s, e)
-
-
-@kernel
-def decide_step(plan: SlotPlan, arrays: TriggerArrays, b: int, s: int, e: int) -> None:
-    """Decide which of the nodes of block ``b`` that are asked in step ``e`` of slot ``s`` send: a
-    decision holds until the next reading. Writes 0 into ``plan.sent[b, s, e]`` (H, L) for silent
-    ones, and new decisions into ``arrays``.
-
-    Axes: H filters, L runs side by side.
-    """
-    for h in range(plan.sent.shape[3]):
-        for q in range(plan.sent.shape[4]):
-            if plan.sent[b, s, e, h, q] == 0:
-                continue
-            if arrays.undecided[b, h, q] == 1:
-                # After its first reading a node always sends, and without a reading (negative
-                # news) too.
-                news, u = arrays.news[b, h, q], plan.uniform[b, s, e, h, q]
-                silent = arrays.has_sent[b, h, q] == 1 and u < silence_probability(news)
-                arrays.undecided[b, h, q], arrays.silent[b, h, q] = 0, silent
-                if news >= 0.0:
-                    arrays.has_sent[b, h, q] = 1
-            if arrays.silent[b, h, q] == 1:
-                plan.sent[b, s, e, h, q] = 0
-
-
-@kernel
-def store_news(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    arrays: TriggerArrays,
-    scratch: SlotScratch,
-    b: int,
-    s: int,
-    predict_first: bool,
-    rebase_first: bool,
-) -> None:
-    """Store the news ``z' Y z`` of the readings of all H nodes of block ``b`` in slot ``s`` in
-    ``arrays.news[b]`` (H, L), and mark each node as undecided, so that it decides anew whether to
-    send.
-
-    The innovation z = y - H x needs the estimate x at the reading, while ``nodes.xhat`` (unchanged)
-    is that before the filter's kernel has simulated the slot. So do in a copy, ``arrays.x``, what
-    the kernel does before the reading: move the origin that estimates are relative to
-    (``rebase_first``), and predict (``predict_first``). Axes: L runs side by side.
-    """
-    lanes = scratch.lanes
-    for h in range(len(nodes.rows)):
-        for i in range(nodes.xhat.shape[2]):
-            x = load(lanes, nodes.xhat, b, h, i)
-            if rebase_first and readings.rebased[s]:
-                # As ``rebase`` does: the true state of this slot becomes the origin.
-                x -= load(lanes, readings.local, b, s, i)
-            store(lanes, arrays.x, b, h, i, x)
-        if predict_first:
-            transform_mean(scratch, arrays.x, b, h, nodes.F)
-        news = weigh_news(
-            lanes, arrays.x, readings, (b, s, h), nodes.rows[h], arrays.trigger, arrays.z
-        )
-        store(lanes, arrays.news, b, h, news)
-        for q in range(len(lanes)):
-            arrays.undecided[b, h, q], arrays.silent[b, h, q] = 1, 0
-
-
-@kernel
-def store_news_of_slot(
-    nodes: SlotNodes, readings: ReadingBlock, arrays: TriggerArrays, scratch: SlotScratch
-) -> None:
-    """Store the news ``z' Y z`` of the readings of all nodes and blocks of one slot in
-    ``arrays.news`` (B, H, L), and mark the nodes as undecided. All that precedes the reading in
-    the slot is done: ``nodes.xhat`` holds the predictions.
-
-    Axes: B blocks of L runs, H filters.
-    """
-    for b in range(nodes.xhat.shape[0]):
-        store_news(nodes, readings, arrays, scratch, b, 0, False, False)
-
-
-class TriggeredSlots:
-    """The ``slot_kernel`` of ``TriggeredMessages``, called like any other: in each slot it decides
-    which nodes send, and runs the kernel of the ``inner`` filter with their messages.
-    """
-
-    def __init__(self, inner: Filter, order: TriggerPlan) -> None:
-        """Take the wrapped filter, which has a kernel, and its ``trigger_plan``."""
-        self._inner = inner
-        self._kernel = inner.slot_kernel
-        self._order = order
-        self._decides = inner.decides_in_slots()
-        # The engine looks for the compiled code of a kernel by its name.
-        self.__name__ = self._kernel.__name__
-
-    def __call__(
-        self,
-        nodes: SlotNodes,
-        readings: ReadingBlock,
-        plan: SlotPlan,
-        links: SlotLinks,
-        samples: SlotSamples,
-        scratch: SlotScratch,
-        arrays: TriggerArrays,
-        states: Sequence[Any],
-        *more: Any,
-    ) -> None:
-        """Simulate the filters over the S slots of a plan in place: changes ``nodes``, the
-        decisions in ``arrays``, ``plan.sent`` and ``plan.up``, and writes ``samples``. ``states``
-        are those in which nodes start, ``more`` the arrays of the inner filter's kernel.
-
-        ``plan.part`` says whether only the decisions are wanted (SENDING), only what follows from
-        the messages that arrive (ARRIVING), or both. ``plan.sent`` flags the nodes that are asked
-        for a message, and then those that send one. If the order of a slot is ``split``, news
-        refer to the estimates between the exchange and the reading: the inner kernel is called
-        once for the exchange, then for the reading and all that follows.
-        """
-        # Innovations refer to the estimates with which nodes go on, not to those they report.
-        carried_nodes = nodes._replace(xhat=self._inner.carried_estimates(nodes.xhat, more))
-        for s in range(plan.up.shape[1]):
-            asked = plan.sent[:, s : s + 1].copy()
-            if plan.part != ARRIVING:
-                decide_senders(
-                    carried_nodes, readings, plan, links, scratch, arrays, self._order, s
-                )
-            # The trigger alone decides who sends: the inner kernel runs when messages have arrived.
-            if plan.part == SENDING and not self._decides:
-                continue
-            slot_readings, slot_plan, slot_samples = single_slot(readings, plan, samples, s)
-            if self._decides:
-                # The filter decides on all that are asked; below, a message needs both decisions.
-                slot_plan = slot_plan._replace(sent=asked, part=plan.part)
-            arguments = (
-                links,
-                slot_samples,
-                scratch,
-                *self._inner.slot_gains(states, more, plan.first + s, 1),
-            )
-            if self._order.split:
-                self._kernel(nodes, slot_readings, slot_plan._replace(sensed=NOWHERE), *arguments)
-                if plan.sensed[s]:
-                    store_news_of_slot(carried_nodes, slot_readings, arrays, scratch)
-                # The first call has written the sample and moved the origin: not again.
-                slot_readings, no_sample = slot_readings._replace(rebased=NOWHERE), np.full(1, -1)
-                slot_plan = slot_plan._replace(exchanged=NOWHERE, sample=no_sample)
-            self._kernel(nodes, slot_readings, slot_plan, *arguments)
-            if self._decides:
-                plan.sent[:, s : s + 1] &= slot_plan.sent
-                plan.up[:, s : s + 1] = slot_plan.up
-
-
-def single_slot(
-    readings: ReadingBlock, plan: SlotPlan, samples: SlotSamples, s: int
-) -> tuple[ReadingBlock, SlotPlan, SlotSamples]:
-    """Return ``readings``, ``plan`` and ``samples`` of slot ``s`` alone, with S = 1, for
-    ``TriggeredSlots``, which calls a kernel slot by slot. The plan's ``sent`` and ``uniform`` are
-    empty, for filters that do not decide who sends.
-    """
-    at = slice(s, s + 1)
-
-    def at_slot(values: Any) -> Any:
-        """Return the values (B, 1, ...) of slot ``s`` from those of all slots (B, S, ...)."""
-        return np.ascontiguousarray(values[:, at])
-
-    # A fixed H has one slot already.
-    local, fixed = at_slot(readings.local), readings.H.shape[1] == 1
-    H = readings.H if fixed else at_slot(readings.H)
-    alone = ReadingBlock(at_slot(readings.y), H, local, readings.rebased[at])
-    nothing = np.zeros((0,) * 5, dtype=np.uint8), np.zeros((0,) * 5)
-    slot_plan = SlotPlan(
-        plan.first + s, plan.sensed[at], plan.exchanged[at], plan.sample[at],
-        at_slot(plan.up), *nothing, WHOLE,
-    )  # fmt: skip
-    slot_samples = samples._replace(
-        absolute=at_slot(samples.absolute), local=at_slot(samples.local)
-    )
-    return alone, slot_plan, slot_samples
+    for name in vars(Filter).keys() - vars(cls).keys():
+        if not name.startswith("_"):
+            setattr(cls, name, forwarded(name))
+    return cls
 
 
 class WrappedState(NamedTuple):
@@ -840,6 +325,51 @@ class WrappedState(NamedTuple):
         return np.asarray(self.inner.root)
 
 
+@kernel
+def decide(record: Any, h: int, run: Any) -> None:
+    """Decide whether node ``h`` is silent until its next reading, in the lanes in which it is asked
+    for a message and that is undecided.
+    """
+    for q in range(len(run.lanes)):
+        if run.sends[q] == 1 and record.trigger_undecided[h, q] == 1:
+            # After its first reading a node always sends, and without a reading (negative news)
+            # too.
+            news = record.trigger_news[h, q]
+            silent = record.trigger_has_sent[h, q] == 1 and run.uniform[q] < silence_probability(
+                news
+            )
+            record.trigger_undecided[h, q], record.trigger_silent[h, q] = 0, silent
+            if news >= 0.0:
+                record.trigger_has_sent[h, q] = 1
+
+
+@cache
+def with_trigger(inner: Kernels) -> Kernels:
+    """Return the kernels of a filter with a trigger before those of the filter ``inner``."""
+    inner_update, inner_emit = inner.update, inner.emit
+
+    @kernel
+    def update(record: Any, h: int, run: Any) -> None:
+        """Weigh the reading before the filter uses it, and decide anew."""
+        weigh_news(run, record.xhat, h, record.trigger_Y, record.trigger_z, record.trigger_news, h)
+        for q in range(len(run.lanes)):
+            record.trigger_undecided[h, q], record.trigger_silent[h, q] = 1, 0
+        inner_update(record, h, run)
+
+    @kernel
+    def emit(record: Any, h: int, m: int, run: Any) -> None:
+        """Send what the filter sends, unless the node is silent."""
+        decide(record, h, run)
+        # The filter's state changes as if it had sent: silence is a lost message.
+        inner_emit(record, h, m, run)
+        for q in range(len(run.lanes)):
+            if record.trigger_silent[h, q] == 1:
+                run.sends[q] = 0
+
+    return replace(inner, update=update, emit=emit, decides=True, under_clocks=None)
+
+
+@forwarding
 @dataclass(frozen=True, eq=False)
 class TriggeredMessages(Filter):
     """The filter ``inner`` with nodes that, after a reading, send nothing with probability
@@ -865,39 +395,56 @@ class TriggeredMessages(Filter):
         return self.inner
 
     @cached_property
-    def slot_kernel(self) -> TriggeredSlots | None:
-        """The compiled simulation of slots with the trigger, or None where the wrapped filter has
-        none or its innovations cannot be computed from outside.
+    def kernels(self) -> Kernels | None:  # type: ignore[override]
+        """The kernels of the wrapped filter with those of the trigger; None where it is one in
+        plain Python.
         """
+        inner = compiled_kernels(self.inner, clocked=False)
+        return None if inner is None else with_trigger(inner)
+
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return the record of the wrapped filter with news and decisions."""
+        inner, p, flag = self.inner.record(infos, models), infos[0].rows, ((), np.uint8)
+        flags = dict.fromkeys(("trigger_undecided", "trigger_silent", "trigger_has_sent"), flag)
+        return replace(
+            inner,
+            node={**inner.node, "trigger_news": (), **flags},
+            scratch={**inner.scratch, "trigger_z": (1, p)},
+            settings={**inner.settings, "trigger_Y": whitened_triggers(models, p, self.Y)},
+        )
+
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Begin as the wrapped filter does, without a reading."""
+        self.inner.begin(node, info, model)
+        node["trigger_news"][...], node["trigger_undecided"][...] = NO_READING, 1
+
+    @cached_property
+    def slot_kernel(self) -> Any:
+        """The compiled simulation of slots with the trigger, where the wrapped filter has one."""
         inner, plan = self.inner, trigger_plan(self.inner)
         # A user's class inherits the kernel of its base, which ignores what it overrides.
         is_compiled = type(inner) in built_in_filters().values() and inner.slot_kernel is not None
         return TriggeredSlots(inner, plan) if is_compiled and plan is not None else None
 
-    def decides_in_slots(self) -> bool:
-        """Return True: a node may send nothing after a reading, and the compiled ``slot_kernel``
-        writes which nodes send.
-        """
-        return True
-
     def slot_arrays(
         self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
     ) -> tuple[Any, ...]:
-        """Return the arguments of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that
-        start in these ``states``: the arrays of the trigger, the wrapped filter's states, and the
-        arrays of its kernel.
-        """
+        """Return the arguments of ``slot_kernel`` for ``runs`` runs of H nodes."""
         inner = [state.inner for state in states]
-        arrays = trigger_arrays([state.model for state in inner], self.Y, runs)
+        models = [state.model for state in inner]
+        trigger = whitened_triggers(models, max(1, *(len(one.R) for one in models)), self.Y)
+        arrays = trigger_arrays(models, trigger, runs)
         return (arrays, inner, *self.inner.slot_arrays(inner, infos, runs))
 
     def slot_gains(
         self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
     ) -> tuple[Any, ...]:
-        """Return the ``arrays`` of ``slot_arrays`` unchanged, whatever the slots: ``slot_kernel``
-        asks the wrapped filter for the gains of each slot.
-        """
+        """Return the ``arrays`` unchanged: ``slot_kernel`` asks for the gains of each slot."""
         return arrays
+
+    def decides_in_slots(self) -> bool:
+        """Return True: a node may send nothing after a reading."""
+        return True
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
         """Return the state of the wrapped filter at time 0 from ``mean`` (n,) and ``cov`` (n, n),
@@ -961,14 +508,10 @@ class TriggeredMessages(Filter):
         return self.inner.conserved(state.inner)
 
 
-# All else that a filter says of itself is what the wrapped filter says.
-for _name in set(FORWARDED) - vars(TriggeredMessages).keys():
-    setattr(TriggeredMessages, _name, forwarded(_name))
-
-
 @built_in("event-triggered", trigger="stochastic")
+@forwarding
 @dataclass(frozen=True, eq=False)
-class StochasticTrigger(Delegate):
+class StochasticTrigger(Filter):
     """A node is silent after a reading with probability ``exp(-z' Y z / 2)``, with the innovation
     ``z = y - H xbar``, Han et al. 2015, closed loop; never after its first reading.
 
@@ -1003,7 +546,7 @@ class StochasticTrigger(Delegate):
         ``netkf.Scenario``.
         """
         inner = self.inner
-        if isinstance(inner, Delegate) or inner.schedule is None or not inner.talks:
+        if inner.wrapped is not None or inner.schedule is None or not inner.talks:
             raise ScenarioError(
                 "filter.inner",
                 "must be a filter in slots whose nodes send messages, without a trigger",

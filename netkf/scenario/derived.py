@@ -94,13 +94,30 @@ class DerivedScenario(ScenarioModel):
             senders[receiver].append(sender)
         max_delay = 0.0 if self.slotted else self.network.channel.delay.longest
         degrees, own_weights, network = self.topology.degrees, self.own_weights, self._network_info
+        rows = max(
+            1,
+            *(
+                sum(self.most_rows(node, placed) for placed in sensors)
+                for node, sensors in self.placed_sensors.items()
+            ),
+        )
         return tuple(
             NodeInfo(
                 node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
-                total_information, max_delay, k, tuple(sorted(senders[node])), network,
+                total_information, max_delay, k, tuple(sorted(senders[node])), network, rows,
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip
+
+    def most_rows(self, node: int, placed: PlacedSensor) -> int:
+        """Return the most rows that a sensor of ``node`` (id) has at one instant: in slots a
+        recorded one may have several readings in a slot.
+        """
+        sensor = self.sensors[placed.entry]
+        if sensor.record is None or not self.slotted:
+            return len(sensor.R)
+        slots = sensor.record.slots(node, self.slot_plant.period)
+        return len(sensor.R) * max(1, *map(len, slots.values()), 1)
 
     @property
     def _informations(self) -> Iterator[FloatArray]:

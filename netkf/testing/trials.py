@@ -90,6 +90,7 @@ class Trial(ABC):
             max_delay=MAX_DELAY,
             place=node,
             network=NetworkInfo(information, neighbours),
+            rows=max(1, *(len(model.H) for model in models)),
         )
         mean = self.system.mean + node * self.system.spread
         state = self.watched.call("init", models[node], mean, self.system.cov, info)

@@ -1,12 +1,16 @@
 """Event triggers: what they send, what silence says, and streams that nothing else draws from."""
 
 import math
+from dataclasses import replace
 
 import jsonschema
 import numpy as np
 import pytest
 
 import netkf
+from netkf.algorithms.stochastic_trigger import ScheduledReadings
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import load, store
 from netkf.scenario.schema import scenario_schema
 from netkf.scenario.writing import as_table, to_toml
 from netkf.trace.schema import CODES
@@ -214,15 +218,16 @@ def test_theory_follows_silence_and_checks_the_rate(tmp_path):
 
 def test_nodes_that_send_too_often_break_the_rate(tmp_path, monkeypatch):
     """Coins that fall on silence half as often as they should."""
-    from netkf.algorithms.stochastic_trigger import ScheduledReadings
+    emit = ScheduledReadings.kernels.emit
 
-    emit = ScheduledReadings.emit
+    @kernel
+    def eager(record, h, m, run):
+        store(run.lanes, run.uniform, 0.5 + 0.5 * load(run.lanes, run.uniform))
+        emit(record, h, m, run)
 
-    def eager(self, state, exchange):
-        return emit(self, state, exchange._replace(uniform=0.5 + 0.5 * exchange.uniform))
-
-    monkeypatch.setattr(ScheduledReadings, "emit", eager)
-    monkeypatch.setattr(ScheduledReadings, "slot_kernel", None)
+    monkeypatch.setattr(
+        ScheduledReadings, "kernels", replace(ScheduledReadings.kernels, emit=eager)
+    )
     scenario = scenario_of(STOCHASTIC, tmp_path, 1, network=ALL, horizon=15.0)
     assert table_of(scenario, 20).loc[RATE, "verdict"] == "broken"
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from netkf.algorithms.kernels.slots import ReadingBlock
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, select, spread, store
@@ -33,39 +32,36 @@ def silence_probability(news: float) -> float:
 
 @kernel
 def weigh_news(
-    lanes: Lanes,
+    run: Any,
     x: FloatArray,
-    readings: ReadingBlock,
-    index: tuple[int, int, int],
-    rows: int,
+    h: int,
     Y: FloatArray,
     z: FloatArray,
-) -> Any:
-    """Return the news ``z' Y z`` (L,) of the whitened reading with ``rows`` rows at ``index`` [b,
-    s, h], block, slot and filter, with its innovation z = y - H x and the trigger's weights Y;
-    NO_READING in lanes without a reading.
+    news: FloatArray,
+    k: int,
+) -> None:
+    """Write the news ``z' Y z`` of the whitened reading of node ``h``, for its innovation
+    z = y - H x[h], into ``news[k]`` (L,); NO_READING in lanes without a reading.
 
-    x (B, H, n, L) are the estimates, Y = ``Y[h]`` of (H, p, p) is for whitened rows, ``z`` (p, L)
-    is scratch. Axes: B blocks of runs, H filters.
+    x is (H, n, L), Y = ``Y[h]`` (p, p) is for whitened rows, ``z`` (1, p, L) is scratch.
     """
-    b, s, h = index
-    # A fixed H is stored for one block and one slot only.
-    d, t = min(b, readings.H.shape[0] - 1), min(s, readings.H.shape[1] - 1)
-    news = magnitudes = spread(lanes, 0.0)
-    for k in range(rows):
-        innovation = load(lanes, readings.y, b, s, h, k)
+    lanes, rows = run.lanes, run.rows[run.reading]
+    first, matrix = run.first_y + run.reading, run.first_H + run.matrix[run.reading]
+    total = magnitudes = spread(lanes, 0.0)
+    for r in range(rows):
+        innovation = load(lanes, run.y, first, r)
         magnitudes += magnitude(innovation)
-        for i in range(x.shape[2]):
-            weight = load(lanes, readings.H, d, t, h, k, i)
+        for i in range(len(run.size)):
+            weight = load(lanes, run.H, matrix, r, i)
             magnitudes += magnitude(weight)
-            innovation -= weight * load(lanes, x, b, h, i)
-        store(lanes, z, k, innovation)
-    for k in range(rows):
+            innovation -= weight * load(lanes, x, h, i)
+        store(lanes, z, 0, r, innovation)
+    for r in range(rows):
         for j in range(rows):
-            news += Y[h, k, j] * load(lanes, z, k) * load(lanes, z, j)
+            total += Y[h, r, j] * load(lanes, z, 0, r) * load(lanes, z, 0, j)
     # Rounding below 0 counts as 0. A slot in which a recorded sensor has no row holds zeros in y
     # and H: no reading.
-    return select(magnitudes > 0.0, select(news > 0.0, news, 0.0), NO_READING)
+    store(lanes, news, k, select(magnitudes > 0.0, select(total > 0.0, total, 0.0), NO_READING))
 
 
 @kernel

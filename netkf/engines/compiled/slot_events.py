@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import NamedTuple
 
@@ -41,6 +41,7 @@ DRAWN_TOGETHER = (
 )
 Draw = tuple[float, bool, float]
 Row = tuple[float, int, int, int, int, int, float]
+Decide = Callable[[int, np.ndarray], np.ndarray]
 
 
 class DirectionDraws:
@@ -124,6 +125,7 @@ class SlotEvents:
         # By receiver and sender: number and age of the message.
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
         self._rows: list[Row | StepEnd | None] = []
+        self._decide: Decide | None = None
         self._sent: np.ndarray | None = None
         self._unread = np.zeros((0, 0), dtype=bool)
         # Pairs of exchanges that were drawn by asked(), before the messages of the slot.
@@ -143,21 +145,22 @@ class SlotEvents:
             asked[step.step, [index[node] for link in links for node in link]] = 1
         return asked
 
-    def following(self, max_events: int, sent: np.ndarray | None) -> tuple[int, np.ndarray]:
+    def following(self, max_events: int, decide: Decide | None) -> tuple[int, np.ndarray]:
         """Make the messages and events of the next slots, up to about ``max_events`` events; return
         the number of slots S and ``up`` (1, S, E, W), which is 1 where a message on directed link w
         is used in step e.
 
         If nodes may be silent (event-triggered filters) it is one slot: ``asked`` says which nodes
-        have a message to send in it, and ``sent`` (E, N) which of them send it. Dimensions: E
-        exchange steps in a slot (rounds of messages), W directed links.
+        have a message to send in it, and ``decide(step, up)`` which of them send it, (N,), given
+        ``up`` (E, W) of the steps before. Dimensions: E exchange steps in a slot (rounds of
+        messages), W directed links.
         """
         setup, arrivals = self._setup, []
-        self._rows, self._sent = [], sent
+        self._rows, self._decide = [], decide
         while self._slot < setup.slots:
             arrivals.append(self._one_slot())
             self._slot += 1
-            if sent is not None or len(self._rows) >= max_events:
+            if decide is not None or len(self._rows) >= max_events:
                 break
         # After the last slot deliver the messages that are still under way.
         if self._slot == setup.slots:
@@ -210,6 +213,8 @@ class SlotEvents:
                 # A message is in time if its exchange is still open.
                 self._exchanges += 1
                 self._open = self._exchanges
+                if self._decide is not None:
+                    self._sent = self._decide(step, up)
                 self._send_all(exchange_step)
                 self._deliver(exchange_step.end)
                 self._end_step(exchange_step, up[step])
@@ -314,7 +319,7 @@ class SlotEvents:
     def _is_silent(self, direction: DirectionDraws, step: Step) -> bool:
         """Return True if the sender of a directed link sends nothing in this step."""
         node = self._scenario.topology.index[direction.ends[0]]
-        if self._sent is not None and not self._sent[step.step, node]:
+        if self._sent is not None and not self._sent[node]:
             return True
         return bool(self._setup.may_miss and self._unread[step.step, node])
 

@@ -20,10 +20,8 @@ from netkf.linalg.generic import struct_like
 from netkf.linalg.lanes import any_lane, load, load_flags, spread, store, store_flags
 
 PREDICT, SENSE, EXCHANGE = range(3)
-WHOLE, SENDING, ARRIVING = range(3)
-"""The part of a slot that a call simulates: SENDING ends when the first exchange has been sent,
-ARRIVING begins there.
-"""
+WHOLE = -1
+"""A call begins with a slot, and ends with one."""
 
 
 class SlotPlan(NamedTuple):
@@ -43,7 +41,8 @@ class SlotPlan(NamedTuple):
         sends nothing; empty if all nodes send that are asked
     uniform : (B, S, E, H, L), uniform numbers for these decisions; empty unless randomised
     varies : whether H differs from block to block and slot to slot
-    part : WHOLE, SENDING or ARRIVING
+    begin, stop : a call may simulate a part of one slot: from the arrival of the messages of step
+        ``begin`` to the sending of those of step ``stop``; WHOLE: from its begin, to its end
     """
 
     first: int
@@ -60,7 +59,8 @@ class SlotPlan(NamedTuple):
     sent: np.ndarray
     uniform: FloatArray
     varies: bool
-    part: int
+    begin: int
+    stop: int
 
 
 class SlotSamples(NamedTuple):
@@ -96,25 +96,25 @@ def exchange_of(kernels: Kernels) -> Any:
     emit, absorb, decides = kernels.emit, kernels.absorb, kernels.decides
 
     @kernel
-    def exchange(
-        record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int, e: int, part: int
-    ) -> None:
+    def exchange(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
         """Let all nodes send and absorb in step ``e`` of the exchanges of slot ``s``."""
         nodes, lanes = len(record.xhat), run.lanes
-        if part != ARRIVING:
+        if e != plan.begin:
             # All messages are made before any arrives.
             for h in range(nodes):
                 if decides:
                     store_flags(lanes, run.sends, load_flags(lanes, plan.sent, b, s, e, h))
                     if plan.uniform.shape[0] > 0:
                         store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
+                run.reading = h
                 emit(record, h, h, run)
                 if decides:
                     store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
             if decides:
                 drop_silent(run, plan, b, s, e)
-        if part != SENDING:
+        if e != plan.stop:
             for h in range(nodes):
+                run.reading = h
                 fill_inbox(run, plan, b, s, e, h)
                 absorb(record, h, run)
 
@@ -132,22 +132,20 @@ def slot_loop(kernels: Kernels) -> Any:
     @kernel
     def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int) -> None:
         """Go through the stages of slot ``s``, or those of its part."""
-        nodes, e, arrived = len(record.xhat), 0, plan.part != ARRIVING
+        nodes, e, begun = len(record.xhat), 0, plan.begin == WHOLE
         for g in range(len(plan.stages)):
             stage = plan.stages[g]
             if stage == EXCHANGE:
                 run.phase = plan.phases[g]
                 for step in range(plan.steps[g]):
-                    if plan.exchanged[s]:
+                    begun |= e == plan.begin
+                    if plan.exchanged[s] and begun:
                         run.step = step
-                        # The first exchange divides a slot of which Python makes the messages.
-                        part = WHOLE if e > 0 else plan.part
-                        exchange(record, run, plan, b, s, e, part)
-                        if plan.part == SENDING:
+                        exchange(record, run, plan, b, s, e)
+                        if e == plan.stop:
                             return
-                        arrived = True
                     e += 1
-            elif plan.sensed[s] and arrived:
+            elif plan.sensed[s] and begun:
                 for h in range(nodes):
                     if stage == PREDICT:
                         predict(record, h, run)
@@ -167,7 +165,7 @@ def slot_loop(kernels: Kernels) -> Any:
                 run.slot = plan.first + s
                 run.first_y = (b * slots + s) * nodes
                 run.first_H = run.first_y if plan.varies else 0
-                begins, ends = plan.part != ARRIVING, plan.part != SENDING
+                begins, ends = plan.begin == WHOLE, plan.stop == WHOLE
                 if plan.predicts and begins:
                     store_sample(block.xhat, block.root, run, plan, samples, b, s)
                     if plan.rebased[s]:

@@ -286,7 +286,8 @@ class SlotRuns:
         if self._events is not None and setup.decides:
             slot_kernel(self._nodes, readings, plan._replace(part=SENDING), *kernel_arguments)
             messages.sent[:, unread] = 0
-            _, up = self._events.following(max_events, messages.sent[0, 0, :, :, 0])
+            sent = messages.sent[0, 0, :, :, 0]
+            _, up = self._events.following(max_events, lambda step, _: sent[step])
             messages.up[..., 0], plan = up, plan._replace(part=ARRIVING)
         slot_kernel(self._nodes, readings, plan, *kernel_arguments)
         if len(messages.sent):
@@ -317,16 +318,22 @@ class SlotRuns:
             "sent": messages.sent,
             "uniform": self._draw_uniforms(messages.sent),
         }
-        unread = self._missed_readings(messages, count)
-        part = loop.WHOLE
-        # Filters decide who sends, and Python makes the messages: the loop runs in two parts, up to
-        # the sending, and from the arrivals on.
+        unread, begin = self._missed_readings(messages, count), loop.WHOLE
+
+        def decided(step: int, up: np.ndarray) -> np.ndarray:
+            """Return the nodes (N,) that send in a step, given ``up`` (E, W) of those before it."""
+            nonlocal begin
+            messages.up[0, 0, ..., 0] = up
+            filters.simulate(readings.y, readings.H, samples, **drawn, begin=begin, stop=step)
+            begin = step
+            sent: np.ndarray = messages.sent[0, 0, step, :, 0] & ~unread[0, step]
+            return sent
+
+        # Filters decide who sends, and Python makes the messages: step by step.
         if self._events is not None and self.setup.decides:
-            filters.simulate(readings.y, readings.H, samples, **drawn, part=loop.SENDING)
-            messages.sent[:, unread] = 0
-            _, up = self._events.following(self._max_events, messages.sent[0, 0, :, :, 0])
-            messages.up[..., 0], part = up, loop.ARRIVING
-        filters.simulate(readings.y, readings.H, samples, **drawn, part=part)
+            _, up = self._events.following(self._max_events, decided)
+            messages.up[..., 0] = up
+        filters.simulate(readings.y, readings.H, samples, **drawn, begin=begin, stop=loop.WHOLE)
         if len(messages.sent):
             # Only now, since the kernel decides for all nodes that are asked, readings or not.
             messages.sent[:, unread] = 0

@@ -162,7 +162,7 @@ class SlotSetup:
             estimator = 0 if pooled else scenario.topology.index[node]
             for placed_sensor in scenario.placed_sensors[node]:
                 R = scenario.noise_covariance(placed_sensor.entry, believed=True)
-                count = self._most_rows(scenario, node, placed_sensor)
+                count = scenario.most_rows(node, placed_sensor)
                 # A filter stacks the readings of its sensors, one below the other.
                 row = int(rows[estimator])
                 self.assigned.append(
@@ -186,16 +186,6 @@ class SlotSetup:
         # The same in all blocks of runs and all slots, hence 1, 1.
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
         self._set_kernel_sensors(scenario)
-
-    def _most_rows(self, scenario: Scenario, node: int, placed_sensor: PlacedSensor) -> int:
-        """Return the number of rows of a sensor of ``node`` (id), of a recorded one the most that
-        it has in a slot.
-        """
-        sensor = scenario.sensors[placed_sensor.entry]
-        if sensor.record is None:
-            return len(sensor.R)
-        slots = sensor.record.slots(node, scenario.slot_plant.period)
-        return len(sensor.R) * max(1, *map(len, slots.values()), 1)
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
         """Set ``self.sensors``, by which kernels draw readings: the whitened H = L_b^-1 H (K, p, n)

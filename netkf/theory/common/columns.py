@@ -147,7 +147,8 @@ class SlotColumns:
             up=np.ascontiguousarray(np.broadcast_to(up[None, None, :, :, None], shape)),
             sent=np.zeros((0,) * 5, dtype=np.uint8),
             uniform=np.zeros((0,) * 5),
-            part=WHOLE,
+            begin=WHOLE,
+            stop=WHOLE,
         )
 
     def _compress(self) -> None:
