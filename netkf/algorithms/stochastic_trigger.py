@@ -30,6 +30,7 @@ from netkf.algorithms.filter import (
 )
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kernels.estimates import update_by_row
+from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.records import Kernels, Record
@@ -121,11 +122,6 @@ def predict_prior(record: Any, h: int, run: Any) -> None:
     for i in range(len(run.size)):
         store(run.lanes, record.prior, h, i, load(run.lanes, record.xhat, h, i))
     store_flags(run.lanes, record.sent, h, spread(run.lanes, 0.0) > 0.0)
-
-
-@kernel
-def keep_reading(record: Any, h: int, run: Any) -> None:
-    """Do nothing: a reading is used in the exchange of its slot, if it is sent."""
 
 
 @kernel
@@ -233,11 +229,12 @@ class ScheduledReadings(Filter):
     reads_what_it_sends: ClassVar[bool] = True
     kernels = Kernels(
         predict=predict_prior,
-        update=keep_reading,
+        update=nothing,  # a reading is used in the exchange of its slot, if it is sent
         emit=emit_reading,
         absorb=absorb_readings,
         shift=shift_prior,
-        positions=(),
+        shift_payload=nothing,
+        sends_readings=True,
         decides=True,
     )
 
