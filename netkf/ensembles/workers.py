@@ -1,8 +1,9 @@
 """Worker processes, each connected by one pipe in either direction.
 
 There are no shared queues, locks or threads. If a worker is killed, even while it sends a result,
-its pipe is closed and this process reads end-of-file; so it never waits for a lock that a dead
-process holds, as concurrent.futures.ProcessPoolExecutor may.
+its pipe is closed and this process reads end-of-file. In the pools of concurrent.futures and loky
+workers share one pipe for results, which stays open when one of them dies: killed in the middle of
+a result, it leaves the command waiting for ever.
 """
 
 from __future__ import annotations
@@ -171,7 +172,12 @@ class WorkerProcesses:
             if not task.future.running() and not task.future.set_running_or_notify_cancel():
                 continue  # it was cancelled
             if worker is None:
-                worker = _Worker(_may_hide_main(task.job))
+                # Without a class of the user's script (__main__) workers need not run it again.
+                scenario = task.job.scenario
+                is_free = (
+                    isinstance(scenario, PackedScenario) and b"__main__" not in scenario.payload
+                )
+                worker = _Worker(hide_main=is_free)
                 self._workers.append(worker)
             try:
                 worker.send(task)
@@ -210,11 +216,6 @@ class WorkerProcesses:
             self._waiting.appendleft(task)
         else:
             task.future.set_exception(BrokenExecutor(f"{task.deaths} workers died"))
-
-
-def _may_hide_main(job: Job) -> bool:
-    """Return True if workers need not import the user's script (__main__)."""
-    return isinstance(job.scenario, PackedScenario) and b"__main__" not in job.scenario.payload
 
 
 def _serve(jobs: Connection, results: Connection) -> None:
