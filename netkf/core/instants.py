@@ -68,16 +68,16 @@ class TimeGrid:
         more = {} if self.refine == 1 else {"refine": self.refine}
         return {"resolution": self.resolution, **more}
 
-    def snap(self, times: FloatArray) -> FloatArray:
+    def snap(self, times: np.ndarray) -> FloatArray:
         """Return ``times`` (any shape), seconds, in canonical form."""
-        return np.asarray(np.rint(np.asarray(times) * self.per_second) / self.per_second)
+        return np.asarray(np.rint(times * self.per_second) / self.per_second, dtype=np.float64)
 
     def instant(self, time: float) -> float:
         """Return one ``time`` in seconds, or a duration, in canonical form."""
         ticks = time * self.per_second
         return round(ticks) / self.per_second if math.isfinite(ticks) else time
 
-    def before(self, horizon: float, times: FloatArray) -> FloatArray:
+    def before(self, horizon: float, times: np.ndarray) -> FloatArray:
         """Return those of ``times`` (K,) that are instants before the ``horizon``, in seconds, in
         canonical form.
         """

@@ -329,8 +329,8 @@ class ExponentialDelay(Delay):
 class UniformDelay(Delay):
     """Delays that are uniform between ``low`` and ``high`` seconds."""
 
-    low: float = field(number(low=0.0))
-    high: float = field(number(low=0.0))
+    low: float = field(of_time(number(low=0.0)))
+    high: float = field(of_time(number(low=0.0)))
 
     def __post_init__(self) -> None:
         """Check the fields; raises ScenarioError if ``high`` is below ``low``."""

@@ -302,7 +302,7 @@ class Renewal(LinkClock):
         else:
             # Tick number 0 is at one gap after time 0, as nothing is sent at time 0. From its
             # number and not from the tick before: rounding does not add up.
-            return self.mean_gap * np.arange(index + 1, index + 1 + count)
+            return np.asarray(self.mean_gap * np.arange(index + 1, index + 1 + count))
         return _accumulate(now, gaps)
 
 
@@ -357,7 +357,7 @@ class Periodic(LinkClock):
         """Return the ticks (count,) of an entity in seconds from number ``index`` on."""
         # With phase 0 the lattice point at time 0 is no tick.
         first = index + (origin == 0.0)
-        times = origin + self.period * np.arange(first, first + count)
+        times = np.asarray(origin + self.period * np.arange(first, first + count))
         return times + self.jitter * random.random(count) if self.jitter > 0.0 else times
 
 

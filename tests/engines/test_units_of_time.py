@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import netkf
 from netkf.scenario.reading import from_table
+from netkf.trace.schema import CODES
 
 UNITS = {
     "ms": 1e-3,
@@ -69,7 +70,7 @@ def slotted(unit, filter_, steps, activation, delay):
     return made(unit, plant, sensors, activation, delay, filter_)
 
 
-def made(unit, plant, sensors, activation, delay, filter_):
+def made(unit, plant, sensors, activation, delay, filter_, folder=pathlib.Path()):
     tables = {
         "format": 1,
         "name": "units",
@@ -84,7 +85,7 @@ def made(unit, plant, sensors, activation, delay, filter_):
         },
         "filter": filter_,
     }
-    return from_table(tables, pathlib.Path())
+    return from_table(tables, folder)
 
 
 def compare(run, other, unit):
@@ -105,6 +106,9 @@ CLOCKED = [
     ({"kind": "diffusion"}, "directions"),
     ({"kind": "hybrid", "epsilon": 0.2}, "links"),
     ({"kind": "covariance-intersection", "epsilon": 0.2}, "directions"),
+    ({"kind": "push-sum", "gamma": 1}, "nodes"),
+    ({"kind": "gossip"}, "links"),
+    ({"kind": "kcf", "epsilon": 0.1}, "directions"),
     ({"kind": "intermittent"}, "readings"),
 ]
 SLOTTED = [
@@ -160,6 +164,51 @@ def test_slots_in_every_unit(case, steps, delay, name):
     ages = runs[1].events.groupby("kind")["age"].max()
     assert ages.get("deliver", 0.0) <= unit
     assert delay < 2 or "deliver" not in ages
+
+
+def tables(folder, unit):
+    """A scenario whose ticks, samples and readings stand in tables, at multiples of the unit."""
+    random = np.random.default_rng(3)
+    folder.mkdir()
+    columns = {
+        "contacts.csv": "from,until,node,peer",
+        "samples.csv": "t,node",
+        "readings.csv": "t,node,y0",
+    }
+    rows = {name: [header] for name, header in columns.items()}
+    for begin, end in ((2, 9), (14, 15), (21, 30)):
+        rows["contacts.csv"] += [f"{begin * unit!r},{end * unit!r},{i},{i + 1}" for i in range(3)]
+    rows["samples.csv"] += [f"{k * unit!r},0" for k in (1, 3, 4, 9, 14, 20, 28)]
+    rows["readings.csv"] += [f"{k * unit!r},2,{random.normal()!r}" for k in (2, 4, 8, 14, 29)]
+    for name, lines in rows.items():
+        (folder / name).write_text("\n".join(lines) + "\n")
+    clock = {"kind": "periodic", "period": unit, "phase": 0.0}
+    activation = {"kind": "contacts", "at": "links", "path": "contacts.csv", "clock": clock}
+    sensors = [
+        {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.1]]},
+        {"kind": "recorded", "path": "readings.csv", "H": [[0.0, 1.0]], "R": [[0.5]]},
+    ]
+    sensors[0]["sampling"] = {"kind": "recorded", "path": "samples.csv"}
+    plant = clocked(unit, {"kind": "local"}, {"kind": "readings"}, FINE, NONE).plant
+    plant = {"kind": "diffusion", "A": plant.A, "B": plant.B, "cov": plant.cov}
+    delay = {"kind": "constant", "seconds": 5 * unit}
+    return made(unit, plant, sensors, activation, delay, {"kind": "gossip"}, folder)
+
+
+FINE, NONE = {"kind": "periodic", "period": 1}, {"kind": "constant", "seconds": 0}
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_tables_in_every_unit(name, tmp_path):
+    unit = UNITS[name]
+    run, other = (
+        netkf.simulate(tables(tmp_path / str(k), u), engine="simpy")
+        for k, u in enumerate((1.0, unit))
+    )
+    compare(run, other, unit)
+    # The ends of a contact belong to it.
+    ticks = run.log["t"][run.log["kind"] == CODES["tick"]]
+    assert sorted(set(ticks)) == [*range(2, 10), 14, 15, *range(21, 31)]
 
 
 @pytest.mark.parametrize("unit", [1 / 12, 0.1])
