@@ -441,6 +441,7 @@ def send(
     if not delay >= 0.0:
         record_event(state, now, LOST, sender_id, receiver_id, number)
         return
+    delay = snapped(delay, state.per_second)
     arrival = snapped(now + delay, state.per_second)
     # The horizon is half open: a message that arrives after it leaves no event.
     if delay > 0.0 and not arrival < state.horizon:

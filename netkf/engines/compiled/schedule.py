@@ -198,7 +198,6 @@ class Outcomes:
         entities (links, directions or nodes) have a clock, and on which directed links each sends.
         """
         self._channel = channel = scenario.network.channel
-        self._snap = scenario.time_grid.snap
         runs = streams.runs
         self._senders, self._directions = senders, len(senders.directions)
         self._first, self._outgoing = senders.first, senders.outgoing
@@ -292,7 +291,7 @@ class Outcomes:
         lost = uniform >= probability
         if delay_depends_on_message(self._channel.delay):
             delay = self._message_delays(directions, counts, first, lost, delay)
-        return np.where(lost, LOST, self._snap(delay))
+        return np.where(lost, LOST, delay)
 
     def _delivery_probability(
         self, directions: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
