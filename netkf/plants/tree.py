@@ -27,6 +27,7 @@ from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import BLOCK_WORDS, USED
 
 MAX_TICKS = 1e15  # ticks of the finest cells up to the horizon
+MAX_DECADES = 18  # from the finest cells to knots
 KNOTS = 3  # knots are 10^KNOTS s apart, unless the plant is unstable or the horizon very long
 SHARES = (2, 3, 5, 10)
 LEFT, RIGHT = (1, 1, 2, 5), (1, 2, 3, 5)
@@ -87,10 +88,11 @@ class Tree:
 
     def __init__(self, moves: Transitions, horizon: float, frame: float | None) -> None:
         self.frame = frame
-        digits = math.floor(math.log10(MAX_TICKS / horizon))
         top = max(KNOTS, math.ceil(math.log10(horizon)) - 6)
         if frame is not None:
             top = min(top, math.floor(math.log10(frame) + 1e-9))
+        # Numbers of ticks in a cell between knots are 64-bit integers.
+        digits = min(math.floor(math.log10(MAX_TICKS / horizon)), MAX_DECADES - top)
         self._per_second = float(f"1e{digits}")
         self._cells = _cells(moves, digits, max(top + digits, 1))
         # Cells between knots in a frame.

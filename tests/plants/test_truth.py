@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+import netkf
 from netkf.plants import tree, truth
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.transitions import Transitions, frame_period
 from netkf.plants.truth import multiples
 from netkf.rng.streams import WIDTH, Streams
+from tests.conftest import SCENARIOS
 from tests.plants.test_path import COV, A, B, covariance_of
 
 DEFECTIVE = np.array([[0.4, 1.0], [0.0, 0.4]])
@@ -233,3 +235,14 @@ def test_recorded_states_are_found_by_their_times():
     local, absolute = path.states(np.array([0.5, 0.0]))
     np.testing.assert_array_equal(local, x[[1, 0]])
     np.testing.assert_array_equal(absolute, local)
+
+
+@pytest.mark.parametrize("horizon", [4e-9, 1e-6, 1e-3, 0.05])
+def test_sampled_sensors_have_a_truth_up_to_any_horizon(horizon):
+    sensor = {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}
+    sampling = {"kind": "periodic", "period": horizon / 4}
+    changes = {"horizon": horizon, "probe": horizon, "sensors": [{**sensor, "sampling": sampling}]}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    run = netkf.simulate(scenario)
+    assert run.status == "complete"
+    assert np.isfinite(run.x).all()
