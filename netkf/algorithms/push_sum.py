@@ -19,13 +19,6 @@ rule of step 2.3 is a choice, since it also fires when all links of a node are d
 
 With ``running_sums`` a node sends, instead of shares, the total of all shares so far: a lost
 message loses no mass. Under clocks the filter is that of ``algorithms.running_sums``.
-
-Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
-``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
-noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
-``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
-(``rebase``, ``shift``), so that large states cost no digits. A kernel ``*_single`` runs one node
-in one run, for the SimPy engine: both engines round alike.
 """
 
 from __future__ import annotations
@@ -33,66 +26,45 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
 from netkf.algorithms import running_sums
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.mass import (
-    add_gain,
-    average,
-    correct_root,
-    keep_share,
-    learn_network,
-    split_mass,
-)
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.estimates import copy_vector, rotate, transform_mean
 from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.kernels.slots import (
-    ARRIVING,
-    SENDING,
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    drop_silent,
-    predict_all,
-    predict_mean,
-    rebase,
-    slot_scratch,
-    star_of,
-    store_sample_of_slot,
-    whiten_reading,
-)
+from netkf.algorithms.kernels.run import predict_estimate, shift_vector
 from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, MassStep, has_stopped
-from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.models import SlotModel
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.running_sums import Offer, RunningSums
 from netkf.algorithms.starts import check_information, information_notes
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, field, integer, node_id, number, one_of, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
-    LANES,
     ONE,
-    aligned,
+    Lanes,
     any_lane,
-    blocks_of,
-    in_lanes,
     load,
     load_flags,
+    root_of,
     select,
     spread,
     store,
 )
+from netkf.linalg.structs import Size
 
 MASS, AVERAGE = 0, 1
 """The two exchanges of a slot, steps 2 and 5: their numbers, ``phase`` in methods."""
 
+NEVER_STOPPED = np.iinfo(np.int64).max
+"""A slot that no run reaches, for a node that never stops."""
+ROUNDING = 2.0**-52
+"""Spacing of floating-point numbers at 1: relative size of pivots that are 0."""
 MAX_STEPS = 100_000
 """The largest ``gamma``: a larger one is a mistake."""
 MAX_DOUBLINGS = 60
@@ -103,470 +75,313 @@ both results are one covariance and not rounding errors.
 """
 
 
-class NetworkInformation(NamedTuple):
-    """A node's estimate of the network: the ``information`` (n, n) of all sensors, G^(i) of
-    paper P (6), and the ``number`` of nodes, N^(i); with asymptotic gains the ``root`` (n, n) of
-    P_inf.
-    """
-
-    information: FloatArray
-    number: float
-    root: FloatArray | None = None
-
-
-class NodeSums(NamedTuple):
-    """Running sums of one node in slots: the total (2 + n^2,) of all shares that it has ever
-    ``offered`` to each of its neighbours, and the last totals that it ``heard``, by sender.
-    """
-
-    offered: FloatArray
-    heard: Mapping[int, FloatArray]
-
-
-class PushSumState(NamedTuple):
-    """The state of a node in slots; under clocks it is a ``RunningSums``.
-
-    xhat, root : estimate (n,), z of steps 4 and 5, and root (n, n) of its covariance
-    model : of the plant and the node's sensors
-    mass : (2 + n^2,), weight w, number n~ and information C~ of paper P (3)-(5)
-    network : the node's estimate of the network, from its mass
-    stopped : whether the stop rule has frozen that estimate
-    degree : number of its links, failed ones included
-    sums : running sums, if mass is exchanged by them, else None
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    mass: FloatArray
-    network: NetworkInformation
-    stopped: bool
-    degree: int
-    sums: NodeSums | None = None
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-
-class PushSumArrays(NamedTuple):
-    """Arrays and settings of H nodes for B blocks of L runs; a mass has m = 2 + n n numbers.
-
-    mass, degree : (B, H, m, L) masses, and numbers (H,) of each node's links, failed ones included
-    information, number : estimates of the network, G^(i) (B, H, n, n, L) and N^(i) (B, H, L)
-    alone : (H, n, n), information of each node's own sensors
-    rule, tolerance, delta, gamma, asymptotic : settings of ``PushSum``; ``rule`` is its stop rule,
-                                                an index in RULES
-    limit : (n, n), root of P_inf, with asymptotic gains
-    running : whether masses are exchanged by running sums
-    offered, heard : then the totals that nodes have offered (B, H, m, L), and those last heard on
-                     each of W directions (B, W, m, L)
-    share, before : scratch, shares (H, m, L) that nodes send, and a mass (m, L) before a step
-    new_information, new_number : scratch, paper P (6) of this slot (n, n, L) and (1, L)
-    silent : scratch (L,), 1 where a node has stopped in an earlier slot
-    stop : scratch of the stop rule, for one lane
-    """
-
-    mass: FloatArray
-    degree: np.ndarray
-    information: FloatArray
-    number: FloatArray
-    alone: FloatArray
-    rule: int
-    tolerance: float
-    delta: float
-    gamma: int
-    asymptotic: bool
-    limit: FloatArray
-    share: FloatArray
-    before: FloatArray
-    new_information: FloatArray
-    new_number: FloatArray
-    silent: np.ndarray
-    stop: MassStep
-    running: bool
-    offered: FloatArray
-    heard: FloatArray
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Step 3. With asymptotic gains the covariance is P_inf, and only the mean is predicted."""
+    if record.asymptotic == 1:
+        F = run.model.F
+        transform_mean(run.lanes, run.size, record.xhat, h, F, run.moved_mean)
+    else:
+        predict_estimate(run.model, run, record.xhat, record.root, h, h)
 
 
 @kernel
-def drop_mass_of_stopped(
-    arrays: PushSumArrays, plan: SlotPlan, links: SlotLinks, samples: SlotSamples, b: int, s: int
-) -> None:
-    """Drop the messages with mass of nodes of block ``b`` that stopped before slot ``s``: by the
-    paper's stop rule they send none. Writes 0 into ``plan.sent[b, s, MASS]`` (H, L) and
-    ``plan.up[b, s, MASS]`` (W, L). Nothing happens under another rule in ``arrays``.
-
-    Axes: W directed links, H nodes, L runs side by side.
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Send z (n,), step 5.1, or mass: the share of the node's mass, step 2.1, or by running sums
+    the total of all shares so far.
     """
-    if arrays.rule == PAPER and not arrays.asymptotic:
-        silence_stopped(plan, samples, b, s)
-        drop_silent(plan, links, b, s, MASS)
+    lanes, mass, payload = run.lanes, record.mass, record.payload
+    if run.phase == AVERAGE:
+        copy_vector(lanes, run.size, payload.xhat, m, record.xhat, h, True)
+        return
+    for i in range(mass.shape[1]):
+        share = load(lanes, mass, h, i) / (record.degree[h] + 1)
+        if record.running == 1:
+            share += load(lanes, record.offered, h, i)
+            store(lanes, record.offered, h, i, share)
+        store(lanes, payload.mass, m, i, share)
+    # Asymptotic gains need no mass, and by the paper's rule a stopped node sends none.
+    for q in range(len(lanes)):
+        if record.asymptotic == 1 or (record.rule == PAPER and record.stopped[h, q] < run.slot):
+            run.sends[q] = 0
 
 
 @kernel
-def push_sum_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: PushSumArrays,
-) -> None:
-    """Simulate H push-sum filters over the S slots of a plan, P Fig. 1, in B blocks of L runs: in
-    each slot they predict, exchange mass, correct by their readings and average estimates.
-
-    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the masses and network
-    estimates in ``arrays`` in place, and writes ``samples``. ``plan.part`` says which part of a
-    slot is simulated: up to the messages that are sent (SENDING), from their arrival on (ARRIVING),
-    or both.
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Average estimates, step 5.2, or take in mass and learn from it what the network is, steps 2.2
+    and 2.3.
     """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            if plan.exchanged[s] and plan.part != ARRIVING:
-                drop_mass_of_stopped(arrays, plan, links, samples, b, s)
-            if plan.part == SENDING:
-                continue
-            # Step 3. With asymptotic gains the covariance is P_inf, and ``correct`` predicts the
-            # mean.
-            if plan.sensed[s] and not arrays.asymptotic:
-                predict_all(nodes, scratch, b)
-            # Step 2 before the correction, so that the gain uses the mass of this slot.
-            if plan.exchanged[s] and not arrays.asymptotic:
-                exchange_mass(arrays, plan, links, samples, scratch, b, s)
-            if plan.sensed[s]:
-                for h in range(len(nodes.rows)):
-                    correct(nodes, readings, scratch, arrays, b, s, h)
-            if plan.exchanged[s]:
-                for step in range(1, 1 + arrays.gamma):
-                    # Row 0 of ``up`` is the exchange of mass; averaging has the rows after it.
-                    average(
-                        scratch.lanes, nodes.xhat, b, links, plan.up, s, step, scratch.xhat,
-                        1.0 / arrays.delta,
-                    )  # fmt: skip
-            if plan.sample[s] >= 0:
-                write_conserved_sums(arrays, links, samples, scratch, b)
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            rebase(nodes, readings, scratch, b, s)
-
-
-@kernel
-def write_conserved_sums(
-    arrays: PushSumArrays, links: SlotLinks, samples: SlotSamples, scratch: SlotScratch, b: int
-) -> None:
-    """Write each node's part of the sums that exchanges conserve in block ``b``, of the weight w
-    (total 1) and of the number n~ (total N), from the masses in ``arrays`` into
-    ``samples.conserved[b]`` (H, 2, L); with running sums including the mass under way to it.
-
-    Runs report how far the sums drift. Axes: H nodes, L runs side by side.
-    """
-    for h in range(len(arrays.degree)):
-        for k in range(2):
-            value = load(scratch.lanes, arrays.mass, b, h, k)
-            if arrays.running:
-                # Mass under way to node h: offered by each neighbour, minus the part that was
-                # heard.
-                for m in range(links.first[h], links.first[h + 1]):
-                    offered = load(scratch.lanes, arrays.offered, b, links.sender[m], k)
-                    value += offered - load(scratch.lanes, arrays.heard, b, m, k)
-            store(scratch.lanes, samples.conserved, b, h, k, value)
-
-
-@kernel
-def exchange_mass(
-    arrays: PushSumArrays,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    b: int,
-    s: int,
-) -> None:
-    """Exchange mass once in slot ``s`` of block ``b``, paper P steps 2.1 to 2.3: all H nodes send
-    shares of their mass (weight, number of nodes and information), add those that arrive to what
-    they keep, and update their estimates of the network.
-
-    Changes in block ``b`` of ``arrays`` ``mass``, ``information``, ``number`` and the running sums,
-    and writes the slot into ``samples.stopped[b]`` (H, L) where a node stops. Axes: L runs side by
-    side.
-    """
-    H, slot = len(arrays.degree), plan.first + s
-    # All shares are computed before any mass changes.
-    for h in range(H):
-        split_mass(scratch.lanes, arrays.mass, b, h, arrays.degree[h], arrays.share)
-    if arrays.running:
-        add_to_totals(arrays, scratch, b)
-    for h in range(H):
+    if run.phase == AVERAGE:
+        average(record, h, run)
+    elif record.asymptotic == 0:
         # Until a node stops, ``stopped`` is later than all slots.
-        for q in range(len(scratch.lanes)):
-            arrays.silent[q] = samples.stopped[b, h, q] < slot
-        if arrays.running:
-            receive_totals(arrays, plan, links, scratch, b, s, h)
-            # Running sums have no stop rule: the number of shares does not matter.
-            update_network_estimate(
-                arrays, samples, scratch, b, h, spread(scratch.lanes, 0.0), slot
-            )
+        for q in range(len(run.lanes)):
+            record.silent[q] = record.stopped[h, q] < run.slot
+        if record.running == 1:
+            receive_totals(record, h, run)
         else:
-            received = mix_mass(arrays, plan, links, scratch, b, s, h)
-            update_network_estimate(arrays, samples, scratch, b, h, received, slot)
-
-
-@kernel
-def silence_stopped(plan: SlotPlan, samples: SlotSamples, b: int, s: int) -> None:
-    """Write 0 into ``plan.sent[b, s, MASS]`` (H, L) for nodes of block ``b`` that stopped before
-    slot ``s``: they send no mass, paper P step 2.3.
-
-    Axes: H nodes, L runs side by side.
-    """
-    for h in range(plan.sent.shape[3]):
-        for q in range(plan.sent.shape[4]):
-            if samples.stopped[b, h, q] < plan.first + s:
-                plan.sent[b, s, MASS, h, q] = 0
-
-
-@kernel
-def add_to_totals(arrays: PushSumArrays, scratch: SlotScratch, b: int) -> None:
-    """Add the share of each of H nodes of block ``b``, ``arrays.share`` (H, m, L), to the total of
-    all its shares so far, ``arrays.offered[b]`` (H, m, L): its message to each neighbour. A share
-    is a part of a node's mass, of m = 2 + n n numbers.
-
-    Axes: L runs side by side.
-    """
-    for h in range(len(arrays.degree)):
-        for i in range(arrays.mass.shape[2]):
-            before = load(scratch.lanes, arrays.offered, b, h, i)
-            total = before + load(scratch.lanes, arrays.share, h, i)
-            store(scratch.lanes, arrays.offered, b, h, i, total)
-
-
-@kernel
-def receive_totals(
-    arrays: PushSumArrays,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), to the growth of the
-    totals that arrive in slot ``s``, plus its own share. Totals that arrive replace the last ones
-    in ``arrays.heard[b]`` (W, m, L). A mass has m = 2 + n n numbers.
-
-    Axes: W directed links, L runs side by side.
-    """
-    lanes, mass = scratch.lanes, arrays.mass
-    for i in range(mass.shape[2]):
-        store(lanes, mass, b, h, i, 0.0)
-    for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-        for i in range(mass.shape[2]):
-            # A lost total does no harm: the next one contains it.
-            last = load(lanes, arrays.heard, b, m, i)
-            total = load(lanes, arrays.offered, b, links.sender[m], i)
-            gain = select(arrived, total - last, 0.0)
-            store(lanes, mass, b, h, i, load(lanes, mass, b, h, i) + gain)
-            store(lanes, arrays.heard, b, m, i, select(arrived, total, last))
-    for i in range(mass.shape[2]):
-        own = load(lanes, arrays.share, h, i)
-        store(lanes, mass, b, h, i, own + load(lanes, mass, b, h, i))
+            mix_mass(record, h, run)
+        learn_network(record, h, run)
 
 
 @kernel(inlined=True)
-def mix_mass(
-    arrays: PushSumArrays,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    b: int,
-    s: int,
-    h: int,
-) -> Any:
-    """Set the mass of node ``h`` of block ``b``, ``arrays.mass[b, h]`` (m, L), m = 2 + n n, to the
-    shares that it keeps and receives in slot ``s``, paper P (3)-(5); return the number (L,) of
-    shares that arrived. The mass from before is left in ``arrays.before`` (m, L).
+def average(record: Any, h: int, run: Any) -> None:
+    """Do one averaging step, P (9): ``z_i += sum_j (z_j - z_i) / delta``."""
+    # It contracts differences if delta exceeds half the largest eigenvalue of the Laplacian.
+    lanes, x, heard = run.lanes, record.xhat, record.payload.xhat
+    for i in range(len(run.size)):
+        own, total = load(lanes, x, h, i), spread(lanes, 0.0)
+        for k in range(run.count):
+            arrived = load_flags(lanes, run.arrived, k)
+            total += select(arrived, load(lanes, heard, run.message[k], i) - own, 0.0)
+        store(lanes, x, h, i, own + record.factor * total)
 
-    Axes: L runs side by side.
+
+@kernel
+def mix_mass(record: Any, h: int, run: Any) -> None:
+    """Set the mass of node h to the shares that it keeps and receives, P (3)-(5), and write the
+    number of shares that arrived into ``run.row[0]``; the mass before is left in ``record.before``.
     """
-    lanes, mass, received = scratch.lanes, arrays.mass, spread(scratch.lanes, 0.0)
-    # The mass before is kept for the stop rule.
-    for i in range(mass.shape[2]):
-        store(lanes, arrays.before, i, load(lanes, mass, b, h, i))
-        store(lanes, mass, b, h, i, 0.0)
-    for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-        received += select(arrived, 1.0, 0.0)
-        for i in range(mass.shape[2]):
-            share = select(arrived, load(lanes, arrays.share, links.sender[m], i), 0.0)
-            store(lanes, mass, b, h, i, load(lanes, mass, b, h, i) + share)
-    # By the paper's rule a stopped node leaves the exchange and keeps its mass. By the safe rule it
+    lanes, mass, degree = run.lanes, record.mass, record.degree[h]
+    received = spread(lanes, 0.0)
+    for k in range(run.count):
+        received += select(load_flags(lanes, run.arrived, k), 1.0, 0.0)
+    # Its own share, once for itself and once for each neighbour whose share did not arrive, so
+    # that the sums of w, n~ and C~ over the network are conserved.
+    times = (degree + 1.0) - received
+    # By the paper's rule a stopped node leaves the exchange and keeps its mass; by the safe rule it
     # goes on mixing, since other nodes still need its mass.
-    has_stopped_before = load_flags(lanes, arrays.silent)
-    if arrays.rule == PAPER and any_lane(has_stopped_before):
-        for i in range(mass.shape[2]):
-            mixed, before = load(lanes, mass, b, h, i), load(lanes, arrays.before, i)
-            store(lanes, mass, b, h, i, select(has_stopped_before, before, mixed))
-    # Its own share, once for itself and once for each neighbour whose share did not arrive.
-    times = (arrays.degree[h] + 1.0) - received
-    if arrays.rule != PAPER:
-        keep_share(lanes, mass, b, h, arrays.share, times, False)
-    else:
-        keep_share(lanes, mass, b, h, arrays.share, times, has_stopped_before)
-    return received
+    frozen = load_flags(lanes, record.silent)
+    for i in range(mass.shape[1]):
+        before, total = load(lanes, mass, h, i), spread(lanes, 0.0)
+        store(lanes, record.before, i, before)
+        for k in range(run.count):
+            arrived = load_flags(lanes, run.arrived, k)
+            total += select(arrived, load(lanes, record.payload.mass, run.message[k], i), 0.0)
+        mixed = times * (before / (degree + 1)) + total
+        if record.rule == PAPER:
+            mixed = select(frozen, before, mixed)
+        store(lanes, mass, h, i, mixed)
+    store(lanes, run.row, 0, received)
 
 
-@kernel(inlined=True)
-def update_network_estimate(
-    arrays: PushSumArrays,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    b: int,
-    h: int,
-    received: Any,
-    slot: int,
-) -> None:
-    """Update the network estimate of node ``h`` of block ``b`` from its mass, paper P (6): the
-    number of nodes and the information of all sensors. Apply the stop rule; ``received`` (L,) is
-    the number of shares that arrived in slot number ``slot``.
-
-    Changes ``arrays.information[b, h]`` (n, n, L) and ``arrays.number[b, h]`` (L,), except where
-    the node stopped before, and writes the slot into ``samples.stopped[b, h]`` (L,) where it stops
-    now. Axes: L runs side by side.
+@kernel
+def receive_totals(record: Any, h: int, run: Any) -> None:
+    """Set the mass of node h to its own share plus the growth of the totals that arrive, which
+    replace the last ones heard.
     """
-    lanes, information = scratch.lanes, arrays.new_information
-    learn_network(lanes, arrays.mass, b, h, arrays.alone, information, arrays.new_number)
+    lanes, mass, heard = run.lanes, record.mass, record.heard
+    for i in range(mass.shape[1]):
+        total = spread(lanes, 0.0)
+        for k in range(run.count):
+            # A lost total does no harm: the next one contains it.
+            arrived, w = load_flags(lanes, run.arrived, k), run.link[k]
+            last = load(lanes, heard, w, i)
+            offered = load(lanes, record.payload.mass, run.message[k], i)
+            total += select(arrived, offered - last, 0.0)
+            store(lanes, heard, w, i, select(arrived, offered, last))
+        own = load(lanes, mass, h, i) / (record.degree[h] + 1)
+        store(lanes, mass, h, i, own + total)
+
+
+@kernel
+def learn_network(record: Any, h: int, run: Any) -> None:
+    """Learn the information of all sensors G = C~ / w and the number of nodes N = n~ / w from the
+    mass of node h, P (6), unless it stopped before, and apply the stop rule. While its weight w is
+    exactly 0 these are its own information and 1.
+    """
+    # w is 0 until the first mass from the leader arrives, which begins with all the weight.
+    lanes, mass, n, new = run.lanes, record.mass, len(run.size), record.new_information
+    weight = load(lanes, mass, h, 0)
+    is_empty = weight == 0.0
+    for i in range(n):
+        # One triangle is computed and mirrored: G is symmetric bit for bit.
+        for j in range(i + 1):
+            # The mean of both triangles, since C~ is symmetric only up to rounding. Where w is 0
+            # these are nan or infinite: kernels do not raise, and ``select`` discards them.
+            upper = load(lanes, mass, h, 2 + i * n + j) / weight
+            lower = load(lanes, mass, h, 2 + j * n + i) / weight
+            value = select(is_empty, record.alone[h, i, j], 0.5 * (upper + lower))
+            store(lanes, new, i, j, value)
+            store(lanes, new, j, i, value)
+    number = select(is_empty, 1.0, load(lanes, mass, h, 1) / weight)
+    store(lanes, record.new_number, 0, number)
     # The stop rule compares with the former G and N, so they are replaced only afterwards.
-    if arrays.rule != NEVER:
-        store(lanes, scratch.row, 0, received)
+    if record.rule != NEVER:
         for q in range(len(lanes)):
-            all_up = scratch.row[0, q] == arrays.degree[h]
-            if arrays.silent[q] == 0 and stops(arrays, b, h, q, all_up):
-                samples.stopped[b, h, q] = slot
-    # A node that stopped in an earlier slot keeps its network estimate.
-    frozen = load_flags(lanes, arrays.silent)
-    n = information.shape[0]
+            all_up = run.row[0, q] == record.degree[h]
+            if record.silent[q] == 0 and stops(record, h, q, all_up):
+                record.stopped[h, q] = run.slot
+    frozen = load_flags(lanes, record.silent)
     for i in range(n):
         for j in range(n):
-            former, present = (
-                load(lanes, arrays.information, b, h, i, j),
-                load(lanes, information, i, j),
+            former = load(lanes, record.information, h, i, j)
+            store(
+                lanes, record.information, h, i, j, select(frozen, former, load(lanes, new, i, j))
             )
-            store(lanes, arrays.information, b, h, i, j, select(frozen, former, present))
-    former, present = load(lanes, arrays.number, b, h), load(lanes, arrays.new_number, 0)
-    store(lanes, arrays.number, b, h, select(frozen, former, present))
+    store(lanes, record.number, h, select(frozen, load(lanes, record.number, h), number))
 
 
 @kernel
-def stops(arrays: PushSumArrays, b: int, h: int, q: int, all_up: bool) -> bool:
-    """Return True if node ``h`` of block ``b`` freezes its network estimate in this slot, in lane
-    ``q``, one of L runs; ``all_up``: all its links were up. Compares the new mass and estimates in
-    ``arrays`` with the former ones; overwrites the scratch ``arrays.stop``.
+def stops(record: Any, h: int, q: int, all_up: bool) -> bool:
+    """Return True if node h freezes its network estimate in this slot, in lane ``q``; ``all_up``:
+    all its links were up.
     """
-    stop, n = arrays.stop, arrays.new_information.shape[0]
-    for i in range(arrays.mass.shape[2]):
-        stop.mass[i], stop.before[i] = arrays.mass[b, h, i, q], arrays.before[i, q]
+    step, n = record.step, record.new_information.shape[0]
+    for i in range(record.mass.shape[1]):
+        step.mass[i], step.before[i] = record.mass[h, i, q], record.before[i, q]
     for i in range(n):
         for j in range(n):
-            stop.information[i, j] = arrays.new_information[i, j, q]
-            stop.former[i, j] = arrays.information[b, h, i, j, q]
-    stop.number[0], stop.former_number[0] = arrays.new_number[0, q], arrays.number[b, h, q]
-    return has_stopped(arrays.rule, arrays.tolerance, stop, all_up)
+            step.information[i, j] = record.new_information[i, j, q]
+            step.former[i, j] = record.information[h, i, j, q]
+    step.number[0], step.former_number[0] = record.new_number[0, q], record.number[h, q]
+    return has_stopped(record.rule, record.tolerance, step, all_up)
+
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Correct node h by its reading, steps 3 and 4, with the information and the number of nodes of
+    the whole network as it estimates them: P (7) and (8).
+    """
+    lanes, r = run.lanes, run.reading
+    if record.asymptotic == 1:
+        for i in range(len(run.size)):
+            for j in range(i + 1):
+                store(lanes, record.root, h, i, j, record.limit[i, j])
+    else:
+        scratch = run.moved, run.moved_mean, run.row, run.gains
+        correct_root(lanes, run.size, record.root, h, record.information, scratch)
+    if run.rows[r] > 0:
+        add_gain(record, h, run)
 
 
 @kernel(inlined=True)
-def correct(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    scratch: SlotScratch,
-    arrays: PushSumArrays,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Correct filter ``h`` of block ``b`` by its reading of slot ``s``, steps 3 and 4, with the
-    information and the number of nodes of the whole network, as it estimates them: paper P (7) and
-    (8). With asymptotic gains also predict its mean.
-
-    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). Axes: L runs side by
-    side.
-    """
-    n, lanes = nodes.xhat.shape[2], scratch.lanes
-    if arrays.asymptotic:
-        # xhat <- F xhat, and P_inf for the root.
-        predict_mean(nodes, scratch, b, h)
-        for i in range(n):
-            for j in range(i + 1):
-                store(lanes, nodes.root, b, h, i, j, arrays.limit[i, j])
-    else:
-        # P (7), from the prediction's root and what the node knows of the network.
-        correct_root(nodes.root, b, h, arrays.information, scratch.moved, scratch)
-    if nodes.rows[h] > 0:
-        # P (8): N^(i) times the gain of the node's own reading.
-        number = load(lanes, arrays.number, b, h)
-        add_gain(
-            lanes, nodes.xhat, nodes.root, b, h, number, readings.y, s, readings.H, nodes.rows[h],
-            scratch.row, scratch.gains,
-        )  # fmt: skip
-
-
-@kernel
-def add_gain_single(
-    x: FloatArray,
+def correct_root(
+    lanes: Lanes,
+    size: Size,
     root: FloatArray,
-    number: float,
-    y: FloatArray,
-    H: FloatArray,
-    scratch: FloatArray,
+    h: int,
+    information: FloatArray,
+    scratch: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
 ) -> None:
-    """Correct the estimate x (1, 1, n, 1) of one filter in one run in place, paper P (8):
-    ``x += number S S' H' (y - H x)`` with its root S (1, 1, n, n, 1), the ``number`` N^(i) of nodes
-    that it believes in, and a whitened reading y (1, 1, 1, p, 1), H (1, 1, 1, p, n, 1); ``scratch``
-    is (2, n, 1).
+    """Replace ``root[h]`` by the root of ``(P^-1 + G)^-1 = P (I + G P)^-1``, P (7), with the
+    information G = ``information[h]`` (n, n, L); ``scratch`` are (n, n, L) and three (n, L).
     """
-    add_gain(ONE, x, root, 0, 0, number, y, 0, H, y.shape[3], scratch[0], scratch[1])
+    # G = sum v v' by Cholesky with the largest pivot first. Each v' is used as an observation with
+    # noise of variance 1: nothing is inverted, and P may be singular.
+    remainder, v, row, gains = scratch
+    n = len(size)
+    largest = spread(lanes, 0.0)
+    # The largest diagonal entry is the scale of G: pivots far below it are rounding.
+    for i in range(n):
+        diagonal = load(lanes, information, h, i, i)
+        largest = select(diagonal > largest, diagonal, largest)
+        for j in range(n):
+            store(lanes, remainder, i, j, load(lanes, information, h, i, j))
+    for _ in range(n):
+        pivot = largest_row(lanes, remainder, v)
+        # The remainder is rounding of G: G has no further rank to use. ``>`` also ends on nan.
+        useful = pivot > ROUNDING * n * largest
+        if not any_lane(useful):
+            return
+        # v' = remainder[largest] / sqrt(pivot), the next row of the Cholesky factor; zeros, which
+        # change nothing, in lanes whose remainder is rounding.
+        scale = select(useful, root_of(pivot), 1.0)
+        for i in range(n):
+            store(lanes, v, i, select(useful, load(lanes, v, i) / scale, 0.0))
+        for j in range(n):
+            total = spread(lanes, 0.0)
+            for i in range(j, n):
+                total += load(lanes, v, i) * load(lanes, root, h, i, j)
+            store(lanes, row, j, total)
+        # P <- P - P v v' P / (1 + v' P v) on the root. P (8) corrects the estimate.
+        rotate(lanes, size, root, h, row, gains)
+        # Deflate, remainder -= v v'.
+        for i in range(n):
+            for j in range(n):
+                entry = load(lanes, remainder, i, j) - load(lanes, v, i) * load(lanes, v, j)
+                store(lanes, remainder, i, j, entry)
+
+
+@kernel(inlined=True)
+def largest_row(lanes: Lanes, remainder: FloatArray, v: FloatArray) -> Any:
+    """Write the row of ``remainder`` (n, n, L) with the largest diagonal entry into ``v`` (n, L),
+    lane by lane; return that entry (L,).
+    """
+    # For correct_root: pivoting by the diagonal reveals the rank of G.
+    n, pivot = len(remainder), load(lanes, remainder, 0, 0)
+    for j in range(n):
+        store(lanes, v, j, load(lanes, remainder, 0, j))
+    for i in range(1, n):
+        diagonal = load(lanes, remainder, i, i)
+        larger = diagonal > pivot
+        pivot = select(larger, diagonal, pivot)
+        for j in range(n):
+            store(lanes, v, j, select(larger, load(lanes, remainder, i, j), load(lanes, v, j)))
+    return pivot
+
+
+@kernel(inlined=True)
+def add_gain(record: Any, h: int, run: Any) -> None:
+    """Correct the estimate of node h, P (8): ``x += N S S' H' (y - H x)`` with the root S."""
+    lanes, n, x, root = run.lanes, len(run.size), record.xhat, record.root
+    y, H, r = run.y, run.H, run.reading
+    first, matrix = run.first_y + r, run.first_H + run.matrix[r]
+    # H' (y - H x); the noise is white with variance 1, so no R^-1 appears.
+    for i in range(n):
+        store(lanes, run.row, i, 0.0)
+    for row in range(run.rows[r]):
+        innovation = load(lanes, y, first, row)
+        for i in range(n):
+            innovation -= load(lanes, H, matrix, row, i) * load(lanes, x, h, i)
+        for i in range(n):
+            part = load(lanes, run.row, i) + load(lanes, H, matrix, row, i) * innovation
+            store(lanes, run.row, i, part)
+    # P d = S (S' d): P itself is never formed.
+    for j in range(n):
+        total = spread(lanes, 0.0)
+        for i in range(j, n):
+            total += load(lanes, root, h, i, j) * load(lanes, run.row, i)
+        store(lanes, run.gains, j, total)
+    number = load(lanes, record.number, h)
+    for i in range(n):
+        total = spread(lanes, 0.0)
+        for j in range(i + 1):
+            total += load(lanes, root, h, i, j) * load(lanes, run.gains, j)
+        store(lanes, x, h, i, load(lanes, x, h, i) + number * total)
 
 
 @kernel
-def split_mass_single(mass: FloatArray, degree: int, share: FloatArray) -> None:
-    """Write into ``share`` (1, m, 1) the ``mass`` (1, 1, m, 1) of one node in one run over
-    ``degree`` + 1, its message to each of ``degree`` neighbours; m = 2 + n n numbers: weight,
-    number of nodes and information.
+def observe(record: Any, h: int, run: Any) -> None:
+    """Write the parts of node h in the sums of the weight w and the number n~ over the network,
+    which exchanges conserve; by running sums with the mass under way to it.
     """
-    split_mass(ONE, mass, 0, 0, degree, share)
+    lanes = run.lanes
+    for k in range(2):
+        value = load(lanes, record.mass, h, k)
+        if record.running == 1:
+            for w in range(run.first[h], run.first[h + 1]):
+                offered = load(lanes, record.offered, run.sender[w], k)
+                value += offered - load(lanes, record.heard, w, k)
+        store(lanes, record.conserved, h, k, value)
 
 
 @kernel
-def keep_share_single(mass: FloatArray, share: FloatArray, times: int) -> None:
-    """Add ``times`` times its own ``share`` (1, m, 1) to the ``mass`` (1, 1, m, 1) that one node
-    received in one run, in place, paper P (3)-(5); m = 2 + n n numbers: weight, number of nodes and
-    information.
-    """
-    keep_share(ONE, mass, 0, 0, share, times, False)
+def shift_payload(record: Any, m: int, run: Any) -> None:
+    """Move the estimate in payload m with the origin; mass does not change."""
+    shift_vector(run, record.payload.xhat, m)
 
 
-@kernel
-def learn_network_single(
-    mass: FloatArray, alone: FloatArray, information: FloatArray, number: FloatArray
-) -> None:
-    """Write the information of all sensors, C~ / w, into ``information`` (n, n, 1) and the number
-    of nodes, n~ / w, into ``number`` (1, 1), as one node estimates them in one run from its
-    ``mass`` (1, 1, 2 + n n, 1) of w, n~ and C~, paper P (6). While its weight w is 0 these are its
-    own information ``alone`` (1, n, n) and 1.
-    """
-    learn_network(ONE, mass, 0, 0, alone, information, number)
-
-
-@kernel
-def correct_root_single(
-    root: FloatArray, information: FloatArray, remainder: FloatArray, scratch: SlotScratch
-) -> None:
-    """Replace the root (1, 1, n, n, 1) of one filter's P in one run by that of ``(P^-1 + G)^-1``,
-    paper P (7), with the information G = ``information`` (1, 1, n, n, 1) that it believes all
-    sensors give; ``remainder`` (n, n, 1) and ``scratch`` are scratch.
-    """
-    correct_root(root, 0, 0, information, remainder, scratch)
+SLOTS = Kernels(
+    predict=predict,
+    update=update,
+    emit=emit,
+    absorb=absorb,
+    shift_payload=shift_payload,
+    observe=observe,
+    under_clocks=running_sums.KERNELS,
+)
+DECIDING = replace(SLOTS, decides=True)
 
 
 @built_in("push-sum")
@@ -611,7 +426,69 @@ class PushSum(Filter):
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("nodes",)
     needs_samples: ClassVar[bool] = True
-    slot_kernel = staticmethod(push_sum_slots)
+
+    @property
+    def kernels(self) -> Kernels:  # type: ignore[override]
+        """The verbs; by the paper's stop rule a node decides whether to send mass."""
+        return DECIDING if self.decides_in_slots() else SLOTS
+
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return masses, network estimates and settings in slots, running sums under clocks."""
+        if not isinstance(models[0], SlotModel):
+            return running_sums.record(infos, models)
+        n = len(models[0].information)
+        m, running = 2 + n * n, self.running_sums and not self.asymptotic
+        limit = np.zeros((n, n))
+        if self.asymptotic:
+            # Every node knows G, of all sensors.
+            found = asymptotic_root(models[0].F, models[0].Q, infos[0].information)
+            limit = np.full((n, n), np.nan) if found is None else found
+        shapes: dict[str, tuple[int, ...]] = {"mass": (m,), "before": (m,), "work": (n, n)}
+        shapes |= dict.fromkeys(("information", "former"), (n, n))
+        shapes |= dict.fromkeys(("number", "former_number"), (1,))
+        return Record(
+            node={
+                "mass": (m,),
+                "information": (n, n),
+                "number": (),
+                "stopped": ((), np.int64),
+                "offered": (m if running else 0,),
+                "conserved": (2,),
+            },
+            link={"heard": (m if running else 0,)},
+            payload={"mass": (m,), "xhat": (n,)},
+            scratch={
+                "before": (m,),
+                "new_information": (n, n),
+                "new_number": (1,),
+                "silent": ((), np.uint8),
+            },
+            settings={
+                "step": MassStep(**{name: np.zeros(shape) for name, shape in shapes.items()}),
+                "degree": np.array([info.degree for info in infos], dtype=np.int64),
+                "alone": np.stack([model.information for model in models]),
+                "limit": np.ascontiguousarray(limit),
+                "rule": RULES.index(self.stop),
+                "tolerance": float(self.tolerance),
+                # In slots check_scenario() demands a delta.
+                "factor": 1.0 / (self.delta or math.inf),
+                "asymptotic": int(self.asymptotic),
+                "running": int(running),
+            },
+        )
+
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Set one node to P step 1: w is 1 at the leader and 0 elsewhere, n~ = 1, C~ is its own
+        information; with asymptotic gains it knows the limits.
+        """
+        if not isinstance(model, SlotModel):
+            node["weight"][...] = 1.0
+            return
+        node["mass"][:2] = 1.0 if info.node == self.leader else 0.0, 1.0
+        node["mass"][2:] = model.information.reshape(-1)
+        node["information"][:] = info.information if self.asymptotic else model.information
+        node["number"][...] = info.nodes if self.asymptotic else 1.0
+        node["stopped"][...] = NEVER_STOPPED
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
         """Return True if nodes send messages in the exchange with number ``phase``, with a sensor
@@ -644,98 +521,9 @@ class PushSum(Filter):
 
     def decides_in_slots(self) -> bool:
         """Return True under the paper's stop rule, by which a node that has stopped sends no
-        mass: the compiled kernel then writes who sends into ``SlotPlan.sent``.
+        mass.
         """
         return not self.asymptotic and self.stop == "paper"
-
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[PushSumArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
-        in these ``states`` and have the degrees in ``infos``: masses and network estimates of all
-        runs, settings, and scratch.
-        """
-        network_estimates = [state.network for state in states]
-        alone = np.stack([state.model.information for state in states])
-        (H, n), blocks = alone.shape[:2], blocks_of(runs)
-        # Unused without asymptotic gains, but kernels need an array of the right shape.
-        limit = np.zeros((n, n)) if network_estimates[0].root is None else network_estimates[0].root
-        mass = np.stack([state.mass for state in states])
-        m, running = mass.shape[1], self._keeps_totals
-        W = sum(info.degree for info in infos) if running else 0
-        shapes = (m,), (m,), (n, n), (n, n), (1,), (1,), (n, n)  # of MassStep's fields
-        return (
-            PushSumArrays(
-                mass=in_lanes(mass, blocks),
-                degree=np.array([state.degree for state in states], dtype=np.int64),
-                information=in_lanes(
-                    np.stack([one.information for one in network_estimates]), blocks
-                ),
-                number=in_lanes(
-                    np.array([one.number for one in network_estimates], dtype=np.float64), blocks
-                ),
-                alone=alone,
-                rule=RULES.index(self.stop),
-                tolerance=self.tolerance,
-                # In slots check_scenario() demands a delta.
-                delta=self.delta or math.inf,
-                gamma=self.steps(AVERAGE),
-                asymptotic=self.asymptotic,
-                limit=np.ascontiguousarray(limit),
-                share=aligned((H, m, LANES)),
-                before=aligned((m, LANES)),
-                new_information=aligned((n, n, LANES)),
-                new_number=aligned((1, LANES)),
-                silent=np.zeros(LANES, dtype=np.uint8),
-                stop=MassStep(*(np.zeros(shape) for shape in shapes)),
-                running=running,
-                offered=aligned((blocks, H if running else 0, m, LANES)),
-                heard=aligned((blocks, W, m, LANES)),
-            ),
-        )
-
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
-        """Return the state at time 0, P step 1, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n): the leader has the weight; with asymptotic gains every node knows the limits. A
-        ``RunningSums`` under clocks, else a ``PushSumState``.
-        """
-        if not isinstance(model, SlotModel):
-            # A model without slots: clocks, where running sums are kept.
-            return running_sums.start(model, mean, cov, node)
-        information = model.information
-        # P step 1: w is 1 at the leader and 0 elsewhere, n~ = 1, C~ = the node's own information.
-        weight = 1.0 if node.node == self.leader else 0.0
-        mass = np.concatenate([[weight, 1.0], information.reshape(-1)])
-        network_estimate = NetworkInformation(information, 1.0)
-        # With asymptotic gains every node knows G = node.information, of all sensors, and N.
-        if self.asymptotic:
-            root = asymptotic_root(model.F, model.Q, node.information)
-            network_estimate = NetworkInformation(node.information, float(node.nodes), root)
-        sums = NodeSums(np.zeros(mass.shape), {}) if self._keeps_totals else None
-        return PushSumState(
-            xhat=mean,
-            root=first_root(cov),
-            model=model,
-            mass=mass,
-            network=network_estimate,
-            stopped=False,
-            degree=node.degree,
-            sums=sums,
-        )
-
-    @property
-    def _keeps_totals(self) -> bool:
-        """True if the mass of slots is exchanged by running sums."""
-        return self.running_sums and not self.asymptotic
-
-    def predict(self, state: Any, gap: float) -> Any:
-        """Return the state ``gap`` seconds later, with estimate and covariance predicted (P
-        step 3); under clocks also the totals of information that the node has sent and heard, which
-        then refer to the plant's state of that time.
-        """
-        if isinstance(state, RunningSums):
-            return running_sums.predict_sums(state, gap)
-        return super().predict(state, gap)
 
     def steps(self, phase: int) -> int:
         """Return the steps of exchange number ``phase`` of a slot: 1 for the mass, ``gamma`` for
@@ -750,120 +538,30 @@ class PushSum(Filter):
         """
         return self.links == "fresh" or step == 0
 
-    def emit(self, state: Any, exchange: Exchange) -> tuple[Any, Any]:
-        """Return the state after sending and the payload: in the first exchange of a slot the
-        node's share of its mass (2 + n n,), step 2.1, or with running sums the total of all shares
-        so far, in the second z (n,), step 5.1; under clocks an ``Offer``.
-        """
-        if isinstance(state, RunningSums):
-            return running_sums.offer(state)
-        if exchange.phase == AVERAGE:
-            # The average is of z, which is the corrected estimate.
-            return state, state.xhat
-        if state.sums is not None:
-            offered = state.sums.offered + share(state.mass, state.degree)
-            return state._replace(sums=state.sums._replace(offered=offered)), offered
-        # None sends nothing; links draw their outcomes all the same.
-        silent = self.asymptotic or (self.stop == "paper" and state.stopped)
-        return state, None if silent else share(state.mass, state.degree)
-
-    def absorb(self, state: Any, messages: Sequence[Message], exchange: Exchange) -> Any:
-        """Return the state after all messages of a step: in the first exchange of a slot with the
-        new mass and network estimate, steps 2.2 and 2.3, in the second with its estimate averaged
-        with those of its neighbours, step 5.2; under clocks with the growth of all totals added.
-        """
-        if isinstance(state, RunningSums):
-            return running_sums.absorb_totals(state, messages)
-        received = [message.payload for message in messages]
-        # P step 5.2.
-        if exchange.phase == AVERAGE:
-            return state._replace(
-                xhat=average_estimates(state.xhat, received, self.delta or math.inf)
-            )
-        if self.asymptotic or (self.stop == "paper" and state.stopped):
-            return state
-        if state.sums is not None:
-            return self._learn_network(
-                _heard_totals(state, state.sums, messages), state.mass, False
-            )
-        # P steps 2.2, (3)-(5), and 2.3, (6) with the stop rule.
-        mass = conserve_mass(state.mass, received, state.degree)
-        all_up = len(received) == state.degree
-        return self._learn_network(state._replace(mass=mass), state.mass, all_up)
-
-    def _learn_network(self, state: PushSumState, before: FloatArray, all_up: bool) -> PushSumState:
-        """Return the ``state`` after an exchange of mass with the network estimate that follows
-        from its mass, paper P (6), and with ``stopped`` by the stop rule. ``before`` (2 + n n,) is
-        the mass before the exchange; ``all_up``: all links of the node were up.
-        """
-        # Frozen by the safe rule: the mass was mixed, but the estimate is not updated any more.
-        if state.stopped:
-            return state
-        estimate, former = network(state.mass, state.model), state.network
-        step = MassStep(
-            before,
-            state.mass,
-            former.information,
-            estimate.information,
-            np.array([former.number]),
-            np.array([estimate.number]),
-            np.empty(estimate.information.shape),
-        )
-        stopped = has_stopped(RULES.index(self.stop), self.tolerance, step, all_up)
-        return state._replace(network=estimate, stopped=stopped)
-
-    def update(self, state: Any, reading: Reading) -> Any:
-        """Return the state after a reading, paper P (7) and (8), from the prediction of the slot;
-        under clocks after a Kalman update that counts the reading N / w times.
-        """
-        if isinstance(state, RunningSums):
-            return running_sums.update_sums(state, reading)
-        root = state.network.root
-        # Without asymptotic gains P (7) with the node's G; with them P_inf.
-        if root is None:
-            root = correct_root_alone(state.root, state.network.information)
-        y, H, R = reading[:3]
-        xhat = correct_estimate(state.xhat, root, state.network.number, y, H, R)
-        return state._replace(xhat=xhat, root=root)
-
     def stopped(self, state: Any) -> bool:
         """Return True if the node's estimate of the network, G^(i) and N^(i), is frozen."""
-        return not isinstance(state, RunningSums) and bool(state.stopped)
+        return hasattr(state, "stopped") and state.stopped < NEVER_STOPPED
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
         """Return the weight w and the number n~ of a node by name, whose sums over all nodes are 1
         and N; with running sums each as a list of terms, which adds to the node's mass the totals
         that it offered to its neighbours and subtracts those it heard: mass under way counts.
         """
-        if isinstance(state, RunningSums):
+        if not hasattr(state, "mass"):
             return running_sums.weights(state)
-        if state.sums is None:
+        if not len(state.offered):
             return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
+        degree = int(state.record.degree[0])
         return {
             name: [
                 float(state.mass[k]),
-                float(state.sums.offered[k]) * state.degree,
-                *(-float(total[k]) for total in state.sums.heard.values()),
+                float(state.offered[k]) * degree,
+                *(-state.heard[:, k]).tolist(),
             ]
             for k, name in enumerate(("weight", "number"))
         }
 
-    def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return the state with ``offset`` (n,) added to the estimate, for a move of the origin:
-        averaging weights sum to one, so that nothing else changes.
-        """
-        if isinstance(state, RunningSums):
-            return running_sums.shift(state, offset)
-        return state._replace(xhat=state.xhat + offset)
-
-    def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return the payload of a message under way, for a move of the origin by which estimates
-        change by ``offset`` (n,): mass does not change.
-        """
-        if isinstance(payload, Offer):
-            return running_sums.shift_offer(payload, offset)
-        # A mass is longer than an estimate: 2 + n^2 > n entries.
-        return payload + offset if len(payload) == len(offset) else payload
+    shift = Filter.shift  # averaging weights sum to one
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots: the
@@ -952,101 +650,21 @@ class PushSum(Filter):
         )
 
 
-def _heard_totals(state: PushSumState, sums: NodeSums, messages: Sequence[Message]) -> PushSumState:
-    """Return the state after an exchange of mass in slots by running sums: its mass (2 + n n,) is
-    the share it keeps plus the growth of the totals in ``messages``, which become the last ones
-    heard in its ``sums``.
+def corrected_root(root: FloatArray, information: FloatArray) -> FloatArray:
+    """Return the root (n, n) of ``(P^-1 + G)^-1``, P (7), for the lower triangular ``root`` (n, n)
+    of P, possibly singular, and the information G = ``information`` (n, n).
     """
-    heard, nothing = dict(sums.heard), np.zeros(state.mass.shape)
-    gained = [message.payload - heard.get(message.sender, nothing) for message in messages]
-    heard |= {message.sender: message.payload for message in messages}
-    mass = share(state.mass, state.degree) + sum(gained, nothing)
-    return state._replace(mass=mass, sums=sums._replace(heard=heard))
-
-
-def correct_estimate(
-    predicted: FloatArray,
-    root: FloatArray,
-    number: float,
-    y: FloatArray,
-    H: FloatArray,
-    R: FloatArray,
-) -> FloatArray:
-    """Return the estimate (n,) of paper P (8): the prediction ``predicted`` (n,) plus ``number``
-    times the gain of the reading y (p,), H (p, n), R (p, p), which may have no rows; ``root``
-    (n, n) is that of the covariance after the reading, paper P (7).
-    """
-    n, x = len(predicted), np.array(predicted, dtype=np.float64)
-    if len(y):
-        # The kernel takes readings whose noise has variance 1.
-        y, H = whiten_reading(y, H, R)
-        add_gain_single(
-            x.reshape(1, 1, n, 1),
-            np.ascontiguousarray(root).reshape(1, 1, n, n, 1),
-            number,
-            y.reshape(1, 1, 1, -1, 1),
-            H.reshape(1, 1, 1, -1, n, 1),
-            np.empty((2, n, 1)),
-        )
-    return x
-
-
-def share(mass: FloatArray, degree: int) -> FloatArray:
-    """Return the mass (2 + n n,), weight, number of nodes and information, that a node of
-    ``degree`` neighbours sends to each of them: ``mass`` over degree + 1.
-    """
-    part = np.empty(mass.shape)
-    split_mass_single(mass.reshape(1, 1, -1, 1), degree, part.reshape(1, -1, 1))
-    return part
-
-
-def conserve_mass(mass: FloatArray, received: Sequence[FloatArray], degree: int) -> FloatArray:
-    """Return the mass (2 + n n,) by paper P (3)-(5): the shares ``received`` and the node's own
-    share of its former ``mass``, which it keeps once for itself and once for each link of its
-    ``degree`` that failed.
-    """
-    total = np.array(sum(received, np.zeros(mass.shape)))
-    # The same kernels as in slots, on arrays of one node: both engines round alike.
-    own = share(mass, degree).reshape(1, -1, 1)
-    keep_share_single(total.reshape(1, 1, -1, 1), own, degree + 1 - len(received))
-    return total
-
-
-def network(mass: FloatArray, model: SlotModel) -> NetworkInformation:
-    """Return a node's network estimate, paper P (6): the information of all sensors C~ / w (n, n)
-    and the number of nodes n~ / w, from its ``mass`` (2 + n n,); while its weight is exactly 0 its
-    own information, by ``model``, and 1.
-    """
-    alone = model.information
-    information, number = np.empty((*alone.shape, 1)), np.empty((1, 1))
-    learn_network_single(mass.reshape(1, 1, -1, 1), alone[None], information, number)
-    return NetworkInformation(information[:, :, 0], float(number[0, 0]))
-
-
-def correct_root_alone(root: FloatArray, information: FloatArray) -> FloatArray:
-    """Return the root (n, n) of ``(P^-1 + G)^-1 = P (I + G P)^-1``, paper P (7), for the lower
-    triangular ``root`` (n, n) of P, possibly singular, and the information G = ``information``
-    (n, n). For the SimPy engine and the asymptotic gains, one node of one run at a time.
-    """
-    # The kernel takes arrays with axes of blocks, nodes and lanes, here of length 1 each.
     n = len(root)
-    result, information_lanes = (np.array(a).reshape(1, 1, n, n, 1) for a in (root, information))
-    correct_root_single(
-        result, information_lanes, np.empty((n, n, 1)), slot_scratch(1, n, False, ONE)
-    )
+    result, G = (np.array(a, dtype=np.float64).reshape(1, n, n, 1) for a in (root, information))
+    _correct_one(np.zeros(n), result, G, np.zeros((n, n, 1)), np.zeros((3, n, 1)))
     return np.asarray(result.reshape(n, n))
 
 
-def average_estimates(z: FloatArray, received: Sequence[FloatArray], delta: float) -> FloatArray:
-    """Return ``z + sum_j (z_j - z) / delta`` (n,), paper P (9), for a node's ``z`` (n,) and the
-    estimates z_j (n,) that it ``received``.
-    """
-    # The kernel of slots on a star: the node itself, and one link from each sender; it does not use
-    # weights of links.
-    x = np.stack([z, *received])[None, :, :, None]
-    links, up = star_of([0.0] * len(received))
-    average(ONE, x, 0, links, up, 0, 0, np.empty((1, len(z), 1)), 1.0 / delta)
-    return np.asarray(x[0, 0, :, 0])
+@kernel
+def _correct_one(
+    size: FloatArray, root: FloatArray, information: FloatArray, remainder: FloatArray, work: Any
+) -> None:
+    correct_root(ONE, size, root, 0, information, (remainder, work[0], work[1], work[2]))
 
 
 def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
@@ -1063,7 +681,7 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
     if np.abs(UNITS * again - P).max() > SAME * np.abs(P).max():
         return None
     # P is the predicted covariance: use the reading to get that of P (12).
-    return correct_root_alone(lower_root(square_root(P)), information)
+    return corrected_root(lower_root(square_root(P)), information)
 
 
 def _steady_prediction(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:

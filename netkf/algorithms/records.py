@@ -48,6 +48,7 @@ class Kernels:
     predict, update, absorb, shift : ``verb(record, h, run)`` for node h
     emit : ``emit(record, h, m, run)`` writes payload number m of node h
     shift_payload : ``shift_payload(record, m, run)``, of payload m
+    observe : ``observe(record, h, run)`` is called where a sample is taken
     interval : ``interval(record, h, run)``, the seconds of increments that ``update`` may use at
                once from this state on
     decides : ``emit`` may write 0 into ``run.sends``
@@ -64,6 +65,7 @@ class Kernels:
     absorb: Any = standard.absorb
     shift: Any = standard.shift
     shift_payload: Any = standard.shift_payload
+    observe: Any = standard.observe
     interval: Any = standard.interval
     decides: bool = False
     sends_readings: bool = False

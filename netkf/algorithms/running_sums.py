@@ -1,5 +1,5 @@
 """Push-sum in continuous time: broadcast rounds by running sums, each node by its own clock; the
-methods of ``push_sum.PushSum`` under clocks.
+verbs of ``push_sum.PushSum`` under clocks.
 
 The network's information is a mass that is spread over the nodes. Node i holds the weight w_i,
 which starts at 1, and with N nodes its share of the information is ``(w_i / N) P_i^-1`` and
@@ -30,16 +30,22 @@ The parts must be kept apart in totals, for that: u is their sum.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-import scipy.linalg
 
-from netkf.algorithms.filter import Message, NodeInfo, Reading
-from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.models import Backward, first_root, sample_update
+from netkf.algorithms.filter import NodeInfo
+from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
+from netkf.algorithms.kernels.root_flow import transform_root
+from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
+from netkf.algorithms.records import Kernels, Record
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.generic import drop_lane
+from netkf.linalg.jacobi import diagonalise
+from netkf.linalg.lanes import ONE
 
 MIN_ACCURACY = 1e-4
 """Relative accuracy with which a total must grow by a share in floating point; otherwise the node
@@ -47,204 +53,335 @@ offers nothing.
 """
 
 
-class Offer(NamedTuple):
-    """The payload of a broadcast: its ``number`` among those of its sender, from 0, and the running
-    ``total`` (1 + n n + G n,) of all shares so far: weight w, information U by rows and, for each
-    of G groups of modes, the part ``U P_g xhat`` of u; ``projectors`` (G, n, n) are the P_g.
+def record(infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+    """Return what a node knows: ``weight`` w, ``sent``, the total of the shares offered to each
+    receiver so far, of w, information U by rows and the G parts of u, and ``heard``, the newest
+    total heard from each sender; ``sent_at`` and ``heard_at`` are the times of the node's own clock
+    ``elapsed`` that they refer to, ``rounds`` and ``number`` count broadcasts.
     """
-
-    number: int
-    total: FloatArray
-    projectors: FloatArray
-
-
-class RunningSums(NamedTuple):
-    """The state of a node that exchanges mass by running sums.
-
-    xhat, root : estimate (n,) and root (n, n) of its covariance
-    model : of the plant and the node's sensors
-    weight : w, the node's part of the N of all nodes
-    sent : total (1 + n n + G n,) of the shares offered to each receiver so far, of w, information
-           U and the G parts of ``u = U xhat``
-    rounds : number of broadcasts so far
-    heard : the newest offer heard, by sender; its total refers to the present state
-    receivers, nodes : number of nodes that can hear this one, and N
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    weight: float
-    sent: FloatArray
-    rounds: int
-    heard: Mapping[int, Offer]
-    receivers: int
-    nodes: int
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-
-def start(model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> RunningSums:
-    """Return the state at time 0, with estimate ``mean`` (n,), covariance ``cov`` (n, n), weight 1
-    and nothing sent; ``node`` says how many nodes can hear it, and how many there are.
-    """
-    n = len(mean)
-    return RunningSums(
-        xhat=mean,
-        root=first_root(cov),
-        model=model,
-        weight=1.0,
-        sent=np.zeros(1 + n * n + n * len(model.groups.rates)),
-        rounds=0,
-        heard={},
-        receivers=node.receivers,
-        nodes=node.nodes,
+    groups, n = models[0].groups, len(models[0].A)
+    m = 1 + n * n + n * len(groups.rates)
+    return Record(
+        node={
+            **dict.fromkeys(("weight", "elapsed", "sent_at"), ()),
+            "sent": (m,),
+            "rounds": ((), np.int64),
+            "conserved": (1,),
+        },
+        link={"heard": (m,), "heard_at": (), "number": ((), np.int64)},
+        payload={"total": (m,), "number": ((), np.int64)},
+        settings={
+            "receivers": np.array([info.receivers for info in infos], dtype=np.int64),
+            "nodes": float(infos[0].nodes),
+            "kept": np.ascontiguousarray(groups.kept),
+            "rates": np.ascontiguousarray(groups.rates),
+            "projectors": np.ascontiguousarray(groups.projectors),
+            "gain": np.zeros(m),
+            "work": np.zeros((4, n, n)),
+        },
     )
 
 
-def predict_sums(state: RunningSums, gap: float) -> RunningSums:
-    """Return the state ``gap`` seconds later: estimate and root are predicted, and all totals of
-    information, sent and heard, are made to refer to the plant's later state.
-    """
-    xhat, root = state.model.predict(state.xhat, state.root, gap)
-    # Totals that were heard move too: the next ones, which are compared with them, will have moved.
-    back = state.model.backward(gap)
-    heard = {sender: predict_offer(offer, back) for sender, offer in state.heard.items()}
-    return state._replace(xhat=xhat, root=root, sent=_move_total(state.sent, back), heard=heard)
-
-
-def predict_offer(offer: Offer, back: Backward) -> Offer:
-    """Return the ``offer`` with its total made to refer to a later state of the plant; ``back`` is
-    the model's transition of information over the time between.
-    """
-    return offer._replace(total=_move_total(offer.total, back))
-
-
-def _move_total(total: FloatArray, back: Backward) -> FloatArray:
-    """Return a ``total`` (1 + n n + G n,) of (w, U, parts of u) about a state one gap later."""
-    inverse, fading = back
-    n, out = len(inverse), total.copy()
-    U = total[1 : 1 + n * n].reshape(n, n)
-    out[1 : 1 + n * n] = (inverse.T @ U @ inverse).reshape(-1)
-    parts = total[1 + n * n :].reshape(-1, n)
-    out[1 + n * n :] = (fading[:, None] * (parts @ inverse)).reshape(-1)
-    return out
-
-
-def offer(state: RunningSums) -> tuple[RunningSums, Offer | None]:
-    """Return the state after one round, and its offer; None if nobody can hear. The node gives a
-    share 1 / (d + 1) of its mass to each of d receivers: its weight shrinks, while estimate and
-    covariance, ratios of masses, stay.
-    """
-    if state.receivers == 0:
-        return state, None
-    n, projectors = len(state.xhat), state.model.groups.projectors
-    # The mass (w, U, parts of u): U = (w / N) P^-1 with P^-1 = S^-T S^-1 for the root S.
-    try:
-        inverse = scipy.linalg.solve_triangular(
-            state.root, np.eye(n), lower=True, check_finite=False
-        )
-    except np.linalg.LinAlgError:  # P has fallen to 0: its inverse ends the run as diverged
-        inverse = np.full((n, n), np.inf)
-    U = (state.weight / state.nodes) * (inverse.T @ inverse)
-    mass = np.concatenate([[state.weight], U.reshape(-1), _parts(projectors, U, state.xhat)])
-    sent = state.sent + mass / (state.receivers + 1)
-    # The node gives up exactly the amount by which its total grew, for each receiver. The mass of a
-    # node that receives nothing shrinks with each round, until the total no longer grows in
-    # floating point: then it keeps its mass, and sends the same total again.
-    grown, share = float(sent[0] - state.sent[0]), float(mass[0]) / (state.receivers + 1)
-    if abs(grown - share) > MIN_ACCURACY * share:
-        offered = Offer(state.rounds, state.sent, projectors)
-        return state._replace(rounds=state.rounds + 1), offered
-    weight, offered = state.weight - state.receivers * grown, Offer(state.rounds, sent, projectors)
-    return state._replace(weight=weight, sent=sent, rounds=state.rounds + 1), offered
-
-
-def absorb_totals(state: RunningSums, messages: Sequence[Message]) -> RunningSums:
-    """Return the state after all offers in ``messages``: its mass gains the growth of each sender's
-    total since it was last heard, while an offer older than that adds nothing. ``xhat``, ``root``,
-    ``weight`` and ``heard`` differ.
-    """
-    gained, heard = np.zeros_like(state.sent), dict(state.heard)
-    for message in messages:
-        new_offer: Offer = message.payload
-        # A total refers to the time of sending.
-        if message.age > 0.0:
-            new_offer = predict_offer(new_offer, state.model.backward(message.age))
-        last_offer = heard.get(message.sender)
-        if last_offer is not None and new_offer.number <= last_offer.number:
-            continue
-        gained = gained + (
-            new_offer.total if last_offer is None else new_offer.total - last_offer.total
-        )
-        heard[message.sender] = new_offer
-    # No weight arrived: with only old totals nothing has changed.
-    if not gained[0] > 0.0:
-        return state
-    n, weight = len(state.xhat), state.weight + float(gained[0])
-    U, u = gained[1 : 1 + n * n].reshape(n, n), gained[1 + n * n :].reshape(-1, n).sum(axis=0)
-    # P^-1 <- (w P^-1 + N U) / w+ with the new weight w+. With ``scaled`` T, T T' = (w+ / w) P, it
-    # is T^-T (I + (N / w+) T' U T) T^-1; eigenvalues of the bracket below 1 would be negative
-    # information, by rounding.
-    scaled = np.sqrt(weight / state.weight) * state.root
-    share = state.nodes / weight
-    values, vectors = np.linalg.eigh(np.eye(n) + 0.5 * share * (scaled.T @ (U + U.T) @ scaled))
-    root = lower_root(scaled @ (vectors / np.sqrt(np.maximum(values, 1.0))))
-    # xhat <- xhat + P (N / w+) (u - U xhat) with the new P.
-    xhat = state.xhat + root @ (root.T @ (share * (u - U @ state.xhat)))
-    return state._replace(xhat=xhat, root=root, weight=weight, heard=heard)
-
-
-def update_sums(state: RunningSums, reading: Reading) -> RunningSums:
-    """Return the state after a ``reading``: ``U += H' R^-1 H`` and ``u += H' R^-1 y``. Since
-    ``U = (w / N) P^-1``, that is a Kalman update by a reading with noise covariance R w / N.
-    """
-    if not len(reading.y):
-        return state
-    R = reading.R * (state.weight / state.nodes)
-    xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, R)
-    return state._replace(xhat=xhat, root=root)
-
-
-def weights(state: RunningSums) -> dict[str, list[float]]:
+def weights(state: Any) -> dict[str, list[float]]:
     """Return as "weight" terms whose sum over all nodes is N, so that a run can report its drift:
     the node's weight, plus the total that it sent to each receiver, less the totals it heard.
     """
-    heard = [-float(offer.total[0]) for offer in state.heard.values()]
-    sent = [float(state.sent[0])] * state.receivers
-    return {"weight": [state.weight, *sent, *heard]}
+    receivers = int(state.record.receivers[0])
+    sent = [float(state.sent[0])] * receivers
+    return {"weight": [float(state.weight), *sent, *(-state.heard[:, 0]).tolist()]}
 
 
-def shift(state: RunningSums, offset: FloatArray) -> RunningSums:
-    """Return the state with ``offset`` (n,) added to the estimate, for a move of the origin, and
-    ``U offset`` to every ``u = U xhat``.
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict the estimate; totals are predicted when they are used."""
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    record.elapsed[h, 0] += run.gap
+
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Add a reading to the mass: ``U += H' R^-1 H`` and ``u += H' R^-1 y``. Since
+    ``U = (w / N) P^-1``, that is a Kalman update by a reading with noise covariance R w / N.
     """
-    heard = {sender: shift_offer(offer, offset) for sender, offer in state.heard.items()}
-    sent = _shift_total(state.sent, offset, state.model.groups.projectors)
-    return state._replace(xhat=state.xhat + offset, sent=sent, heard=heard)
+    r, scale = run.reading, math.sqrt(record.nodes / record.weight[h, 0])
+    for i in range(run.rows[r]):
+        run.y[run.first_y + r, i, 0] *= scale
+        for j in range(len(run.size)):
+            run.H[run.first_H + run.matrix[r], i, j, 0] *= scale
+    use_reading(run, record.xhat, record.root, h, r, True)
 
 
-def shift_offer(offer: Offer, offset: FloatArray) -> Offer:
-    """Return the ``offer`` with ``U offset`` added to its vector ``u = U xhat``, for a move of the
-    origin by which estimates change by ``offset`` (n,).
+@kernel
+def predict_total(record: Any, total: FloatArray, gap: float) -> None:
+    """Make a ``total`` (1 + n n + G n,) refer to the state ``gap`` seconds later, in place."""
+    if not gap > 0.0:
+        return
+    # Information moves by the transpose of M from the left and by M from the right.
+    fill_inverse_transition(record.kept, gap, record.work)
+    inverse, half, predicted = record.work[0], record.work[1], record.work[2]
+    n = len(inverse)
+    for i in range(n):
+        for j in range(n):
+            entry = 0.0
+            for r in range(n):
+                entry += total[1 + i * n + r] * inverse[r, j]
+            half[i, j] = entry
+    for i in range(n):
+        for j in range(n):
+            entry = 0.0
+            for r in range(n):
+                entry += inverse[r, i] * half[r, j]
+            total[1 + i * n + j] = entry
+    for g in range(len(record.rates)):
+        # The mean of the modes of a group decays, unlike the information about them.
+        begin, fading = 1 + (n + g) * n, math.exp(-record.rates[g] * gap)
+        for i in range(n):
+            entry = 0.0
+            for r in range(n):
+                entry += inverse[r, i] * total[begin + r]
+            predicted[0, i] = fading * entry
+        for i in range(n):
+            total[begin + i] = predicted[0, i]
+
+
+@kernel
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Offer a share 1 / (d + 1) of all mass to each of d receivers: the node's weight shrinks,
+    while estimate and covariance, ratios of masses, stay; a node that nobody hears sends nothing.
     """
-    return offer._replace(total=_shift_total(offer.total, offset, offer.projectors))
+    receivers = record.receivers[h]
+    if receivers == 0:
+        run.sends[0] = 0
+        return
+    sent, now = drop_lane(record.sent), record.elapsed[h, 0]
+    # Predict the total to now before it grows.
+    predict_total(record, sent[h], now - record.sent_at[h, 0])
+    record.sent_at[h, 0] = now
+    record.rounds[h, 0] += 1
+    before, share = sent[h, 0], record.weight[h, 0] / (receivers + 1)
+    # The node gives up exactly the amount by which its total grew in floating point, for each
+    # receiver. The mass of a node that receives nothing shrinks with each round, until the total no
+    # longer grows: then it keeps its mass, and sends the same total again.
+    grown = (before + share) - before
+    if abs(grown - share) <= MIN_ACCURACY * share:
+        add_share(record, h, receivers)
+        sent[h, 0] = before + share
+        record.weight[h, 0] -= receivers * grown
+    payload = record.payload
+    for i in range(sent.shape[1]):
+        payload.total[m, i, 0] = sent[h, i]
+    payload.number[m, 0] = record.rounds[h, 0]
 
 
-def _shift_total(total: FloatArray, offset: FloatArray, projectors: FloatArray) -> FloatArray:
-    """Return a ``total`` (1 + n n + G n,) of (w, U, parts of u) after a move of the origin by which
-    estimates change by ``offset`` (n,): ``u + U offset``.
+@kernel
+def add_share(record: Any, h: int, receivers: int) -> None:
+    """Add a share of U = (w / N) P^-1 and of the parts of u = U xhat to what node h has sent."""
+    inverse, U, part = record.work[0], record.work[1], record.work[2]
+    sent, xhat, root, n = record.sent, record.xhat, record.root, record.xhat.shape[1]
+    # P^-1 = S^-T S^-1.
+    for i in range(n):
+        for j in range(i + 1):
+            value = 1.0 if j == i else 0.0
+            for r in range(j, i):
+                value -= root[h, i, r, 0] * inverse[r, j]
+            inverse[i, j] = value / root[h, i, i, 0]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(max(i, j), n):
+                total += inverse[r, i] * inverse[r, j]
+            U[i, j] = record.weight[h, 0] / record.nodes * total
+            sent[h, 1 + i * n + j, 0] += U[i, j] / (receivers + 1)
+    for g in range(len(record.rates)):
+        # U P_g xhat
+        for i in range(n):
+            part[0, i] = 0.0
+            for j in range(n):
+                part[0, i] += record.projectors[g, i, j] * xhat[h, j, 0]
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += U[i, j] * part[0, j]
+            sent[h, 1 + (n + g) * n + i, 0] += total / (receivers + 1)
+
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Gain the growth of each sender's total since it was last heard, which makes up for messages
+    lost in between; a total older than that adds nothing.
     """
-    n, out = len(offset), total.copy()
-    out[1 + n * n :] += _parts(projectors, total[1 : 1 + n * n].reshape(n, n), offset)
-    return out
+    gain, payload, now = record.gain, record.payload, record.elapsed[h, 0]
+    totals, heard = drop_lane(payload.total), drop_lane(record.heard)
+    # Two passes: first the sum of all growth, because the totals are not stored as heard unless the
+    # weight grows.
+    for j in range(len(gain)):
+        gain[j] = 0.0
+    for k in range(run.count):
+        m, w = run.message[k], run.link[k]
+        if payload.number[m, 0] > record.number[w, 0]:
+            # Predict both totals to now before they are compared.
+            predict_total(record, totals[m], run.age[k])
+            predict_total(record, heard[w], now - record.heard_at[w, 0])
+            record.heard_at[w, 0] = now
+            for j in range(len(gain)):
+                gain[j] += totals[m, j] - heard[w, j]
+    # No growth but rounding, or old totals only.
+    if not gain[0] > 0.0:
+        return
+    for k in range(run.count):
+        m, w = run.message[k], run.link[k]
+        if payload.number[m, 0] > record.number[w, 0]:
+            record.number[w, 0] = payload.number[m, 0]
+            for j in range(len(gain)):
+                heard[w, j] = totals[m, j]
+    # The weight grows by the gain, and P^-1 becomes the weighted mean.
+    weight = record.weight[h, 0] + gain[0]
+    factor = math.sqrt(weight / record.weight[h, 0])
+    record.weight[h, 0] = weight
+    gain_mass(record, h, run, factor, record.nodes / weight)
 
 
-def _parts(projectors: FloatArray, U: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the parts ``U P_g x`` (G n,) of ``U x``, with U (n, n), x (n,) and the ``projectors``
-    P_g (G, n, n) on G groups of modes.
+@kernel
+def gain_mass(record: Any, h: int, run: Any, factor: float, share: float) -> None:
+    """Add the mass ``record.gain`` to the estimate of node h: ``P^-1 <- (w P^-1 + N U) / w+`` with
+    the new weight w+, and the estimate likewise; ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
     """
-    return np.asarray((projectors @ x @ U.T).reshape(-1))
+    root, gain, n = drop_lane(record.root), record.gain, record.xhat.shape[1]
+    inner, half, vectors = record.work[0], record.work[1], record.work[2]
+    # S sqrt(w+ / w): the root of P with P^-1 scaled by w / w+.
+    for i in range(n):
+        for j in range(i + 1):
+            root[h, i, j] *= factor
+    # inner = I + share S' U S, with U symmetrised; then P = S inner^-1 S'.
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(j, n):
+                total += (gain[1 + i * n + r] + gain[1 + r * n + i]) * root[h, r, j]
+            half[i, j] = total
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(i, n):
+                total += root[h, r, i] * half[r, j]
+            inner[i, j] = 0.5 * share * total + (1.0 if i == j else 0.0)
+    # Invert it by eigenvalues: U is a difference of sums, and may be indefinite by rounding.
+    diagonalise(inner, vectors)
+    update_root_by_gain(root, h, run, inner, vectors)
+    move_by_gain(root, drop_lane(record.xhat), h, gain, share, record.work[3, 0])
+
+
+@kernel
+def update_root_by_gain(
+    root: FloatArray, h: int, run: Any, values: FloatArray, vectors: FloatArray
+) -> None:
+    """Replace the root S of node h by the lower triangular root of ``S V D^-1 V' S'``, with the
+    eigenvalues D on the diagonal of ``values`` (n, n), raised to at least 1, and eigenvectors V.
+    """
+    scratch, n = run.model.scratch, root.shape[1]
+    F, wide, noise = scratch.values, scratch.wide, scratch.T
+    # F = S V D^-1/2, a root that is not triangular yet.
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for r in range(i + 1):
+                total += root[h, i, r] * vectors[r, j]
+            # Eigenvalues below 1 would add covariance: information cannot be negative.
+            F[i * n + j] = total / math.sqrt(max(values[j, j], 1.0))
+    # The new root is I times F, made triangular by Householder's reflections.
+    for i in range(n):
+        for j in range(i + 1):
+            root[h, i, j] = 1.0 if i == j else 0.0
+            noise[i, j] = 0.0
+    transform_root(ONE, scratch.size, root[h], F, 0, wide, noise)
+
+
+@kernel
+def move_by_gain(
+    root: FloatArray,
+    xhat: FloatArray,
+    h: int,
+    gain: FloatArray,
+    share: float,
+    innovation: FloatArray,
+) -> None:
+    """Correct the estimate of node h by the mass that it has heard: ``xhat += P share (u - U
+    xhat)`` with the new P; ``innovation`` (n,) is scratch.
+    """
+    n = root.shape[1]
+    # innovation = N / w+ (u - U xhat).
+    for i in range(n):
+        total = 0.0
+        for k in range(1 + n * n + i, len(gain), n):
+            total += gain[k]
+        for j in range(n):
+            total -= gain[1 + i * n + j] * xhat[h, j]
+        innovation[i] = share * total
+    # S' innovation in place: entry j is not read again.
+    for j in range(n):
+        total = 0.0
+        for i in range(j, n):
+            total += root[h, i, j] * innovation[i]
+        innovation[j] = total
+    # S (S' innovation) = P innovation.
+    for i in range(n):
+        for j in range(i + 1):
+            xhat[h, i] += root[h, i, j] * innovation[j]
+
+
+@kernel
+def shift_total(record: Any, total: FloatArray, run: Any) -> None:
+    """Add ``U P_g offset`` to each part of u: since u = U x, it moves with x."""
+    n, moved = len(run.size), record.work[2]
+    for g in range(len(record.rates)):
+        for i in range(n):
+            moved[0, i] = 0.0
+            for j in range(n):
+                moved[0, i] += record.projectors[g, i, j] * run.offset[j, 0]
+        for i in range(n):
+            for j in range(n):
+                total[1 + (n + g) * n + i] += total[1 + i * n + j] * moved[0, j]
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move the estimate and all totals of node h with the origin."""
+    shift_vector(run, record.xhat, h)
+    # Predicted forward: back to a time long ago an offset would grow with the modes that decay.
+    sent, heard, now = drop_lane(record.sent), drop_lane(record.heard), record.elapsed[h, 0]
+    predict_total(record, sent[h], now - record.sent_at[h, 0])
+    record.sent_at[h, 0] = now
+    shift_total(record, sent[h], run)
+    for w in range(run.first[h], run.first[h + 1]):
+        predict_total(record, heard[w], now - record.heard_at[w, 0])
+        record.heard_at[w, 0] = now
+        shift_total(record, heard[w], run)
+
+
+@kernel
+def shift_payload(record: Any, m: int, run: Any) -> None:
+    """Move the total in payload m with the origin."""
+    shift_total(record, drop_lane(record.payload.total)[m], run)
+
+
+@kernel
+def observe(record: Any, h: int, run: Any) -> None:
+    """Write the part of node h in the sum of all weights, held and under way, which stays N."""
+    total = record.weight[h, 0] + record.receivers[h] * record.sent[h, 0, 0]
+    for w in range(run.first[h], run.first[h + 1]):
+        total -= record.heard[w, 0, 0]
+    record.conserved[h, 0, 0] = total
+
+
+KERNELS = Kernels(
+    predict=predict,
+    update=update,
+    emit=emit,
+    absorb=absorb,
+    shift=shift,
+    shift_payload=shift_payload,
+    observe=observe,
+    decides=True,
+    counts_sends=True,
+    unrolled=False,
+)

@@ -399,6 +399,11 @@ def absorb(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
+def observe(record: Any, h: int, run: Any) -> None:
+    """Do nothing where a sample is taken."""
+
+
+@kernel
 def shift(record: Any, h: int, run: Any) -> None:
     """Move the estimate of node ``h`` with the origin."""
     shift_vector(run, record.xhat, h)

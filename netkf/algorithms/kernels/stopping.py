@@ -10,16 +10,16 @@ slot.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Struct
 
 RULES = ("never", "safe", "paper")
 NEVER, SAFE, PAPER = range(3)
 
 
-class MassStep(NamedTuple):
+class MassStep(Struct):
     """How the mass and the network estimate of one node changed in a step, for n states.
 
     before, mass : (2 + n n,), its mass before the step and after it: weight, number of nodes and

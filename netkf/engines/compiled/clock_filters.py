@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,19 @@ class ClockFilters:
         self.records = make_records(
             scenario.node_filter, starts, infos, models, links=count, messages=messages
         )
+        states = (
+            [
+                scenario.node_filter.init(model, *scenario.initial_estimate(info.node), info)
+                for model, info in zip(models, infos, strict=True)
+            ]
+            if "conserved" in self.records.arrays
+            else []
+        )
+        values = [scenario.node_filter.conserved(state) for state in states]
+        self._at_start = {
+            name: math.fsum(np.concatenate([np.atleast_1d(sums[name]) for sums in values]))
+            for name in (values[0] if values else ())
+        }
         self.record, self.start = self.records.struct, self.records.copied()
         n, size = start.xhat.shape[1], size_of(start.xhat.shape[1], kernels.unrolled)
         cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
@@ -78,6 +92,18 @@ class ClockFilters:
         """Estimates (N, n) and roots (N, n, n): views of those of the record."""
         arrays = self.records.arrays
         return arrays["xhat"][0, ..., 0], arrays["root"][0, ..., 0]
+
+    def sums(self) -> dict[str, tuple[float, float]]:
+        """Return by name the sums over all nodes that exchanges conserve, at the start and at the
+        last sample.
+        """
+        now = self.records.arrays.get("conserved")
+        if now is None:
+            return {}
+        return {
+            name: (self._at_start[name], math.fsum(now[0, :, k, 0].tolist()))
+            for k, name in enumerate(self._at_start)
+        }
 
     def _inbox(self, messages: int, n: int) -> dict[str, np.ndarray]:
         """Return an inbox for so many messages, and room for their readings and the own one."""

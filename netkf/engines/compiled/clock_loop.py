@@ -68,7 +68,7 @@ def clock_loop(kernels: Kernels) -> Any:
     on_tick = ticking_of(kernels, predict_node)
     on_absorb = absorption_of(kernels)
     on_sample = sampling_of(kernels)
-    counts_sends = kernels.counts_sends
+    counts_sends, observe = kernels.counts_sends, kernels.observe
 
     @kernel
     def predict_participants(
@@ -114,6 +114,8 @@ def clock_loop(kernels: Kernels) -> Any:
                 # Python moves the origin and goes to the next frame.
                 return WANT_REBASE
             else:
+                for h in range(len(state.nodes)):
+                    observe(record, h, run)
                 store_sample(state, state.run, 0, state.samples)
                 if not count_sample(state):
                     return WANT_SAMPLES

@@ -542,7 +542,9 @@ class FlowRun:
         samples = StateSamples(times, x, xhat, P, error)
         run = self._scenario, self._recorder, self._progress
         finite = record_samples(*run, samples, pass_rows_on)
-        if self._totals is not None:
+        if self._clocked is not None:
+            self._recorder.sums = self._clocked.sums()
+        elif self._totals is not None:
             self._recorder.sums = _sums(buffer.terms[last[0]], self._totals.receivers)
         return finite
 

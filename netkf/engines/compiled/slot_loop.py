@@ -126,7 +126,8 @@ def slot_loop(kernels: Kernels) -> Any:
     """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan,
     samples)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first.
     """
-    predict, update, shift = kernels.predict, kernels.update, kernels.shift
+    predict, update = kernels.predict, kernels.update
+    shift, observe = kernels.shift, kernels.observe
     exchange = exchange_of(kernels)
 
     @kernel
@@ -154,6 +155,20 @@ def slot_loop(kernels: Kernels) -> Any:
                         update(record, h, run)
 
     @kernel
+    def sample_slot(
+        record: Any, run: SlotRun, plan: SlotPlan, samples: SlotSamples, b: int, s: int
+    ) -> None:
+        """Write the sample of a slot, if it has one, and then move the origin, if it does."""
+        if plan.sample[s] >= 0:
+            for h in range(len(record.xhat)):
+                observe(record, h, run)
+            store_sample(record.xhat, record.root, run, plan, samples, b, s)
+        if plan.rebased[s]:
+            set_offset(run, samples, b, s)
+            for h in range(len(record.xhat)):
+                shift(record, h, run)
+
+    @kernel
     def loop(
         record: Any, memories: np.ndarray, run: SlotRun, plan: SlotPlan, samples: SlotSamples
     ) -> None:
@@ -165,20 +180,11 @@ def slot_loop(kernels: Kernels) -> Any:
                 run.slot = plan.first + s
                 run.first_y = (b * slots + s) * nodes
                 run.first_H = run.first_y if plan.varies else 0
-                begins, ends = plan.begin == WHOLE, plan.stop == WHOLE
-                if plan.predicts and begins:
-                    store_sample(block.xhat, block.root, run, plan, samples, b, s)
-                    if plan.rebased[s]:
-                        set_offset(run, samples, b, s)
-                        for h in range(nodes):
-                            shift(block, h, run)
+                if plan.predicts and plan.begin == WHOLE:
+                    sample_slot(block, run, plan, samples, b, s)
                 simulate_slot(block, run, plan, b, s)
-                if not plan.predicts and ends:
-                    store_sample(block.xhat, block.root, run, plan, samples, b, s)
-                    if plan.rebased[s]:
-                        set_offset(run, samples, b, s)
-                        for h in range(nodes):
-                            shift(block, h, run)
+                if not plan.predicts and plan.stop == WHOLE:
+                    sample_slot(block, run, plan, samples, b, s)
 
     return loop
 
@@ -226,12 +232,10 @@ def store_sample(
     b: int,
     s: int,
 ) -> None:
-    """Write the sample of slot ``s``, if it has one, of the L runs of block ``b`` with estimates
-    ``xhat`` (H, n, L) and roots ``root`` (H, n, n, L).
+    """Write the sample of slot ``s`` of the L runs of block ``b`` with estimates ``xhat`` (H, n, L)
+    and roots ``root`` (H, n, n, L).
     """
     k, lanes = plan.sample[s], run.lanes
-    if k < 0:
-        return
     n, first = len(run.size), b * len(lanes)
     sum_of_all = load(lanes, samples.total, b)
     for h in range(len(xhat)):

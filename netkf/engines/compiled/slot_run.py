@@ -127,6 +127,10 @@ class SlotRuns:
         # NEVER: a slot that no run reaches, for a node that never stops.
         self._stopped = np.full((blocks, setup.estimators, LANES), NEVER)
         self._conserved = aligned((blocks, setup.estimators, 2, LANES))
+        if self._filters is not None:
+            arrays = self._filters.records.arrays
+            self._stopped = arrays.get("stopped", self._stopped)
+            self._conserved = arrays.get("conserved", self._conserved)
         self._sent = np.zeros(len(setup.directions), dtype=np.int64)
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
