@@ -95,7 +95,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
         copy_vector(lanes, run.size, payload.xhat, m, record.xhat, h, True)
         return
     for i in range(mass.shape[1]):
-        share = load(lanes, mass, h, i) / (record.degree[h] + 1)
+        share = load(lanes, mass, h, i) / (record.degree[h, 0] + 1)
         if record.running == 1:
             share += load(lanes, record.offered, h, i)
             store(lanes, record.offered, h, i, share)
@@ -142,7 +142,7 @@ def mix_mass(record: Any, h: int, run: Any) -> None:
     """Set the mass of node h to the shares that it keeps and receives, P (3)-(5), and write the
     number of shares that arrived into ``run.row[0]``; the mass before is left in ``record.before``.
     """
-    lanes, mass, degree = run.lanes, record.mass, record.degree[h]
+    lanes, mass, degree = run.lanes, record.mass, record.degree[h, 0]
     received = spread(lanes, 0.0)
     for k in range(run.count):
         received += select(load_flags(lanes, run.arrived, k), 1.0, 0.0)
@@ -180,7 +180,7 @@ def receive_totals(record: Any, h: int, run: Any) -> None:
             offered = load(lanes, record.payload.mass, run.message[k], i)
             total += select(arrived, offered - last, 0.0)
             store(lanes, heard, w, i, select(arrived, offered, last))
-        own = load(lanes, mass, h, i) / (record.degree[h] + 1)
+        own = load(lanes, mass, h, i) / (record.degree[h, 0] + 1)
         store(lanes, mass, h, i, own + total)
 
 
@@ -209,7 +209,7 @@ def learn_network(record: Any, h: int, run: Any) -> None:
     # The stop rule compares with the former G and N, so they are replaced only afterwards.
     if record.rule != NEVER:
         for q in range(len(lanes)):
-            all_up = run.row[0, q] == record.degree[h]
+            all_up = run.row[0, q] == record.degree[h, 0]
             if record.silent[q] == 0 and stops(record, h, q, all_up):
                 record.stopped[h, q] = run.slot
     frozen = load_flags(lanes, record.silent)
@@ -452,6 +452,7 @@ class PushSum(Filter):
                 "information": (n, n),
                 "number": (),
                 "stopped": ((), np.int64),
+                "degree": ((), np.int64),
                 "offered": (m if running else 0,),
                 "conserved": (2,),
             },
@@ -465,7 +466,6 @@ class PushSum(Filter):
             },
             settings={
                 "step": MassStep(**{name: np.zeros(shape) for name, shape in shapes.items()}),
-                "degree": np.array([info.degree for info in infos], dtype=np.int64),
                 "alone": np.stack([model.information for model in models]),
                 "limit": np.ascontiguousarray(limit),
                 "rule": RULES.index(self.stop),
@@ -488,7 +488,7 @@ class PushSum(Filter):
         node["mass"][2:] = model.information.reshape(-1)
         node["information"][:] = info.information if self.asymptotic else model.information
         node["number"][...] = info.nodes if self.asymptotic else 1.0
-        node["stopped"][...] = NEVER_STOPPED
+        node["stopped"][...], node["degree"][...] = NEVER_STOPPED, info.degree
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
         """Return True if nodes send messages in the exchange with number ``phase``, with a sensor
@@ -551,7 +551,7 @@ class PushSum(Filter):
             return running_sums.weights(state)
         if not len(state.offered):
             return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
-        degree = int(state.record.degree[0])
+        degree = int(state.degree)
         return {
             name: [
                 float(state.mass[k]),

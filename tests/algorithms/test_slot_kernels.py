@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from netkf.algorithms.filter import NodeInfo, Reading
 from netkf.algorithms.kernels import slots
-from netkf.algorithms.push_sum import correct_estimate
+from netkf.algorithms.models import SlotModel
+from netkf.algorithms.push_sum import PushSum
 from netkf.linalg.lanes import LANES, aligned
 
 CASES = [(seed, n) for seed in range(3) for n in (1, 2, 4, 7)]
@@ -107,10 +109,15 @@ def test_the_gain_of_push_sum(seed, n):
     random = np.random.default_rng(seed)
     x, root = random.standard_normal(n), triangular(random, n)[0]
     y, H, R = random.standard_normal(2), random.standard_normal((2, n)), _covariance(random, 2)
+    filter_ = PushSum(gamma=1, delta=2.0)
+    model, info = SlotModel(np.eye(n), np.eye(n), H, R), NodeInfo(0, 1, 1, 2, 1.0, np.eye(n))
+    state = filter_.init(model, x, root @ root.T, info)
+    state = state._replace(information=np.zeros((n, n)), number=3.5)
+    found = filter_.update(state, Reading(y, H, R))
     expected = x + 3.5 * root @ root.T @ H.T @ np.linalg.inv(R) @ (y - H @ x)
-    found = correct_estimate(x, root, 3.5, y, H, R)
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
-    assert (correct_estimate(x, root, 3.5, y[:0], H[:0], R[:0, :0]) == x).all()
+    np.testing.assert_allclose(found.xhat, expected, rtol=1e-10, atol=1e-12)
+    nothing = filter_.update(state, Reading(y[:0], H[:0], R[:0, :0]))
+    assert (nothing.xhat == x).all()
 
 
 @pytest.mark.parametrize("framed", [False, True])

@@ -10,7 +10,7 @@ from netkf.algorithms.filter import Estimate, Filter
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
-from netkf.algorithms.push_sum import AVERAGE, PushSum, average_estimates
+from netkf.algorithms.push_sum import AVERAGE, PushSum
 from netkf.core.fields import positive, setting
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
@@ -244,8 +244,9 @@ class SendsTooMuch(PushSum):
 
     def emit(self, state, exchange):
         state, sent = super().emit(state, exchange)
-        much = exchange.phase != AVERAGE
-        return state, sent * (state.degree + 1) / state.degree if much else sent
+        if exchange.phase == AVERAGE:
+            return state, sent
+        return state, sent._replace(mass=sent.mass * (state.degree + 1) / state.degree)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,8 +264,8 @@ class Overshoots(PushSum):
     def absorb(self, state, messages, exchange):
         if exchange.phase != AVERAGE:
             return super().absorb(state, messages, exchange)
-        received = [message.payload for message in messages]
-        return state._replace(xhat=average_estimates(state.xhat, received, 0.6 * self.delta))
+        apart = [message.payload.xhat - state.xhat for message in messages]
+        return state._replace(xhat=state.xhat + sum(apart) / (0.6 * self.delta))
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,9 +273,8 @@ class ForgetsN(PushSum):
     """Leaves the factor N out of its gain."""
 
     def update(self, state, reading):
-        whole = state.network
-        alone = state._replace(network=whole._replace(number=1.0))
-        return super().update(alone, reading)._replace(network=whole)
+        alone = state._replace(number=1.0)
+        return super().update(alone, reading)._replace(number=state.number)
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,6 +83,14 @@ def clock_loop(kernels: Kernels) -> Any:
                 predict_node(state, record, run, h, now)
 
     @kernel
+    def on_probe(state: Simulation, record: Any, run: ClockRun) -> bool:
+        """Store a sample of all nodes; return False if there is no space for another one."""
+        for h in range(len(state.nodes)):
+            observe(record, h, run)
+        store_sample(state, state.run, 0, state.samples)
+        return count_sample(state)
+
+    @kernel
     def loop(state: Simulation, record: Any, run: ClockRun) -> int:
         """Simulate the run ``state`` until the loop needs something from Python."""
         while True:
@@ -113,12 +121,8 @@ def clock_loop(kernels: Kernels) -> Any:
             elif event == ON_REBASE:
                 # Python moves the origin and goes to the next frame.
                 return WANT_REBASE
-            else:
-                for h in range(len(state.nodes)):
-                    observe(record, h, run)
-                store_sample(state, state.run, 0, state.samples)
-                if not count_sample(state):
-                    return WANT_SAMPLES
+            elif not on_probe(state, record, run):
+                return WANT_SAMPLES
 
     return loop
 

@@ -164,6 +164,10 @@ class SlotColumns:
                     linear[name] = matrix, rows
         parts = [matrix[rows, NOISE:] - matrix[rows, ZERO : ZERO + 1]
                  for matrix, rows in linear.values()]  # fmt: skip
+        # Columns that came after a sample are zero there.
+        self._kept = [
+            np.pad(form, ((0, 0), (0, columns - MEAN - form.shape[1]))) for form in self._kept
+        ]
         stack = np.concatenate([self._x[:, NOISE:], *parts, *(form[:, 1:] for form in self._kept)])
         if len(stack) < stack.shape[1]:
             # stack' = Q R, and stack Q = R' has the same products.
@@ -228,7 +232,6 @@ class SlotColumns:
         at which ``keep`` was called.
         """
         width = max(form.shape[1] for form in self._kept)
-        # Columns that came after a time are zero there.
         forms = np.concatenate([
             np.pad(form, ((0, 0), (0, width - form.shape[1]))) for form in self._kept
         ])  # fmt: skip
