@@ -201,19 +201,46 @@ def simulate_group(
         begin(state, batch, first + k)
         suspend(state, batch, progress, k)
     # Each run in turn up to the same time; then the visits of all runs together.
-    until, running = pause, True
+    pauses, frame, running = 1, next_of(state.frames, 0), True
     while running:
-        running = False
+        # All runs stop where their origins move.
+        until, running = min(pauses * pause, frame), False
         for k in range(len(progress)):
             resume(state, batch, progress, k)
             running = run_agenda(state, visits, until) != DONE or running
             suspend(state, batch, progress, k)
         # Together, so that more visits are in one level and fill the lanes.
         process_visits(state, visits)
-        until += pause
+        if until < frame:
+            pauses += 1
+        elif frame < NEVER:
+            for k in range(len(progress)):
+                resume(state, batch, progress, k)
+                move_origin_of_run(state, visits, k * len(state.nodes), frame)
+                suspend(state, batch, progress, k)
+            state.frame_at += 1
+            frame = next_of(state.frames, state.frame_at)
     for k in range(len(progress)):
         resume(state, batch, progress, k)
         finish(state, batch, first + k)
+
+
+@kernel
+def move_origin_of_run(state: Simulation, visits: Visits, first: int, now: float) -> None:
+    """Predict all nodes of the present run to ``now`` (seconds), where a frame begins, and move the
+    origin of their estimates to the true state. ``first`` is the row of the run's first node in
+    ``state.xhat``.
+    """
+    seek_piece(state, now)
+    for h in range(len(state.nodes)):
+        if visits.count == len(visits.records):
+            process_visits(state, visits)
+        queue_visit(state, visits, now, first + h)
+    process_visits(state, visits)
+    x = state.path.x_stop[state.run, state.piece]
+    for h in range(len(state.nodes)):
+        for i in range(len(x)):
+            state.xhat[first + h, i] -= x[i]
 
 
 @kernel

@@ -28,6 +28,7 @@ from netkf.engines.compiled.ticks import all_ticks, window_of
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES
+from netkf.linalg.portable import apply
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -89,8 +90,8 @@ def _simulate(
         draws = BatchDraws(scenario, seed, replicas)
         # simulate_batch() handles neither state outside the Simulation (SPECIAL) nor moves of the
         # origin, which Python does run by run.
-        special = scenario.node_filter.combination in SPECIAL
-        if len(draws.paths.frame_times) or special:
+        alone = scenario.node_filter.combination in SPECIAL
+        if alone or (len(draws.paths.frame_times) and not is_immediate(scenario)):
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
         return _all_at_once(scenario, workspace, draws)
 
@@ -131,6 +132,14 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
         workspace.clocked.simulate(workspace.begin(draws, traced=False, buffer=buffer), arrays)
     else:
         simulate_batch(workspace.begin(draws, traced=False, buffer=buffer), arrays)
+    if len(draws.paths.frame_times):
+        local = arrays.x.copy()
+        arrays.x += draws.origins(scenario.times)
+        # As in a run alone, to the last bit.
+        buffer.xhat += (arrays.x - local)[:, :, None]
+        if not np.isfinite(arrays.x).all():
+            # A run ends where its states overflow.
+            return _run_by_run(scenario, workspace, draws.runs(), draws.replicas)
     return RunBatch(
         replicas=draws.replicas,
         times=scenario.times,
@@ -235,9 +244,7 @@ class BatchDraws:
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
         self._scenario, self.replicas, blocks = scenario, replicas, blocks_to_the_end(scenario)
         self.paths = Paths(scenario, streams, blocks)
-        # Runs that are simulated one by one, since origins move, need outcomes and not bits.
-        at_once = is_immediate(scenario) and not len(self.paths.frame_times)
-        self.ticks = all_ticks(scenario, streams, at_once)
+        self.ticks = all_ticks(scenario, streams, is_immediate(scenario))
         steps = steps_to_the_end(scenario)
         self._block = self.paths.following(steps)
         noise = Noise(scenario, streams, steps)
@@ -246,7 +253,7 @@ class BatchDraws:
         self.sensing = noise.sensing
         # An empty table: increment sensors have no samples.
         self.instants = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
-        self.states: States = PathStates(scenario, np.empty(0))
+        self.states: States = PathStates(scenario, self.paths.frame_times)
 
     def window(self) -> Window:
         """Return the ticks of all R runs, one run after the other in each array, in the form that a
@@ -281,15 +288,35 @@ class BatchDraws:
         return self.paths.block(block._replace(**own))
 
     def sampled_states(self, times: FloatArray) -> FloatArray:
-        """Return the states (R, T, n) of all R runs at the T sample ``times`` (T,) in seconds; only
-        for runs in which no origin moves, so that these are absolute states.
+        """Return the states (R, T, n) of all R runs at the T sample ``times`` (T,) in seconds,
+        relative to the origin of their frame.
         """
         block = self._block
         # Times of samples are ends of pieces or, at time 0, the start of the first.
         pieces = np.searchsorted(block.end, times)
         x, starts = block.x_end.take(pieces, axis=1), times != block.end[pieces]
         x[:, starts] = block.x_start[:, pieces[starts]]
+        # The origin has moved to the state where a frame begins.
+        x[:, np.isin(times, self.paths.frame_times)] = 0.0
         return x
+
+    def origins(self, times: FloatArray) -> FloatArray:
+        """Return the origins (R, T, n) to which the states of ``sampled_states`` are relative."""
+        frame_times, moves = self.paths.frame_times, self._scenario.diffusion.moves
+        starts = np.concatenate([[0.0], frame_times])
+        offsets = self._block.x_end[:, np.searchsorted(self._block.end, frame_times)]
+        origin = np.zeros(offsets[:, :1].shape)
+        positions, Phi = [origin[:, 0]], moves.transitions(np.diff(starts))
+        for k in range(len(frame_times)):
+            # The first origin is 0, and its transition may overflow.
+            moved = apply(Phi[k], positions[k]) if k else positions[k]
+            positions.append(moved + offsets[:, k])
+        frame = np.searchsorted(frame_times, times, side="right")
+        shift = apply(
+            moves.transitions(times - starts[frame]), np.stack(positions, axis=1)[:, frame]
+        )
+        shift[:, frame == 0] = 0.0
+        return shift
 
 
 class RunDraws:
