@@ -108,6 +108,7 @@ ROWS = [
     kernel("hybrid, 50 nodes, n = 4, 17 sensors", partial(cases.planar, 50), 2.0),
     kernel("hybrid, 1000 nodes, n = 4, 334 sensors", partial(cases.planar, 1000), 2.0),
     kernel("hybrid, 1000 nodes, n = 2, 2 sensors", partial(cases.hybrid, 1000), 2.0),
+    kernel("hybrid, unstable plant, 2 nodes, n = 1", partial(cases.load, "threshold"), 3.0),
     kernel("gossip, ring of 5, 400 slots", partial(cases.load, "gossip_ring"), 3.0),
     kernel("gossip, 100 nodes, degree 4, 400 slots", partial(cases.gossip, 100), 3.0),
     kernel("push-sum, 10 nodes, gamma 3", partial(cases.load, "push_sum_planar"), 3.0),
