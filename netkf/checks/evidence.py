@@ -283,7 +283,9 @@ def _decide(finding: Finding, runs: int) -> tuple[str, int | None, str]:
     if finding.blurred:
         return UNDECIDED, None, message
     if finding.early:
-        return UNDECIDED, None, f"{message}; {_describe_horizon(finding.horizon)}"
+        known = math.isfinite(finding.horizon)
+        advice = f"one of about {finding.horizon:.3g} s would do" if known else "lengthen it"
+        return UNDECIDED, None, f"{message}; not reached in this horizon, {advice}"
     if math.isnan(low) or math.isnan(high):
         return UNDECIDED, None, f"not judged, its test gives no number (nan): {message}"
     if high < 0.0:
@@ -313,13 +315,6 @@ def _factor_needed(finding: Finding, max_factor: float) -> float:
         middle = math.sqrt(lower * upper)
         lower, upper = (lower, middle) if finding.forecast(middle) <= tolerance else (middle, upper)
     return upper
-
-
-def _describe_horizon(seconds: float) -> str:
-    """Return advice on the horizon for a limit that is not reached; ``seconds`` would suffice."""
-    if math.isfinite(seconds):
-        return f"not reached in this horizon, one of about {seconds:.3g} s would do"
-    return "not reached in this horizon, lengthen it"
 
 
 def _unpromised_row(promise: Promise, reason: str) -> Evidence:

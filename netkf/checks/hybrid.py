@@ -335,7 +335,7 @@ class HybridChecks(PaperChecks):
         """Return the statements about a scenario's filter that are tested."""
         listed, promised = list(PROMISES), with_promised_filter(scenario)
         # One function for each of LIMITS raises TheoryError if its subject does not exist.
-        requirements = _require_known_steadiness, _require_constant_gains, _require_limit
+        requirements = has_steady_state, _require_constant_gains, _require_limit
         for promise, require in zip(LIMITS, requirements, strict=True):
             try:
                 require(promised)
@@ -358,11 +358,6 @@ def _settling_rows(scenario: Scenario) -> list[Assumption]:
         except TheoryError as error:
             evidence = f"H Proposition 4 is false here: {error}"
     return [Assumption("H(12) has a steady state", "H (12), (16)", settles, evidence)]
-
-
-def _require_known_steadiness(scenario: Scenario) -> None:
-    """Raise TheoryError if it cannot be decided whether the bound has a steady state."""
-    has_steady_state(scenario)
 
 
 def _require_constant_gains(scenario: Scenario) -> None:

@@ -127,11 +127,6 @@ def pool(
     )
 
 
-def _rounding_of(P: FloatArray, start: float) -> float:
-    """Return the rounding errors in entries of ``P`` (S, n, n), from traces up to ``start``."""
-    return OPERATIONS * EPS * max(start, float(np.median(np.trace(P, axis1=-2, axis2=-1))))
-
-
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
     """Test the null hypothesis that both samples of covariances of each pair have the same
     probability distribution (law), within LAW_TOLERANCE.
@@ -146,7 +141,8 @@ def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Fin
     for pair in pairs:
         for k in range(pair.first.shape[-1]):
             first, second = pair.first[:, k, k], pair.second[:, k, k]
-            blur = _rounding_of(pair.first, start)
+            size = float(np.median(np.trace(pair.first, axis1=-2, axis2=-1)))
+            blur = OPERATIONS * EPS * max(start, size)  # rounding of entries of P
             if pair.expected is None:
                 distance = law_distance(first, second, single_level, blur)
             else:

@@ -134,14 +134,11 @@ def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
     # Size of the compared values, of the terms whose rounding errors they inherit, and relative
     # tolerance: the drift is relative, and every addition may add a rounding error.
-    limits = np.ones_like(drift), _count_exchanges(samples), 1e-9
+    # Additions (slots times nodes) whose rounding a total may carry.
+    additions = float(check_slots(samples.scenario)[-1] * len(samples.scenario.nodes))
+    limits = np.ones_like(drift), additions, 1e-9
     finding = compare_identities(drift, *limits, message)
     return finding._replace(replica=first_wrong(drift, *limits))
-
-
-def _count_exchanges(samples: PushSumSamples) -> float:
-    """Return the number of additions (slots times nodes) whose rounding a total may carry."""
-    return float(check_slots(samples.scenario)[-1] * len(samples.scenario.nodes))
 
 
 def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
