@@ -8,117 +8,246 @@ that came after it.
 
 The origin of coordinates moves now and then to near the true state, so that large states cost no
 digits (``shift``, ``rebase``). A move is an event of the past too.
-
-Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
-``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings``, ``plan`` (the events
-of S slots), ``links``, ``samples`` (output) and ``scratch``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.neighbours import fuse_readings
-from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    predict_all,
-    rebase,
-    store_sample_of_slot,
+import numpy as np
+
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.estimates import update_by_row
+from netkf.algorithms.kernels.intersection import merge_lanes
+from netkf.algorithms.kernels.neighbours import use_readings_heard
+from netkf.algorithms.kernels.run import (
+    copy_estimate,
+    predict_estimate,
+    shift_vector,
+    use_reading,
 )
-from netkf.algorithms.models import first_root, sample_update
+from netkf.algorithms.models import SlotModel
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import field, of_time, one_of, positive
-from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 
 SLACK = 1.0 + 1e-6
 """Factor by which the past that is remembered is longer than needed, since ages are rounded."""
-
-TIME_TOLERANCE = 1e-14
-"""Relative difference up to which times count as equal, since the time of a state is a
-sum of gaps.
-"""
-
-
-class Past(NamedTuple):
-    """One event in the past of a node, the start, a reading or a move of the origin, to repeat when
-    a late reading arrives.
-
-    time : in seconds
-    reading : the reading that was used, or None
-    offset : what a move of the origin added to the estimate (n,), or None
-    xhat, root : estimate (n,) and root (n, n) right after the event
-    before : the event before it, None if that is forgotten or there is none
-    """
-
-    time: float
-    reading: Reading | None
-    offset: FloatArray | None
-    xhat: FloatArray
-    root: FloatArray
-    before: Past | None
-
-
-class IntermittentState(NamedTuple):
-    """The state of a node.
-
-    xhat, root : estimate (n,) and root (n, n) of its covariance
-    model : of the plant and the node's sensors
-    unsent : own reading of this instant, which may still be sent, or None
-    time : of the last prediction or reading, in seconds
-    past : the newest event, linked to those before it, as far back as a late reading may reach
-    lag : length of that past in seconds; 0: no events are stored
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    unsent: Reading | None
-    time: float
-    past: Past
-    lag: float
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
+MOVE = -1
+"""In place of a number of rows: the event is a move of the origin."""
 
 
 @kernel
-def intermittent_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-) -> None:
-    """Simulate H intermittent filters over the S slots of a plan, paper R (15)-(18), in B blocks of
-    L runs: in each slot they use their own readings and those that arrive, then predict.
+def send_reading(record: Any, h: int, m: int, run: Any) -> None:
+    """Do nothing: the reading of this instant goes with the message."""
 
-    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
-    ``samples``, of the predictions with which slots begin.
+
+@kernel
+def keep_payload(record: Any, m: int, run: Any) -> None:
+    """Do nothing: a reading keeps the coordinates of its time."""
+
+
+# Under clocks.
+
+
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict the estimate of node ``h``, and keep its time."""
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    record.time[h, 0] += run.gap
+
+
+@kernel
+def send_origin(record: Any, h: int, m: int, _run: Any) -> None:
+    """Send how often the origin has moved, beside the reading of this instant."""
+    record.payload.moves[m, 0] = record.moves[h, 0]
+
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Use the node's own reading, and remember it."""
+    use_and_remember(record, h, run, run.reading)
+
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Use the readings that arrive, each as if it had come at the time when it was taken."""
+    for k in range(run.count):
+        if run.heard[k] < 0:
+            continue
+        if run.age[k] > 0.0:
+            use_late(record, h, run, k)
+        else:
+            use_and_remember(record, h, run, run.heard[k])
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move the estimate with the origin. The past keeps the coordinates of its time, and the move
+    becomes its newest event, which is repeated after a late reading.
     """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            # Samples show the predictions with which the slot begins.
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            rebase(nodes, readings, scratch, b, s)
-            if plan.sensed[s]:
-                for h in range(len(nodes.rows)):
-                    # The own reading and, by True, those that arrive, one after the other: with
-                    # independent noise that equals one update.
-                    fuse_readings(nodes, readings, plan, links, scratch, True, b, s, h)
-                predict_all(nodes, scratch, b)
+    shift_vector(run, record.xhat, h)
+    if record.lag <= 0.0:
+        return
+    e = record.kept[h, 0]
+    record.moves[h, 0] += 1.0
+    record.past_time[h, e, 0], record.past_moves[h, e, 0] = record.time[h, 0], record.moves[h, 0]
+    record.past_rows[h, e, 0] = MOVE
+    for i in range(len(run.size)):
+        record.past_y[h, e, i, 0] = run.offset[i, 0]
+    store_state(record, h, run, e)
+    record.kept[h, 0] = e + 1
+
+
+@kernel
+def use_and_remember(record: Any, h: int, run: Any, r: int) -> None:
+    """Update node ``h`` with reading ``r`` of the present instant, its newest event then."""
+    # A reading without rows changes nothing.
+    if run.rows[r] == 0:
+        return
+    use_reading(run, record.xhat, record.root, h, r, True)
+    if record.lag <= 0.0:
+        return
+    forget(record, h, run)
+    e = record.kept[h, 0]
+    record.past_time[h, e, 0], record.past_moves[h, e, 0] = record.time[h, 0], record.moves[h, 0]
+    store_reading(record, h, run, e, r)
+    store_state(record, h, run, e)
+    record.kept[h, 0] = e + 1
+
+
+@kernel
+def use_late(record: Any, h: int, run: Any, k: int) -> None:
+    """Go back to the event before the reading of message ``k``, use it, and repeat all later
+    events.
+    """
+    r = run.heard[k]
+    if run.rows[r] == 0:
+        return
+    forget(record, h, run)
+    time, moves = record.time[h, 0] - run.age[k], record.payload.moves[run.message[k], 0]
+    last = record.kept[h, 0]
+    # The order of events at one time is that of moves, and does not matter for readings.
+    e = last
+    while e > 1 and (
+        record.past_moves[h, e - 1, 0] > moves
+        or (record.past_moves[h, e - 1, 0] == moves and record.past_time[h, e - 1, 0] > time)
+    ):
+        copy_event(record, h, run, e, e - 1)
+        e -= 1
+    record.past_time[h, e, 0], record.past_moves[h, e, 0] = time, moves
+    store_reading(record, h, run, e, r)
+    record.kept[h, 0] = last + 1
+    repeat(record, h, run, e)
+
+
+@kernel
+def repeat(record: Any, h: int, run: Any, first: int) -> None:
+    """Repeat the past events of node ``h`` from number ``first`` on, then predict to now."""
+    x, root, past_x, past_root = record.xhat, record.root, record.past_x[h], record.past_root[h]
+    y, H, gap, last = record.past_y[h], record.past_H[h], run.gap, record.kept[h, 0]
+    copy_estimate(run, x, root, h, past_x, past_root, first - 1, True)
+    for e in range(first, last):
+        run.gap = record.past_time[h, e, 0] - record.past_time[h, e - 1, 0]
+        if run.gap > 0.0:
+            predict_estimate(run.model, run, x, root, h, h)
+        for i in range(record.past_rows[h, e, 0]):
+            scratch = run.row, run.gains
+            update_by_row(run.lanes, run.size, x, root, h, y, H, (e, e, i), True, scratch)
+        if record.past_rows[h, e, 0] == MOVE:
+            for i in range(len(run.size)):
+                x[h, i, 0] += y[e, i, 0]
+        store_state(record, h, run, e)
+    run.gap = record.time[h, 0] - record.past_time[h, last - 1, 0]
+    if run.gap > 0.0:
+        predict_estimate(run.model, run, x, root, h, h)
+    run.gap = gap
+
+
+@kernel
+def store_state(record: Any, h: int, run: Any, e: int) -> None:
+    """Store the estimate of node ``h`` as that right after its event ``e``."""
+    past_x, past_root = record.past_x[h], record.past_root[h]
+    copy_estimate(run, past_x, past_root, e, record.xhat, record.root, h, True)
+
+
+@kernel
+def store_reading(record: Any, h: int, run: Any, e: int, r: int) -> None:
+    """Store reading ``r`` as event ``e`` of node ``h``, in at most n rows."""
+    n, rows, y, H = len(run.size), run.rows[r], record.past_y, record.past_H
+    first, matrix = run.first_y + r, run.first_H + run.matrix[r]
+    record.past_rows[h, e, 0] = min(rows, n)
+    if rows <= n:
+        for i in range(rows):
+            y[h, e, i, 0] = run.y[first, i, 0]
+            for j in range(n):
+                H[h, e, i, j, 0] = run.H[matrix, i, j, 0]
+        return
+    # More rows than states: the root [Z, z] of their information has the same.
+    total, row = run.total, run.whitened
+    for i in range(n):
+        for j in range(n + 1):
+            total[i, j, 0] = row[i, j, 0] = 0.0
+    for k in range(rows):
+        for j in range(n):
+            row[n - 1, j, 0] = run.H[matrix, k, j, 0]
+            for i in range(n - 1):
+                row[i, j, 0] = row[i, n, 0] = 0.0
+        row[n - 1, n, 0] = run.y[first, k, 0]
+        merge_lanes(run.lanes, total, row)
+    for i in range(n):
+        y[h, e, i, 0] = total[i, n, 0]
+        for j in range(n):
+            H[h, e, i, j, 0] = total[i, j, 0]
+
+
+@kernel
+def copy_event(record: Any, h: int, run: Any, to: int, e: int) -> None:
+    """Copy event ``e`` of node ``h``, without its state, to number ``to``."""
+    record.past_time[h, to, 0] = record.past_time[h, e, 0]
+    record.past_moves[h, to, 0] = record.past_moves[h, e, 0]
+    record.past_rows[h, to, 0] = record.past_rows[h, e, 0]
+    for i in range(len(run.size)):
+        record.past_y[h, to, i, 0] = record.past_y[h, e, i, 0]
+        for j in range(len(run.size)):
+            record.past_H[h, to, i, j, 0] = record.past_H[h, e, i, j, 0]
+
+
+@kernel
+def forget(record: Any, h: int, run: Any) -> None:
+    """Forget the events of node ``h`` that no late reading can reach any more, all but the last of
+    them; once in each interval of length ``lag``, since those that stay are moved.
+    """
+    time, kept = record.time[h, 0], record.kept[h, 0]
+    if time - record.swept[h, 0] < record.lag:
+        return
+    record.swept[h, 0] = time
+    # A late reading of that time starts from the event before it.
+    first = kept - 1
+    while first > 0 and record.past_time[h, first, 0] >= time - record.lag:
+        first -= 1
+    x, root = record.past_x[h], record.past_root[h]
+    for e in range(first, kept if first > 0 else 0):
+        copy_event(record, h, run, e - first, e)
+        copy_estimate(run, x, root, e - first, x, root, e, True)
+    record.kept[h, 0] = kept - first
+
+
+UNDER_CLOCKS = Kernels(
+    predict=predict,
+    update=update,
+    emit=send_origin,
+    absorb=absorb,
+    shift=shift,
+    shift_payload=keep_payload,
+    sends_readings=True,
+    remembers=True,
+    unrolled=False,
+)
 
 
 @built_in("intermittent")
@@ -144,8 +273,36 @@ class Intermittent(Filter):
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
     newest_only: ClassVar[bool] = False
-    slot_kernel = staticmethod(intermittent_slots)
-    unrolled: ClassVar[bool] = True
+    kernels = Kernels(
+        emit=send_reading,
+        absorb=use_readings_heard,
+        shift_payload=keep_payload,
+        sends_readings=True,
+        under_clocks=UNDER_CLOCKS,
+    )
+
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return what nodes keep under clocks: their time, the number of moves of the origin, the
+        time when they last forgot events, and events of the past with the state after each.
+        """
+        if isinstance(models[0], SlotModel):
+            return Record()
+        n = len(models[0].information)
+        return Record(
+            node={"time": (), "moves": (), "swept": ()},
+            past={
+                **{"past_time": (), "past_moves": (), "past_rows": ((), np.int64)},
+                **{"past_y": (n,), "past_H": (n, n), "past_x": (n,), "past_root": (n, n)},
+            },
+            payload={"moves": ()},
+            settings={"lag": self.history_span(max(info.max_delay for info in infos))},
+        )
+
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Make the start the first event of the past: every late reading has a state before it."""
+        if "kept" in node:
+            node["past_x"][0], node["past_root"][0] = node["xhat"], node["root"]
+            node["kept"][...] = 1
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
         """Return True for nodes with a sensor: they send their readings."""
@@ -156,25 +313,6 @@ class Intermittent(Filter):
         states.
         """
         return rows * (1 + n) + rows * (rows + 1) // 2
-
-    def init(
-        self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
-    ) -> IntermittentState:
-        """Return the state of ``node`` at time 0, before any reading, with estimate ``mean`` (n,)
-        and covariance ``cov`` (n, n); ``model`` is that of the plant and the node's sensors.
-        """
-        root = first_root(cov)
-        # The start is the first entry of the past: every late reading has a state before it.
-        start = Past(time=0.0, reading=None, offset=None, xhat=mean, root=root, before=None)
-        return IntermittentState(
-            xhat=mean,
-            root=root,
-            model=model,
-            unsent=None,
-            time=0.0,
-            past=start,
-            lag=self.history_span(node.max_delay),
-        )
 
     @property
     def max_age(self) -> float:
@@ -191,132 +329,10 @@ class Intermittent(Filter):
         """
         return SLACK * min(self.max_age, max_delay)
 
-    def predict(self, state: IntermittentState, gap: float) -> IntermittentState:
-        """Return the state ``gap`` seconds later, without an unsent reading: a reading is sent at
-        its own instant or never.
-        """
-        xhat, root = state.model.predict(state.xhat, state.root, gap)
-        return state._replace(xhat=xhat, root=root, time=state.time + gap, unsent=None)
-
-    def update(self, state: IntermittentState, reading: Reading) -> IntermittentState:
-        """Return the state after the reading, paper R (15)-(18), which is kept to be sent."""
-        return _use_reading(state, reading)._replace(unsent=reading if len(reading.y) else None)
-
-    def emit(
-        self, state: IntermittentState, exchange: Exchange
-    ) -> tuple[IntermittentState, Reading | None]:
-        """Return the state, unchanged, and the payload: the reading of this instant, None from
-        nodes that have none.
-        """
-        return state, state.unsent
-
-    def absorb(
-        self, state: IntermittentState, messages: Sequence[Message], exchange: Exchange
-    ) -> IntermittentState:
-        """Return the state after the readings in ``messages``, each used as if it had come at the
-        time when it was taken.
-        """
-        for message in messages:
-            reading: Reading = message.payload
-            # In slots a message is used in the slot in which it was sent.
-            if exchange.slot >= 0 or message.age <= 0.0:
-                state = _use_reading(state, reading)
-            else:
-                state = _use_late(state, reading, exchange.time)
-        return state
-
-    def accepts(self, payload: Reading, age: float) -> bool:
+    def accepts(self, payload: Any, age: float) -> bool:
         """Return False if the message, ``age`` seconds old, took longer than the window, or if late
         readings are dropped.
         """
         return age <= self.max_age
 
-    def shift(self, state: IntermittentState, offset: FloatArray) -> IntermittentState:
-        """Return the state with ``offset`` (n,) added to the estimate, for a move of the origin.
-        The past keeps the coordinates of its time, and the move becomes its newest event.
-        """
-        xhat = state.xhat + offset
-        # After a late reading, the way forward from before this time must shift again.
-        if state.lag > 0.0:
-            past = Past(state.time, None, offset, xhat, state.root, state.past)
-            state = state._replace(past=past)
-        return state._replace(xhat=xhat)
-
-    def shift_payload(self, payload: Reading, offset: FloatArray) -> Reading:
-        """Return the ``payload`` of a message under way, for a move of the origin by which
-        estimates change by ``offset`` (n,): unchanged, since a reading keeps the coordinates of its
-        time, to which the receiver goes back.
-        """
-        return payload
-
-
-def _use_reading(state: IntermittentState, reading: Reading) -> IntermittentState:
-    """Return the state after a ``reading`` of the present instant, with updated estimate and root;
-    if late readings are used exactly, the reading joins the past events, which a late one repeats.
-    """
-    # A reading without rows changes nothing.
-    if not len(reading.y):
-        return state
-    xhat, root = sample_update(state.xhat, state.root, reading.y, reading.H, reading.R)
-    state = state._replace(xhat=xhat, root=root)
-    if state.lag <= 0.0:
-        return state
-    time, past = reading.time, state.past
-    # Forget old events once in each interval of length lag: each time copies those that stay.
-    if time // state.lag > past.time // state.lag:
-        past = _drop_old(past, time - state.lag)
-    return state._replace(time=time, past=Past(time, reading, None, xhat, root, past))
-
-
-def _use_late(state: IntermittentState, reading: Reading, now: float) -> IntermittentState:
-    """Return the state at ``now`` (seconds) as if a late reading had come in time: go back to the
-    event before it, use it, and repeat all later events.
-    """
-    later_events: list[Past] = []
-    past = state.past
-    # Entries after the reading's time are taken off; times that differ by rounding count as equal.
-    while past.time > reading.time + TIME_TOLERANCE * now and past.before is not None:
-        later_events.append(past)
-        past = past.before
-    model = state.model
-    # The late reading, with the state before it, takes its place in time.
-    late_event = Past(reading.time, reading, None, past.xhat, past.root, None)
-    # Forward again: predict to each event, and repeat it.
-    for event in [late_event, *reversed(later_events)]:
-        xhat, root = past.xhat, past.root
-        if event.time > past.time:
-            xhat, root = model.predict(xhat, root, event.time - past.time)
-        if event.reading is not None:
-            # R (17) and (18) with this reading.
-            r = event.reading
-            xhat, root = sample_update(xhat, root, r.y, r.H, r.R)
-        if event.offset is not None:
-            xhat = xhat + event.offset
-        past = Past(event.time, event.reading, event.offset, xhat, root, past)
-    xhat, root = past.xhat, past.root
-    # From the last event to now.
-    if now > past.time:
-        xhat, root = model.predict(xhat, root, now - past.time)
-    return state._replace(xhat=xhat, root=root, time=now, past=_drop_old(past, now - state.lag))
-
-
-def _drop_old(past: Past, since: float) -> Past:
-    """Return the past without the events that no late reading can reach: those from ``since``
-    (seconds) on stay, and one before it.
-    """
-    recent: list[Past] = []
-    event: Past | None = past
-    while event is not None:
-        recent.append(event)
-        # One entry before ``since`` stays: a late reading of that time starts from it.
-        if event.time < since:
-            break
-        event = event.before
-    else:
-        # All events are recent: no copy.
-        return past
-    trimmed = recent[-1]._replace(before=None)
-    # Entries are immutable, so the list is built anew from its oldest entry.
-    for event in reversed(recent[:-1]):
-        trimmed = event._replace(before=trimmed)
-    return trimmed
+    shift = Filter.shift  # affine in the readings

@@ -28,6 +28,10 @@ class Record:
     """The arrays of a filter besides ``xhat`` (n,) and ``root`` (n, n) of each node.
 
     node : shapes of what each node knows, by name
+    past : shapes of what a node keeps of each of its past events, such as the readings that it has
+           used: arrays (H, E, *shape, L), of which the first ``kept`` (H, L) entries of a node
+           count, which kernels set. Engines make E (``room``) larger where ``update``, ``shift`` or
+           a message of ``absorb`` might find no free entry
     link : shapes of what a node knows for each of its incoming links
     payload : shapes of what a message carries
     scratch : shapes of arrays for intermediate results, shared by all nodes
@@ -35,6 +39,7 @@ class Record:
     """
 
     node: Shapes = field(default_factory=dict)
+    past: Shapes = field(default_factory=dict)
     link: Shapes = field(default_factory=dict)
     payload: Shapes = field(default_factory=dict)
     scratch: Shapes = field(default_factory=dict)
@@ -53,6 +58,7 @@ class Kernels:
                once from this state on
     decides : ``emit`` may write 0 into ``run.sends``
     sends_readings : a message brings the sender's reading of that instant, ``run.heard``
+    remembers : the record has a ``past``
     counts_sends : ``emit`` changes the record, so that it is called even if no message arrives
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
@@ -69,6 +75,7 @@ class Kernels:
     interval: Any = standard.interval
     decides: bool = False
     sends_readings: bool = False
+    remembers: bool = False
     counts_sends: bool = False
     unrolled: bool = True
     under_clocks: Kernels | None = None
@@ -78,6 +85,8 @@ class Kernels:
         return self.under_clocks or self if clocked else self
 
 
+FIRST_PAST = 16
+"""Past events of a node for which there is room at first."""
 ESTIMATE = ("xhat", "root")
 _classes: dict[tuple[str, ...], Any] = {}
 
@@ -127,12 +136,13 @@ class Records:
 
     struct : its fields are the arrays of the first block, ``payload`` and the settings
     arrays : of nodes (B, H, ..., L) and links (B, W, ..., L)
-    links : names of those of links
+    links, past : names of those of links, and of past events
     """
 
     struct: Any
     arrays: dict[str, np.ndarray]
     links: tuple[str, ...] = ()
+    past: tuple[str, ...] = ()
 
     def copied(self) -> Any:
         """Return the struct of the first block with its own copies of the arrays of nodes and
@@ -169,7 +179,11 @@ def make_records(
     """
     n, count = len(starts[0][0]), len(starts)
     record: Record = filtering.record(infos, models)
-    nodes = make_arrays({**estimate_shapes(n), **record.node}, (blocks, count), lanes)
+    known = {**estimate_shapes(n), **record.node}
+    if record.past:
+        known["kept"] = ((), np.int64)
+    nodes = make_arrays(known, (blocks, count), lanes)
+    nodes |= make_arrays(record.past, (blocks, count, FIRST_PAST), lanes)
     per_link = make_arrays(record.link, (blocks, links), lanes)
     for h, ((mean, root), info, model) in enumerate(zip(starts, infos, models, strict=True)):
         views = {name: array[0, h, ..., 0] for name, array in nodes.items()}
@@ -187,7 +201,19 @@ def make_records(
     values["payload"] = record_class(f"{name}Payload", payload)(**payload)
     values |= make_arrays(record.scratch, (), lanes)
     values |= record.settings
-    return Records(record_class(f"{name}Record", values)(**values), arrays, tuple(per_link))
+    if record.past:
+        values["room"] = FIRST_PAST
+    return Records(
+        record_class(f"{name}Record", values)(**values), arrays, tuple(per_link), tuple(record.past)
+    )
+
+
+def double_past(record: Any, names: Sequence[str]) -> None:
+    """Make room for twice as many past events in a record, whose fields of them have ``names``."""
+    for name in names:
+        array = getattr(record, name)
+        setattr(record, name, np.concatenate([array, np.zeros_like(array)], axis=1))
+    record.room *= 2
 
 
 def resized(payload: Any, messages: int) -> Any:

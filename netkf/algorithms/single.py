@@ -25,7 +25,7 @@ from netkf.algorithms.kernels.run import (
 )
 from netkf.algorithms.kernels.slots import whiten_reading
 from netkf.algorithms.models import FlowModel, first_root
-from netkf.algorithms.records import Kernels, Records, make_records
+from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Size
@@ -113,8 +113,8 @@ class NodeState:
             getattr(new, name)[...] = value
         return new
 
-    def copied(self) -> NodeState:
-        """Return a state with arrays of its own."""
+    def copied(self, events: int = 0) -> NodeState:
+        """Return a state with arrays of its own, with room for so many more past events."""
         record, cls = self.record, type(self.record)
         new: Any = object.__new__(cls)
         memory = record.memory.copy()
@@ -127,6 +127,8 @@ class NodeState:
                 memory[cls.struct_offsets[name]] = address_of(array)
             elif name not in ("memory", "address"):
                 new.__dict__[name] = value
+        while self.run.past and int(new.kept[0, 0]) + events > new.room:
+            double_past(new, self.run.past)
         state = NodeState(self.kernels, new, self.changing, self.run)
         state.reading = self.reading
         return state
@@ -135,8 +137,15 @@ class NodeState:
 class Surroundings:
     """The run of one node: the struct that kernels take, and how Python fills it."""
 
-    def __init__(self, filtering: Any, model: Any, info: Any, node_fields: tuple[str, ...]) -> None:
-        self.filtering = filtering
+    def __init__(
+        self,
+        filtering: Any,
+        model: Any,
+        info: Any,
+        node_fields: tuple[str, ...],
+        past: tuple[str, ...],
+    ) -> None:
+        self.filtering, self.past = filtering, past
         n, self.info, self.node_fields = len(model.information), info, node_fields
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
@@ -250,7 +259,7 @@ def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: A
     fields = tuple(records.arrays)
     nodes = tuple(name for name in fields if name not in records.links)
     kernels = filtering.kernels.of(isinstance(model, FlowModel))
-    run = Surroundings(filtering, model, info, nodes)
+    run = Surroundings(filtering, model, info, nodes, records.past)
     return NodeState(kernels, records.struct, fields, run)
 
 
@@ -260,6 +269,8 @@ def _restored(filtering: Any, model: Any, info: Any, values: dict[str, Any], rea
     state = begin(filtering, model, np.zeros(n), np.eye(n), info)
     for name, array in values.items():
         setattr(state.record, name, array)
+    if state.run.past:
+        state.record.room = values[state.run.past[0]].shape[1]
     state.reading = reading
     return state
 
@@ -277,7 +288,7 @@ def predict(state: NodeState, gap: float) -> NodeState:
 
 def update(state: NodeState, reading: Any) -> NodeState:
     """Return the state after a reading or increments."""
-    new, surroundings = state.copied(), state.run
+    new, surroundings = state.copied(events=1), state.run
     run = surroundings.struct
     if hasattr(reading, "moments"):
         run.model.moments = np.array(reading.moments)
@@ -303,7 +314,11 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     payload = _payload_struct(record, 1)
     record.payload = payload
     state.kernels.emit(record, 0, 0, run)
-    if not run.sends[0]:
+    has_reading = new.reading is not None
+    silent = exchange.slot >= 0 and not surroundings.filtering.sends_in_slots(
+        exchange.phase, has_reading
+    )
+    if silent or not run.sends[0]:
         return new, None
     fields = {name: getattr(payload, name) for name in type(payload).struct_fields}
     return new, Payload(fields, new.reading, new)
@@ -311,7 +326,7 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
 
 def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeState:
     """Return the state after all messages of this instant."""
-    new, surroundings = state.copied(), state.run
+    new, surroundings = state.copied(events=len(messages)), state.run
     record, run = new.record, surroundings.struct
     surroundings.set_exchange(exchange)
     surroundings.prepare(record, exchange.slot)
@@ -336,7 +351,7 @@ def interval(state: NodeState) -> float:
 
 def shift(state: NodeState, offset: FloatArray) -> NodeState:
     """Return the state after the origin of coordinates moved by ``-offset`` (n,)."""
-    new, run = state.copied(), state.run.struct
+    new, run = state.copied(events=1), state.run.struct
     run.offset[:, 0] = offset
     state.kernels.shift(new.record, 0, run)
     return new
@@ -350,11 +365,8 @@ def shift_payload(payload: Payload, offset: FloatArray) -> Payload:
     fields = {name: array.copy() for name, array in payload.fields.items()}
     record.payload = type(record.payload)(**fields)
     new.kernels.shift_payload(record, 0, run)
-    reading = payload.reading
-    if reading is not None:
-        y, H = reading
-        reading = y + H @ offset, H
-    return Payload(fields, reading, payload.sender)
+    # A reading keeps the coordinates of its time.
+    return Payload(fields, payload.reading, payload.sender)
 
 
 def _field(payload: Any, name: str) -> np.ndarray:

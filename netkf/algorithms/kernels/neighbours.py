@@ -20,7 +20,7 @@ from __future__ import annotations
 from typing import Any
 
 from netkf.algorithms.kernels.estimates import triangularise
-from netkf.algorithms.kernels.run import carry
+from netkf.algorithms.kernels.run import carry, use_reading
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
     SlotLinks,
@@ -264,3 +264,14 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
     for i in range(n):
         mean = load(lanes, record.xhat, h, i) + load(lanes, run.moved_mean, i)
         store(lanes, record.xhat, h, i, mean)
+
+
+@kernel
+def use_readings_heard(record: Any, h: int, run: Any) -> None:
+    """Update node ``h`` with the readings that its messages bring, one after the other: with
+    independent noise that equals one update.
+    """
+    for k in range(run.count):
+        if run.heard[k] >= 0:
+            arrived = load_flags(run.lanes, run.arrived, k)
+            use_reading(run, record.xhat, record.root, h, run.heard[k], arrived)

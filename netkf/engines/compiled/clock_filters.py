@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.run import ClockRun, clock_tables, scratch_of, size_of
-from netkf.algorithms.records import Kernels, make_records, resized
+from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_loop import BatchArrays
 from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
 from netkf.engines.compiled.state import Filters, Instants, Simulation, add_messages
@@ -144,10 +144,17 @@ class ClockFilters:
         for name, array in self._inbox(messages, len(self.run.size)).items():
             setattr(self.run, name, array)
 
+    def grow_past(self) -> None:
+        """Make room for twice as many past events of each node."""
+        for record in (self.record, self.start):
+            double_past(record, self.records.past)
+
     def shift(self, scenario: Scenario, state: Simulation, offset: FloatArray) -> None:
         """Move all nodes and messages under way by ``offset`` (n,): the origin of coordinates has
         moved by its negative.
         """
+        if self.kernels.remembers and self.record.kept.max() == self.record.room:
+            self.grow_past()
         run, now = self.run, float(state.frames[state.frame_at])
         run.offset[:, 0] = offset
         shift_loop(self.kernels)(self.record, run)

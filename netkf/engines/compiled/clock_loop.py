@@ -31,6 +31,7 @@ from netkf.engines.compiled.event_loop import (
     TICK,
     TRANSMIT,
     WANT_MESSAGES,
+    WANT_PAST,
     WANT_REBASE,
     WANT_SAMPLES,
     arrive,
@@ -39,6 +40,7 @@ from netkf.engines.compiled.event_loop import (
     ends_instant,
     find_shortage,
     is_lost,
+    max_readings,
     next_event,
     on_deliver,
     on_sense,
@@ -68,7 +70,8 @@ def clock_loop(kernels: Kernels) -> Any:
     on_tick = ticking_of(kernels, predict_node)
     on_absorb = absorption_of(kernels)
     on_sample = sampling_of(kernels)
-    counts_sends, observe = kernels.counts_sends, kernels.observe
+    counts_sends, remembers = kernels.counts_sends, kernels.remembers
+    observe = kernels.observe
 
     @kernel
     def predict_participants(
@@ -91,13 +94,21 @@ def clock_loop(kernels: Kernels) -> Any:
         return count_sample(state)
 
     @kernel
+    def shortage(state: Simulation, record: Any, event: int, now: float) -> int:
+        """Return the request for what an event lacks, as ``find_shortage``."""
+        request = int(find_shortage(state, None, event, now))
+        if remembers and request == GO_ON and lacks_past(state, record, event):
+            return WANT_PAST
+        return request
+
+    @kernel
     def loop(state: Simulation, record: Any, run: ClockRun) -> int:
         """Simulate the run ``state`` until the loop needs something from Python."""
         while True:
             # Check first that the event has everything it needs: if not, nothing has changed, and
             # the next call finds the same event again.
             event, now = next_event(state)
-            request = find_shortage(state, None, event, now)
+            request = shortage(state, record, event, now)
             if request != GO_ON:
                 return request
             seek_piece(state, now)
@@ -105,7 +116,7 @@ def clock_loop(kernels: Kernels) -> Any:
             if event == ON_TICK:
                 on_tick(state, record, run, now)
                 # Absorptions come next, unless there are other events at this instant.
-                if state.receivers > 0 and ends_instant(state, now):
+                if not remembers and state.receivers > 0 and ends_instant(state, now):
                     sort_indices(state.waiting, state.receivers)
                     while state.receivers > 0:
                         predict_node(state, record, run, state.waiting[state.absorbing], now)
@@ -300,6 +311,15 @@ def absorption_of(kernels: Kernels) -> Any:
             state.absorbing = state.receivers = 0
 
     return on_absorb
+
+
+@kernel
+def lacks_past(state: Simulation, record: Any, event: int) -> bool:
+    """Return True if an event may add more past events to a node than there is room for."""
+    if event not in (ON_SAMPLE, ON_ABSORB):
+        return False
+    h = participant(state, event, 0)
+    return bool(record.kept[h, 0] + max_readings(state, event) > record.room)
 
 
 @kernel

@@ -450,8 +450,8 @@ class FlowRun:
         elif request == WANT_ROWS:
             self._record_rows(state.row, state.counts)
             self._enlarge_rows()
-        elif request == WANT_PAST and self._history is not None:
-            add_past(self._history, len(state.nodes))
+        elif request == WANT_PAST and self._clocked is not None:
+            self._clocked.grow_past()
         elif request == WANT_REBASE:
             self._rebase()
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.algorithms.intermittent import TIME_TOLERANCE
 from netkf.algorithms.kernels.root_flow import propagate_root
 from netkf.algorithms.kernels.root_update import sample_root
 from netkf.engines.compiled.state import Simulation
@@ -16,6 +15,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Size, Struct
 
+TIME_TOLERANCE = 1e-14
 PAST = np.dtype(
     [("instant", np.int64), ("frame", np.int64), ("before", np.int64), ("time", np.float64)]
 )
