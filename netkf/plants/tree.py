@@ -106,8 +106,9 @@ class Tree:
         which the state is taken to 0. ``stream`` (1, WIDTH) is the state of the plant's stream.
         """
         n, depth = len(start), len(self._cells.length) + 1
-        integers = (np.zeros(depth, dtype=np.int64) for _ in range(3))
-        walk = Walk(*integers, np.zeros((depth, n)), np.zeros((depth, n)), np.zeros(2 * n))
+        kind, begin, end = (np.zeros(depth, dtype=np.int64) for _ in range(3))
+        x, z = np.zeros((depth, n)), np.zeros((depth, n))
+        walk = Walk(kind, begin, end, x, z, np.zeros(2 * n))
         states, offsets = np.empty((len(times), n)), np.zeros((frames, n))
         walk.x[0] = start
         ticks = np.rint(times * self._per_second).astype(np.int64)

@@ -45,7 +45,8 @@ class Streams:
         id or the two ends of a link.
         """
         key, counter = _key_and_counter(self.seed, self.replica, _purpose_code(purpose), entity)
-        return np.random.Generator(np.random.Philox(_Key(key), counter=counter))
+        bits: Any = np.random.Philox
+        return np.random.Generator(bits(_Key(key), counter=counter))
 
     @property
     def runs(self) -> int:

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from netkf.engines.compiled import schedule as schedule_module
 from netkf.engines.compiled import ticks as ticks_module
+from netkf.engines.compiled.outcomes import PythonOutcomes, outcomes_of
 from netkf.engines.compiled.schedule import Schedule, all_windows
 from netkf.engines.compiled.ticks import KernelSchedules, is_drawn_in_kernels, schedule
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -35,6 +37,12 @@ CLOCKS = {
     "uniform": {"kind": "renewal", "distribution": "uniform", "low": 0.1, "high": 0.4},
     "constant": {"kind": "renewal", "distribution": "constant", "rate": 3.0, "at": "directions"},
 }
+
+
+@pytest.fixture(autouse=True)
+def _outcomes_in_python(monkeypatch):
+    """What a Schedule draws is drawn by the channels themselves."""
+    monkeypatch.setattr(schedule_module, "outcomes_of", PythonOutcomes)
 
 
 def all_of(windows):
@@ -102,6 +110,19 @@ def test_all_clocks_and_channels(ring, monkeypatch, clock, channel):
             ticks_of(ticks_module.window_of(batch, run)), ticks_of(window), strict=True
         ):
             np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("at", ["links", "nodes"])
+@pytest.mark.parametrize("channel", ["shared", "bursts", "shared bursts", "lognormal"])
+def test_outcomes_after_ticks_of_other_clocks(ring, monkeypatch, channel, at):
+    gamma = {"kind": "renewal", "distribution": "gamma", "mean": 0.3, "shape": 2.0, "at": at}
+    changes = {"network.activation": gamma, "network.channel": CHANNELS[channel]}
+    case = ring.replace({"horizon": 20.0, **changes})
+    _, plain = all_of(Schedule(case, Streams(3)))
+    monkeypatch.setattr(schedule_module, "outcomes_of", outcomes_of)
+    _, made = all_of(schedule(case, Streams(3)))
+    for one, other in zip(made, plain, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_room_grows_where_there_are_more_ticks_than_expected(busy):

@@ -38,7 +38,7 @@ from netkf.engines.compiled.event_loop import (
     seek_piece,
 )
 from netkf.engines.compiled.message_queue import sort_indices
-from netkf.engines.compiled.schedule import delay_is_zero
+from netkf.engines.compiled.outcomes import delay_is_zero
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import LINKS, NODES, Simulation
 from netkf.engines.compiled.visits import (

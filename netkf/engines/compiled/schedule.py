@@ -15,19 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.clock import ClockPosition, next_ticks
+from netkf.engines.compiled.outcomes import outcomes_of
 from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import (
-    Channel,
-    ChannelSampler,
-    checked_delay,
-    delay_depends_on_message,
-    delivery_probabilities,
-    identical_per_link,
-)
 from netkf.network.clocks import LinkClock
-from netkf.network.graphs import Link
-from netkf.rng.draws import StreamBatch
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
@@ -35,7 +26,6 @@ from netkf.scenario.scenario import Scenario
 FIRST_BLOCK, MAX_BLOCK_SLOTS = 8, 1024
 TICKS_PER_ENTITY = 256  # ticks of an entity in a window, which share its fixed cost
 MAX_WINDOW_TICKS, MIN_WINDOW_TICKS = 1 << 20, 1 << 12  # limits for all entities together
-LOST = -1.0  # no delay is negative
 
 
 class Window(NamedTuple):
@@ -158,185 +148,6 @@ class TickSource:
         return next_ticks(self._clock, entity, position, random, int(count))
 
 
-def has_table_law(channel: Channel) -> bool:
-    """Return True if each directed link has one probability and all messages one delay."""
-    delay = channel.delay
-    fixed = delay.fixed is not None and not delay.is_random and not delay_depends_on_message(delay)
-    return fixed and identical_per_link(channel.loss)
-
-
-def delay_is_zero(channel: Channel) -> bool:
-    """Return True if no message takes time."""
-    delay = channel.delay
-    return delay.fixed == 0.0 and not delay.is_random and not delay_depends_on_message(delay)
-
-
-def delivery_probabilities_of(scenario: Scenario, directions: tuple[Link, ...]) -> FloatArray:
-    """Return the delivery probabilities (W,) of the messages of W directed links, for channels in
-    which they depend neither on a state of the link nor on the message.
-    """
-    loss = scenario.network.channel.loss
-    return np.array(
-        [
-            # Message number 0 and a good state: the probability is the same for all others.
-            loss.delivery_probability(direction, 0, False, scenario.table_probability(direction))
-            for direction in directions
-        ]
-    )
-
-
-class Outcomes:
-    """Draws the outcomes of all messages of R runs: delays in seconds, or LOST. ``sizes`` (R E,) is
-    the number of messages that each entity sends at a tick.
-    """
-
-    def __init__(
-        self, scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders
-    ) -> None:
-        """Make the random streams of losses and delays of all runs, and tables of delivery
-        probabilities (W,) where these depend on the W directed links only. ``senders`` says which
-        entities (links, directions or nodes) have a clock, and on which directed links each sends.
-        """
-        self._channel = channel = scenario.network.channel
-        runs = streams.runs
-        self._senders, self._directions = senders, len(senders.directions)
-        self._first, self._outgoing = senders.first, senders.outgoing
-        self._count, self._sources = len(senders.entities), len(senders.sources)
-        self._table_probabilities = np.array(
-            [scenario.table_probability(direction) for direction in senders.directions]
-        )
-        self._identical, self._has_table_law = (
-            identical_per_link(channel.loss),
-            has_table_law(channel),
-        )
-        # Probabilities that depend on the link only are tabulated.
-        if self._identical:
-            self._probabilities = delivery_probabilities_of(scenario, senders.directions)
-        # Channels with memory or random delays need a sampler for each stream.
-        if not self._has_table_law:
-            self._samplers = [
-                ChannelSampler(channel, partial(_stream, run_streams, source))
-                for run_streams in streams.per_replica
-                for source in senders.sources
-            ]
-        elif not channel.loss.deterministic:
-            # Otherwise a batch of streams draws uniform numbers for all links at once.
-            self._uniforms = StreamBatch(streams, "loss", senders.sources)
-        self.sizes = np.tile(np.diff(senders.first), runs)
-
-    def of(self, indices: np.ndarray, counts: np.ndarray, first: np.ndarray) -> FloatArray:
-        """Return the outcomes (K,) of the next ``counts`` (M,) ticks of M entities with the
-        ``indices`` (M,), over all runs, K messages in all, entity by entity and tick after tick:
-        delays in seconds, or LOST. ``first`` (M,) are the numbers of their first ticks, from 0.
-        """
-        runs, entity = np.divmod(indices, max(self._count, 1))
-        sizes = self.sizes[indices]
-        out = np.empty(int((counts * sizes).sum()))
-        begin = np.cumsum(counts * sizes) - counts * sizes
-        draws: tuple[np.ndarray, ...] = ()
-        # Vectorised over entities: the k-th directed link of all entities with more than k.
-        for k in range(int(sizes.max(initial=0))):
-            has_link = sizes > k
-            directions = self._outgoing[self._first[entity[has_link]] + k]
-            count = counts[has_link]
-            # With a symmetric channel the second direction of a link takes the draws of the first.
-            if not draws or not self._senders.shared:
-                sources = runs[has_link] * self._sources + self._senders.source[directions]
-                draws = self._draw(sources, count)
-            # Position of each outcome: tick after tick, and inside a tick in the order of its
-            # links.
-            step = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-            positions = np.repeat(begin[has_link] + k, count) + step * np.repeat(
-                sizes[has_link], count
-            )
-            out[positions] = self._delays(directions, count, first[has_link], *draws)
-        return out
-
-    def _draw(self, sources: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Draw for the next ``counts`` (M,) messages of each of M streams ``sources`` (M,), K in
-        all: return uniform numbers, which decide about losses, bad states of the channel (bool) and
-        delays in seconds, (K,) each.
-        """
-        total = int(counts.sum())
-        if not self._has_table_law:
-            parts = [
-                self._samplers[k].draws(n) for k, n in zip(sources, counts.tolist(), strict=True)
-            ]
-            columns = zip(*parts, strict=True)
-            return tuple(np.concatenate([np.empty(0), *column]) for column in columns)
-        # A broadcast view: one delay for all.
-        delay = np.broadcast_to(np.float64(self._channel.delay.fixed or 0.0), (total,))
-        lossless = self._channel.loss.deterministic
-        # A uniform number of 0 is below every positive probability: nothing is lost.
-        uniform = np.zeros(total) if lossless else self._uniforms.units(sources, counts)
-        return uniform, np.zeros(total, dtype=bool), delay
-
-    def _delays(
-        self,
-        directions: np.ndarray,
-        counts: np.ndarray,
-        first: np.ndarray,
-        uniform: np.ndarray,
-        bad: np.ndarray,
-        delay: np.ndarray,
-    ) -> FloatArray:
-        """Return the outcomes (K,) of K messages, delays in seconds or LOST: of ``counts`` (M,)
-        messages on each of M ``directions`` (M,), numbered from ``first`` (M,) on. Their draws (K,)
-        are a ``uniform`` number, whether the channel is ``bad``, and a ``delay`` in seconds.
-        """
-        if self._identical:
-            probability = np.repeat(self._probabilities[directions], counts)
-        else:
-            probability = self._delivery_probability(directions, counts, first, bad)
-        lost = uniform >= probability
-        if delay_depends_on_message(self._channel.delay):
-            delay = self._message_delays(directions, counts, first, lost, delay)
-        return np.where(lost, LOST, delay)
-
-    def _delivery_probability(
-        self, directions: np.ndarray, counts: np.ndarray, first: np.ndarray, bad: np.ndarray
-    ) -> FloatArray:
-        """Return the delivery probabilities (K,) of K messages by the loss model, which may be a
-        user's own: ``counts`` (M,) messages on each of M ``directions`` (M,) with numbers from
-        ``first`` (M,) on; ``bad`` (K,) is the state of the channel.
-        """
-        loss, out, done = self._channel.loss, np.empty(len(bad)), 0
-        # Probabilities that may depend on the state of the link and on the number of the message.
-        for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
-            part = slice(done, done + count)
-            direction, table_probability = (
-                self._senders.directions[w],
-                float(self._table_probabilities[w]),
-            )
-            out[part] = delivery_probabilities(
-                loss, direction, number, bad[part].astype(bool), table_probability
-            )
-            done += count
-        return out
-
-    def _message_delays(
-        self,
-        directions: np.ndarray,
-        counts: np.ndarray,
-        first: np.ndarray,
-        lost: np.ndarray,
-        delay: np.ndarray,
-    ) -> FloatArray:
-        """Return the delays (K,) of K messages in seconds if their law depends on the message (its
-        direction and number), for ``counts`` (M,) messages on each of M ``directions`` (M,) with
-        numbers from ``first`` (M,) on. Messages that are ``lost`` (K,) keep ``delay`` (K,).
-        """
-        model, out, k = self._channel.delay, np.array(delay), 0
-        for w, count, number in zip(directions, counts.tolist(), first.tolist(), strict=True):
-            # A delay is asked only for messages that arrive.
-            for message in range(number, number + count):
-                if not lost[k]:
-                    direction = self._senders.directions[w]
-                    out[k] = checked_delay(model, direction, message, float(delay[k]))
-                k += 1
-        return out
-
-
 class EntityDraws:
     """Draws ticks and outcomes of E entities on demand. Entities are those of all runs, run by run;
     none if the filter sends no messages.
@@ -350,7 +161,7 @@ class EntityDraws:
         """
         self.count = len(senders.entities) * streams.runs
         self._clocks = TickSource(scenario, streams, senders)
-        self._outcomes = Outcomes(scenario, streams, senders)
+        self._outcomes = outcomes_of(scenario, streams, senders)
         self.sizes = self._outcomes.sizes
         # Longer blocks cost less for each tick; the limit is the memory for all entities together.
         self._max_block = min(
@@ -444,7 +255,7 @@ class ReadingsSchedule:
         samples, and the index ``index`` (K,) of each sending node, and make the streams of their
         outcomes (delays or losses).
         """
-        self._outcomes = Outcomes(scenario, streams, senders)
+        self._outcomes = outcomes_of(scenario, streams, senders)
         self._t, self._index, self._begin = t, index, 0
         self._sent = np.zeros(len(senders.entities), dtype=np.int64)
 
@@ -500,8 +311,3 @@ def all_windows(scenario: Scenario, streams: ReplicaStreams) -> list[Window]:
 
 
 NO_TICKS = Ticks(np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
-
-
-def _stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:
-    """Return the random generator of a purpose for one directed link."""
-    return streams.generator(purpose, *ends)

@@ -14,33 +14,25 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.instants import snapped
+from netkf.engines.compiled.outcomes import (
+    ChannelStreams,
+    channel_streams,
+    draw_outcomes,
+    is_kernel_channel,
+)
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.schedule import (
-    LOST,
     MAX_WINDOW_TICKS,
     Schedule,
     Window,
     all_windows,
 )
 from netkf.engines.compiled.senders import Senders, senders_of
-from netkf.engines.compiled.slot_messages import next_state
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.network.channels import (
-    Bernoulli,
-    ConstantDelay,
-    ExponentialDelay,
-    GilbertElliott,
-    LognormalDelay,
-    NoDelay,
-    NoLoss,
-    PerLink,
-    UniformDelay,
-)
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
 from netkf.rng.draws import StreamBatch, Ziggurat, next_exponential, next_unit, ziggurat
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
-from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 TICKS, MIN_TICKS_PER_ENTITY = 1 << 15, 4
@@ -52,10 +44,6 @@ EXPONENTIAL_GAPS, UNIFORM_GAPS, LATTICE = range(3)
 """Kinds of clocks: random gaps, and times that follow from the number of the tick, but for a
 jitter.
 """
-LOSSES = (NoLoss, Bernoulli, PerLink, GilbertElliott)
-DELAYS = (NoDelay, ConstantDelay, ExponentialDelay, UniformDelay, LognormalDelay)
-FIXED, EXPONENTIAL, UNIFORM, LOGNORMAL = range(4)
-"""Laws of delays."""
 
 
 class Clocks(NamedTuple):
@@ -80,36 +68,6 @@ class Clocks(NamedTuple):
     first: IntArray
     outgoing: IntArray
     per_second: float
-
-
-class ChannelStreams(NamedTuple):
-    """The losses and delays of the messages of R runs, on W directions, from S streams a run.
-
-    source : (W,), stream of each direction, within a run
-    count : S
-    delivery : (2, W), delivery probabilities in the good and the bad state of the link
-    loss, state, delay : (R S, WIDTH), states of the random streams; (0, WIDTH): nothing is drawn
-    bad : (R S,), state of each link (1: bad), -1 at first
-    to_bad, to_good : transition probabilities of that state
-    law, scale, width : law of the delays (FIXED, ...) and its parameters
-    bits : whether outcomes are stored as arrival bits, see TickBuffer
-    """
-
-    source: IntArray
-    count: int
-    delivery: FloatArray
-    loss: np.ndarray
-    state: np.ndarray
-    delay: np.ndarray
-    bad: IntArray
-    to_bad: float
-    to_good: float
-    law: int
-    scale: float
-    width: float
-    bits: bool
-    exponential: Ziggurat
-    normal: NormalZiggurat
 
 
 class TickBuffer(NamedTuple):
@@ -168,13 +126,15 @@ def draw_ticks(
 def tick_after(clocks: Clocks, k: int, now: float, exponential: Ziggurat) -> float:
     """Return the time of the tick of entity ``k`` after that at ``now`` (seconds), off the grid."""
     if clocks.kind == EXPONENTIAL_GAPS:
-        return now + next_exponential(clocks.streams, k, exponential) / clocks.scale[k]
+        return float(now + next_exponential(clocks.streams, k, exponential) / clocks.scale[k])
     if clocks.kind == UNIFORM_GAPS:
         return now + (clocks.low + clocks.width * next_unit(clocks.streams, k))
     number = clocks.number[k]
     clocks.number[k] = number + 1
     time: float = clocks.scale[k] + clocks.low * number
-    return time + clocks.width * next_unit(clocks.streams, k) if clocks.width > 0.0 else time
+    if clocks.width > 0.0:
+        time += clocks.width * next_unit(clocks.streams, k)
+    return time
 
 
 @kernel
@@ -182,59 +142,6 @@ def start_clocks(clocks: Clocks, exponential: Ziggurat) -> None:
     """Draw the first tick of each entity."""
     for k in range(len(clocks.next_tick)):
         clocks.next_tick[k] = tick_after(clocks, k, 0.0, exponential)
-
-
-@kernel(inlined=True)
-def draw_outcomes(
-    channels: ChannelStreams,
-    run: int,
-    outgoing: IntArray,
-    first: int,
-    after: int,
-    out: FloatArray,
-    counts: IntArray,
-) -> int:
-    """Draw which messages of a tick arrive in run number ``run``, on the directed links
-    ``outgoing[first:after]``, and append their delays (seconds or LOST) to ``out`` at
-    ``counts[1]``, which advances. Return the ``first_outcome`` of the tick: where its outcomes
-    begin, or, with ``channels.bits``, a bit for each message that arrives instead of outcomes.
-    """
-    outcome, uniform, bad, last = 0 if channels.bits else counts[1], 0.0, 0, -1
-    delay = channels.scale
-    # One draw for each stream: directions that share a stream are neighbours.
-    for m in range(first, after):
-        w = outgoing[m]
-        if channels.source[w] != last:
-            last = channels.source[w]
-            k = run * channels.count + last
-            if len(channels.loss) > 0:
-                # Below 1, so that a link with probability 1 loses nothing.
-                uniform = next_unit(channels.loss, k)
-            if len(channels.state) > 0:
-                u = next_unit(channels.state, k)
-                bad = next_state(channels.bad[k], u, channels.to_bad, channels.to_good)
-                channels.bad[k] = bad
-            if channels.law != FIXED:
-                delay = draw_delay(channels, k)
-        arrives = uniform < channels.delivery[bad, w]
-        if channels.bits:
-            outcome |= np.int64(arrives) << (m - first)
-        else:
-            out[counts[1]] = delay if arrives else LOST
-            counts[1] += 1
-    return outcome
-
-
-@kernel
-def draw_delay(channels: ChannelStreams, k: int) -> float:
-    """Return the next random delay (seconds) of stream ``k``."""
-    if channels.law == EXPONENTIAL:
-        return channels.scale * next_exponential(channels.delay, k, channels.exponential)
-    if channels.law == UNIFORM:
-        return channels.scale + channels.width * next_unit(channels.delay, k)
-    sigma = channels.width
-    z = next_normal(channels.delay, k, channels.normal)
-    return channels.scale * math.exp(sigma * (z - 0.5 * sigma))
 
 
 class Sorting(NamedTuple):
@@ -409,8 +316,7 @@ def is_drawn_in_kernels(scenario: Scenario) -> bool:
         talks
         and bool(scenario.topology.links)
         and is_kernel_clock(network.activation)
-        and type(network.channel.loss) in LOSSES
-        and type(network.channel.delay) in DELAYS
+        and is_kernel_channel(network.channel)
     )
 
 
@@ -450,61 +356,12 @@ def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Send
     )
 
 
-def _channel_streams(
-    scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders, bits: bool
-) -> ChannelStreams:
-    """Return the losses and delays of all runs, before anything is drawn."""
-    channel = scenario.network.channel
-    none: np.ndarray = np.empty((0, WIDTH), dtype=np.uint64)
-    loss, delay = channel.loss, channel.delay
-    to_bad, to_good = loss.transitions if isinstance(loss, GilbertElliott) else (0.0, 1.0)
-    law, scale, width = FIXED, float(delay.fixed or 0.0), 0.0
-    if isinstance(delay, ExponentialDelay):
-        law, scale = EXPONENTIAL, delay.mean
-    elif isinstance(delay, UniformDelay):
-        law, scale, width = UNIFORM, delay.low, delay.high - delay.low
-    elif isinstance(delay, LognormalDelay):
-        law, scale, width = LOGNORMAL, delay.mean, delay.sigma
-    sources = senders.sources
-    return ChannelStreams(
-        source=senders.source,
-        count=len(sources),
-        delivery=_delivery_table(scenario),
-        loss=none if loss.deterministic else streams.states("loss", sources),
-        state=streams.states("weather", sources) if loss.stateful else none,
-        delay=streams.states("delay", sources) if delay.is_random else none,
-        bad=np.full(len(sources) * streams.runs, -1, dtype=np.int64),
-        to_bad=to_bad,
-        to_good=to_good,
-        law=law,
-        scale=scale,
-        width=width,
-        bits=bits,
-        exponential=ziggurat(),
-        normal=normal_ziggurat(),
-    )
-
-
 @once_per_scenario
 def _rates(scenario: Scenario) -> FloatArray:
     """Return the ticks per second (E,) of each entity: link, direction or node with a clock."""
     clock, senders = scenario.network.activation, senders_of(scenario)
     assert isinstance(clock, LinkClock)
     return np.array([clock.mean_rate(entity) for entity in senders.entities])
-
-
-@once_per_scenario
-def _delivery_table(scenario: Scenario) -> FloatArray:
-    """Return the delivery probabilities (2, W) of each direction in a good and a bad state."""
-    loss = scenario.network.channel.loss
-    table = [
-        [
-            loss.delivery_probability(direction, 0, bad, scenario.table_probability(direction))
-            for direction in senders_of(scenario).directions
-        ]
-        for bad in (False, True)
-    ]
-    return np.array(table)
 
 
 class KernelSchedules:
@@ -521,7 +378,7 @@ class KernelSchedules:
         """
         senders = senders_of(scenario)
         self._clocks = _clocks(scenario, streams, senders)
-        self._channels = _channel_streams(scenario, streams, senders, bits)
+        self._channels = channel_streams(scenario, streams, senders, bits)
         start_clocks(self._clocks, ziggurat())
         rates = _rates(scenario)
         self._runs, self._rate = streams.runs, float(rates.sum())
@@ -552,8 +409,8 @@ class KernelSchedules:
         runs.
         """
         clocks, channels = self._clocks, self._channels
-        states = clocks.next_tick, clocks.number, clocks.streams, channels.loss, channels.state
-        states += (channels.delay, channels.bad)
+        states: list[np.ndarray] = [clocks.next_tick, clocks.number, clocks.streams]
+        states += [channels.loss, channels.state, channels.delay, channels.bad]
         # Copies of the streams: an attempt that runs out of space starts again from them.
         copies = [state.copy() for state in states]
         # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
