@@ -7,10 +7,14 @@ draw, with that draw 1 and all others 0, gives the columns of the linear map, he
 from unittest import mock
 
 import numpy as np
+import scipy.linalg
 
 from netkf import simulate
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.plants import linear, paths, sensors
+from netkf.plants.diffusion import Diffusion
+from netkf.plants.transitions import frame_period
+from netkf.plants.truth import SampledTruth, multiples
 from netkf.rng.streams import Streams
 from netkf.trace.recorder import MemorySink, Recorder
 
@@ -48,6 +52,35 @@ class OneDraw(Streams):
         return self.made[name]
 
 
+class Chain:
+    """The states of a plant at some times, each from the one before and the next n normals: the
+    law of ``netkf.plants.tree``, which draws inside kernels (``tests/plants/test_truth.py``).
+    """
+
+    def __init__(self, plant, frame_times):
+        self.plant, self.frame_times = plant, frame_times
+
+    def states(self, times, start, random, frames):
+        A, Q, n = self.plant.A, self.plant.B @ self.plant.B.T, len(start)
+        states, offsets = np.empty((len(times), n)), np.zeros((frames, n))
+        states[0] = start
+        for k, gap in enumerate(np.diff(times).tolist()):
+            E = scipy.linalg.expm(np.block([[-A, Q], [np.zeros((n, n)), A.T]]) * gap)
+            values, axes = np.linalg.eigh(E[n:, n:].T @ E[:n, n:])
+            root = axes * np.sqrt(np.maximum(values, 0.0))
+            states[k + 1] = E[n:, n:].T @ states[k] + root @ random.standard_normal(n)
+            for frame in np.flatnonzero(self.frame_times[:frames] == times[k + 1]):
+                offsets[frame], states[k + 1] = states[k + 1], 0.0
+        return states, offsets
+
+
+def chained_truth(plant, random, times, horizon, frames=False):
+    """What ``Diffusion.sampled_truth`` returns, from the numbers of a ``Unit``."""
+    frame_times = multiples(frame_period(plant.A), horizon, plant.time_grid)
+    chain, start = Chain(plant, frame_times), plant.start(random)
+    return SampledTruth(plant.moves, chain, start, random, times, frame_times, frames)
+
+
 def run(scenario, streams):
     memory = MemorySink()
     SimpyEngine().run(scenario, streams, Recorder([memory]), lambda time: None)
@@ -64,6 +97,7 @@ def engine_covariance(scenario, engine="auto"):
         mock.patch.object(linear, "BLOCK", 1),
         mock.patch.object(paths, "BLOCK", 1),
         mock.patch.object(sensors, "BLOCK", 1),
+        mock.patch.object(Diffusion, "sampled_truth", chained_truth),
     ):
         silent = OneDraw(scenario.seed)
         assert not run(scenario, silent).any()
