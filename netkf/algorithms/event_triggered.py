@@ -4,9 +4,7 @@ filter with event-triggered communication and guaranteed stability", Automatica 
 In each slot a node predicts, updates with its reading, sends its estimate unless its neighbours can
 predict it well enough (they keep a copy of what it sent last), and combines by covariance
 intersection (Xie, Gan and Liu, paper D (8) and (9)): ``P^-1 = sum w_j P_j^-1`` and
-``P^-1 x = sum w_j P_j^-1 x_j``. ``triggered_ci_slots`` simulates many runs in the compiled engine,
-in place of the methods of ``EventTriggeredCi``; the types of its arguments are described in
-``kernels.slots``.
+``P^-1 x = sum w_j P_j^-1 x_j``.
 """
 
 from __future__ import annotations
@@ -14,331 +12,99 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.algorithms.filter import Estimate, Exchange, Filter, Message, NodeInfo
+from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.information_consensus import INFORMATION, Hcmci
 from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
-from netkf.algorithms.kernels.root_update import intersect_roots
-from netkf.algorithms.kernels.slots import (
-    ARRIVING,
-    SENDING,
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    drop_silent,
-    move_root,
-    predict_all,
-    read_all,
-    rebase,
-    store_sample_of_slot,
-    transform_mean,
+from netkf.algorithms.kernels.run import (
+    copy_estimate,
+    predict_copy,
+    predict_estimate,
+    shift_vector,
 )
 from netkf.algorithms.kernels.triggers import is_near
-from netkf.algorithms.models import first_root
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import Rule, field, number, tuple_of
-from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    LANES,
-    ONE,
-    Lanes,
-    aligned,
-    any_lane,
-    blocks_of,
-    load,
-    load_flags,
-    select,
-    spread,
-    store,
-)
-
-
-class NeighbourCopy(NamedTuple):
-    """The last estimate that a neighbour sent, predicted to now: ``xhat`` (n,) and ``root`` (n, n);
-    and the ``weight`` of its messages.
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    weight: float
-
-
-class TriggeredState(NamedTuple):
-    """The state of a node.
-
-    xhat, root : estimate (n,) and root (n, n) of its covariance
-    model : of the plant and the node's sensors
-    sent : the neighbours' copy of this node's estimate (what it sent last, predicted to now), None
-           before the first message
-    senders, copies : ids of the neighbours heard so far, and the copy of the estimate of each
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    sent: Estimate | None = None
-    senders: tuple[int, ...] = ()
-    copies: tuple[NeighbourCopy, ...] = ()
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-
-class TriggeredCiArrays(NamedTuple):
-    """Arrays for B blocks of runs of H nodes and W directed links, with C = W + 2 H copies of
-    estimates: those received last on each link, then what each node sends now, then what it sent
-    last.
-
-    alpha : threshold of the mean, see ``EventTriggeredCi.thresholds``
-    ratio : 1 + delta, threshold of the covariance
-    share : part of the information of a silent neighbour's copy that counts, 1 / widening^2
-    x, root : the copies (B, C, n, L) and their roots (B, C, n, n, L)
-    has_copy : (B, C, L), 1 once there is a copy
-    mean, inverse : (W + H, n, L) and (W + H, n, n, L), scratch
-    """
-
-    alpha: float
-    ratio: float
-    share: float
-    x: FloatArray
-    root: FloatArray
-    has_copy: np.ndarray
-    mean: FloatArray
-    inverse: FloatArray
+from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store_flags
 
 
 @kernel
-def triggered_ci_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: TriggeredCiArrays,
-) -> None:
-    """Simulate H filters by event-triggered consensus over the S slots of a plan, in B blocks of L
-    runs: in each slot they predict, read, decide whether to send, and combine.
-
-    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the copies in ``arrays``
-    in place, writes 0 into ``plan.sent`` and ``plan.up`` for messages that are not sent, and writes
-    ``samples``. ``plan.part`` says which part of a slot is simulated: all, up to the decisions to
-    send (SENDING), or from the arrivals on (ARRIVING).
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict node ``h``, and the copies of estimates as their senders do: so they stay the same at
+    both ends.
     """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            if plan.part != ARRIVING and plan.sensed[s]:
-                predict_all(nodes, scratch, b)
-                predict_copies(nodes, scratch, arrays, b)
-                read_all(nodes, readings, scratch, b, s)
-            if plan.part != ARRIVING and plan.exchanged[s]:
-                for h in range(len(nodes.rows)):
-                    decide_estimate(nodes, plan, links, scratch, arrays, b, s, h)
-                drop_silent(plan, links, b, s, 0)
-            if plan.part != SENDING:
-                # Messages are copies from before the exchange: the order of nodes does not matter.
-                if plan.exchanged[s]:
-                    for h in range(len(nodes.rows)):
-                        combine_copies(nodes, plan, links, scratch, arrays, b, s, h)
-                store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-                # Keep estimates and copies relative to an origin near the true state.
-                rebase(nodes, readings, scratch, b, s)
-                if readings.rebased[s]:
-                    rebase_copies(readings, scratch.lanes, arrays, b, s)
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    if any_lane(load_flags(run.lanes, record.has_sent, h)):
+        predict_copy(run.model, run, record.sent_x, record.sent_root, h)
+    for w in range(run.first[h], run.first[h + 1]):
+        if any_lane(load_flags(run.lanes, record.has_copy, w)):
+            predict_copy(run.model, run, record.copy_x, record.copy_root, w)
 
 
 @kernel
-def predict_copies(
-    nodes: SlotNodes, scratch: SlotScratch, arrays: TriggeredCiArrays, b: int
-) -> None:
-    """Predict all C copies of estimates in block ``b`` to the next slot as their senders do:
-    changes ``arrays.x[b]`` (C, n, L) and ``arrays.root[b]`` (C, n, n, L).
-
-    Axes: L runs side by side.
-    """
-    lanes = scratch.lanes
-    for k in range(arrays.x.shape[1]):
-        if any_lane(load_flags(lanes, arrays.has_copy, b, k)):
-            transform_mean(scratch, arrays.x, b, k, nodes.F)
-            move_root(scratch, arrays.root, b, k, nodes.F, nodes.root_Q)
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the estimate of node ``h``, unless the neighbours' copy of it is near enough."""
+    lanes, payload, x, root = run.lanes, record.payload, record.xhat, record.root
+    near = is_near(run, x, root, h, record.sent_x, record.sent_root, h, record.alpha, record.ratio)
+    known = load_flags(lanes, record.has_sent, h)
+    silent = select(known, select(near, 1.0, 0.0), 0.0) > 0.0
+    sent = select(silent, 0.0, select(load_flags(lanes, run.sends), 1.0, 0.0)) > 0.0
+    store_flags(lanes, run.sends, sent)
+    store_flags(lanes, record.has_sent, h, select(sent, 1.0, select(known, 1.0, 0.0)) > 0.0)
+    copy_estimate(run, record.sent_x, record.sent_root, h, x, root, h, sent)
+    copy_estimate(run, payload.xhat, payload.root, m, x, root, h, True)
 
 
 @kernel
-def rebase_copies(
-    readings: ReadingBlock, lanes: Lanes, arrays: TriggeredCiArrays, b: int, s: int
-) -> None:
-    """Move the origin of all C copies of estimates in block ``b`` to the true state of slot ``s``:
-    subtract ``readings.local[b, s]`` (n, L) from each of ``arrays.x[b]`` (C, n, L). To be called
-    in the slots in which ``rebase`` moves the origin of the estimates.
-
-    Axes: L runs side by side.
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Combine the estimate of node ``h`` with those that arrive and with the copies of silent
+    neighbours' estimates, whose covariances are enlarged, by covariance intersection.
     """
-    for k in range(arrays.x.shape[1]):
-        for i in range(arrays.x.shape[2]):
-            origin = load(lanes, readings.local, b, s, i)
-            store(lanes, arrays.x, b, k, i, load(lanes, arrays.x, b, k, i) - origin)
-
-
-@kernel(inlined=True)
-def copy_estimate(
-    lanes: Lanes,
-    target: tuple[FloatArray, FloatArray],
-    index: int,
-    x: FloatArray,
-    root: FloatArray,
-    sender: int,
-    b: int,
-    flags: Any,
-) -> None:
-    """Copy the estimate and root with index ``sender`` in block ``b`` of ``x`` (B, K, n, L) and
-    ``root`` (B, K, n, n, L) to entry ``index`` of block ``b`` of ``target``, a pair of such arrays
-    (estimates, roots), in the lanes with ``flags`` (L,).
-
-    Axes: B blocks of runs, K estimates.
-    """
-    target_x, target_root = target
-    for i in range(x.shape[2]):
-        former, present = load(lanes, target_x, b, index, i), load(lanes, x, b, sender, i)
-        store(lanes, target_x, b, index, i, select(flags, present, former))
-        for j in range(i + 1):
-            former = load(lanes, target_root, b, index, i, j)
-            present = load(lanes, root, b, sender, i, j)
-            store(lanes, target_root, b, index, i, j, select(flags, present, former))
-
-
-@kernel
-def decide_estimate(
-    nodes: SlotNodes,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: TriggeredCiArrays,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Decide whether node ``h`` of block ``b`` sends its estimate in slot ``s``, in each of L runs:
-    writes 0 into ``plan.sent[b, s, 0, h]`` (L,) where it does not.
-
-    Updates in ``arrays`` the copy of what the node sent last, where it sends, and the copy of what
-    it sends now. ``plan.sent`` (B, S, E, H, L) is 1 on entry where the node is asked for a message.
-    """
-    lanes, copies = scratch.lanes, (arrays.x, arrays.root)
-    # Indices in the C copies: W last received on each link, H sent now, H sent last by each node.
-    own = len(links.sender) + h
-    last = own + len(nodes.rows)
-    near = is_near(
-        lanes, nodes.xhat, nodes.root, arrays.x, arrays.root, (b, h, last),
-        (arrays.alpha, arrays.ratio), scratch.total, scratch.noise,
-    )  # fmt: skip
-    store(lanes, scratch.row, 0, select(near, 1.0, 0.0))
-    for q in range(len(lanes)):
-        # Silent if the copy is near; the first estimate is always sent.
-        if scratch.row[0, q] == 1.0 and arrays.has_copy[b, last, q] == 1:
-            plan.sent[b, s, 0, h, q] = 0
-        if plan.sent[b, s, 0, h, q] == 1:
-            arrays.has_copy[b, last, q] = 1
-    sent = load_flags(lanes, plan.sent, b, s, 0, h)
-    copy_estimate(lanes, copies, last, nodes.xhat, nodes.root, h, b, sent)
-    # The payload of this exchange: estimates change one after the other while nodes combine.
-    all_lanes = spread(lanes, 1.0) > 0.0
-    copy_estimate(lanes, copies, own, nodes.xhat, nodes.root, h, b, all_lanes)
-
-
-@kernel
-def combine_copies(
-    nodes: SlotNodes,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: TriggeredCiArrays,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Combine the estimate of filter ``h`` of block ``b`` with those that arrive in slot ``s`` and
-    with the copies of silent neighbours' estimates, whose covariances are enlarged: paper D (8) and
-    (9).
-
-    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L); the estimates that
-    arrive replace the copies of their links in ``arrays``. Information P^-1 = Z' Z is added up as
-    roots [Z, z] (n, n + 1) with the mean Z^-1 z relative to the node's own estimate. Axes: L runs
-    side by side.
-    """
-    lanes = scratch.lanes
-    n = nodes.xhat.shape[2]
-    # Copies 0 to W - 1 are those of links, W to W + H - 1 what each node sends now.
-    W = len(links.sender)
-    own = W + h
-    copied_weight = spread(lanes, 0.0)
-    for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-        copies = (arrays.x, arrays.root)
-        # The estimates that arrive replace the copies of their links.
-        if any_lane(arrived):
-            sender = W + links.sender[m]
-            copy_estimate(lanes, copies, m, arrays.x, arrays.root, sender, b, arrived)
+    lanes, payload, x, first = run.lanes, record.payload, record.xhat, run.first
+    copy_x, copy_root, inverse = record.copy_x, record.copy_root, record.copy_inverse
+    for w in range(first[h], first[h + 1]):
+        store_flags(lanes, record.fresh, w, spread(lanes, 0.0) > 0.0)
+    # The estimates that arrive replace the copies of their links.
+    for k in range(run.count):
+        w, m, arrived = run.link[k], run.message[k], load_flags(lanes, run.arrived, k)
+        copy_estimate(run, copy_x, copy_root, w, payload.xhat, payload.root, m, arrived)
         for q in range(len(lanes)):
-            if plan.up[b, s, 0, links.direction[m], q] == 1:
-                arrays.has_copy[b, m, q] = 1
-        # A silent neighbour counts too: its estimate is near its copy.
-        copied_weight += select(load_flags(lanes, arrays.has_copy, b, m), links.weight[m], 0.0)
-        invert_lanes(lanes, arrays.inverse, m, arrays.root[b], m)
-        for i in range(n):
-            store(lanes, arrays.mean, m, i, load(lanes, arrays.x, b, m, i))
+            if run.arrived[k, q] == 1:
+                record.has_copy[w, q] = record.fresh[w, q] = 1
+                record.weight[w, q] = run.message_weight[k]
+    # The weight of a neighbour that was never heard is 0: it stays with the node itself.
+    copied = spread(lanes, 0.0)
+    for w in range(first[h], first[h + 1]):
+        copied += load(lanes, record.weight, w)
     # A node without any copy keeps its estimate, without rounding.
-    has_no_copy = copied_weight == 0.0
-    if not any_lane(copied_weight > 0.0):
+    if not any_lane(copied > 0.0):
         return
-    invert_lanes(lanes, arrays.inverse, own, arrays.root[b], own)
-    for i in range(n):
-        x = load(lanes, arrays.x, b, own, i)
-        store(lanes, arrays.mean, own, i, x)
-        store(lanes, scratch.xhat, h, i, x)
-    # Covariance intersection: sum_j w_j P_j^-1, as roots that are merged one after the other.
-    own_weight = select(copied_weight < 1.0, 1.0 - copied_weight, 0.0)
-    whiten(lanes, scratch.total, own_weight, arrays.inverse, arrays.mean, own, arrays.mean, own)
-    for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(lanes, plan.up, b, s, 0, links.direction[m])
-        has_copy = load_flags(lanes, arrays.has_copy, b, m)
-        if any_lane(has_copy):
+    own = select(copied < 1.0, 1.0 - copied, 0.0)
+    invert_lanes(lanes, record.inverse, h, record.root, h)
+    whiten(lanes, run.total, own, record.inverse, x, h, x, h)
+    for w in range(first[h], first[h + 1]):
+        if any_lane(load_flags(lanes, record.has_copy, w)):
             # The covariance of a silent neighbour's copy is enlarged by 1 / share.
-            weight = select(arrived, links.weight[m], arrays.share * links.weight[m])
-            weight = select(has_copy, weight, 0.0)
-            mean = arrays.mean
-            whiten(lanes, scratch.whitened, weight, arrays.inverse, mean, m, mean, own)
-            merge_lanes(lanes, scratch.total, scratch.whitened)
-    # root = Z^-1 and xhat = own + Z^-1 z, but unchanged in lanes without any copy.
-    finish_lanes(
-        lanes, nodes.root[b], nodes.xhat[b], h, scratch.xhat, scratch.total, scratch.whitened,
-        has_no_copy,
-    )  # fmt: skip
+            share = select(load_flags(lanes, record.fresh, w), 1.0, record.share)
+            invert_lanes(lanes, inverse, w, copy_root, w)
+            weight = share * load(lanes, record.weight, w)
+            whiten(lanes, run.whitened, weight, inverse, copy_x, w, x, h)
+            merge_lanes(lanes, run.total, run.whitened)
+    finish_lanes(lanes, record.root, x, h, x, run.total, run.whitened, copied == 0.0)
 
 
 @kernel
-def is_near_single(
-    x: FloatArray,
-    root: FloatArray,
-    bounds: tuple[float, float],
-    ratio: FloatArray,
-    work: FloatArray,
-) -> bool:
-    """Return True if the second of two estimates, a copy, is near the first, in one run: estimates
-    ``x`` (1, 2, n, 1) with lower triangular roots ``root`` (1, 2, n, n, 1), and ``bounds``
-    (alpha, 1 + delta) as in ``EventTriggeredCi.thresholds``. ``ratio`` (n, n + 1, 1) and ``work``
-    (n, n, 1) are scratch. For ``EventTriggeredCi.is_near``.
-    """
-    near: bool = is_near(ONE, x, root, x, root, (0, 0, 1), bounds, ratio, work)
-    return near
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move the estimate of node ``h`` and all copies: the triggers look at differences."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.sent_x, h)
+    for w in range(run.first[h], run.first[h + 1]):
+        shift_vector(run, record.copy_x, w)
 
 
 def _is_information_consensus(value: Any) -> Filter:
@@ -394,36 +160,25 @@ class EventTriggeredCi(Filter):
     clocks: ClassVar[tuple[str, ...]] = ()
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
-    slot_kernel = staticmethod(triggered_ci_slots)
-    unrolled: ClassVar[bool] = True
+    kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, decides=True)
 
-    def decides_in_slots(self) -> bool:
-        """Return True: a node sends nothing while its neighbours' copy of its estimate is near
-        enough. The engine then asks for decisions in ``SlotPlan.sent``.
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return what nodes sent last, the copies of what they heard last on each link, and the
+        thresholds.
         """
-        return True
-
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[TriggeredCiArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes with W
-        directed links, counted from ``infos``: thresholds, and space for W + 2 H copies of
-        estimates, none of which exists yet.
-        """
-        (H, n), blocks = (len(states), len(states[0].xhat)), blocks_of(runs)
-        W, alpha = sum(info.degree for info in infos), self.thresholds[0]
-        entries = W + 2 * H
-        return (
-            TriggeredCiArrays(
-                alpha,
-                1.0 + self.thresholds[1],
-                1.0 / self.widening**2,
-                aligned((blocks, entries, n, LANES)),
-                aligned((blocks, entries, n, n, LANES)),
-                np.zeros((blocks, entries, LANES), dtype=np.uint8),
-                aligned((W + H, n, LANES)),
-                aligned((W + H, n, n, LANES)),
-            ),
+        n, flag = len(models[0].information), ((), np.uint8)
+        return Record(
+            node={"sent_x": (n,), "sent_root": (n, n), "has_sent": flag, "inverse": (n, n)},
+            link={
+                **{"copy_x": (n,), "copy_root": (n, n), "copy_inverse": (n, n)},
+                **{"has_copy": flag, "fresh": flag, "weight": ()},
+            },
+            payload={"xhat": (n,), "root": (n, n)},
+            settings={
+                "alpha": float(self.thresholds[0]),
+                "ratio": 1.0 + self.thresholds[1],
+                "share": 1.0 / self.widening**2,
+            },
         )
 
     @property
@@ -445,83 +200,4 @@ class EventTriggeredCi(Filter):
             "what it sent; P may then be too small",
         )
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TriggeredState:
-        """Return the first state, with estimate ``mean`` (n,) and covariance ``cov`` (n, n), in
-        which nothing was sent or heard.
-        """
-        return TriggeredState(mean, first_root(cov), model)
-
-    def predict(self, state: TriggeredState, gap: float) -> TriggeredState:
-        """Return the state ``gap`` seconds later: the estimate is predicted, and all copies of
-        estimates as their senders do.
-        """
-        xhat, root = state.model.predict(state.xhat, state.root, gap)
-        # Sender and receivers predict the copy alike, so that it stays the same at both ends.
-        sent, copies = state.sent, []
-        if sent is not None:
-            sent = Estimate(*state.model.predict(sent.xhat, sent.root, gap))
-        for copy in state.copies:
-            x, S = state.model.predict(copy.xhat, copy.root, gap)
-            copies.append(NeighbourCopy(x, S, copy.weight))
-        return state._replace(xhat=xhat, root=root, sent=sent, copies=tuple(copies))
-
-    def emit(
-        self, state: TriggeredState, exchange: Exchange
-    ) -> tuple[TriggeredState, Estimate | None]:
-        """Return the state and the payload: the estimate, which is kept as ``sent``, or None while
-        the neighbours' copy of it is good enough.
-        """
-        if state.sent is not None and self.is_near(state, state.sent):
-            return state, None
-        own = Estimate(state.xhat, state.root)
-        return state._replace(sent=own), own
-
-    def is_near(self, state: TriggeredState, sent: Estimate) -> bool:
-        """Return True if the copy ``sent`` of a node's estimate, predicted to now, is within both
-        thresholds of the estimate in ``state``.
-        """
-        (alpha, delta), n = self.thresholds, len(state.xhat)
-        x = np.stack([state.xhat, sent.xhat]).reshape(1, 2, n, 1)
-        root = np.stack([state.root, sent.root]).reshape(1, 2, n, n, 1)
-        ratio, work = np.empty((n, n + 1, 1)), np.empty((n, n, 1))
-        return bool(is_near_single(x, root, (alpha, 1.0 + delta), ratio, work))
-
-    def absorb(
-        self, state: TriggeredState, messages: Sequence[Message], exchange: Exchange
-    ) -> TriggeredState:
-        """Return the state after covariance intersection of the node's estimate with those
-        received, which become the copies of their senders, and with the copies of silent
-        neighbours, whose covariances are enlarged (``widening``).
-        """
-        copies = dict(zip(state.senders, state.copies, strict=True))
-        received = {
-            m.sender: NeighbourCopy(m.payload.xhat, m.payload.root, m.weight) for m in messages
-        }
-        copies.update(received)
-        if not copies:
-            return state
-        senders = tuple(sorted(copies))
-        widening = self.widening
-        pairs = [(state.xhat, state.root)]
-        pairs += [
-            (copies[j].xhat, copies[j].root if j in received else widening * copies[j].root)
-            for j in senders
-        ]
-        # Weights of neighbours that were never heard stay with the node itself.
-        link_weights = [copies[j].weight for j in senders]
-        weights = np.array([max(0.0, 1.0 - math.fsum(link_weights)), *link_weights])
-        means, roots = (np.stack(part) for part in zip(*pairs, strict=True))
-        xhat, root = intersect_roots(weights, means, roots)
-        return state._replace(
-            xhat=xhat, root=root, senders=senders, copies=tuple(copies[j] for j in senders)
-        )
-
-    def shift(self, state: TriggeredState, offset: FloatArray) -> TriggeredState:
-        """Return the state with ``offset`` (n,) added to the estimate and to all copies, for a move
-        of the origin: the triggers look at differences.
-        """
-        sent = state.sent
-        if sent is not None:
-            sent = sent._replace(xhat=sent.xhat + offset)
-        copies = tuple(copy._replace(xhat=copy.xhat + offset) for copy in state.copies)
-        return state._replace(xhat=state.xhat + offset, sent=sent, copies=copies)
+    shift = Filter.shift  # affine, given who sends

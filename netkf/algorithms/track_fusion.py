@@ -27,9 +27,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading, State
-from netkf.algorithms.kernels.neighbours import copy_pairs
-from netkf.algorithms.kernels.pair_fusion import fuse_pair, fuse_tracks
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.kernels.pair_fusion import fuse_pair
+from netkf.algorithms.kernels.run import carry
 from netkf.algorithms.kernels.slots import (
     ReadingBlock,
     SlotLinks,
@@ -51,6 +51,7 @@ from netkf.algorithms.kernels.tracks import (
     update_joint,
 )
 from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import field, one_of
 from netkf.linalg.arrays import FloatArray
@@ -66,101 +67,36 @@ its keys.
 """
 
 
-class FusionArrays(NamedTuple):
-    """The rule of fusion and scratch, for one estimate of n states at a time.
-
-    inverse : whether the rule is inverse covariance intersection, else covariance intersection
-    trace : whether the weight minimises the trace of P, else its determinant
-    pair : (2 n + 2, n), scratch of ``fuse_pair``
-    x, root : (n,) and (n, n), estimate that is fused, and its root
-    other_x, other : (n,) and (n, n), those of a sender
-    """
-
-    inverse: bool
-    trace: bool
-    pair: FloatArray
-    x: FloatArray
-    root: FloatArray
-    other_x: FloatArray
-    other: FloatArray
-
-
 @kernel
-def fusion_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: FusionArrays,
-) -> None:
-    """Simulate H filters that fuse pairs of estimates by the rule in ``arrays`` over the S slots of
-    a plan, in B blocks of L runs: in each slot they predict, read and fuse what they hear.
-
-    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
-    ``samples`` in the slots that have one.
+def fuse_heard(record: Any, h: int, run: Any) -> None:
+    """Fuse the estimate of node ``h`` with each one that it hears, one after the other, by the rule
+    of the record. Weights of links are not used: the covariances decide.
     """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            if plan.sensed[s]:
-                predict_all(nodes, scratch, b)
-                read_all(nodes, readings, scratch, b, s)
-            if plan.exchanged[s]:
-                # The messages: copies of all estimates from before the exchange.
-                copy_pairs(nodes, scratch, b)
-                # Run by run: the best weight is found by iterations that differ from run to run.
-                for h in range(len(nodes.rows)):
-                    for q in range(len(scratch.lanes)):
-                        fuse_received(nodes, plan, links, scratch, arrays, (b, s, h, q))
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            rebase(nodes, readings, scratch, b, s)
-
-
-@kernel
-def fuse_received(
-    nodes: SlotNodes,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: FusionArrays,
-    index: tuple[int, int, int, int],
-) -> None:
-    """Fuse filter h of block b in lane q (one run) with all estimates that arrive in slot s, one
-    after the other, by the rule in ``arrays``; ``index`` is [b, s, h, q]. Changes
-    ``nodes.xhat[b, h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n); the messages are the
-    copies of all estimates in ``scratch``.
-    """
-    b, s, h, q = index
-    n, has_received = nodes.xhat.shape[2], False
-    for m in range(links.first[h], links.first[h + 1]):
-        if not plan.up[b, s, 0, links.direction[m], q]:
-            continue
-        # The weight of a link is not used: the covariances decide.
-        sender = links.sender[m]
-        if not has_received:
-            copy_track(arrays.x, arrays.root, scratch.xhat, scratch.root, h, q)
-            has_received = True
-        copy_track(arrays.other_x, arrays.other, scratch.xhat, scratch.root, sender, q)
-        fuse_pair(
-            arrays.x, arrays.root, arrays.other_x, arrays.other, arrays.inverse, arrays.trace,
-            arrays.pair,
-        )  # fmt: skip
-    if has_received:
-        for i in range(n):
-            nodes.xhat[b, h, i, q] = arrays.x[i]
-            for j in range(i + 1):
-                nodes.root[b, h, i, j, q] = arrays.root[i, j]
+    payload = record.payload
+    for k in range(run.count):
+        m = run.message[k]
+        carry(run.model, run, payload.xhat, payload.root, m, run.age[k])
+        # Run by run: the best weight is found by iterations that differ from run to run.
+        for q in range(len(run.lanes)):
+            if run.arrived[k, q] == 1:
+                copy_track(record.x, record.S, record.xhat, record.root, h, q)
+                copy_track(record.other_x, record.other_S, payload.xhat, payload.root, m, q)
+                fuse_pair(
+                    record.x, record.S, record.other_x, record.other_S, record.inverse,
+                    record.trace, record.work,
+                )  # fmt: skip
+                for i in range(len(run.size)):
+                    record.xhat[h, i, q] = record.x[i]
+                    for j in range(i + 1):
+                        record.root[h, i, j, q] = record.S[i, j]
 
 
 @kernel(inlined=True)
 def copy_track(
     x: FloatArray, root: FloatArray, means: FloatArray, roots: FloatArray, h: int, q: int
 ) -> None:
-    """Copy the estimate of filter ``h`` in lane ``q``, from ``means`` (H, n, L) and lower
-    triangular ``roots`` (H, n, n, L), to x (n,) and ``root`` (n, n).
-
-    Axes: H filters.
+    """Copy estimate ``h`` in lane ``q`` of ``means`` (H, n, L) and lower triangular ``roots``
+    (H, n, n, L) to x (n,) and ``root`` (n, n).
     """
     for i in range(len(x)):
         x[i] = means[h, i, q]
@@ -183,29 +119,21 @@ class PairFusion(Filter):
     one_way: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
     inverse: ClassVar[bool] = False
-    slot_kernel = staticmethod(fusion_slots)
+    kernels = Kernels(absorb=fuse_heard, unrolled=False)
 
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[FusionArrays]:
-        """Return the settings and scratch of the compiled ``slot_kernel``, the same for all nodes
-        and runs.
-        """
-        n = len(states[0].xhat)
-        shapes = [(2 * n + 2, n), (n,), (n, n), (n,), (n, n)]
-        scratch = [np.zeros(shape) for shape in shapes]
-        return (FusionArrays(self.inverse, self.minimise == TRACE, *scratch),)
-
-    def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
-        """Return the state after fusion with each estimate heard, predicted to now, one after the
-        other.
-        """
-        pair = state.xhat, state.root
-        for message in messages:
-            payload = message.payload
-            other = state.model.extrapolate(payload.xhat, payload.root, message.age)
-            pair = fuse_tracks(pair, other, self.inverse, self.minimise == TRACE)
-        return state._replace(xhat=pair[0], root=pair[1])
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return the rule, and scratch for one fusion at a time."""
+        n = len(models[0].information)
+        scratch = {"work": (2 * n + 2, n), "x": (n,), "S": (n, n), "other_x": (n,)}
+        scratch |= {"other_S": (n, n)}
+        return Record(
+            payload={"xhat": (n,), "root": (n, n)},
+            settings={
+                "inverse": self.inverse,
+                "trace": self.minimise == TRACE,
+                **{name: np.zeros(shape) for name, shape in scratch.items()},
+            },
+        )
 
     shift = Filter.shift  # affine: the gains of both estimates sum to I, and only P decides them
 

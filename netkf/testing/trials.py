@@ -89,6 +89,7 @@ class Trial(ABC):
             information=information.sum(axis=0),
             max_delay=MAX_DELAY,
             place=node,
+            senders=neighbours[node],
             network=NetworkInfo(information, neighbours),
             rows=max(1, *(len(model.H) for model in models)),
         )

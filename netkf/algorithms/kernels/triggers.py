@@ -3,9 +3,6 @@ stochastic trigger (Han et al. 2015), which sends a reading with much news, and 
 event-triggered consensus (Battistelli, Chisci and Selvi 2018), which sends an estimate only when it
 is no longer near the copy of the last one that was sent, which sender and receivers both predict.
 
-Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
-estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
-
 ``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
 and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
@@ -66,42 +63,38 @@ def weigh_news(
 
 @kernel
 def is_near(
-    lanes: Lanes,
+    run: Any,
     x: FloatArray,
     root: FloatArray,
+    h: int,
     copies_x: FloatArray,
     copies_root: FloatArray,
-    index: tuple[int, int, int],
-    bounds: tuple[float, float],
-    ratio: FloatArray,
-    work: FloatArray,
+    k: int,
+    alpha: float,
+    bound: float,
 ) -> Any:
     """Return flags (L,) of the runs in which a copy is near the estimate, so that the node need not
-    send: ``|S^-1 (x - xbar)|^2 < alpha`` and ``P < (1 + delta) Pbar`` and ``Pbar < (1 + delta) P``,
-    for ``bounds`` (alpha, 1 + delta).
-
-    ``index`` is [b, h, k]: x and the root S of P are ``x[b, h]`` (n, L) and ``root[b, h]``
-    (n, n, L), of filter h of block b; xbar and the root of Pbar are ``copies_x[b, k]`` and
-    ``copies_root[b, k]``, copy k of the block. ``ratio`` (n, n + 1, L) and ``work`` (n, n, L) are
-    scratch.
+    send: ``|S^-1 (x - xbar)|^2 < alpha`` and ``P < bound Pbar`` and ``Pbar < bound P``, with
+    x = ``x[h]`` and the root S = ``root[h]`` of P, xbar = ``copies_x[k]`` and the root
+    ``copies_root[k]`` of Pbar.
     """
-    (b, h, k), n = index, x.shape[2]
+    lanes, n, ratio, work = run.lanes, len(run.size), run.total, run.noise
     distance = spread(lanes, 0.0)
     # S^-1 [Sbar, x - xbar] by forward substitution; both roots are lower triangular.
     for i in range(n):
-        inverse = 1.0 / load(lanes, root, b, h, i, i)
-        distance_row = load(lanes, x, b, h, i) - load(lanes, copies_x, b, k, i)
+        inverse = 1.0 / load(lanes, root, h, i, i)
+        distance_row = load(lanes, x, h, i) - load(lanes, copies_x, k, i)
         for j in range(i + 1):
-            value = load(lanes, copies_root, b, k, i, j)
+            value = load(lanes, copies_root, k, i, j)
             for m in range(j, i):
-                value -= load(lanes, root, b, h, i, m) * load(lanes, ratio, m, j)
+                value -= load(lanes, root, h, i, m) * load(lanes, ratio, m, j)
             store(lanes, ratio, i, j, value * inverse)
         for m in range(i):
-            distance_row -= load(lanes, root, b, h, i, m) * load(lanes, ratio, m, n)
+            distance_row -= load(lanes, root, h, i, m) * load(lanes, ratio, m, n)
         distance_row *= inverse
         store(lanes, ratio, i, n, distance_row)
         distance += distance_row * distance_row
-    near = select(distance < bounds[0], 1.0, 0.0)
+    near = select(distance < alpha, 1.0, 0.0)
     # With M = S^-1 Sbar, P^-1 Pbar has the eigenvalues of M M'. Both bounds on P mean that a matrix
     # is positive definite: (1 + delta) M M' - I, then (1 + delta) I - M M'.
     for sign in (-1.0, 1.0):
@@ -110,9 +103,9 @@ def is_near(
                 total = spread(lanes, 0.0)
                 for m in range(j + 1):
                     total += load(lanes, ratio, i, m) * load(lanes, ratio, j, m)
-                entry = bounds[1] * total if sign < 0.0 else -total
+                entry = bound * total if sign < 0.0 else -total
                 if i == j:
-                    entry += -1.0 if sign < 0.0 else bounds[1]
+                    entry += -1.0 if sign < 0.0 else bound
                 store(lanes, work, i, j, entry)
         near = select(is_positive(lanes, work), near, 0.0)
     return near > 0.0
