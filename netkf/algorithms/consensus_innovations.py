@@ -7,14 +7,12 @@ pseudo-state y = G x, of which its pseudo-observation ``H_i' R_i^-1 z_i`` shows 
     yhat+ = yhat + sum_l B_il (yhat_l - yhat) + M_i (H_i' R_i^-1 z_i - H_i' R_i^-1 H_i G^+ yhat)
     xhat+ = xhat + K_i (yhat+ - G xhat)
 
-then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G^+ G) xhat+)``
-(``kernels.pseudo_states`` computes both steps). The gains are those of the Gauss-Markov theorem: B
+then both are predicted, ``xhat = F xhat+`` and ``yhat = G F (G^+ yhat+ + (I - G^+ G) xhat+)``. The
+gains are those of the Gauss-Markov theorem: B
 and M minimise the mean square error of yhat+, and K that of xhat+; where several do, they are those
 of least norm (``optimal_gain``). They follow from the joint
 covariance of the errors of all nodes, in which nothing depends on data, and which is computed as if
-no message were lost and no reading were missing (``GainSequence``). ``pseudo_slots`` simulates many
-runs in the compiled engine, in place of the methods of ``ConsensusInnovations``; the types of its
-arguments are described in ``kernels.slots``.
+no message were lost and no reading were missing (``GainSequence``).
 
 The text of the paper was not at hand: its construction (pseudo-states, gains by the Gauss-Markov
 theorem) is followed, without the numbers of its equations. The null space of G lies in that of each
@@ -23,40 +21,23 @@ theorem) is followed, without the numbers of its equations. The null space of G 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.pseudo_states import (
-    correct_pseudo,
-    correct_state,
-    fill_pseudo_innovation,
-    predict_pseudo,
-    shift_pseudo,
-)
+from netkf.algorithms.filter import Filter, NetworkInfo, NodeInfo
+from netkf.algorithms.kernels.estimates import transform_mean
 from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    block_of_reading,
-    predict_mean,
-    rebase,
-    star_of,
-    store_sample_of_slot,
-    whiten_reading,
-)
+from netkf.algorithms.kernels.run import absorb as nothing
+from netkf.algorithms.kernels.run import shift_vector
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, store
+from netkf.linalg.lanes import load, load_flags, select, spread, store
 
 NEGLIGIBLE = 1e-6
 """Standard deviation of a difference, relative to those of its terms, that counts as rounding."""
@@ -99,7 +80,7 @@ class NodeGains(NamedTuple):
 
 
 class SlotGains(NamedTuple):
-    """Gains of all N nodes in K slots, see ``NodeGains``.
+    """Gains of N nodes in K slots, see ``NodeGains``.
 
     B : (K, W, n, n) of the W directions, by receiver and sender
     M, K, root : (K, N, n, n)
@@ -176,20 +157,20 @@ class GainSequence:
             self._converged = len(self._gains) > 1 and self._has_converged(*self._gains[-2:])
         return self._gains[min(slot, len(self._gains)) - 1]
 
-    def table(self, first: int, count: int) -> tuple[np.ndarray, SlotGains]:
+    def table(self, first: int, count: int, places: Sequence[int]) -> tuple[np.ndarray, SlotGains]:
         """Return the table rows (count,) of ``count`` slots from number ``first`` on, and the table
-        of gains.
+        of the gains of the nodes with the indices ``places``.
 
         Slots after convergence share one row. Slot 0 gets that of slot 1, since nothing happens in
-        it. For the compiled engine.
+        it.
         """
         slots = np.maximum(np.arange(first, first + count), 1)
         self.at(int(slots[-1]))
         slots = np.minimum(slots, len(self._gains))
         slot_gains = self._gains[slots[0] - 1 : slots[-1]]
         # Flat, slot by slot and node by node: the B of all nodes of a slot become its W directions.
-        node_gains = [one for gains in slot_gains for one in gains]
-        K, N, n = len(slot_gains), len(self._neighbours), self._n
+        node_gains = [gains[place] for gains in slot_gains for place in places]
+        K, N, n = len(slot_gains), len(places), self._n
         B, *other_gains = (
             np.concatenate([getattr(one, name).reshape(-1, n, n) for one in node_gains])
             for name in SlotGains._fields
@@ -329,172 +310,130 @@ def gain_sequence(design: Design) -> GainSequence:
     return GainSequence(design)
 
 
-class PseudoState(NamedTuple):
-    """The state of a node.
-
-    xhat, root : estimate (n,) and root (n, n) of its covariance
-    model : of the plant and the node's sensors
-    yhat : estimate (n,) of the pseudo-state
-    pseudo : matrices of pseudo-states
-    reading : whitened y (p,) and H (p, n) of this slot, noise variance 1, or None
-    slot : number of the slot
-    design, node_index : the network and the node's index in it, from which the gains follow
+def design_of(model: Any, network: NetworkInfo, cov: FloatArray) -> Design:
+    """Return the design of a ``network`` of nodes with F and Q of ``model`` that start with the
+    covariance ``cov`` (n, n).
     """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    yhat: FloatArray
-    pseudo: PseudoStates
-    reading: tuple[FloatArray, FloatArray] | None
-    slot: int
-    design: Design
-    node_index: int
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-    @property
-    def gains(self) -> NodeGains:
-        """The node's gains of this slot, from the sequence that all nodes of the design share."""
-        return gain_sequence(self.design).at(self.slot)[self.node_index]
-
-
-class PseudoEstimate(NamedTuple):
-    """A payload: the sender's ``yhat`` (n,) and index. G (n, n), which all nodes know, is not sent:
-    ``shift_payload`` needs it.
-    """
-
-    yhat: FloatArray
-    node_index: int
-    G: FloatArray
-
-
-class PseudoArrays(NamedTuple):
-    """Arrays of all H nodes for B blocks of L runs.
-
-    pseudo, gains : matrices of pseudo-states, and the gains of the slots being simulated
-    table_row : row (S,) of each of the S slots in ``gains``
-    yhat : estimates of pseudo-states (B, H, n, L)
-    corrected : (H, n, L), scratch
-    state, z : (n, L), scratch
-    """
-
-    pseudo: PseudoStates
-    gains: SlotGains
-    table_row: np.ndarray
-    yhat: FloatArray
-    corrected: FloatArray
-    state: FloatArray
-    z: FloatArray
+    # Bytes, so that the design can be the key of a cache that all nodes share.
+    F, Q, start, information = (
+        np.asarray(part, dtype=np.float64).tobytes()
+        for part in (model.F, model.Q, cov, network.information)
+    )
+    size = len(cov), len(network.information)
+    return Design(*size, F, Q, start, information, network.heard)
 
 
 @kernel
-def pseudo_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: PseudoArrays,
-) -> None:
-    """Simulate H filters by consensus plus innovations over the S slots of a plan, in B blocks of L
-    runs: in each slot they predict, then correct their estimates of the pseudo-state ``G x`` by
-    readings and messages, and those of the state by these.
-
-    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and ``arrays.yhat``
-    (B, H, n, L) in place and writes ``samples`` in the slots that have one.
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict the estimates of node ``h``, of the pseudo-state and of the state; the root follows
+    from the gains.
     """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            if plan.sensed[s]:
-                for h in range(len(nodes.rows)):
-                    predict_pseudo(
-                        scratch.lanes, nodes.xhat, arrays.yhat, b, h, arrays.pseudo.A,
-                        arrays.pseudo.coupling, scratch.moved_mean,
-                    )  # fmt: skip
-                    predict_mean(nodes, scratch, b, h)
-                correct_all(nodes, readings, plan, links, scratch, arrays, b, s)
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            # Keep xhat and, alike, yhat relative to an origin near the true state.
-            rebase(nodes, readings, scratch, b, s)
-            shift_pseudo(scratch.lanes, arrays.yhat, readings, arrays.pseudo.G, b, s)
+    lanes, n, x, y, A = run.lanes, len(run.size), record.xhat, record.pseudo, record.A
+    for i in range(n):
+        total = spread(lanes, 0.0)
+        for j in range(n):
+            total += A[i, j] * load(lanes, y, h, j)
+            total += record.coupling[i, j] * load(lanes, x, h, j)
+        store(lanes, run.row, i, total)
+    for i in range(n):
+        store(lanes, y, h, i, load(lanes, run.row, i))
+    transform_mean(lanes, run.size, x, h, run.model.F, run.moved_mean)
 
 
 @kernel
-def correct_all(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: PseudoArrays,
-    b: int,
-    s: int,
-) -> None:
-    """Correct all H filters of block ``b`` by their readings and messages of slot ``s``: changes
-    ``nodes.xhat[b]`` and the estimates ``arrays.yhat[b]`` (H, n, L) of the pseudo-state G x, and
-    sets ``nodes.root[b]`` (H, n, n, L) to the roots that belong to the gains.
-
-    Axes: L runs side by side.
-    """
-    lanes, k = scratch.lanes, arrays.table_row[s]
-    # yhat+ of each filter, into ``corrected``: innovation z, then B and M.
-    for h in range(len(nodes.rows)):
-        fill_pseudo_innovation(
-            lanes, arrays.yhat, b, h, nodes.rows[h], arrays.pseudo.inverse, readings, s,
-            arrays.state, arrays.z,
-        )  # fmt: skip
-        correct_pseudo(
-            lanes, arrays.yhat, b, h, links, plan.up, s, arrays.gains.B[k], arrays.gains.M[k],
-            arrays.z, arrays.corrected,
-        )  # fmt: skip
-    # yhat <- yhat+ and xhat <- xhat + K (yhat+ - G xhat), only after all filters have used the
-    # estimates from before the exchange.
-    for h in range(len(nodes.rows)):
-        correct_state(
-            lanes, nodes.xhat, arrays.yhat, b, h, arrays.gains.K[k], arrays.pseudo.G,
-            arrays.corrected, arrays.state,
-        )  # fmt: skip
-        for i in range(nodes.xhat.shape[2]):
-            for j in range(i + 1):
-                store(lanes, nodes.root, b, h, i, j, arrays.gains.root[k, h, i, j])
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the estimate of the pseudo-state."""
+    for i in range(len(run.size)):
+        store(run.lanes, record.payload.pseudo, m, i, load(run.lanes, record.pseudo, h, i))
 
 
 @kernel
-def predict_pseudo_single(
-    x: FloatArray, y: FloatArray, A: FloatArray, coupling: FloatArray, work: FloatArray
-) -> None:
-    """Replace the estimate y (1, 1, n, 1) of the pseudo-state G x of one node in one run by its
-    prediction ``A y + coupling x``, with the estimate x (1, 1, n, 1) of the state; A and
-    ``coupling`` (n, n) as in ``PseudoStates``, ``work`` (n, 1) is scratch.
+def write_innovation(record: Any, h: int, run: Any) -> None:
+    """Write the pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)`` of node ``h`` into
+    ``run.gains``.
     """
-    predict_pseudo(ONE, x, y, 0, 0, A, coupling, work)
+    lanes, n, state, z = run.lanes, len(run.size), run.row, run.gains
+    for i in range(n):
+        total = spread(lanes, 0.0)
+        for j in range(n):
+            total += record.inverse[i, j] * load(lanes, record.pseudo, h, j)
+        store(lanes, state, i, total)
+        store(lanes, z, i, 0.0)
+    first, matrix = run.first_y + run.reading, run.first_H + run.matrix[run.reading]
+    # Whitened rows have R = I, so that H' R^-1 is H'.
+    for k in range(run.rows[run.reading]):
+        innovation = load(lanes, run.y, first, k)
+        for j in range(n):
+            innovation -= load(lanes, run.H, matrix, k, j) * load(lanes, state, j)
+        for i in range(n):
+            entry = load(lanes, run.H, matrix, k, i) * innovation
+            store(lanes, z, i, load(lanes, z, i) + entry)
 
 
 @kernel
-def correct_single(
-    x: FloatArray,
-    readings: ReadingBlock,
-    links: SlotLinks,
-    up: Any,
-    arrays: PseudoArrays,
-) -> None:
-    """Correct one node in one run by its reading and messages: its estimate x (1, 1, n, 1) and that
-    of the pseudo-state, ``arrays.yhat[0, 0]``, are changed in place. The entries 1 to H - 1 of
-    ``arrays.yhat`` (1, H, n, 1) are those of its senders, and ``up`` (1, 1, 1, W, 1) flags their
-    messages.
-
-    Axes: W directed links. For ``correct_estimates``.
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Correct the estimate of the pseudo-state by messages and the own reading, and that of the
+    state by it: ``yhat+ = yhat + sum_l B_l (yhat_l - yhat) + M z`` and
+    ``xhat+ = xhat + K (yhat+ - G xhat)``. A lost message takes its gain with it.
     """
-    gains, pseudo = arrays.gains, arrays.pseudo
-    y, state, z = arrays.yhat, arrays.state, arrays.z
-    fill_pseudo_innovation(ONE, y, 0, 0, readings.y.shape[3], pseudo.inverse, readings, 0, state, z)
-    correct_pseudo(ONE, y, 0, 0, links, up, 0, gains.B[0], gains.M[0], z, arrays.corrected)
-    correct_state(ONE, x, y, 0, 0, gains.K[0], pseudo.G, arrays.corrected, state)
+    lanes, n, x, y = run.lanes, len(run.size), record.xhat, record.pseudo
+    t, corrected, difference = (
+        record.table_row[run.slot - record.first_slot],
+        run.moved_mean,
+        run.row,
+    )
+    write_innovation(record, h, run)
+    for i in range(n):
+        total = load(lanes, y, h, i)
+        for j in range(n):
+            total += record.M[t, h, i, j] * load(lanes, run.gains, j)
+        store(lanes, corrected, i, total)
+    for k in range(run.count):
+        w, m, arrived = run.link[k], run.message[k], load_flags(lanes, run.arrived, k)
+        for i in range(n):
+            total = spread(lanes, 0.0)
+            for j in range(n):
+                heard = load(lanes, record.payload.pseudo, m, j)
+                total += record.B[t, w, i, j] * (heard - load(lanes, y, h, j))
+            term = select(arrived, total, 0.0)
+            store(lanes, corrected, i, load(lanes, corrected, i) + term)
+    for i in range(n):
+        total = load(lanes, corrected, i)
+        store(lanes, y, h, i, total)
+        for j in range(n):
+            total -= record.G[i, j] * load(lanes, x, h, j)
+        store(lanes, difference, i, total)
+    for i in range(n):
+        total = load(lanes, x, h, i)
+        for j in range(n):
+            total += record.K[t, h, i, j] * load(lanes, difference, j)
+            if j <= i:
+                store(lanes, record.root, h, i, j, record.roots[t, h, i, j])
+        store(lanes, x, h, i, total)
+
+
+@kernel
+def shift_pseudo(record: Any, run: Any, y: FloatArray, k: int) -> None:
+    """Add G ``run.offset`` to ``y[k]``, an estimate of the pseudo-state."""
+    lanes = run.lanes
+    for i in range(len(run.size)):
+        total = load(lanes, y, k, i)
+        for j in range(len(run.size)):
+            total += record.G[i, j] * load(lanes, run.offset, j)
+        store(lanes, y, k, i, total)
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move the estimates of state and pseudo-state: gains multiply differences."""
+    shift_vector(run, record.xhat, h)
+    shift_pseudo(record, run, record.pseudo, h)
+
+
+@kernel
+def shift_payload(record: Any, m: int, run: Any) -> None:
+    """Move the pseudo-state in payload ``m``."""
+    shift_pseudo(record, run, record.payload.pseudo, m)
 
 
 @built_in("consensus-innovations")
@@ -516,29 +455,53 @@ class ConsensusInnovations(Filter):
     every_reading: ClassVar[bool] = True
     common_start: ClassVar[bool] = True
     needs_network: ClassVar[bool] = True
-    slot_kernel = staticmethod(pseudo_slots)
+    kernels = Kernels(
+        predict=predict,
+        update=nothing,  # a reading is used in the exchange of its slot
+        emit=emit,
+        absorb=absorb,
+        shift=shift,
+        shift_payload=shift_payload,
+        unrolled=False,
+    )
 
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[PseudoArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
-        in these ``states``: the first pseudo-states (B, H, n, L) in B blocks of L runs, the gains
-        of slot 0, and scratch.
-        """
-        H, n = len(states), len(states[0].xhat)
-        yhat = in_lanes(np.stack([state.yhat for state in states]), blocks_of(runs))
-        scratch = [aligned(shape) for shape in ((H, n, LANES), (n, LANES), (n, LANES))]
-        rows, gains = gain_sequence(states[0].design).table(0, 1)
-        return (PseudoArrays(states[0].pseudo, gains, rows, yhat, *scratch),)
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return pseudo-states of nodes and messages, their matrices, and room for gains."""
+        network = infos[0].network
+        assert network is not None
+        n, H = len(models[0].information), len(infos)
+        pseudo = pseudo_states(models[0].F, network.information.sum(axis=0))
+        return Record(
+            node={"pseudo": (n,), "start": (n, n)},
+            payload={"pseudo": (n,)},
+            settings={
+                **{name: np.array(part, order="C") for name, part in pseudo._asdict().items()},
+                "B": np.zeros((1, 1, n, n)),
+                **{name: np.zeros((1, H, n, n)) for name in ("M", "K", "roots")},
+                "table_row": np.zeros(1, dtype=np.int64),
+                "first_slot": -1,
+            },
+        )
 
-    def slot_gains(
-        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
-    ) -> tuple[PseudoArrays]:
-        """Return ``arrays`` with the gains of ``count`` slots from number ``first`` on, which
-        follow from the network and its start, the ``design`` of all ``states``.
-        """
-        rows, gains = gain_sequence(states[0].design).table(first, count)
-        return (arrays[0]._replace(table_row=rows, gains=gains),)
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Set the first pseudo-state, and keep the covariance from which gains follow."""
+        assert info.network is not None
+        node["pseudo"][:] = info.network.information.sum(axis=0) @ node["xhat"]
+        node["start"][:] = node["root"] @ node["root"].T
+
+    def prepare(
+        self, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
+    ) -> None:
+        """Set the gains of the slots, which follow from the network and its start."""
+        network = infos[0].network
+        assert network is not None
+        if record.first_slot == first and len(record.table_row) == count:
+            return
+        start = np.ascontiguousarray(record.start[0, ..., 0])
+        sequence = gain_sequence(design_of(models[0], network, start))
+        record.table_row, gains = sequence.table(first, count, [info.place for info in infos])
+        record.B, record.M, record.K, record.roots = map(np.ascontiguousarray, gains)
+        record.first_slot = first
 
     def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, or held
@@ -557,112 +520,4 @@ class ConsensusInnovations(Filter):
         """
         return n
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PseudoState:
-        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n); the node knows the whole network, ``node.network``.
-        """
-        network = node.network
-        assert network is not None
-        # Bytes, so that the design can be the key of a cache that all nodes share.
-        F, Q, start, information = (
-            np.asarray(part, dtype=np.float64).tobytes()
-            for part in (model.F, model.Q, cov, network.information)
-        )
-        size = len(mean), len(network.information)
-        design = Design(*size, F, Q, start, information, network.heard)
-        pseudo = pseudo_states(model.F, network.information.sum(axis=0))
-        root = lower_root(square_root(cov))
-        return PseudoState(
-            xhat=mean,
-            root=root,
-            model=model,
-            yhat=pseudo.G @ mean,
-            pseudo=pseudo,
-            reading=None,
-            slot=0,
-            design=design,
-            node_index=node.place,
-        )
-
-    def predict(self, state: PseudoState, gap: float) -> PseudoState:
-        """Return the state ``gap`` seconds later: the estimates of the state and of the
-        pseudo-state are predicted, the root follows from the gains of the new slot, and no reading
-        is kept.
-        """
-        slot, n = state.slot, len(state.xhat)
-        xhat, yhat = state.xhat, state.yhat.reshape(1, 1, n, 1).copy()
-        # A gap is a whole number of slots. yhat first: it needs the xhat of the same slot.
-        for _ in range(round(gap / state.model.period)):
-            x = np.array(xhat).reshape(1, 1, n, 1)
-            predict_pseudo_single(x, yhat, state.pseudo.A, state.pseudo.coupling, np.empty((n, 1)))
-            xhat, slot = state.model.F @ xhat, slot + 1
-        state = state._replace(xhat=xhat, yhat=yhat.reshape(n), slot=slot, reading=None)
-        return state._replace(root=state.gains.predicted)
-
-    def update(self, state: PseudoState, reading: Reading) -> PseudoState:
-        """Return the state with the reading, whitened, kept for the exchange of the slot."""
-        if not len(reading.y):
-            return state
-        return state._replace(reading=whiten_reading(reading.y, reading.H, reading.R))
-
-    def emit(self, state: PseudoState, exchange: Exchange) -> tuple[PseudoState, PseudoEstimate]:
-        """Return the state, unchanged, and the payload: the prediction ``yhat`` (n,) of the
-        pseudo-state G x.
-        """
-        return state, PseudoEstimate(state.yhat, state.node_index, state.pseudo.G)
-
-    def absorb(
-        self, state: PseudoState, messages: Sequence[Message], exchange: Exchange
-    ) -> PseudoState:
-        """Return the state of a node at the end of the slot: messages and the node's own reading
-        correct its estimate of the pseudo-state, this corrects its estimate of the state, and the
-        root of P is the one that follows from the gains of the slot.
-        """
-        # A lost message takes its gain with it: only the B of senders that were heard are used.
-        gains, order = state.gains, state.design.heard[state.node_index]
-        senders = [order.index(message.payload.node_index) for message in messages]
-        received_gains = gains._replace(B=gains.B[senders])
-        received = [message.payload.yhat for message in messages]
-        xhat, yhat = correct_estimates(state, received_gains, received)
-        return state._replace(xhat=xhat, yhat=yhat, root=gains.root)
-
-    def shift(self, state: PseudoState, offset: FloatArray) -> PseudoState:
-        """Return the state for coordinates with another origin, to which engines change: with
-        ``offset`` (n,) added to the estimate of the plant's state x, G ``offset`` to that of the
-        pseudo-state G x, and H ``offset`` to the reading. Gains multiply differences, and do not
-        change.
-        """
-        reading = state.reading
-        if reading is not None:
-            y, H = reading
-            reading = y + H @ offset, H
-        return state._replace(
-            xhat=state.xhat + offset, yhat=state.yhat + state.pseudo.G @ offset, reading=reading
-        )
-
-    def shift_payload(self, payload: PseudoEstimate, offset: FloatArray) -> PseudoEstimate:
-        """Return the payload of a message under way with G ``offset`` added to its pseudo-state,
-        for a move of the origin by which states change by ``offset`` (n,).
-        """
-        return payload._replace(yhat=payload.yhat + payload.G @ offset)
-
-
-def correct_estimates(
-    state: PseudoState, gains: NodeGains, received: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the estimates xhat (n,) of the state and yhat (n,) of the pseudo-state of a node after
-    an exchange in which it ``received`` the estimates (n,) of pseudo-states; ``gains.B`` (d, n, n)
-    holds the gain of each of these d.
-    """
-    # The kernel takes blocks, nodes and lanes: the node itself is number 0, its senders follow.
-    n, y = len(state.xhat), np.stack([state.yhat, *received])[None, :, :, None]
-    links, up = star_of([1.0] * len(received))
-    readings = block_of_reading(*(state.reading or (np.zeros(0), np.zeros((0, n)))))
-    # A table of one slot (K = 1) and one node (N = 1), of which the W links are those received on.
-    gain_arrays = SlotGains(*(np.array(getattr(gains, name)) for name in SlotGains._fields))
-    table = SlotGains(gain_arrays.B[None], *(part[None, None] for part in gain_arrays[1:]))
-    x = np.array(state.xhat).reshape(1, 1, n, 1)
-    scratch = np.empty((1, n, 1)), np.empty((n, 1)), np.empty((n, 1))
-    arrays = PseudoArrays(state.pseudo, table, np.zeros(1, dtype=np.int64), y, *scratch)
-    correct_single(x, readings, links, up, arrays)
-    return x.reshape(n), np.ascontiguousarray(y[0, 0, :, 0])
+    shift = Filter.shift  # affine: gains multiply differences

@@ -285,9 +285,11 @@ class Filter(Component):
         views by name, with xhat (n,) and root (n, n) set.
         """
 
-    def prepare(self, record: Any, first: int, count: int) -> None:
-        """Set the fields of a ``record`` that are known before the run for ``count`` slots from
-        number ``first`` on, such as gains.
+    def prepare(
+        self, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
+    ) -> None:
+        """Set the fields of a ``record`` of nodes with these ``infos`` and ``models`` that are
+        known before the run for ``count`` slots from number ``first`` on, such as gains.
         """
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:

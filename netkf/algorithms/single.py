@@ -226,7 +226,7 @@ class Surroundings:
     def prepare(self, record: Any, slot: int) -> None:
         """Let the filter set what it knows of a slot before the run."""
         if slot >= 0:
-            self.filtering.prepare(record, slot, 1)
+            self.filtering.prepare(record, [self.info], [self.model], slot, 1)
 
     def set_exchange(self, exchange: Any) -> None:
         """Set the circumstances of ``emit`` or ``absorb``."""

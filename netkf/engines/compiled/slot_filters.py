@@ -43,7 +43,6 @@ class SlotFilters:
             blocks=blocks,
             lanes=LANES,
         )
-        self._memories = self.records.memories
         size = size_of(n, kernels.unrolled)
         cls = SlotRun.of_size(n) if isinstance(size, tuple) else SlotRun
         # Inbox: a node hears at most all of its links.
@@ -114,6 +113,7 @@ class SlotFilters:
             varies=H.shape[0] * H.shape[1] > 1,
             **drawn,
         )
-        self._setup.algorithm.prepare(self.records.struct, plan.first, len(plan.sensed))
+        setup, record = self._setup, self.records.struct
+        setup.algorithm.prepare(record, setup.infos, setup.models, plan.first, len(plan.sensed))
         loop = slot_loop(self._kernels)
-        loop(self.records.struct, self._memories, self._run, plan, samples)
+        loop(record, self.records.memories, self._run, plan, samples)

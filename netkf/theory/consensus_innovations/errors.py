@@ -8,11 +8,10 @@ yhat is ``u + G e``.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.consensus_innovations import gain_sequence
+from netkf.algorithms.consensus_innovations import design_of, gain_sequence, pseudo_states
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
@@ -27,14 +26,12 @@ class PseudoStateRule(ErrorRule):
     def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
         """Take the errors at time 0, and add a difference yhat - G xhat = 0 for each node."""
         super().__init__(scenario, errors)
-        algorithm: Any = scenario.filter.algorithm
         self._observations: EstimatorObservations = {}
-        state = algorithm.init(
-            scenario.slot_models[0],
-            *scenario.initial_estimate(scenario.nodes[0]),
-            scenario.node_infos[0],
-        )
-        self._design, self._pseudo = state.design, state.pseudo
+        model, network = scenario.slot_models[0], scenario.node_infos[0].network
+        assert network is not None
+        _, cov = scenario.initial_estimate(scenario.nodes[0])
+        self._design = design_of(model, network, cov)
+        self._pseudo = pseudo_states(model.F, network.information.sum(axis=0))
         self._slot = 0
         for estimator in range(errors.estimators):
             errors.stack.put(_difference_name(estimator), np.zeros((errors.n, 0)))
