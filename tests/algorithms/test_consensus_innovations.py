@@ -5,7 +5,7 @@ import pytest
 
 import netkf
 from netkf import theory
-from netkf.algorithms.consensus_innovations import optimal_gain
+from netkf.algorithms.consensus_innovations import design_of, gain_sequence, optimal_gain
 from netkf.algorithms.filter import Exchange, Reading
 from netkf.theory.common.errors import error_law
 from tests.algorithms.test_literature import (
@@ -242,15 +242,19 @@ def test_a_reading_of_which_a_row_is_missing_is_compared_with_the_rest(tmp_path)
     model, info = scenario.slot_models[node], scenario.node_infos[node]
     state = algorithm.predict(algorithm.init(model, *scenario.initial_estimate(node), info), 1.0)
     y, H, R = np.array([0.7, -0.4]), model.H[1:], model.R[1:, 1:]
-    after = algorithm.absorb(algorithm.update(state, Reading(y, H, R)), [], Exchange())
-    z = H.T @ np.linalg.inv(R) @ (y - H @ state.pseudo.inverse @ state.yhat)
-    yhat = state.yhat + state.gains.M @ z
-    np.testing.assert_allclose(after.yhat, yhat, rtol=1e-12)
-    xhat = state.xhat + state.gains.K @ (yhat - state.pseudo.G @ state.xhat)
-    np.testing.assert_allclose(after.xhat, xhat, rtol=1e-12)
+    slot = Exchange(phase=0, step=0, slot=1)
+    after = algorithm.absorb(algorithm.update(state, Reading(y, H, R)), [], slot)
+    cov = scenario.initial_estimate(node)[1]
+    gains = gain_sequence(design_of(model, info.network, cov)).at(1)[node]
+    G = info.network.information.sum(axis=0)
+    z = H.T @ np.linalg.inv(R) @ (y - H @ np.linalg.pinv(G, hermitian=True) @ state.pseudo)
+    yhat = state.pseudo + gains.M @ z
+    np.testing.assert_allclose(after.pseudo, yhat, rtol=1e-11)
+    xhat = state.xhat + gains.K @ (yhat - G @ state.xhat)
+    np.testing.assert_allclose(after.xhat, xhat, rtol=1e-11)
     # Without a reading and messages it stays.
-    silent = algorithm.absorb(state, [], Exchange())
-    np.testing.assert_array_equal(silent.yhat, state.yhat)
+    silent = algorithm.absorb(state, [], slot)
+    np.testing.assert_array_equal(silent.pseudo, state.pseudo)
 
 
 def test_better_than_gains_that_are_not_optimal_and_no_better_than_central(tmp_path):
