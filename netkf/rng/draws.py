@@ -12,7 +12,6 @@ modulo 2^64.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, blocks_of
 from netkf.linalg.words import high_word
-from netkf.rng.streams import BLOCK_WORDS, BUFFER, USED, WIDTH, ReplicaStreams, Streams
+from netkf.rng.streams import BLOCK_WORDS, BUFFER, USED, WIDTH
 
 _U = np.uint64
 # Multipliers and Weyl constants of Philox4x64, see Random123 and numpy/random/src/philox.
@@ -128,31 +127,12 @@ def next_exponential(states: np.ndarray, k: int, ziggurat: Ziggurat) -> float:
 
 
 @kernel
-def fill_units(states: np.ndarray, which: np.ndarray, counts: np.ndarray, out: FloatArray) -> None:
-    """Write the next ``counts[m]`` uniform numbers of stream ``which[m]`` of the ``states``
-    (K, WIDTH) into ``out``, for each of M entries m in turn; ``counts`` and ``which`` are (M,),
-    ``out`` (sum of counts,).
+def fill_units(states: np.ndarray, out: FloatArray) -> None:
+    """Write the next uniform number of each of the streams ``states`` (K, WIDTH) into ``out``
+    (K,).
     """
-    index = 0
-    for m in range(len(which)):
-        for _ in range(counts[m]):
-            out[index] = next_unit(states, which[m])
-            index += 1
-
-
-@kernel
-def fill_exponentials(
-    states: np.ndarray, which: np.ndarray, counts: np.ndarray, ziggurat: Ziggurat, out: FloatArray
-) -> None:
-    """Write the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]`` of the
-    ``states`` (K, WIDTH) into ``out``, for each of M entries m in turn; ``counts`` and ``which``
-    are (M,), ``out`` (sum of counts,).
-    """
-    index = 0
-    for m in range(len(which)):
-        for _ in range(counts[m]):
-            out[index] = next_exponential(states, which[m], ziggurat)
-            index += 1
+    for k in range(len(out)):
+        out[k] = next_unit(states, k)
 
 
 def states_in_lanes(states: np.ndarray, runs: int) -> np.ndarray:
@@ -163,38 +143,3 @@ def states_in_lanes(states: np.ndarray, runs: int) -> np.ndarray:
     by_lane = np.zeros((blocks * LANES, count, WIDTH), dtype=np.uint64)
     by_lane[:runs] = states.reshape(runs, count, WIDTH)
     return np.ascontiguousarray(np.swapaxes(by_lane.reshape(blocks, LANES, count, WIDTH), 1, 2))
-
-
-class StreamBatch:
-    """The streams of one purpose for many entities: ``states`` (K, WIDTH), which drawing changes.
-
-    With ReplicaStreams of R runs, K is R times the number of entities, run by run.
-    """
-
-    def __init__(
-        self, streams: Streams | ReplicaStreams, purpose: str, entities: Sequence[tuple[int, ...]]
-    ) -> None:
-        """Take one stream of ``purpose`` for each of ``entities``: tuples of ids, such as (node,)
-        or (sender, receiver).
-        """
-        self.states = streams.states(purpose, entities)
-
-    def units(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return the next ``counts[m]`` uniforms of stream ``which[m]``, concatenated over m
-        (sum of counts,); both arguments are (M,), for M entries m.
-
-        They equal ``Generator.random(counts[m])`` of that stream.
-        """
-        out = np.empty(int(counts.sum()))
-        fill_units(self.states, which, counts, out)
-        return out
-
-    def exponentials(self, which: np.ndarray, counts: np.ndarray) -> FloatArray:
-        """Return the next ``counts[m]`` exponential numbers of mean 1 of stream ``which[m]``,
-        concatenated over m (sum of counts,); both arguments are (M,), for M entries m.
-
-        They equal ``Generator.standard_exponential(counts[m])`` of that stream.
-        """
-        out = np.empty(int(counts.sum()))
-        fill_exponentials(self.states, which, counts, ziggurat(), out)
-        return out

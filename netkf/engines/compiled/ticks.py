@@ -31,7 +31,7 @@ from netkf.engines.compiled.senders import Senders, senders_of
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
-from netkf.rng.draws import StreamBatch, Ziggurat, next_exponential, next_unit, ziggurat
+from netkf.rng.draws import Ziggurat, fill_units, next_exponential, next_unit, ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
@@ -330,8 +330,8 @@ def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Send
     if isinstance(clock, Periodic):
         kind, low, width = LATTICE, clock.period, clock.jitter
         if isinstance(clock.phase, str):
-            units = StreamBatch(streams, "phase", entities).units(np.arange(count), number + 1)
-            scale = clock.period * units
+            fill_units(streams.states("phase", entities), scale)
+            scale *= clock.period
         else:
             scale = np.full(count, clock.phase)
         # With phase 0 the lattice point at time 0 is no tick.
