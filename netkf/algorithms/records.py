@@ -60,6 +60,7 @@ class Kernels:
     sends_readings : a message brings the sender's reading of that instant, ``run.heard``
     remembers : the record has a ``past``
     counts_sends : ``emit`` changes the record, so that it is called even if no message arrives
+    slotwise : ``prepare`` is called for one slot at a time
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
     under_clocks : the verbs under clocks, where they are others than in slots
@@ -77,6 +78,7 @@ class Kernels:
     sends_readings: bool = False
     remembers: bool = False
     counts_sends: bool = False
+    slotwise: bool = False
     unrolled: bool = True
     under_clocks: Kernels | None = None
 

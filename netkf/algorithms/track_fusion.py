@@ -11,57 +11,46 @@ A track is a node's estimate. By the first two rules (``PairFusion``) nodes fuse
 of their own. By the third (``BarShalomCampo``) each node's own track is a Kalman filter on its own
 readings; fused estimates are only reported. Its joint covariance holds E[e_i e_j'] (n, n) of the
 errors of all pairs of tracks.
-
-Kernels simulate L runs at once (lanes, the last axis) in B blocks, with the structs of
-``kernels.slots``: ``nodes`` (estimates and roots of H filters), ``readings`` (whitened, so that
-noise has variance 1), ``plan`` (the events of S slots), ``links``, ``samples`` (output) and
-``scratch``. Estimates are relative to an origin near the true state, which moves in some slots
-(``rebase``, ``shift``), so that large states cost no digits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
+from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.pair_fusion import fuse_pair
-from netkf.algorithms.kernels.run import carry
+from netkf.algorithms.kernels.run import (
+    carry,
+    copy_estimate,
+    predict_estimate,
+    shift_vector,
+    update_estimate,
+)
 from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    predict_all,
-    read_all,
-    rebase,
-    store_sample_of_slot,
     whiten_reading,
 )
 from netkf.algorithms.kernels.tracks import (
-    TrackScratch,
     combine_tracks,
     predict_joint,
     track_scratch,
     update_joint,
 )
-from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import field, one_of
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import blocks_of, in_lanes, load, store
+from netkf.linalg.lanes import load, store
 from netkf.linalg.small import copy_matrix
 
 TRACE, DETERMINANT = "trace", "determinant"
 INTERSECTION = 'rule = "ci"'  # the filter that error messages recommend
-COMBINATIONS, MAX_DIRECTION_BITS = 64, 62
+COMBINATIONS, MAX_DIRECTION_BITS = 32, 62
 """Combinations of tracks in the cache of a node, and incoming links that have a bit of their own in
 its keys.
 """
@@ -163,222 +152,106 @@ class InverseIntersection(PairFusion):
     inverse: ClassVar[bool] = True
 
 
-class Track(NamedTuple):
-    """A payload: the sender's own track ``xhat`` (n,), and the whitened H (p, n) of its sensors."""
-
-    xhat: FloatArray
-    H: FloatArray
-
-
-class TrackState(NamedTuple):
-    """The state of a node of ``BarShalomCampo``.
-
-    xhat, root : the node's own track (n,) and its root (n, n)
-    model : of the plant and the node's sensors
-    fused, fused_root : the reported estimate (n,) and its root (n, n)
-    slot : number of the slot
-    senders, sensors : ids of the m nodes whose sensors it knows, first -1 for itself, then those it
-                       has heard, and the whitened H of each
-    joint : (m, m, n, n), covariances E[e_i e_j'] of the errors of their tracks
-    start : covariance (n, n) of the error with which all tracks began
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    fused: FloatArray
-    fused_root: FloatArray
-    slot: int
-    senders: tuple[int, ...]
-    sensors: tuple[FloatArray, ...]
-    joint: FloatArray
-    start: FloatArray
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``fused_root fused_root'`` (n, n) of the reported estimate."""
-        return self.fused_root @ self.fused_root.T
-
-
-class CombinationCache(NamedTuple):
-    """Combinations that were computed for one node in one slot, C at most: all runs in which it
-    hears the same nodes share one.
-
-    key : (C,), a number with a bit for each incoming link on which a track arrived; -1: free entry
-    rank : (C,), rank of the differences of the tracks; 0: all tracks are the same
-    gain : (C, n, k n), gains of the differences of up to k tracks to the own one
-    root : (C, n, n), root of the covariance of the combination
-    """
-
-    key: np.ndarray
-    rank: np.ndarray
-    gain: FloatArray
-    root: FloatArray
-
-
-class TrackArrays(NamedTuple):
-    """What ``track_slots`` keeps of all H nodes for B blocks of L runs.
-
-    xhat, root : own tracks (B, H, n, L) and their roots (B, H, n, n, L)
-    Q, H : process noise covariance (n, n) and whitened sensors (H, p, n)
-    joint, pairs : covariances E[e_i e_j'] (K, n, n), the same in all runs, of the pairs (i, j),
-                   (K, 2), of tracks that some node may combine
-    first : (H + 1,), pairs (i, .) begin at ``first[i]``
-    closed : (H, n, n), scratch, I - K_i H_i of each node
-    tracks, block : scratch, indices (D + 1,) of the tracks to combine, the own one first, and their
-                    joint covariance (D + 1, D + 1, n, n), for at most D senders
-    scratch, cache : for combinations
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    Q: FloatArray
-    H: FloatArray
-    joint: FloatArray
-    pairs: np.ndarray
-    first: np.ndarray
-    closed: FloatArray
-    tracks: np.ndarray
-    block: FloatArray
-    scratch: TrackScratch
-    cache: CombinationCache
+@kernel
+def report_track(record: Any, h: int, run: Any) -> None:
+    """Report the own track of node ``h``."""
+    x, root = record.track_x, record.track_root
+    copy_estimate(run, record.xhat, record.root, h, x, root, h, True)
 
 
 @kernel
-def track_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: TrackArrays,
-) -> None:
-    """Simulate H filters that combine tracks over the S slots of a plan, in B blocks of L runs: in
-    each slot the own tracks predict and read, and each node combines its own with those it hears.
-
-    Changes the tracks and their covariances ``joint`` in ``arrays``, writes the reported estimates
-    into ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L), and ``samples``.
-    """
-    # The own tracks as nodes of a Kalman filter; ``nodes`` are the reported estimates.
-    tracks = SlotNodes(arrays.xhat, arrays.root, nodes.F, nodes.root_Q, nodes.rows)
-    work = arrays.scratch.work
-    # Slot by slot: the covariances of tracks are the same in all runs.
-    for s in range(plan.up.shape[1]):
-        if plan.sensed[s]:
-            predict_joint(arrays.joint, nodes.F, arrays.Q, work)
-            update_joint(
-                arrays.joint, arrays.pairs, arrays.H, nodes.rows, arrays.closed, work
-            )  # fmt: skip
-            for b in range(plan.up.shape[0]):
-                predict_all(tracks, scratch, b)
-                read_all(tracks, readings, scratch, b, s)
-                copy_tracks(nodes, tracks, scratch, b)
-            # Runs in which a node hears the same nodes share the combination of this slot.
-            for h in range(len(nodes.rows)):
-                for k in range(len(arrays.cache.key)):
-                    arrays.cache.key[k] = -1
-                for b in range(plan.up.shape[0]):
-                    for q in range(len(scratch.lanes)):
-                        combine_received(nodes, plan, links, arrays, (b, s, h, q))
-        for b in range(plan.up.shape[0]):
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            rebase(nodes, readings, scratch, b, s)
-            rebase(tracks, readings, scratch, b, s)
+def predict_track(record: Any, h: int, run: Any) -> None:
+    """Predict the own track, which is reported until tracks arrive."""
+    predict_estimate(run.model, run, record.track_x, record.track_root, h, h)
+    report_track(record, h, run)
 
 
 @kernel
-def copy_tracks(nodes: SlotNodes, tracks: SlotNodes, scratch: SlotScratch, b: int) -> None:
-    """Copy the own tracks of all H nodes of block ``b`` to ``nodes.xhat[b]`` (H, n, L) and
-    ``nodes.root[b]`` (H, n, n, L), the estimates that they report.
+def update_track(record: Any, h: int, run: Any) -> None:
+    """Update the own track with the reading of node ``h``."""
+    update_estimate(run.model, run, record.track_x, record.track_root, h, h)
+    report_track(record, h, run)
 
-    Axes: L runs side by side.
-    """
-    for h in range(len(nodes.rows)):
-        for i in range(nodes.xhat.shape[2]):
-            store(scratch.lanes, nodes.xhat, b, h, i, load(scratch.lanes, tracks.xhat, b, h, i))
+
+@kernel
+def emit_track(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the own track; all nodes know the sensors."""
+    for i in range(len(run.size)):
+        store(run.lanes, record.payload.xhat, m, i, load(run.lanes, record.track_x, h, i))
+
+
+@kernel
+def combine_heard(record: Any, h: int, run: Any) -> None:
+    """Report the best combination of the own track with those that arrive, run by run."""
+    n, x, payload = len(run.size), record.track_x, record.payload
+    degree = run.first[h + 1] - run.first[h]
+    for q in range(len(run.lanes)):
+        count, key = 0, 0
+        record.tracks[0] = record.own[h]
+        for k in range(run.count):
+            if run.arrived[k, q] == 1:
+                count += 1
+                w = run.link[k]
+                record.tracks[count], record.messages[count] = record.heard[w], run.message[k]
+                # A bit for each incoming link on which a track arrives.
+                key += 1 << min(w - run.first[h], MAX_DIRECTION_BITS)
+        if count == 0:
+            continue
+        k = combination_of(record, h, key, count, degree)
+        # Rank 0: all tracks are the same, and the own one stays to the last bit.
+        if record.rank[h, k] == 0:
+            continue
+        # xhat = x_h + sum_a G_a (x_a - x_h): the gains are those of differences to the own track.
+        for a in range(count):
+            for j in range(n):
+                difference = payload.xhat[record.messages[1 + a], j, q] - x[h, j, q]
+                for i in range(n):
+                    record.xhat[h, i, q] += record.gain[h, k, i, a * n + j] * difference
+        for i in range(n):
             for j in range(i + 1):
-                entry = load(scratch.lanes, tracks.root, b, h, i, j)
-                store(scratch.lanes, nodes.root, b, h, i, j, entry)
+                record.root[h, i, j, q] = record.combined[h, k, i, j]
 
 
 @kernel
-def combine_received(
-    nodes: SlotNodes,
-    plan: SlotPlan,
-    links: SlotLinks,
-    arrays: TrackArrays,
-    index: tuple[int, int, int, int],
-) -> None:
-    """Replace the reported estimate of filter h of block b in lane q (one run) by the combination
-    of its track with those that arrive in slot s, all of them in ``arrays``; ``index`` is [b, s, h,
-    q]. Changes ``nodes.xhat[b, h, :, q]`` (n,) and ``nodes.root[b, h, :, :, q]`` (n, n).
+def combination_of(record: Any, h: int, key: int, count: int, degree: int) -> int:
+    """Return the index in the cache of node ``h`` of the combination of its track with ``count``
+    others, the first ``count + 1`` of ``record.tracks``: all runs in which it hears the same nodes
+    share one. ``key`` has a bit for each of its ``degree`` links on which a track arrived.
     """
-    b, s, h, q = index
-    n, count, key = nodes.xhat.shape[2], 0, 0
-    arrays.tracks[0] = h
-    for m in range(links.first[h], links.first[h + 1]):
-        if plan.up[b, s, 0, links.direction[m], q]:
-            count += 1
-            arrays.tracks[count] = links.sender[m]
-            # The key of the combination has a bit for each incoming link on which a track arrives.
-            key += 1 << min(m - links.first[h], MAX_DIRECTION_BITS)
-    if count == 0:
-        return
-    k = combination_of(arrays, key, count, links.first[h + 1] - links.first[h])
-    gain, root = arrays.cache.gain[k], arrays.cache.root[k]
-    # Rank 0: all tracks are the same, and the own one stays to the last bit.
-    if arrays.cache.rank[k] == 0:
-        return
-    # xhat = x_h + sum_a G_a (x_a - x_h): the gains are those of differences to the own track.
-    for a in range(count):
-        for j in range(n):
-            difference = arrays.xhat[b, arrays.tracks[1 + a], j, q] - arrays.xhat[b, h, j, q]
-            for i in range(n):
-                nodes.xhat[b, h, i, q] += gain[i, a * n + j] * difference
-    for i in range(n):
-        for j in range(i + 1):
-            nodes.root[b, h, i, j, q] = root[i, j]
-
-
-@kernel
-def combination_of(arrays: TrackArrays, key: int, count: int, degree: int) -> int:
-    """Return the index in ``arrays.cache`` of the combination of the own track with ``count``
-    others, the first ``count + 1`` indices in ``arrays.tracks``; compute it if the cache lacks it.
-    ``key`` has a bit for each of the node's ``degree`` incoming links on which a track arrived.
-    """
-    cache = arrays.cache
     # A hash of the key; a combination with the same hash is overwritten.
-    k = (key ^ (key >> 6) ^ (key >> 12)) % len(cache.key)
+    k = (key ^ (key >> 6) ^ (key >> 12)) % record.key.shape[1]
     # With more links than bits a key is not unique: always compute.
-    if degree > MAX_DIRECTION_BITS or cache.key[k] != key:
-        cache.key[k] = key
+    if degree > MAX_DIRECTION_BITS or record.key[h, k] != key:
+        record.key[h, k] = key
         for a in range(count + 1):
             for b in range(count + 1):
-                pair = pair_of(arrays, arrays.tracks[a], arrays.tracks[b])
-                copy_matrix(arrays.block[a, b], arrays.joint[pair])
-        cache.rank[k] = combine_tracks(
-            arrays.block, count, arrays.scratch, cache.gain[k], cache.root[k]
+                pair = pair_of(record, record.tracks[a], record.tracks[b])
+                copy_matrix(record.block[a, b], record.joint[pair])
+        record.rank[h, k] = combine_tracks(
+            record.block, count, record.scratch, record.gain[h, k], record.combined[h, k]
         )
     return k
 
 
 @kernel
-def pair_of(arrays: TrackArrays, i: int, j: int) -> int:
-    """Return the index in ``arrays.pairs`` (K, 2) of the pair (i, j) of tracks, which is among
-    them.
-
-    Axes: K pairs of tracks.
-    """
+def pair_of(record: Any, i: int, j: int) -> int:
+    """Return the index in ``record.pairs`` (K, 2) of the pair (i, j), which is among them."""
     # Bisection: pairs of track i are sorted by the second track.
-    low, high = arrays.first[i], arrays.first[i + 1] - 1
+    low, high = record.pairs_of[i], record.pairs_of[i + 1] - 1
     while low < high:
         middle = (low + high) // 2
-        if arrays.pairs[middle, 1] < j:
+        if record.pairs[middle, 1] < j:
             low = middle + 1
         else:
             high = middle
     return int(low)
+
+
+@kernel
+def shift_tracks(record: Any, h: int, run: Any) -> None:
+    """Move track and combination: tracks enter by their differences."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.track_x, h)
 
 
 @built_in("track-fusion", rule="cross-covariance")
@@ -399,59 +272,79 @@ class BarShalomCampo(Filter):
     fixed_sensors: ClassVar[bool] = True
     every_reading: ClassVar[bool] = True
     common_start: ClassVar[bool] = True
-    needs_network: ClassVar[bool] = True  # for the compiled slots alone
-    slot_kernel = staticmethod(track_slots)
-    unrolled: ClassVar[bool] = True
+    needs_network: ClassVar[bool] = True
+    kernels = Kernels(
+        predict=predict_track,
+        update=update_track,
+        emit=emit_track,
+        absorb=combine_heard,
+        shift=shift_tracks,
+        slotwise=True,
+    )
 
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[TrackArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
-        in these ``states`` and hear the nodes in ``infos``: the tracks with their covariances, and
-        scratch. A tuple of one, since kernels take any number of such arguments.
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return tracks of nodes and messages, the pairs of tracks that some node may combine, room
+        for their covariances, which are the same in all runs, and for combinations.
         """
-        H, n, start = len(states), len(states[0].xhat), states[0].start
-        max_degree = max(info.degree for info in infos)
-        xhat, root = (
-            in_lanes(np.stack([getattr(state, name) for state in states]), blocks_of(runs))
-            for name in ("xhat", "root")
-        )
-        # Scratch of the kernel for the combinations of one slot; key -1: a free entry.
-        cache = CombinationCache(
-            key=np.full(COMBINATIONS, -1),
-            rank=np.zeros(COMBINATIONS, dtype=np.int64),
-            gain=np.zeros((COMBINATIONS, n, max(max_degree, 1) * n)),
-            root=np.zeros((COMBINATIONS, n, n)),
-        )
-        sensors, _ = stacked_sensors([state.sensors[0] for state in states])
-        # Pairs (i, j) of tracks that some node may combine, ordered by i: those of i begin at
-        # first[i]. All tracks start with one common error, whose covariance is ``start``.
-        pairs = combined_pairs(infos)
-        first = np.searchsorted(pairs[:, 0], np.arange(H + 1))
-        return (
-            TrackArrays(
-                xhat=xhat,
-                root=root,
-                Q=np.array(states[0].model.Q),
-                H=sensors,
-                joint=np.tile(start, (len(pairs), 1, 1)),
-                pairs=pairs,
-                first=first,
-                closed=np.zeros((H, n, n)),
-                tracks=np.zeros(max_degree + 1, dtype=np.int64),
-                block=np.zeros((max_degree + 1, max_degree + 1, n, n)),
-                scratch=track_scratch(max_degree, n),
-                cache=cache,
-            ),
+        network, n, H = infos[0].network, len(models[0].information), len(infos)
+        assert network is not None
+        places = [info.place for info in infos]
+        others = {j for place in places for j in network.heard[place]}.difference(places)
+        index = {place: k for k, place in enumerate([*places, *sorted(others)])}
+        heard = [[index[j] for j in network.heard[place]] for place in places]
+        pairs = combined_pairs(len(index), heard)
+        degree = max(1, *map(len, heard))
+        information = network.information[list(index)]
+        return Record(
+            node={"track_x": (n,), "track_root": (n, n), "start": (n, n)},
+            payload={"xhat": (n,)},
+            settings={
+                "own": np.arange(H),
+                "heard": np.array([j for some in heard for j in some] + [0]),
+                "pairs": pairs,
+                "pairs_of": np.searchsorted(pairs[:, 0], np.arange(len(index) + 1)),
+                "joint": np.zeros((len(pairs), n, n)),
+                # Number of the slot that they belong to.
+                "joint_slot": np.full(1, -1),
+                # Rows of unit noise with the information of the sensors.
+                "sensors": np.ascontiguousarray(
+                    np.stack([square_root(one).T for one in information])
+                ),
+                "rows": np.where(information.any(axis=(1, 2)), n, 0),
+                "closed": np.zeros((len(index), n, n)),
+                **{name: np.zeros(degree + 1, dtype=np.int64) for name in ("tracks", "messages")},
+                "block": np.zeros((degree + 1, degree + 1, n, n)),
+                "scratch": track_scratch(degree, n),
+                # -1: a free entry.
+                "key": np.full((H, COMBINATIONS), -1),
+                "rank": np.zeros((H, COMBINATIONS), dtype=np.int64),
+                "gain": np.zeros((H, COMBINATIONS, n, degree * n)),
+                "combined": np.zeros((H, COMBINATIONS, n, n)),
+            },
         )
 
-    def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the own tracks (B, H, n, L) in ``arrays``, from ``slot_arrays``, with which nodes
-        go on, instead of the combinations that are ``reported`` (B, H, n, L): B blocks of L runs, H
-        nodes. A trigger refers to them.
-        """
-        tracks: TrackArrays = arrays[0]
-        return tracks.xhat
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Begin the track with the first estimate, and keep its covariance."""
+        node["track_x"][:], node["track_root"][:] = node["xhat"], node["root"]
+        node["start"][:] = node["root"] @ node["root"].T
+
+    def prepare(
+        self, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
+    ) -> None:
+        """Compute the covariances of tracks in slot ``first``."""
+        joint, slot = record.joint, record.joint_slot
+        if slot[0] == first:
+            return
+        # All tracks start with one common error.
+        if slot[0] < 0 or slot[0] > first:
+            joint[:], slot[0] = record.start[0, ..., 0], 0
+        F, Q = (np.array(part, order="C") for part in (models[0].F, models[0].Q))
+        work = np.empty(F.shape)
+        while slot[0] < first:
+            predict_joint(joint, F, Q, work)
+            update_joint(joint, record.pairs, record.sensors, record.rows, record.closed, work)
+            slot[0] += 1
+        record.key[:] = -1
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message in numbers of 64 bits: n, a track; sensors do not change and
@@ -459,68 +352,7 @@ class BarShalomCampo(Filter):
         """
         return n
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TrackState:
-        """Return the first state of a node, whose own track, with estimate ``mean`` (n,) and
-        covariance ``cov`` (n, n), is also reported.
-        """
-        root, joint = first_root(cov), np.array(cov)[None, None]
-        sensors = (whitened_sensors(model),)
-        return TrackState(
-            xhat=mean,
-            root=root,
-            model=model,
-            fused=mean,
-            fused_root=root,
-            slot=0,
-            senders=(-1,),
-            sensors=sensors,
-            joint=joint,
-            start=joint[0, 0],
-        )
-
-    def predict(self, state: TrackState, gap: float) -> TrackState:
-        """Return the state ``gap`` seconds, a slot, later: own track and joint covariance are
-        predicted, and the own track is reported until tracks arrive.
-        """
-        xhat, root = state.model.predict(state.xhat, state.root, gap)
-        joint = predicted_joint(state.joint, state.model)
-        return state._replace(
-            xhat=xhat, root=root, fused=xhat, fused_root=root, joint=joint, slot=state.slot + 1
-        )
-
-    def update(self, state: TrackState, reading: Reading) -> TrackState:
-        """Return the state with the own track updated by the reading, and the covariances of all
-        known tracks as if each had used a reading of its sensors.
-        """
-        tracked: TrackState = super().update(state, reading)
-        joint = updated_joint(state.joint, state.sensors)
-        return tracked._replace(joint=joint, fused=tracked.xhat, fused_root=tracked.root)
-
-    def emit(self, state: TrackState, exchange: Exchange) -> tuple[TrackState, Track]:
-        """Return the state, unchanged, and the payload: the own track with its sensors."""
-        return state, Track(state.xhat, state.sensors[0])
-
-    def absorb(
-        self, state: TrackState, messages: Sequence[Message], exchange: Exchange
-    ) -> TrackState:
-        """Return the state that reports the best combination of the own track and those heard."""
-        if not messages:
-            return state
-        state = add_senders(state, messages)
-        tracks = [0, *(state.senders.index(message.sender) for message in messages)]
-        differences = np.concatenate([message.payload.xhat - state.xhat for message in messages])
-        gain, root = best_combination(state.joint, tracks, state.root)
-        return state._replace(fused=state.xhat + gain @ differences, fused_root=root)
-
-    def estimate(self, state: TrackState) -> tuple[FloatArray, FloatArray]:
-        """Return the combination that is reported, (n,), and its covariance (n, n)."""
-        return state.fused, state.P
-
-    def shift(self, state: TrackState, offset: FloatArray) -> TrackState:
-        """Return the state with ``offset`` (n,) added to the track and to the combination, for a
-        move of the origin: tracks enter by their differences.
-        """
-        return state._replace(xhat=state.xhat + offset, fused=state.fused + offset)
+    shift = Filter.shift  # affine: tracks enter by their differences
 
 
 def whitened_sensors(model: SlotModel) -> FloatArray:
@@ -542,18 +374,16 @@ def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarr
     return stack, rows
 
 
-def combined_pairs(infos: Sequence[NodeInfo]) -> np.ndarray:
-    """Return the pairs (K, 2) of indices of tracks that some of the N nodes in ``infos`` may
-    combine, in lexical order: both orders of each pair, and each track with itself.
-
-    Axes: K pairs of tracks.
+def combined_pairs(count: int, heard: Sequence[Sequence[int]]) -> np.ndarray:
+    """Return the pairs (K, 2) of indices of ``count`` tracks that some node may combine, in lexical
+    order: both orders of each pair, and each track with itself; node h hears ``heard[h]``.
     """
-    network, N = infos[0].network, len(infos)
-    assert network is not None
-    tracks = [np.array([h, *heard]) for h, heard in enumerate(network.heard)]
-    # The pair (i, j) as one number, i N + j, which sorts and removes duplicates quickly.
-    codes = np.unique(np.concatenate([np.add.outer(N * one, one).reshape(-1) for one in tracks]))
-    return np.ascontiguousarray(np.stack(np.divmod(codes, N), axis=1))
+    groups = [np.array([h, *others]) for h, others in enumerate(heard)]
+    groups += [np.array([k]) for k in range(count)]
+    # The pair (i, j) as one number, which sorts and removes duplicates quickly.
+    codes = [np.add.outer(count * one, one).reshape(-1) for one in groups]
+    pairs = np.divmod(np.unique(np.concatenate(codes)), count)
+    return np.ascontiguousarray(np.stack(pairs, axis=1))
 
 
 def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
@@ -576,22 +406,6 @@ def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArra
     work = np.empty((m, n, n)), np.empty((n, n))
     update_joint(updated.reshape(-1, n, n), pairs, H, rows, *work)
     return updated
-
-
-def add_senders(state: TrackState, messages: Sequence[Message]) -> TrackState:
-    """Return the state extended by the new senders of ``messages``: their ids, their sensors, and
-    the joint covariance (m, m, n, n) of the errors of all m tracks that are known then.
-    """
-    new_messages = [message for message in messages if message.sender not in state.senders]
-    if not new_messages:
-        return state
-    senders = (*state.senders, *(message.sender for message in new_messages))
-    sensors = (*state.sensors, *(message.payload.H for message in new_messages))
-    # The joint covariance does not depend on data: recompute it from slot 0 with the new tracks.
-    joint = np.tile(state.start, (len(senders), len(senders), 1, 1))
-    for _ in range(state.slot):
-        joint = updated_joint(predicted_joint(joint, state.model), sensors)
-    return state._replace(senders=senders, sensors=sensors, joint=joint)
 
 
 def best_combination(

@@ -12,12 +12,12 @@ pairs there are.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Struct
 
 NEGLIGIBLE = 1e-12
 """Variance of a difference of two tracks, relative to the sum of both variances, at the level of
@@ -25,7 +25,7 @@ rounding.
 """
 
 
-class TrackScratch(NamedTuple):
+class TrackScratch(Struct):
     """Scratch for the fusion of a node's own track with k others.
 
     difference_cov, factor : (k n, k n), covariance of the differences d_a = e_own - e_a of errors,
@@ -56,7 +56,14 @@ def track_scratch(k: int, n: int) -> TrackScratch:
     )
     order = np.zeros(K, dtype=np.int64)
     return TrackScratch(
-        difference_cov, factor, cross_cov, white_cov, variance_scale, order, weights, work
+        difference_cov=difference_cov,
+        factor=factor,
+        cross_cov=cross_cov,
+        white_cov=white_cov,
+        variance_scale=variance_scale,
+        order=order,
+        weights=weights,
+        work=work,
     )
 
 

@@ -111,9 +111,14 @@ class SlotFilters:
             predicts=self._setup.algorithm.predicts,
             direction=self._setup.links.direction,
             varies=H.shape[0] * H.shape[1] > 1,
+            start=0,
+            end=0,
             **drawn,
         )
-        setup, record = self._setup, self.records.struct
-        setup.algorithm.prepare(record, setup.infos, setup.models, plan.first, len(plan.sensed))
-        loop = slot_loop(self._kernels)
-        loop(record, self.records.memories, self._run, plan, samples)
+        setup, record, count = self._setup, self.records.struct, len(plan.sensed)
+        loop, step = slot_loop(self._kernels), 1 if self._kernels.slotwise else max(1, count)
+        for start in range(0, count, step):
+            first = plan.first + start
+            setup.algorithm.prepare(record, setup.infos, setup.models, first, step)
+            part = plan._replace(start=start, end=start + step)
+            loop(record, self.records.memories, self._run, part, samples)

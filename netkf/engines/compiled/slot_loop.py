@@ -41,6 +41,7 @@ class SlotPlan(NamedTuple):
         sends nothing; empty if all nodes send that are asked
     uniform : (B, S, E, H, L), uniform numbers for these decisions; empty unless randomised
     varies : whether H differs from block to block and slot to slot
+    start, end : the slots that a call simulates, of those of the plan
     begin, stop : a call may simulate a part of one slot: from the arrival of the messages of step
         ``begin`` to the sending of those of step ``stop``; WHOLE: from its begin, to its end
     """
@@ -61,6 +62,8 @@ class SlotPlan(NamedTuple):
     varies: bool
     begin: int
     stop: int
+    start: int
+    end: int
 
 
 class SlotSamples(NamedTuple):
@@ -176,7 +179,7 @@ def slot_loop(kernels: Kernels) -> Any:
         nodes, slots = len(record.xhat), plan.up.shape[1]
         for b in range(len(memories)):
             block = struct_like(record, memories[b])
-            for s in range(slots):
+            for s in range(plan.start, plan.end):
                 run.slot = plan.first + s
                 run.first_y = (b * slots + s) * nodes
                 run.first_H = run.first_y if plan.varies else 0
