@@ -16,7 +16,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.random.bit_generator import ISeedSequence
@@ -45,7 +45,7 @@ class Streams:
         id or the two ends of a link.
         """
         key, counter = _key_and_counter(self.seed, self.replica, _purpose_code(purpose), entity)
-        bits: Any = np.random.Philox
+        bits = cast(Any, np.random.Philox)
         return np.random.Generator(bits(_Key(key), counter=counter))
 
     @property

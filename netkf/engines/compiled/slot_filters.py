@@ -77,11 +77,11 @@ class SlotFilters:
             **scratch_of(n, LANES),
         )
         # L entries are copied at a time, so that the last copy may go beyond the last entry.
-        means, covariances = H * n + LANES, H * n * n + LANES
+        for_means, for_roots = H * n + LANES, H * n * n + LANES
         self.sample_scratch: tuple[FloatArray, FloatArray, FloatArray] = (
-            aligned((means, LANES)),
-            aligned((means, LANES)),
-            aligned((covariances, LANES)),
+            aligned((for_means, LANES)),
+            aligned((for_means, LANES)),
+            aligned((for_roots, LANES)),
         )
         algorithm = setup.algorithm
         stages = [

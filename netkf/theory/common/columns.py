@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -171,7 +172,7 @@ class SlotColumns:
         stack = np.concatenate([self._x[:, NOISE:], *parts, *(form[:, 1:] for form in self._kept)])
         if len(stack) < stack.shape[1]:
             # stack' = Q R, and stack Q = R' has the same products.
-            stack = np.linalg.qr(stack.T, mode="r").T
+            stack = cast(FloatArray, np.linalg.qr(stack.T, mode="r")).T
         count = stack.shape[1]
         sizes = np.cumsum([self.n, *map(len, parts), *map(len, self._kept)])[:-1]
         x, *others = np.split(stack, sizes)
