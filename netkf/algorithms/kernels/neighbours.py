@@ -22,12 +22,10 @@ from typing import Any
 from netkf.algorithms.kernels.estimates import triangularise
 from netkf.algorithms.kernels.run import carry, use_reading
 from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
     SlotLinks,
     SlotNodes,
     SlotPlan,
     SlotScratch,
-    update_by_reading,
     write_root_column,
 )
 from netkf.linalg.arrays import FloatArray
@@ -42,37 +40,6 @@ from netkf.linalg.lanes import (
     spread,
     store,
 )
-
-
-@kernel
-def sum_differences(
-    lanes: Lanes,
-    x: FloatArray,
-    b: int,
-    h: int,
-    links: SlotLinks,
-    up: Any,
-    s: int,
-    e: int,
-    weighted: bool,
-    differences: FloatArray,
-) -> None:
-    """Write into ``differences[h]`` (n, L) the sum of x_j - x_h over the estimates x_j that filter
-    ``h`` of block ``b`` hears in step ``e`` of the exchanges of slot ``s``, each times the weight
-    of its link if ``weighted``.
-
-    ``x`` (B, H, n, L) holds the estimates of H filters in B blocks of L runs; ``up``
-    (B, S, E, W, L) flags the messages that arrive on each of W directions. Axes: S slots, E
-    exchange steps.
-    """
-    for i in range(x.shape[2]):
-        own, total = load(lanes, x, b, h, i), spread(lanes, 0.0)
-        for m in range(links.first[h], links.first[h + 1]):
-            arrived = load_flags(lanes, up, b, s, e, links.direction[m])
-            difference = load(lanes, x, b, links.sender[m], i) - own
-            factor = links.weight[m] if weighted else 1.0
-            total += select(arrived, factor * difference, 0.0)
-        store(lanes, differences, h, i, total)
 
 
 @kernel
@@ -112,45 +79,6 @@ def scale_by_covariance(
         for j in range(i + 1):
             total += load(lanes, root, b, h, i, j) * load(lanes, work, j)
         store(lanes, differences, h, i, gain * total)
-
-
-@kernel(inlined=True)
-def add_to_estimate(lanes: Lanes, x: FloatArray, b: int, h: int, term: FloatArray) -> None:
-    """Add ``term[h]`` (n, L) to ``x[b, h]`` of ``x`` (B, H, n, L), the estimate of filter ``h`` of
-    block ``b``, in place.
-
-    Axes: B blocks of L runs, H filters.
-    """
-    for i in range(x.shape[2]):
-        store(lanes, x, b, h, i, load(lanes, x, b, h, i) + load(lanes, term, h, i))
-
-
-@kernel
-def fuse_readings(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    share: bool,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Update filter ``h`` of block ``b`` with its own reading of slot ``s`` and, if nodes ``share``
-    readings, with those that arrive in the first step of the slot's exchanges
-    (``plan.up[b, s, 0]``).
-
-    Changes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L), in L runs.
-    """
-    update_by_reading(nodes, readings, scratch, b, s, h, h, True)
-    if not share:
-        return
-    for m in range(links.first[h], links.first[h + 1]):
-        arrived = load_flags(scratch.lanes, plan.up, b, s, 0, links.direction[m])
-        # Skip the update if the message arrives in no run of the block.
-        if any_lane(arrived):
-            update_by_reading(nodes, readings, scratch, b, s, h, links.sender[m], arrived)
 
 
 @kernel
