@@ -308,8 +308,7 @@ def queue_events(state: Simulation, visits: Visits, until: float) -> int:
     first, max_visits = (state.run - state.first_run) * nodes, nodes + 2 + state.most_messages
     while True:
         event, now = next_event(state)
-        # These filters have no history of readings.
-        request = find_shortage(state, None, event, now)
+        request = find_shortage(state, now)
         if request != GO_ON:
             return request
         if now >= until:

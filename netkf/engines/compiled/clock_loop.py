@@ -96,7 +96,7 @@ def clock_loop(kernels: Kernels) -> Any:
     @kernel
     def shortage(state: Simulation, record: Any, event: int, now: float) -> int:
         """Return the request for what an event lacks, as ``find_shortage``."""
-        request = int(find_shortage(state, None, event, now))
+        request = int(find_shortage(state, now))
         if remembers and request == GO_ON and lacks_past(state, record, event):
             return WANT_PAST
         return request

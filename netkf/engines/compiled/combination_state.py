@@ -25,7 +25,7 @@ from netkf.algorithms.kernels.root_flow import (
 from netkf.algorithms.kernels.slots import predict_root
 from netkf.engines.compiled.evidence import EvidenceArrays, empty_evidence
 from netkf.engines.compiled.increments import fill_readings, next_interval
-from netkf.engines.compiled.late_readings import copy_state, use_instant
+from netkf.engines.compiled.instant_updates import copy_state, use_instant
 from netkf.engines.compiled.state import (
     BELIEFS,
     BEST,

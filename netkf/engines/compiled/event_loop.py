@@ -38,13 +38,7 @@ from netkf.engines.compiled.evidence import (
     send_evidence,
 )
 from netkf.engines.compiled.increments import predict_with_increments
-from netkf.engines.compiled.late_readings import (
-    History,
-    copy_state,
-    use_instant,
-    use_late_reading,
-    use_reading,
-)
+from netkf.engines.compiled.instant_updates import copy_state, use_instant
 from netkf.engines.compiled.message_queue import pop, push, put, release, sort_indices, take
 from netkf.engines.compiled.running_totals import Totals, add_reading, hear, offer_round
 from netkf.engines.compiled.state import (
@@ -56,7 +50,6 @@ from netkf.engines.compiled.state import (
     LINKS,
     NODES,
     PREDICTIONS,
-    READINGS,
     SHARES,
     SWAP,
     Simulation,
@@ -72,7 +65,7 @@ SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT = (
 (GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE,
  WANT_PAST, DONE) = range(9)  # fmt: skip
 """Requests of the loop to Python: the next window of ticks, the next steps of the path, a larger
-pool of messages, space for rows, for samples; a move of the origin; a longer history; DONE: the run
+pool of messages, space for rows, for samples; a move of the origin; a longer past; DONE: the run
 has reached the horizon. GO_ON: no request.
 """
 ON_REBASE, ON_SENSE, ON_SAMPLE, ON_TICK, ON_DELIVER, ON_ABSORB, ON_PROBE = range(7)
@@ -84,22 +77,21 @@ NEVER = math.inf
 def event_loop(
     state: Simulation,
     totals: Totals | None,
-    history: History | None,
     combination: CombinationState | None,
 ) -> int:
     """Simulate the run ``state`` until the loop needs something from Python; return the request
-    (WANT_... or DONE), after which Python calls the loop again. ``totals`` (running sums),
-    ``history`` (past events) and ``combination`` (see CombinationState) hold the extra state that
-    some filters need, None for the others; all of these are changed.
+    (WANT_... or DONE), after which Python calls the loop again. ``totals`` (running sums)
+    and ``combination`` (see CombinationState) hold the extra state that some filters need, None for
+    the others; all of these are changed.
     """
     # With running sums a sender must be predicted even if all of its messages are lost, since its
-    # totals grow; with a history find_shortage() must check free entries before each absorption.
-    absorbs_at_once = totals is None and history is None
+    # totals grow.
+    absorbs_at_once = totals is None
     while True:
         # Check first that the event has everything it needs: if not, nothing has changed, and the
         # next call finds the same event again.
         event, now = next_event(state)
-        request = find_shortage(state, history, event, now)
+        request = find_shortage(state, now)
         if request != GO_ON:
             return request
         seek_piece(state, now)
@@ -110,13 +102,13 @@ def event_loop(
             on_tick(state, totals, combination, now)
             # Absorptions come next, unless there are other events at this instant.
             if absorbs_at_once and ends_instant(state, now):
-                absorb_messages(state, totals, history, combination, now)
+                absorb_messages(state, totals, combination, now)
         elif event == ON_ABSORB:
-            on_absorb(state, totals, history, combination, now)
+            on_absorb(state, totals, combination, now)
         elif event == ON_SENSE:
             on_sense(state, now)
         elif event == ON_SAMPLE:
-            on_sample(state, totals, history, combination, now)
+            on_sample(state, totals, combination, now)
         elif event == ON_DELIVER:
             on_deliver(state, now)
         elif event == ON_REBASE:
@@ -137,8 +129,8 @@ def seek_piece(state: Simulation, now: float) -> None:
 
 
 @kernel
-def find_shortage(state: Simulation, history: History | None, event: int, now: float) -> int:
-    """Return the request for what an event (ON_...) at ``now`` (seconds) needs and lacks (WANT_...,
+def find_shortage(state: Simulation, now: float) -> int:
+    """Return the request for what an event at ``now`` (seconds) needs and lacks (WANT_...,
     DONE), or GO_ON if the event can happen; nothing is changed.
     """
     # Space for the worst case of one event, so that no handler has to stop half-way.
@@ -155,9 +147,6 @@ def find_shortage(state: Simulation, history: History | None, event: int, now: f
         request = WANT_STEPS
     elif now == NEVER:
         request = DONE
-    # Each reading that is used needs an entry of the history, of which ``free[1]`` are free.
-    elif history is not None and history.free[1] < max_readings(state, event):
-        request = WANT_PAST
     return request
 
 
@@ -263,7 +252,7 @@ def participant(state: Simulation, event: int, k: int) -> int:
 @kernel
 def max_readings(state: Simulation, event: int) -> int:
     """Return the largest number of readings that the next event, of kind ``event`` (ON_...), uses:
-    so many free entries the history of readings needs before it.
+    so many free entries the past of a node needs before it.
     """
     if event == ON_SAMPLE:
         return 1
@@ -355,13 +344,12 @@ def on_sense(state: Simulation, now: float) -> None:
 def on_sample(
     state: Simulation,
     totals: Totals | None,
-    history: History | None,
     combination: CombinationState | None,
     now: float,
 ) -> None:
     """Update a node with all its samples of the next instant, ``now`` (seconds), and advance
     ``state.instant_at``. Changes the row of ``state.xhat`` and ``state.root`` of that node, its
-    newest ``reading``, and what ``totals``, ``history`` or ``combination`` (None if unused) hold of
+    newest ``reading``, and what ``totals`` or ``combination`` (None if unused) hold of
     it.
     """
     instants, instant = state.instants, state.instant_at
@@ -374,8 +362,6 @@ def on_sample(
     # Running sums weight the reading, and filters of readings remember it.
     if totals is not None:
         add_reading(state, totals, h, instant)
-    elif history is not None:
-        use_reading(state, history, h, instant)
     elif combination is not None and combination.kind == GAINS:
         sample_with_gain(state, combination, h, instant)
     elif combination is not None and combination.kind == BELIEFS:
@@ -458,8 +444,6 @@ def send(
         send_prediction(state, combination, m, h)
     elif combination is not None and combination.kind == BELIEFS:
         send_evidence(state, combination.evidence, m, h)
-    elif state.combination_kind == READINGS:
-        message.tag = state.nodes[h].reading
     else:
         # A copy: the sender's estimate changes while the message is under way.
         copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
@@ -500,18 +484,17 @@ def ends_instant(state: Simulation, now: float) -> bool:
 def absorb_messages(
     state: Simulation,
     totals: Totals | None,
-    history: History | None,
     combination: CombinationState | None,
     now: float,
 ) -> None:
     """Let all nodes in ``state.waiting``, which have messages of this instant ``now`` (seconds),
     absorb these: predict each node, update its estimate in ``state.xhat`` and ``root``, and empty
-    its inbox. ``totals``, ``history``, ``combination``: extra state of the filter, None if unused.
+    its inbox. ``totals``, ``combination``: extra state of the filter, None if unused.
     """
     sort_indices(state.waiting, state.receivers)
     while state.receivers > 0:
         predict_node(state, combination, state.waiting[state.absorbing], now)
-        on_absorb(state, totals, history, combination, now)
+        on_absorb(state, totals, combination, now)
 
 
 @kernel
@@ -552,14 +535,13 @@ def arrive(state: Simulation, m: int, now: float) -> None:
 def on_absorb(
     state: Simulation,
     totals: Totals | None,
-    history: History | None,
     combination: CombinationState | None,
     now: float,
 ) -> None:
     """Let the next node, ``state.waiting[state.absorbing]``, absorb all messages of this instant
     ``now`` (seconds), in the order of senders: combine its estimate with theirs in the way of its
     filter. Changes its estimate in ``state.xhat`` and ``root``, empties its inbox, and advances
-    ``absorbing``. ``totals``, ``history``, ``combination``: extra state of the filter, None if
+    ``absorbing``. ``totals``, ``combination``: extra state of the filter, None if
     unused.
     """
     pool, h = state.pool, state.waiting[state.absorbing]
@@ -571,8 +553,6 @@ def on_absorb(
     oldest = snapped(oldest, state.per_second)
     if totals is not None:
         hear(state, totals, h, now)
-    elif history is not None:
-        use_messages(state, history, h, now)
     elif combination is not None:
         combine_with_state(state, combination, h, now)
     else:
@@ -589,23 +569,6 @@ def on_absorb(
     # All messages of this instant are absorbed.
     if state.absorbing == state.receivers:
         state.absorbing = state.receivers = 0
-
-
-@kernel
-def use_messages(state: Simulation, history: History, h: int, now: float) -> None:
-    """Update node ``h`` (index in ``state.nodes``) at ``now`` (seconds) with the readings that
-    messages in its inbox refer to, late ones as if they had come at their own time. Changes
-    ``state.xhat[h]``, ``root[h]`` and the node's ``history``, its remembered events.
-    """
-    m = state.nodes[h].inbox
-    while m != -1:
-        message = state.pool[m]
-        # ``tag`` is the index of the instant. A reading that took no time is of the present one.
-        if now - message.sent <= 0.0:
-            use_reading(state, history, h, message.tag)
-        else:
-            use_late_reading(state, history, h, message.tag, now)
-        m = message.next
 
 
 @kernel

@@ -23,7 +23,7 @@ from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.intersection import finish_lanes
 from netkf.algorithms.kernels.root_flow import transform_root
 from netkf.algorithms.modes import flow_frame
-from netkf.engines.compiled.late_readings import copy_state
+from netkf.engines.compiled.instant_updates import copy_state
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel

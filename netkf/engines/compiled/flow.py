@@ -33,7 +33,6 @@ from netkf.engines.compiled.event_loop import (
 )
 from netkf.engines.compiled.evidence import enlarge_evidence
 from netkf.engines.compiled.lane_series import series_of_lanes
-from netkf.engines.compiled.late_readings import History, add_past, empty_history
 from netkf.engines.compiled.origins import move_origin
 from netkf.engines.compiled.running_totals import Totals, empty_totals
 from netkf.engines.compiled.sample_tables import SampleTables
@@ -74,8 +73,8 @@ from netkf.trace.recorder import Recorder
 from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT
 
-# Entries at the start of a run: the pool of messages, event rows, and the free ones of a history.
-FIRST_MESSAGES, FIRST_ROWS, FIRST_PAST = 64, 4096, 256
+# Entries at the start of a run: the pool of messages, and event rows.
+FIRST_MESSAGES, FIRST_ROWS = 64, 4096
 # Most samples in the buffer of a run, and most float64 in their covariances together.
 MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS = 256, 1 << 18
 AT_START = (
@@ -389,10 +388,9 @@ class FlowRun:
         self._visits = workspace.visits() if is_immediate(scenario) else None
         self._clocked = workspace.clocked
         if self._clocked is not None:
-            self._totals = self._history = self._combination = None
+            self._totals = self._combination = None
             return
         self._totals = _make_totals(scenario, self._state)
-        self._history = _make_history(scenario, self._state)
         self._combination = combination_state_of(scenario, self._state)
 
     def to_the_end(self) -> str:
@@ -429,7 +427,7 @@ class FlowRun:
             return advance_alone(self._state, self._visits)
         if self._scenario.node_filter.combination not in SPECIAL:
             return run_alone(self._state)
-        return int(event_loop(self._state, self._totals, self._history, self._combination))
+        return int(event_loop(self._state, self._totals, self._combination))
 
     def _fulfil(self, request: int) -> None:
         """Fulfil a ``request`` (WANT_...) of the event loop, before the loop goes on: put the next
@@ -462,16 +460,11 @@ class FlowRun:
         """
         state, k = self._state, self._state.frame_at
         offset = -self._draws.states.offset(k, state.path, state.piece)
-        # The history of each node gets one entry: the beginning of the frame.
-        if self._history is not None and self._history.free[1] < len(state.nodes):
-            add_past(self._history, len(state.nodes))
         if self._clocked is not None:
             self._clocked.shift(self._scenario, state, offset)
             state.frame_at = k + 1
             return
-        move_origin(
-            self._scenario, state, self._totals, self._history, self._combination, k, offset
-        )
+        move_origin(self._scenario, state, self._totals, self._combination, k, offset)
         state.frame_at = k + 1
 
     def _enlarge_pool(self) -> None:
@@ -575,12 +568,3 @@ def _make_totals(scenario: Scenario, state: Simulation) -> Totals | None:
     receivers = np.array([info.receivers for info in scenario.node_infos], dtype=np.int64)
     model: FlowModel = scenario.models[0]
     return empty_totals(state, receivers, model.groups)
-
-
-def _make_history(scenario: Scenario, state: Simulation) -> History | None:
-    """Return the history of all nodes, or None for filters that use no late readings."""
-    if scenario.node_filter.combination != "readings":
-        return None
-    algorithm: Any = scenario.node_filter
-    delay = max((info.max_delay for info in scenario.node_infos), default=0.0)
-    return empty_history(state, algorithm.history_span(delay), FIRST_PAST)

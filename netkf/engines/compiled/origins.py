@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from netkf.engines.compiled.combination_state import CombinationState
-from netkf.engines.compiled.late_readings import History, remember
 from netkf.engines.compiled.running_totals import Totals, predict_total
-from netkf.engines.compiled.state import READINGS, Simulation
+from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 
@@ -14,7 +13,6 @@ def move_origin(
     scenario: Scenario,
     state: Simulation,
     totals: Totals | None,
-    history: History | None,
     combination: CombinationState | None,
     k: int,
     offset: FloatArray,
@@ -22,7 +20,7 @@ def move_origin(
     """Move the origin of all states at the beginning of frame ``k`` (for an unstable plant,
     whose numbers would lose their digits): add ``offset`` (n,) to all estimates, and to
     the estimates in messages under way the offset predicted back to the time of sending. Changes
-    ``state.xhat`` and ``state.pool_x``; and what ``totals``, ``history`` and ``combination``, None
+    ``state.xhat`` and ``state.pool_x``; and what ``totals`` and ``combination``, None
     if the filter has none, hold of estimates.
     """
     now = float(state.frames[k])
@@ -32,13 +30,8 @@ def move_origin(
         combination.prior[:] += offset
     if totals is not None:
         _shift_totals(scenario, state, totals, now, offset)
-    # A late reading that goes back beyond this time must repeat the move.
-    if history is not None and history.lag > 0.0:
-        history.offsets[k] = offset
-        for h in range(len(state.nodes)):
-            remember(state, history, h, now, -1, k)
-    # Totals are shifted above, and readings keep the coordinates of their own time.
-    if totals is not None or state.combination_kind == READINGS:
+    # Totals are shifted above.
+    if totals is not None:
         return
     for m in state.heap[: state.in_flight]:
         # An estimate under way refers to the time of sending: predict the offset back to it.

@@ -14,7 +14,7 @@ from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.root_flow import transform_root
 from netkf.algorithms.modes import RateGroups
 from netkf.algorithms.running_sums import MIN_ACCURACY
-from netkf.engines.compiled.late_readings import use_instant
+from netkf.engines.compiled.instant_updates import use_instant
 from netkf.engines.compiled.state import Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
