@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from netkf.algorithms import models
+from netkf.engines.simpy import nodes
 from netkf.theory import error_covariance
 
 from .linearity import engine_covariance
@@ -24,9 +24,8 @@ def test_default_sensing_period_keeps_what_the_docs_state(ring):
 
 
 def test_the_error_has_fourth_order_in_the_sensing_period(ring, monkeypatch):
-    monkeypatch.setattr(
-        models, "usable", lambda rate: np.inf
-    )  # no shorter stretches where P is large
+    # no shorter stretches where P is large
+    monkeypatch.setattr(nodes, "interval_end", lambda now, time, length: time)
     clock = {"kind": "periodic", "period": 0.5}  # ticks on the grid: no interval is cut
     short = ring.replace({"horizon": 2.0, "probe": 1.0, "network.activation": clock})
     errors = [deviation(short.replace({"plant.sensing_period": h})) for h in (0.5, 0.25, 0.125)]
