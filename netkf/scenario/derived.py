@@ -94,17 +94,15 @@ class DerivedScenario(ScenarioModel):
             senders[receiver].append(sender)
         max_delay = 0.0 if self.slotted else self.network.channel.delay.longest
         degrees, own_weights, network = self.topology.degrees, self.own_weights, self._network_info
-        rows = max(
-            1,
-            *(
-                sum(self.most_rows(node, placed) for placed in sensors)
-                for node, sensors in self.placed_sensors.items()
-            ),
-        )
+        rows = [
+            sum(self.most_rows(node, placed) for placed in sensors)
+            for node, sensors in self.placed_sensors.items()
+        ]
+        most_rows = max([1, *rows])
         return tuple(
             NodeInfo(
                 node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
-                total_information, max_delay, k, tuple(sorted(senders[node])), network, rows,
+                total_information, max_delay, k, tuple(sorted(senders[node])), network, most_rows,
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from netkf.algorithms.filter import Estimate, Exchange, Increments, Message, State
+from netkf.algorithms.filter import Estimate, Exchange, Increments, Message, NodeInfo
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.kernels.gains import gain_table, longest_interval
 from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
@@ -12,6 +12,7 @@ from netkf.algorithms.kernels.root_flow import gain_update_root
 from netkf.algorithms.models import FlowModel
 from tests import reference
 
+INFO = NodeInfo(0, degree=2, receivers=2, nodes=3, own_weight=0.5, information=np.eye(3))
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
 
 
@@ -57,8 +58,8 @@ def test_gains_are_the_projections_of_the_exact_weight(seed):
     )
     moments = np.array([0.3, -0.2, 0.02, 0.05])
     expected = x + np.concatenate([K[0], K[1]], axis=1) @ (moments - predicted)
-    root = np.linalg.cholesky(P)
-    state = Hybrid(epsilon=0.5).update(State(x, root, model), Increments(moments, g))
+    hybrid = Hybrid(epsilon=0.5)
+    state = hybrid.update(hybrid.init(model, x, P, INFO), Increments(moments, g))
     np.testing.assert_allclose(state.xhat, expected, rtol=0, atol=2e-7)
 
 
@@ -96,7 +97,7 @@ def test_the_innovation_does_not_see_the_state():
             ]
         )
         hybrid = Hybrid(epsilon=0.5)
-        start = State(x + np.array([1.0, 0.0, 0.0]), np.linalg.cholesky(P), model)
+        start = hybrid.init(model, x + np.array([1.0, 0.0, 0.0]), P, INFO)
         after = hybrid.update(hybrid.predict(start, g), Increments(moments, g))
         return scipy.linalg.expm(A * g) @ x - after.xhat
 
@@ -117,7 +118,8 @@ def test_reset_is_the_convex_combination_of_values_before_it():
     model, random = FlowModel(A, Q, H, R, 1.0, 0.1), np.random.default_rng(0)
     own, one, two = (Estimate(random.normal(size=3), np.diag(random.random(3))) for _ in range(3))
     messages = [Message(1, 0.3, one, 0.0), Message(2, 0.3, two, 0.0)]
-    state = Hybrid(epsilon=0.3).absorb(State(*own, model), messages, Exchange())
+    hybrid = Hybrid(epsilon=0.3)
+    state = hybrid.absorb(hybrid.init(model, own.xhat, own.P, INFO), messages, Exchange())
     np.testing.assert_allclose(state.xhat, 0.4 * own.xhat + 0.3 * one.xhat + 0.3 * two.xhat)
     np.testing.assert_allclose(state.P, 0.4 * own.P + 0.3 * one.P + 0.3 * two.P)
 
@@ -126,8 +128,8 @@ def test_an_old_message_is_predicted_to_its_arrival():
     A, Q, H, R, _ = system(4)
     model, age = FlowModel(A, Q, H, R, 1.0, 0.1), 0.4
     sent = Estimate(np.array([1.0, 2.0, 3.0]), np.eye(3))
-    start, messages = State(np.zeros(3), np.eye(3), model), [Message(1, 1.0, sent, age)]
-    state = Hybrid(epsilon=1.0).absorb(start, messages, Exchange())
+    hybrid, messages = Hybrid(epsilon=1.0), [Message(1, 1.0, sent, age)]
+    state = hybrid.absorb(hybrid.init(model, np.zeros(3), np.eye(3), INFO), messages, Exchange())
     E = scipy.linalg.expm(A * age)
     noise = sum(
         0.5 * age * w * (F := scipy.linalg.expm(A * 0.5 * age * (1 + z))) @ Q @ F.T
