@@ -88,11 +88,12 @@ class Tree:
 
     def __init__(self, moves: Transitions, horizon: float, frame: float | None) -> None:
         self.frame = frame
+        digits = math.floor(math.log10(MAX_TICKS / horizon))
         top = max(KNOTS, math.ceil(math.log10(horizon)) - 6)
+        # Numbers of ticks in a cell between knots are 64-bit integers.
+        top = min(top, MAX_DECADES - digits)
         if frame is not None:
             top = min(top, math.floor(math.log10(frame) + 1e-9))
-        # Numbers of ticks in a cell between knots are 64-bit integers.
-        digits = min(math.floor(math.log10(MAX_TICKS / horizon)), MAX_DECADES - top)
         self._per_second = float(f"1e{digits}")
         self._cells = _cells(moves, digits, max(top + digits, 1))
         # Cells between knots in a frame.

@@ -82,7 +82,7 @@ def linear_map(monkeypatch, plant, times, horizon):
         x = truth.absolute_states(plant.moves, frame_times, offsets[: len(frame_times)], at, local)
         return x[np.searchsorted(at, times)].ravel()
 
-    columns = [states(column) for column in np.linalg.cholesky(COV).T]
+    columns = [states(column[: plant.n]) for column in np.linalg.cholesky(COV).T]
     while place[0] < len(used) * plant.n:
         place[0] += 1
         columns.append(states(np.zeros(plant.n)))
@@ -106,6 +106,15 @@ def test_states_at_any_times_have_their_exact_joint_law(kind, times, monkeypatch
     found = linear_map(monkeypatch, plant, np.array(times), 9.0)
     exact = joint_covariance(A, B, times)
     np.testing.assert_allclose(found @ found.T, exact, rtol=0, atol=1e-11 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("horizon", [1e-9, 0.02, 3e4])
+def test_the_law_for_short_and_long_horizons(horizon, monkeypatch):
+    plant = Diffusion([[-1.0 / horizon]], [[1.0]], mean=[0.0], cov=[[2.0 * horizon]])
+    times = horizon * np.array([0.1, 0.37, 0.9])
+    found = linear_map(monkeypatch, plant, times, horizon)[:, 2:]
+    exact = joint_covariance(plant.A, plant.B, times, np.zeros((1, 1)))
+    np.testing.assert_allclose(found @ found.T, exact, rtol=1e-9)
 
 
 def test_paths_of_many_runs_have_the_law():
