@@ -113,7 +113,8 @@ def _loaded_class(entry: EntryPoint) -> Any:
     """Return what an entry point names, None if that is not loaded."""
     try:
         return attrgetter(entry.attr)(sys.modules[entry.module])
-    except (AttributeError, KeyError, TypeError):  # not loaded, or no "package.module:Class"
+    # Not loaded, or no "package.module:Class"; importlib_metadata, where loaded, has a ValueError.
+    except (AttributeError, KeyError, TypeError, ValueError):
         return None
 
 

@@ -189,7 +189,7 @@ def test_assumptions_of_section_vi_hold_and_their_breaking_is_seen(regression):
     assert table["the digraph is strongly connected"][0]
     shift = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     table = held(regression.replace({"filter.weights": shift}))
-    assert "weights of one's own" in table["the digraph is strongly connected"][1]
+    assert "positive own weights" in table["the digraph is strongly connected"][1]
     lossy = {"network.channel": {"loss": {"kind": "bernoulli", "delivery": 0.5}}}
     assert not held(regression.replace(lossy))["every message arrives"][0]
     blind = regression.replace({"sensors.2.C": np.zeros((3, 3)).tolist()})

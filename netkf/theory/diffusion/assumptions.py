@@ -90,7 +90,7 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
     smallest = float(np.linalg.matrix_power(W.toarray(), max(diameter, 1)).min())
     evidence = f"diameter {diameter}; least entry of the weights to that power {smallest:.3g}"
     if not smallest > 0.0:
-        evidence += ": D Remark 3.3 needs custom weights"
+        evidence += ": D Remark 3.3 needs positive own weights"
     return smallest > 0.0, evidence
 
 
