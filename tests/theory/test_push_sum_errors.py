@@ -6,6 +6,7 @@ import pytest
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
+from tests.engines.linearity import engine_covariance
 
 TABLE = {
     "format": 1,
@@ -53,10 +54,25 @@ def test_errors_on_recorded_links_have_the_exact_covariance(tmp_path):
         assert whitened.mean() == pytest.approx(1.0, abs=0.24)
 
 
-def test_what_is_not_known_is_refused(tmp_path):
-    frozen = from_table({**TABLE, "filter": {**TABLE["filter"], "stop": "safe"}}, tmp_path)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"filter.stop": "safe"},
+        {"filter.asymptotic": True},
+        {"filter.model": {"F": [[1.0, 0.1], [0.0, 0.9]]}},
+    ],
+    ids=["for ever", "safe", "asymptotic", "another F"],
+)
+def test_errors_are_the_linear_map_of_the_engine(changes, tmp_path):
+    """Also at the horizon, where a slot begins whose exchanges the run does not have."""
+    scenario = from_table({**TABLE, "probe": [2.0, 7.0, 8.0]}, tmp_path).replace(changes)
+    expected, run = engine_covariance(scenario, "simpy")
+    found = theory.error_covariance(scenario, run)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
+
+
+def test_nodes_that_decide_whether_to_send_are_refused(tmp_path):
+    scenario = from_table({**TABLE, "filter": {**TABLE["filter"], "stop": "paper"}}, tmp_path)
     with pytest.raises(netkf.TheoryError, match="mass is exchanged in every slot"):
-        theory.error_covariance(frozen, netkf.simulate(frozen))
-    late = from_table({**TABLE, "probe": [8.0]}, tmp_path)
-    with pytest.raises(netkf.TheoryError, match="sample before it"):
-        theory.error_covariance(late, netkf.simulate(late))
+        theory.error_covariance(scenario, netkf.simulate(scenario))
