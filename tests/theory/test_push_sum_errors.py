@@ -60,9 +60,10 @@ def test_errors_on_recorded_links_have_the_exact_covariance(tmp_path):
         {},
         {"filter.stop": "safe"},
         {"filter.asymptotic": True},
+        {"filter.running_sums": True},
         {"filter.model": {"F": [[1.0, 0.1], [0.0, 0.9]]}},
     ],
-    ids=["for ever", "safe", "asymptotic", "another F"],
+    ids=["for ever", "safe", "asymptotic", "running sums", "another F"],
 )
 def test_errors_are_the_linear_map_of_the_engine(changes, tmp_path):
     """Also at the horizon, where a slot begins whose exchanges the run does not have."""

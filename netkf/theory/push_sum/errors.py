@@ -1,9 +1,6 @@
-"""Exact errors of the push-sum filter along the messages of a run.
+"""Exact errors of the push-sum filter under clocks: broadcast rounds with running sums.
 
-In slots the rule is P Fig. 1 with the corrected update of the mass; under clocks it is that of
-broadcast rounds with running sums.
-
-Under clocks a node of weight w among N nodes holds the mass ``(w / N) (P^-1, P^-1 xhat)``. A total
+A node of weight w among N nodes holds the mass ``(w / N) (P^-1, P^-1 xhat)``. A total
 (U, u) that was sent is information U and information vector u, in parts u_g = U P_g x for groups of
 modes (``algorithms.running_sums``), with the errors ``u_g - U P_g x``. Totals are predicted to the
 present: over a gap with noise v, ``U+ = M' U M`` and
@@ -16,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -25,7 +21,6 @@ from netkf.algorithms.modes import rate_groups
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import arrivals_by_step
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
@@ -33,121 +28,6 @@ from netkf.theory.numerics.roots import fade_totals
 from netkf.theory.numerics.updates import add_information_to_root
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
-
-
-def require_known_errors(scenario: Scenario, run: Run) -> None:
-    """Raise TheoryError if the exact errors of a run in slots cannot be computed from its events
-    (:class:`AveragingRule`).
-
-    That is so for frozen or asymptotic gains, for filters whose F differs from the plant's, for
-    sensors whose H varies, and for samples at the horizon, since the trace lacks the exchanges of a
-    slot that begins there.
-    """
-    algorithm: Any = scenario.filter.algorithm
-    plant = scenario.slot_plant
-    if algorithm.stop != "never" or algorithm.asymptotic:
-        raise TheoryError("the exact errors are known while mass is exchanged in every slot")
-    if not np.array_equal(scenario.slot_belief[0], plant.F):
-        raise TheoryError("the exact errors are known for filters that have the plant's F")
-    if any(sensor.varying for sensor in scenario.sensors):
-        raise TheoryError("the exact errors are known for sensors whose H is fixed")
-
-
-class AveragingRule(ErrorRule):
-    """Rule by which errors change in a slot: push-sum masses are exchanged once (exchange 0), then
-    estimates are predicted, updated by readings, and averaged in gamma steps (exchange 1).
-    """
-
-    takes_messages = False
-
-    def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
-        """Take the stacked errors of all nodes at time 0, and which messages of the run arrived;
-        the nodes' push-sum masses ``_z`` (N, 2 + n^2) begin as in P (3) of the push-sum paper.
-        """
-        super().__init__(scenario, errors)
-        algorithm: Any = scenario.filter.algorithm
-        self._gamma, self._delta = int(algorithm.gamma or 1), float(algorithm.delta or math.nan)
-        self._arrivals = arrivals_by_step(scenario, run)
-        self._N, n = len(scenario.nodes), errors.n
-        self._nu = np.array([scenario.topology.degrees[node] + 1 for node in scenario.nodes])
-        models = scenario.slot_models
-        self._information = np.array([m.H.T @ np.linalg.solve(m.R, m.H) for m in models])
-        information = self._information.reshape(self._N, n * n)
-        # Masses z = (w, n~, C~) of each node, P (3): only the leader starts with a weight.
-        self._z = np.concatenate(
-            [np.zeros((self._N, 1)), np.ones((self._N, 1)), information], axis=1
-        )
-        self._z[scenario.topology.index[algorithm.leader], 0] = 1.0
-        # Running sums: totals offered by each node, and those last heard by i of j.
-        self._running = algorithm.running_sums
-        self._offered = np.zeros_like(self._z)
-        self._heard = np.zeros((self._N, *self._z.shape))
-
-    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Exchange the push-sum masses, paper P (3)-(5) (``phase`` 0), or average the estimates of
-        all nodes in gamma steps, paper P step 5 (``phase`` 1); called by the replay for each phase
-        of a slot.
-
-        Phase 0 changes ``_z`` (and the running sums), phase 1 the errors in the stack. Which
-        messages arrived is known from the log, so that ``messages`` are not used.
-        """
-        if phase == 0:
-            received = self._arrived_weights(slot, 0, 0)
-            shares = self._z / self._nu[:, None]
-            if self._running:
-                # A receiver gains what was offered since it last heard the sender.
-                self._offered = self._offered + shares
-                news = np.where(received[..., None] > 0.0, self._offered - self._heard, 0.0)
-                self._heard, self._z = self._heard + news, shares + news.sum(axis=1)
-                return
-            # P (3)-(5) corrected: z_i+ = z_i/nu_i + sum_j [b_ij z_j/nu_j + (1 - b_ij) z_i/nu_i].
-            # A node keeps the shares of its failed links, which fail in both directions.
-            retained = (self._nu - received.sum(axis=1))[:, None]
-            self._z = retained * shares + received @ shares
-            return
-        mixing, estimators = np.eye(self._N), range(self._N)
-        for step in range(self._gamma):
-            received = self._arrived_weights(slot, 1, step)
-            # z <- (I - L / delta) z with the Laplacian L of the links that are up in this step.
-            laplacian = np.diag(received.sum(axis=1)) - received
-            mixing = mixing - laplacian @ mixing / self._delta
-        # The errors of all nodes are mixed as their estimates are: weights sum to 1.
-        stack = self.errors.stack
-        indices = stack.indices(estimators)
-        forms = stack.table[indices, :, : stack.used].reshape(self._N, -1)
-        stack.table[indices, :, : stack.used] = (mixing @ forms).reshape(self._N, -1, stack.used)
-
-    def _arrived_weights(self, slot: int, phase: int, step: int) -> FloatArray:
-        """Return a table (N, N), receiver by sender, that is 1 where a message arrived in this
-        averaging ``step`` of a ``phase`` (0: masses, 1: estimates) of a ``slot``, else 0.
-        """
-        return self._arrivals.get((slot, phase, step), np.zeros((self._N, self._N)))
-
-    def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Update the estimates of all nodes with their readings (push-sum paper, step 4), by the
-        total information G and the number N of nodes that each has learned from push-sum, its
-        equations 6 to 8. Changes errors and roots of P. Called by the replay at every time of
-        readings.
-
-        Columns of ``_z``: 0 the weight, 1 the mass whose ratio to the weight is N, from 2 on that
-        for G.
-        """
-        n, errors = self.errors.n, self.errors
-        heard = self._z[:, 0] > 0.0  # before any weight arrives a node knows its own sensor only
-        weight = np.where(heard, self._z[:, 0], 1.0)
-        learned = self._z[:, 2:].reshape(self._N, n, n) / weight[:, None, None]
-        G = np.where(heard[:, None, None], learned, self._information)
-        number = np.where(heard, self._z[:, 1] / weight, 1.0)
-        columns = errors.reading_noises(observations)
-        for estimator in range(self._N):
-            root = add_information_to_root(errors.roots[estimator], G[estimator])
-            if estimator not in observations:
-                errors.roots[estimator] = root
-                continue
-            observation = observations[estimator]
-            K = number[estimator] * root @ root.T @ np.linalg.solve(observation.R, observation.H).T
-            errors.multiply(estimator, np.eye(n) - K @ observation.H, root)
-            errors.stack.add(estimator, columns[estimator], -K @ observation.root)
 
 
 class RunningTotalsRule(ErrorRule):
@@ -340,10 +220,9 @@ def error_rule(
     changes ``errors``, the stacked errors of all nodes, as the push-sum filter uses readings and
     messages.
 
-    ``messages`` are those of the run that arrived. Raises TheoryError if the errors in slots are
-    not known.
+    ``messages`` are those of the run that arrived. Raises TheoryError in slots, where errors follow
+    from the verbs (``theory.common.columns``), but not for nodes that decide whether to send.
     """
-    if not scenario.slotted:
-        return RunningTotalsRule(scenario, errors, _read_rounds(scenario, run))
-    require_known_errors(scenario, run)
-    return AveragingRule(scenario, errors, run)
+    if scenario.slotted:
+        raise TheoryError("the exact errors are known while mass is exchanged in every slot")
+    return RunningTotalsRule(scenario, errors, _read_rounds(scenario, run))
