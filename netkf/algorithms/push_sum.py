@@ -381,7 +381,7 @@ SLOTS = Kernels(
     observe=observe,
     under_clocks=running_sums.KERNELS,
 )
-DECIDING = replace(SLOTS, decides=True)
+DECIDING = replace(SLOTS, decides=True, depends_on_data=False)
 
 
 @built_in("push-sum")

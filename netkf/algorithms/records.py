@@ -64,6 +64,7 @@ class Kernels:
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
     under_clocks : the verbs under clocks, where they are others than in slots
+    depends_on_data : whether who sends depends on readings or estimates; by default ``decides``
     """
 
     predict: Any = standard.predict
@@ -81,6 +82,14 @@ class Kernels:
     slotwise: bool = False
     unrolled: bool = True
     under_clocks: Kernels | None = None
+    depends_on_data: bool | None = None
+
+    @property
+    def affine(self) -> bool:
+        """True if estimates are affine in readings and messages: what is sent does not depend on
+        them. By default not where ``emit`` decides.
+        """
+        return not (self.decides if self.depends_on_data is None else self.depends_on_data)
 
     def of(self, clocked: bool) -> Kernels:
         """Return the verbs under clocks, or in slots."""

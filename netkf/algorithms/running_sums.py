@@ -382,6 +382,7 @@ KERNELS = Kernels(
     shift_payload=shift_payload,
     observe=observe,
     decides=True,
+    depends_on_data=False,
     counts_sends=True,
     unrolled=False,
 )

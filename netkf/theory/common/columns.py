@@ -9,7 +9,7 @@ into as few as their rank allows, which leaves the sum of products as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -39,10 +39,102 @@ def has_columns(scenario: Scenario) -> bool:
     follow from the verbs. A filter that commutes with a shift of the truth says that it is affine.
     """
     kernels = compiled_kernels(scenario.node_filter, clocked=False)
-    return kernels is not None and not kernels.decides and commutes(scenario.node_filter)
+    return kernels is not None and kernels.affine and commutes(scenario.node_filter)
 
 
-class SlotColumns:
+class ErrorColumns:
+    """The errors of M estimators as columns: derived classes have the filters.
+
+    ``_x`` (n, C) is the true state; its columns are ZERO, MEAN and the noises. ``_kept`` are the
+    errors (M n, C - 1) at earlier times.
+    """
+
+    estimators: int
+    n: int
+    _x: FloatArray
+    _kept: list[FloatArray]
+
+    def _matrices(self) -> dict[str, FloatArray]:
+        """Return all arrays of the filters as matrices (entries, C), by name."""
+        raise NotImplementedError
+
+    def _write(self, values: dict[str, FloatArray], columns: int) -> None:
+        """Give the filters so many columns, with these matrices (entries, columns)."""
+        raise NotImplementedError
+
+    def _compress(self, others: Sequence[FloatArray] = ()) -> list[FloatArray]:
+        """Turn the columns of noises into as few as their rank allows; return ``others`` (rows, C),
+        what else depends on noises, in the new columns.
+        """
+        columns = self._x.shape[1]
+        linear = {}
+        for name, matrix in self._matrices().items():
+            rows = (matrix[:, NOISE:] != matrix[:, ZERO : ZERO + 1]).any(axis=1)
+            if rows.any():
+                linear[name] = matrix, rows
+        parts = [
+            matrix[rows, NOISE:] - matrix[rows, ZERO : ZERO + 1] for matrix, rows in linear.values()
+        ]
+        # Columns that came after a time are zero there.
+        kept = [np.pad(form, ((0, 0), (1, columns - 1 - form.shape[1]))) for form in self._kept]
+        forms = [self._x, *others, *kept]
+        stack = np.concatenate([*(form[:, NOISE:] for form in forms), *parts])
+        if len(stack) < stack.shape[1]:
+            # stack' = Q R, and stack Q = R' has the same products.
+            stack = cast(FloatArray, np.linalg.qr(stack.T, mode="r")).T
+        count = NOISE + stack.shape[1]
+        pieces = np.split(stack, np.cumsum([len(form) for form in (*forms, *parts)])[:-1])
+        forms = [
+            np.column_stack([form[:, :NOISE], piece])
+            for form, piece in zip(forms, pieces, strict=False)
+        ]
+        self._x, self._kept = forms[0], [form[:, MEAN:] for form in forms[1 + len(others) :]]
+        values = {}
+        for (name, (matrix, rows)), part in zip(linear.items(), pieces[len(forms) :], strict=True):
+            whole = np.repeat(matrix[:, ZERO : ZERO + 1], count, axis=1)
+            whole[:, MEAN] = matrix[:, MEAN]
+            whole[rows, NOISE:] += part
+            values[name] = whole
+        self._write(values, count)
+        return forms[1 : 1 + len(others)]
+
+    def _forms(self) -> FloatArray:
+        """Return the errors (M n, C - 1): the mean, and the columns of noises."""
+        estimates = self._matrices()["xhat"]
+        return np.asarray(np.tile(self._x, (self.estimators, 1)) - estimates)[:, MEAN:]
+
+    def covariance(self) -> FloatArray:
+        """Return the joint covariance (M n, M n) of the errors of the estimators."""
+        noises = self._forms()[:, 1:]
+        return np.asarray(noises @ noises.T)
+
+    def second_moments(self) -> FloatArray:
+        """Return the joint second moments (M n, M n): covariances and products of means."""
+        forms = self._forms()
+        return np.asarray(forms @ forms.T)
+
+    def covariances(self) -> FloatArray:
+        """Return P (M, n, n) of the estimators."""
+        roots = self._matrices()["root"][:, ZERO]
+        S = np.tril(roots.reshape(self.estimators, self.n, self.n))
+        return np.asarray(S @ np.swapaxes(S, 1, 2))
+
+    def keep(self) -> None:
+        """Store the present errors for ``law``."""
+        self._kept.append(self._forms())
+
+    def law(self) -> tuple[FloatArray, FloatArray]:
+        """Return the mean (K M n,) and the covariance (K M n, K M n) of the errors at the K times
+        at which ``keep`` was called.
+        """
+        width = max(form.shape[1] for form in self._kept)
+        padded = [np.pad(form, ((0, 0), (0, width - form.shape[1]))) for form in self._kept]
+        forms = np.concatenate(padded)
+        noises = forms[:, 1:]
+        return forms[:, 0], np.asarray(noises @ noises.T)
+
+
+class SlotColumns(ErrorColumns):
     """The errors of M estimators in slots, as columns."""
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
@@ -54,7 +146,7 @@ class SlotColumns:
         plant = scenario.slot_plant
         self._F, self._noise = plant.F, square_root(plant.Q)
         self._kernels = replace(kernels, decides=False)
-        self._kept: list[FloatArray] = []
+        self._kept = []
         # The true state (n, columns).
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._filters = self._begin()
@@ -152,46 +244,18 @@ class SlotColumns:
             stop=WHOLE,
         )
 
-    def _compress(self) -> None:
-        """Turn the columns of noises into as few as their rank allows."""
-        arrays = self._filters.records.arrays
-        blocks, columns = len(arrays["xhat"]), self._x.shape[1]
-        linear = {}
-        for name, array in arrays.items():
-            if array.dtype == np.float64:
-                matrix = np.moveaxis(array, 0, -2).reshape(-1, blocks * LANES)[:, :columns]
-                rows = (matrix[:, NOISE:] != matrix[:, ZERO : ZERO + 1]).any(axis=1)
-                if rows.any():
-                    linear[name] = matrix, rows
-        parts = [matrix[rows, NOISE:] - matrix[rows, ZERO : ZERO + 1]
-                 for matrix, rows in linear.values()]  # fmt: skip
-        # Columns that came after a sample are zero there.
-        self._kept = [
-            np.pad(form, ((0, 0), (0, columns - MEAN - form.shape[1]))) for form in self._kept
-        ]
-        stack = np.concatenate([self._x[:, NOISE:], *parts, *(form[:, 1:] for form in self._kept)])
-        if len(stack) < stack.shape[1]:
-            # stack' = Q R, and stack Q = R' has the same products.
-            stack = cast(FloatArray, np.linalg.qr(stack.T, mode="r")).T
-        count = stack.shape[1]
-        sizes = np.cumsum([self.n, *map(len, parts), *map(len, self._kept)])[:-1]
-        x, *others = np.split(stack, sizes)
-        self._x = np.column_stack([self._x[:, :NOISE], x])
-        compressed, kept = others[: len(parts)], others[len(parts) :]
-        self._kept = [
-            np.column_stack([form[:, :1], part])
-            for form, part in zip(self._kept, kept, strict=True)
-        ]
-        values = {}
-        for (name, (matrix, rows)), part in zip(linear.items(), compressed, strict=True):
-            whole = np.repeat(matrix[:, ZERO : ZERO + 1], NOISE + count, axis=1)
-            whole[:, MEAN] = matrix[:, MEAN]
-            whole[rows, NOISE:] += part
-            values[name] = whole
-        self._restore(values, NOISE + count)
+    def _matrices(self) -> dict[str, FloatArray]:
+        """Return all arrays of the filters as matrices (entries, C), by name."""
+        arrays, columns = self._filters.records.arrays, self._x.shape[1]
+        width = len(arrays["xhat"]) * LANES
+        return {
+            name: np.moveaxis(array, 0, -2).reshape(-1, width)[:, :columns]
+            for name, array in arrays.items()
+            if array.dtype == np.float64
+        }
 
-    def _restore(self, values: dict[str, FloatArray], columns: int) -> None:
-        """Write so many columns of the arrays that depend on noise back into the records."""
+    def _write(self, values: dict[str, FloatArray], columns: int) -> None:
+        """Give the filters so many columns, with these matrices (entries, columns)."""
         self._fit(columns)
         arrays = self._filters.records.arrays
         width = len(arrays["xhat"]) * LANES
@@ -201,43 +265,6 @@ class SlotColumns:
             full[:, :columns] = whole
             shape = (*array.shape[1:-1], len(array), LANES)
             array[:] = np.moveaxis(full.reshape(shape), -2, 0)
-
-    def _forms(self) -> FloatArray:
-        """Return the errors (M n, 1 + C): the mean, and the columns of noises."""
-        xhat = self._filters.records.arrays["xhat"]
-        blocks, columns = len(xhat), self._x.shape[1]
-        estimates = np.moveaxis(xhat, 0, -2).reshape(-1, blocks * LANES)[:, :columns]
-        return np.asarray(np.tile(self._x, (self.estimators, 1)) - estimates)[:, MEAN:]
-
-    def covariance(self) -> FloatArray:
-        """Return the joint covariance (M n, M n) of the errors of the estimators."""
-        noises = self._forms()[:, 1:]
-        return np.asarray(noises @ noises.T)
-
-    def second_moments(self) -> FloatArray:
-        """Return the joint second moments (M n, M n): covariances and products of means."""
-        forms = self._forms()
-        return np.asarray(forms @ forms.T)
-
-    def covariances(self) -> FloatArray:
-        """Return P (M, n, n) of the estimators."""
-        S = np.tril(self._filters.records.arrays["root"][0, ..., ZERO])
-        return np.asarray(S @ np.swapaxes(S, 1, 2))
-
-    def keep(self) -> None:
-        """Store the present errors for ``law``."""
-        self._kept.append(self._forms())
-
-    def law(self) -> tuple[FloatArray, FloatArray]:
-        """Return the mean (K M n,) and the covariance (K M n, K M n) of the errors at the K times
-        at which ``keep`` was called.
-        """
-        width = max(form.shape[1] for form in self._kept)
-        forms = np.concatenate([
-            np.pad(form, ((0, 0), (0, width - form.shape[1]))) for form in self._kept
-        ])  # fmt: skip
-        noises = forms[:, 1:]
-        return forms[:, 0], np.asarray(noises @ noises.T)
 
 
 def _no_samples(setup: SlotSetup, blocks: int, filters: SlotFilters) -> SlotSamples:

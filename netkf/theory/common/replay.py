@@ -16,7 +16,8 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
-from netkf.theory.common.columns import SlotColumns, has_columns
+from netkf.theory.common.clock_columns import ClockColumns, has_clock_columns
+from netkf.theory.common.columns import ErrorColumns, SlotColumns, has_columns
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.evidence import NONLINEAR
 from netkf.theory.common.observations import (
@@ -75,7 +76,7 @@ def replay_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
 def _begin_replay(
     scenario: Scenario, run: Run
-) -> tuple[SlotColumns | StackedErrors, Iterator[None]]:
+) -> tuple[ErrorColumns | StackedErrors, Iterator[None]]:
     """Return the errors at time 0 of all estimators of a scenario (the filters of its nodes, or one
     pooled filter), and the replay of a run on them, which stops at each of ``run.times``; raises
     TheoryError for a filter whose equations are not known here.
@@ -87,6 +88,9 @@ def _begin_replay(
         if has_columns(scenario):
             columns = SlotColumns(scenario, run)
             return columns, columns.replay()
+    elif has_clock_columns(scenario):
+        clocked = ClockColumns(scenario, run)
+        return clocked, clocked.replay()
     require_known_filter(scenario)
     errors = StackedErrors(scenario, len(nodes_by_estimator(scenario)))
     replay = _replay_slots if scenario.slotted else _replay_instants
