@@ -230,7 +230,7 @@ def combination_of(record: Any, h: int, key: int, count: int, degree: int) -> in
         record.rank[h, k] = combine_tracks(
             record.block, count, record.scratch, record.gain[h, k], record.combined[h, k]
         )
-    return k
+    return int(k)
 
 
 @kernel

@@ -213,7 +213,7 @@ def test_the_worst_of_many_samples_is_judged_as_that(ring, tmp_path):
 
 def test_errors_of_the_start_up_are_called_so(tmp_path):
     far = {key: [[25.0, 0.0], [0.0, 25.0]] for key in ("plant.cov", "filter.cov")}
-    directory = hybrid_ring(tmp_path, "far", {**far, "network.activation.rate": 4.0})
+    directory = hybrid_ring(tmp_path, "far", {**far, "network.activation.rate": 4.0, "seed": 10})
     source, run = read_source(directory), netkf.open(directory)
     worst = source.worst.overall
     k = run.nodes.index(worst.node)
