@@ -10,66 +10,42 @@ On a graph with loops readings return to where they came from and count again: P
 Evidence is information about coordinates e of the state ``x = W e``, as a root [Z, z] (n, n + 1)
 with Z lower triangular: ``Z (e - c) = z + v``, cov(v) = I, relative to a centre c (n,), so that the
 information is ``Z' Z`` and its estimate ``c + Z^-1 z``. Independent pieces add up: their rows are
-stacked, and made triangular again. The centre of all evidence of a node is its belief ``xhat``.
+stacked, and made triangular again.
 
 What is kept is predicted with the plant. Pulled back by the inverse transition, the information
 about a mode that decays would soon be so large that the others lose their digits; so W follows the
 plant (``modes.ModeFrame``): such modes are those of time 0, and information about them stays as it
 is. Where nothing is kept, W is the identity.
 
-``belief_slots`` simulates many runs in the compiled engine, in place of the methods of
-``BeliefPropagation``; the types of its arguments are described in ``kernels.slots``.
+The centre is the prediction of the present slot or instant; with the next one it moves to the
+belief.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading
-from netkf.algorithms.kernels.beliefs import (
-    BeliefScratch,
-    add_part,
-    add_reading_to_part,
-    clear_part,
-    copy_part,
-    gather_evidence,
-    predict_part,
-    predict_part_single,
-    receive_evidence,
-    recentre_part,
-    set_growing,
-    write_prior,
-    write_prior_single,
-)
-from netkf.algorithms.kernels.constant_gains import inverse_transition
-from netkf.algorithms.kernels.intersection import finish_lanes
-from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    move_root,
-    predict_all,
-    predict_mean,
-    predict_root_alone,
-    rebase,
-    store_sample_of_slot,
-    whiten_reading,
-)
-from netkf.algorithms.models import SlotModel, first_root
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
+from netkf.algorithms.kernels.estimates import copy_vector, transform_root
+from netkf.algorithms.kernels.intersection import finish_lanes, merge_lanes
+from netkf.algorithms.kernels.root_update import lower_root
+from netkf.algorithms.kernels.run import ALL as ALL_RECEIVERS
+from netkf.algorithms.kernels.run import carry_mean, predict_estimate, shift_vector
+from netkf.algorithms.models import SlotModel
 from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, ONE, aligned, blocks_of, in_lanes, load, store
+from netkf.linalg.lanes import Lanes, load, load_flags, select, spread, store
+from netkf.linalg.small import copy_matrix, multiply_square
 
 MAX_STEPS = 10_000
 """Far beyond the diameter of any tree of use: a larger value is a mistake."""
@@ -78,278 +54,321 @@ MAX_LOSS = float(np.log(1e6))
 SLOT, ALL = "slot", "all"
 """Values of ``BeliefPropagation.memory``."""
 
-
-class HeardEvidence(NamedTuple):
-    """The ``evidence`` (n, n + 1) that a neighbour sent last, a root [Z, z] of information, at the
-    time ``sent``, seconds.
-    """
-
-    evidence: FloatArray
-    sent: float
-
-
-class BeliefState(NamedTuple):
-    """The state of a node; all evidence (n, n + 1), roots [Z, z], is relative to ``xhat``.
-
-    xhat, root : the belief (n,) and the lower triangular root (n, n) of its covariance
-    model : of the plant and the node's sensors
-    frame, W : of the coordinates e of evidence, ``x = W e`` with W (n, n)
-    centre : (n,), the belief as an e; of its first ``frame.growing`` entries see ``centre_at``
-    prior : evidence of the estimate before the readings in ``own`` and ``received``
-    own : evidence of the node's own readings
-    senders, received : ids of the neighbours heard, and the evidence that each sent last
-    node : the node's id
-    """
-
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    frame: ModeFrame
-    W: FloatArray
-    centre: FloatArray
-    prior: FloatArray
-    own: FloatArray
-    senders: tuple[int, ...]
-    received: tuple[HeardEvidence, ...]
-    node: int
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-
-class Beliefs(NamedTuple):
-    """A payload for all neighbours; evidence is relative to ``xhat``. Each receiver sums all of it
-    but what the sender has from the receiver itself (``evidence_for``).
-
-    xhat, centre : the sender's belief (n,), and as an e, see ``BeliefState``
-    own : evidence (n, n + 1) of the sender's own readings
-    senders, heard : ids of the neighbours that the sender has heard, and the evidence of each
-    """
-
-    xhat: FloatArray
-    centre: FloatArray
-    own: FloatArray
-    senders: tuple[int, ...]
-    heard: tuple[FloatArray, ...]
-
-
-class BeliefArrays(NamedTuple):
-    """Arrays of belief propagation for B blocks of L runs (B = 1 for all blocks if nothing is kept
-    from slot to slot); H filters and W directed links.
-
-    steps : steps of exchange in a slot
-    keeps : whether messages are kept from slot to slot, ``memory`` "all"
-    inverse, growing, back : of the ``ModeFrame`` of evidence
-    W : (S, n, n), its W in each slot that is simulated
-    centre : (B, H, n, L), centres of the evidence of each filter
-    prior, own : evidence of priors and own readings (B, H, n, n + 1, L)
-    received : evidence received on each direction (B, W, n, n + 1, L)
-    scratch : evidence that is sent, and scratch
-    """
-
-    steps: int
-    keeps: bool
-    inverse: FloatArray
-    growing: int
-    back: FloatArray
-    W: FloatArray
-    centre: FloatArray
-    prior: FloatArray
-    own: FloatArray
-    received: FloatArray
-    scratch: BeliefScratch
+# A ``part`` is evidence [Z, z] (n, n + 1, L); entries above the diagonal of Z are never read.
 
 
 @kernel
-def belief_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: BeliefArrays,
-) -> None:
-    """Simulate H filters by belief propagation over the S slots of a plan, in B blocks of L runs:
-    in each slot they predict, read, exchange evidence (information about the state)
-    ``arrays.steps`` times and compute their beliefs.
-
-    Changes ``nodes.xhat`` (B, H, n, L), ``nodes.root`` (B, H, n, n, L) and the evidence in
-    ``arrays`` in place, and writes ``samples`` in the slots that have one.
-    """
-    for b in range(plan.up.shape[0]):
-        # If no message is kept for the next slot, all blocks share the arrays of evidence.
-        k, lanes = min(b, arrays.own.shape[0] - 1), scratch.lanes
-        own, received, centre = arrays.own[k], arrays.received[k], arrays.centre[k]
-        for s in range(plan.up.shape[1]):
-            if plan.sensed[s]:
-                predict_beliefs(nodes, scratch, arrays, b)
-                W = arrays.W[min(s, len(arrays.W) - 1)]
-                for h in range(len(nodes.rows)):
-                    add_reading_to_part(
-                        lanes, own[h], readings.y, readings.H, (b, s, h), nodes.rows[h],
-                        scratch.xhat, W, arrays.scratch.work,
-                    )  # fmt: skip
-                for e in range(arrays.steps):
-                    # All messages of a step are made before any arrives: each sender's evidence
-                    # but that of the receiver.
-                    for h in range(len(nodes.rows)):
-                        first, last = links.first[h], links.first[h + 1]
-                        gather_evidence(lanes, own, received, first, last, h, arrays.scratch)
-                    for h in range(len(nodes.rows)):
-                        receive_evidence(
-                            lanes,
-                            received,
-                            links,
-                            plan.up,
-                            (b, s, e),
-                            h,
-                            centre,
-                            arrays.scratch,
-                        )
-                for h in range(len(nodes.rows)):
-                    update_beliefs(nodes, links, scratch, arrays, W, b, h)
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            # Keep the estimates relative to an origin near the true state; evidence is relative to
-            # the estimate, and needs no shift.
-            rebase(nodes, readings, scratch, b, s)
-
-
-@kernel
-def predict_beliefs(nodes: SlotNodes, scratch: SlotScratch, arrays: BeliefArrays, b: int) -> None:
-    """Predict all H filters of block ``b`` to the next slot, ``nodes.xhat[b]`` (H, n, L), and copy
-    the predictions to ``scratch.xhat`` (H, n, L): all evidence is relative to them.
-
-    If messages are kept, all evidence in ``arrays`` is predicted, and ``nodes.root`` waits for
-    ``update_beliefs``; else ``nodes.root[b]`` (H, n, n, L) is predicted too, the predicted belief
-    becomes ``arrays.prior``, and all other evidence is cleared. Axes: L runs side by side.
-    """
-    # k is the block of evidence: there is one for all b if nothing is kept.
-    lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
-    if not arrays.keeps:
-        predict_all(nodes, scratch, b)
-    for h in range(len(nodes.rows)):
-        if arrays.keeps:
-            predict_mean(nodes, scratch, b, h)
-        else:
-            write_prior(lanes, nodes.root, b, h, arrays.prior[k, h])
-            clear_part(lanes, arrays.own[k, h])
-        for i in range(nodes.xhat.shape[2]):
-            store(lanes, scratch.xhat, h, i, load(lanes, nodes.xhat, b, h, i))
-        set_growing(
-            lanes, arrays.centre[k, h], scratch.xhat[h], arrays.inverse, arrays.growing
-        )  # fmt: skip
-    if not arrays.keeps:
-        for m in range(arrays.received.shape[1]):
-            clear_part(lanes, arrays.received[k, m])
-    elif arrays.growing > 0:
-        # Z <- Z back, as no noise enters; information about other modes stays as it is.
-        for h in range(len(nodes.rows)):
-            predict_part(lanes, arrays.prior[k, h], arrays.back, beliefs.total, beliefs.work)
-            predict_part(lanes, arrays.own[k, h], arrays.back, beliefs.total, beliefs.work)
-        for m in range(arrays.received.shape[1]):
-            predict_part(lanes, arrays.received[k, m], arrays.back, beliefs.total, beliefs.work)
-
-
-@kernel
-def update_beliefs(
-    nodes: SlotNodes,
-    links: SlotLinks,
-    scratch: SlotScratch,
-    arrays: BeliefArrays,
-    W: FloatArray,
-    b: int,
-    h: int,
-) -> None:
-    """Compute the belief of filter ``h`` of block ``b``, the sum of its prior and all evidence
-    (information): writes ``nodes.xhat[b, h]`` (n, L) and ``nodes.root[b, h]`` (n, n, L). If
-    messages are kept, the evidence of the filter in ``arrays`` is made relative to the new belief;
-    W (n, n) is that of the slot.
-
-    Axes: L runs side by side.
-    """
-    # k is the block of evidence: there is one for all b if nothing is kept.
-    lanes, beliefs, k = scratch.lanes, arrays.scratch, min(b, arrays.own.shape[0] - 1)
-    # total = prior + own + sum of received, relative to the prediction, ``scratch.xhat``.
-    copy_part(lanes, arrays.prior[k, h], beliefs.total)
-    add_part(lanes, beliefs.total, arrays.own[k, h], beliefs.work)
-    for m in range(links.first[h], links.first[h + 1]):
-        add_part(lanes, beliefs.total, arrays.received[k, m], beliefs.work)
-    if not arrays.keeps:
-        # root = Z^-1 and xhat = centre + Z^-1 z in all lanes (False: none keeps its estimate).
-        finish_lanes(
-            lanes, nodes.root[b], nodes.xhat[b], h, scratch.xhat, beliefs.total, beliefs.work, False
-        )  # fmt: skip
-        return
-    finish_lanes(
-        lanes, beliefs.root[0], beliefs.step[0], 0, beliefs.origin, beliefs.total, beliefs.work,
-        False,
-    )  # fmt: skip
-    # root = W Z^-1, made triangular, and xhat = centre + W Z^-1 z.
-    n, origin, step = nodes.xhat.shape[2], beliefs.origin[0], beliefs.step[0, 0]
+def clear_part(lanes: Lanes, part: FloatArray) -> None:
+    """Set a part to no information."""
+    n = len(part)
     for i in range(n):
-        moved = load(lanes, scratch.xhat, h, i)
+        for j in range(i + 1):
+            store(lanes, part, i, j, 0.0)
+        store(lanes, part, i, n, 0.0)
+
+
+@kernel
+def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
+    """Copy a part."""
+    n = len(source)
+    for i in range(n):
+        for j in range(i + 1):
+            store(lanes, target, i, j, load(lanes, source, i, j))
+        store(lanes, target, i, n, load(lanes, source, i, n))
+
+
+@kernel
+def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray) -> None:
+    """Add the independent evidence ``part`` to ``total``; ``work`` is scratch of that shape."""
+    copy_part(lanes, part, work)
+    merge_lanes(lanes, total, work)
+
+
+@kernel
+def write_prior(lanes: Lanes, root: FloatArray, part: FloatArray) -> None:
+    """Write an estimate whose covariance has the ``root`` S (n, n, L), relative to itself, as
+    evidence [S^-1, 0] into ``part``.
+    """
+    n = len(part)
+    for i in range(n):
+        inverse = 1.0 / load(lanes, root, i, i)
+        # Forward substitution, row i of S^-1.
+        for j in range(i):
+            value = spread(lanes, 0.0)
+            for m in range(j, i):
+                value -= load(lanes, root, i, m) * load(lanes, part, m, j)
+            store(lanes, part, i, j, value * inverse)
+        store(lanes, part, i, i, inverse)
+        store(lanes, part, i, n, 0.0)
+
+
+@kernel
+def predict_part(
+    lanes: Lanes, part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
+) -> None:
+    """Predict a part to a later state of a plant without noise, ``Z <- Z back``, with the inverse
+    transition ``back`` (n, n); the caller predicts the centre. Two parts are scratch.
+    """
+    # Z (x - c) = Z back (x+ - c+) for x+ - c+ = back^-1 (x - c); Z back is not triangular, so its
+    # rows are merged one by one into a triangular root.
+    n = len(part)
+    clear_part(lanes, total)
+    for k in range(n):
+        # Merge row k of [Z back, z], as the last row of a lower triangular root.
+        clear_part(lanes, work)
         for j in range(n):
-            moved += W[i, j] * load(lanes, step, j)
-            if j <= i:
-                store(lanes, nodes.root, b, h, i, j, load(lanes, beliefs.root, 0, 0, i, j))
-        store(lanes, nodes.xhat, b, h, i, moved)
-        if i >= arrays.growing:
-            moved = load(lanes, arrays.centre, k, h, i) + load(lanes, step, i)
-            store(lanes, arrays.centre, k, h, i, moved)
-    # There is no plant noise where messages are kept: ``root_Q`` is zero.
-    move_root(scratch, nodes.root, b, h, W, nodes.root_Q)
-    for part in (arrays.prior[k, h], arrays.own[k, h]):
-        recentre_part(lanes, part, origin, step, part)
-    for m in range(links.first[h], links.first[h + 1]):
-        recentre_part(lanes, arrays.received[k, m], origin, step, arrays.received[k, m])
+            entry = spread(lanes, 0.0)
+            for i in range(k + 1):
+                entry += load(lanes, part, k, i) * back[i, j]
+            store(lanes, work, n - 1, j, entry)
+        store(lanes, work, n - 1, n, load(lanes, part, k, n))
+        merge_lanes(lanes, total, work)
+    copy_part(lanes, total, part)
 
 
 @kernel
-def add_part_single(parts: FloatArray, total: FloatArray, work: FloatArray) -> None:
-    """Add all ``parts`` (K, n, n + 1, 1), K pieces of independent evidence of one run, to ``total``
-    (n, n + 1, 1) in place; evidence is a root [Z, z] of information Z' Z. ``work`` of the shape of
-    ``total`` is scratch. For ``merge_evidence``.
-    """
-    for k in range(len(parts)):
-        add_part(ONE, total, parts[k], work)
+def move_part(lanes: Lanes, part: FloatArray, step: FloatArray) -> None:
+    """Move the centre of a part by ``step`` (n, L)."""
+    n = len(part)
+    for i in range(n):
+        mean = load(lanes, part, i, n)
+        # Z (x - c - step) = Z (x - c) - Z step.
+        for j in range(i + 1):
+            mean -= load(lanes, part, i, j) * load(lanes, step, j)
+        store(lanes, part, i, n, mean)
 
 
 @kernel
-def add_reading_single(
-    y: FloatArray,
-    H: FloatArray,
-    xhat: FloatArray,
-    W: FloatArray,
-    total: FloatArray,
-    work: FloatArray,
-) -> None:
-    """Add a whitened reading of one node in one run, y (1, 1, 1, p, 1) and H (1, 1, 1, p, n, 1), to
-    the evidence ``total`` (n, n + 1, 1), a root [Z, z] of information relative to ``xhat``
-    (1, n, 1) about e in ``x = W e``, W (n, n), in place; ``work`` (n, n + 1, 1) is scratch.
+def set_growing(record: Any, lanes: Lanes, centre: FloatArray, x: FloatArray) -> None:
+    """Set the entries of a centre e (n, L) that are of the present, those of growing modes, to
+    those of the state ``x`` (n, L); the others are of time 0 (``modes.ModeFrame``).
     """
-    add_reading_to_part(ONE, total, y, H, (0, 0, 0), y.shape[3], xhat, W, work)
+    for i in range(record.growing):
+        total = spread(lanes, 0.0)
+        for j in range(len(record.inverse)):
+            total += record.inverse[i, j] * load(lanes, x, j)
+        store(lanes, centre, i, total)
 
 
 @kernel
-def recentre_part_single(part: FloatArray, before: FloatArray, after: FloatArray) -> None:
-    """Move the centre c that the evidence ``part`` (n, n + 1, 1) of one run, [Z, z] with
-    ``Z (x - c) = z + noise``, is relative to from ``before`` (n, 1) to ``after`` (n, 1), in place.
+def fill_transition(record: Any, generator: FloatArray, gap: float) -> None:
+    """Write the transition over ``gap`` seconds, in slots one slot, into ``record.maps[0]``; under
+    clocks that of ``-generator`` (n, n).
     """
-    recentre_part(ONE, part, before, after, part)
+    if record.clocked == 1:
+        fill_inverse_transition(generator, gap, record.maps)
+    else:
+        copy_matrix(record.maps[0], generator)
 
 
 @kernel
-def finish_single(
-    root: FloatArray, x: FloatArray, centre: FloatArray, total: FloatArray, work: FloatArray
-) -> None:
-    """Write the estimate of the evidence ``total`` (n, n + 1, 1) of one run, [Z, z] relative to
-    ``centre`` (1, n, 1): its root Z^-1 into ``root`` (1, 1, n, n, 1) and ``centre + Z^-1 z`` into
-    ``x`` (1, 1, n, 1); ``work`` (n, n + 1, 1) is scratch.
+def read_frame(record: Any, h: int) -> None:
+    """Copy W of node ``h``, the same in all lanes, to ``record.W``; it is I if nothing is kept."""
+    n = len(record.W)
+    for i in range(n if record.keeps == 1 else 0):
+        for j in range(n):
+            record.W[i, j] = record.frame[h, i, j, 0]
+
+
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict the belief, and the evidence if messages are kept; else the predicted belief is the
+    prior, and all other evidence is dropped.
     """
-    finish_lanes(ONE, root[0], x[0], 0, centre, total, work, False)
+    lanes, n, first, stop = run.lanes, len(run.size), run.first[h], run.first[h + 1]
+    if record.keeps == 1:
+        move_evidence(record, h, run)
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    for i in range(n):
+        store(lanes, record.base, h, i, load(lanes, record.xhat, h, i))
+    set_growing(record, lanes, record.centre[h], record.base[h])
+    if record.keeps == 0:
+        write_prior(lanes, record.root[h], record.prior[h])
+        clear_part(lanes, record.own[h])
+        for w in range(first, stop):
+            clear_part(lanes, record.received[w])
+        return
+    if record.growing < n:
+        read_frame(record, h)
+        fill_transition(record, record.forward, run.gap)
+        multiply_square(record.maps[1], record.W, record.maps[0])
+        for i in range(n):
+            for j in range(n):
+                store(lanes, record.frame, h, i, j, record.maps[1, i, j])
+    if record.growing > 0:
+        # The inverse transition of the modes that grow.
+        fill_transition(record, record.back, run.gap)
+        back = record.maps[0]
+        predict_part(lanes, record.prior[h], back, run.total, run.whitened)
+        predict_part(lanes, record.own[h], back, run.total, run.whitened)
+        for w in range(first, stop):
+            predict_part(lanes, record.received[w], back, run.total, run.whitened)
+    if record.clocked == 1:
+        record.elapsed[h, 0] += run.gap
+
+
+@kernel
+def move_evidence(record: Any, h: int, run: Any) -> None:
+    """Make the belief of node ``h`` the centre of its evidence."""
+    lanes, step = run.lanes, record.step[h]
+    move_part(lanes, record.prior[h], step)
+    move_part(lanes, record.own[h], step)
+    for w in range(run.first[h], run.first[h + 1]):
+        move_part(lanes, record.received[w], step)
+    for i in range(len(run.size)):
+        moved = load(lanes, record.centre, h, i) + load(lanes, step, i)
+        store(lanes, record.centre, h, i, moved)
+        store(lanes, step, i, 0.0)
+
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Add the reading of node ``h`` to its own evidence: the rows ``[H W, y - H base]``. In slots
+    the belief follows after the exchange.
+    """
+    lanes, n, r, W, work = run.lanes, len(run.size), run.reading, record.W, run.whitened
+    y, matrix = run.first_y + r, run.first_H + run.matrix[r]
+    read_frame(record, h)
+    for k in range(run.rows[r]):
+        # Merge one row, as the last row of a lower triangular root.
+        clear_part(lanes, work)
+        innovation = load(lanes, run.y, y, k)
+        for j in range(n):
+            innovation -= load(lanes, run.H, matrix, k, j) * load(lanes, record.base, h, j)
+            entry = spread(lanes, 0.0)
+            for i in range(n):
+                entry += load(lanes, run.H, matrix, k, i) * W[i, j]
+            store(lanes, work, n - 1, j, entry)
+        store(lanes, work, n - 1, n, innovation)
+        merge_lanes(lanes, record.own[h], work)
+    if record.clocked == 1:
+        believe(record, h, run)
+
+
+@kernel
+def believe(record: Any, h: int, run: Any) -> None:
+    """Compute the belief of node ``h`` from its prior and all evidence."""
+    # From all evidence, and not as an update of the old belief: on an unstable plant the old one
+    # may be so far off that digits are lost.
+    lanes, n, total, work, W = run.lanes, len(run.size), run.total, run.whitened, record.W
+    copy_part(lanes, record.prior[h], total)
+    add_part(lanes, total, record.own[h], work)
+    for w in range(run.first[h], run.first[h + 1]):
+        add_part(lanes, total, record.received[w], work)
+    if record.keeps == 0:
+        # root = Z^-1 and xhat = base + Z^-1 z in all lanes (False: none keeps its estimate).
+        finish_lanes(lanes, record.root, record.xhat, h, record.base, total, work, False)
+        return
+    step = record.step
+    for i in range(n):
+        store(lanes, step, h, i, 0.0)
+    finish_lanes(lanes, record.root, step, h, step, total, work, False)
+    # root = W Z^-1, made triangular, and xhat = base + W Z^-1 z.
+    read_frame(record, h)
+    for i in range(n):
+        moved = load(lanes, record.base, h, i)
+        for j in range(n):
+            moved += W[i, j] * load(lanes, step, h, j)
+        store(lanes, record.xhat, h, i, moved)
+    transform_root(lanes, run.size, record.root, h, W, record.zeros, (run.moved, run.noise))
+
+
+@kernel
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Send each neighbour the sum of the evidence of node ``h``, its own and that of all other
+    neighbours: what came from the receiver would count twice.
+    """
+    lanes, evidence, work = run.lanes, record.payload.evidence, run.whitened
+    first, stop = run.first[h], run.first[h + 1]
+    if run.receiver != ALL_RECEIVERS:
+        write_centre(record, h, m, run)
+        copy_part(lanes, record.own[h], evidence[m])
+        for w in range(first, stop):
+            if w != run.receiver:
+                add_part(lanes, evidence[m], record.received[w], work)
+        return
+    D = stop - first
+    for k in range(D + 1):
+        write_centre(record, h, m + k, run)
+        copy_part(lanes, record.own[h], evidence[m + k])
+    if record.keeps == 0 and run.step == 0:
+        # Nothing was received so far.
+        return
+    # The sum without link k is a prefix sum plus a suffix sum: nothing is subtracted.
+    suffix, prefix = record.suffix, evidence[m + D]
+    for k in range(D - 1, 0, -1):
+        copy_part(lanes, record.received[first + k], suffix[k])
+        if k < D - 1:
+            add_part(lanes, suffix[k], suffix[k + 1], work)
+    for k in range(D):
+        copy_part(lanes, prefix, evidence[m + k])
+        if k < D - 1:
+            add_part(lanes, evidence[m + k], suffix[k + 1], work)
+        add_part(lanes, prefix, record.received[first + k], work)
+
+
+@kernel
+def write_centre(record: Any, h: int, m: int, run: Any) -> None:
+    """Write the centre of the evidence of node ``h`` into payload ``m``, as a state and as an e."""
+    copy_vector(run.lanes, run.size, record.payload.xhat, m, record.base, h, True)
+    copy_vector(run.lanes, run.size, record.payload.centre, m, record.centre, h, True)
+
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Replace the evidence of each sender by that of its message, unless the one that node ``h``
+    has was sent later, and compute the belief, in slots after the last step.
+    """
+    for k in range(run.count):
+        m, w = run.message[k], run.link[k]
+        if record.clocked == 1:
+            # Messages may overtake each other: an older one holds nothing that the newer lacks.
+            sent = max(record.elapsed[h, 0] - run.age[k], 0.0)
+            if record.heard_at[w, 0] > sent:
+                continue
+            record.heard_at[w, 0] = sent
+            predict_message(record, m, run, run.age[k])
+        receive(record, h, m, w, run, load_flags(run.lanes, run.arrived, k))
+    if record.clocked == 1 or run.step == record.steps - 1:
+        believe(record, h, run)
+
+
+@kernel
+def predict_message(record: Any, m: int, run: Any, age: float) -> None:
+    """Predict payload ``m``, sent ``age`` seconds ago, to now."""
+    payload, lanes = record.payload, run.lanes
+    carry_mean(run.model, run, payload.xhat, m, age)
+    if age > 0.0 and record.growing > 0:
+        fill_transition(record, record.back, age)
+        predict_part(lanes, payload.evidence[m], record.maps[0], run.total, run.whitened)
+    set_growing(record, lanes, payload.centre[m], payload.xhat[m])
+
+
+@kernel
+def receive(record: Any, h: int, m: int, w: int, run: Any, arrived: Any) -> None:
+    """Replace the evidence received on link ``w`` by that of payload ``m``, relative to the centre
+    of node ``h``, in the lanes in which it has ``arrived``.
+    """
+    lanes, n, received = run.lanes, len(run.size), record.received
+    evidence, before, after = record.payload.evidence, record.payload.centre, record.centre
+    for i in range(n):
+        mean = load(lanes, evidence, m, i, n)
+        # Z (x - c') = Z (x - c) + Z (c - c').
+        for j in range(i + 1):
+            entry = load(lanes, evidence, m, i, j)
+            mean += entry * (load(lanes, before, m, j) - load(lanes, after, h, j))
+            former = load(lanes, received, w, i, j)
+            store(lanes, received, w, i, j, select(arrived, entry, former))
+        former = load(lanes, received, w, i, n)
+        store(lanes, received, w, i, n, select(arrived, mean, former))
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move the estimate and the centre of evidence: evidence is relative to it."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.base, h)
+    set_growing(record, run.lanes, record.centre[h], record.base[h])
 
 
 @built_in("belief-propagation")
@@ -376,48 +395,66 @@ class BeliefPropagation(Filter):
     one_way: ClassVar[bool] = True
     needs_samples: ClassVar[bool] = True
     inverts: ClassVar[bool] = True
-    slot_kernel = staticmethod(belief_slots)
+    kernels = Kernels(
+        predict=predict,
+        update=update,
+        emit=emit,
+        absorb=absorb,
+        shift=shift,
+        addressed=True,
+        unrolled=False,
+    )
 
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[BeliefArrays]:
-        """Return the arrays of the compiled ``slot_kernel`` for ``runs`` runs of H nodes that start
-        in these ``states`` and have the degrees in ``infos``: the initial evidence of all nodes,
-        and scratch.
+    def _keeps(self, model: Any) -> bool:
+        """Return whether messages are kept from slot to slot, or under clocks."""
+        return not isinstance(model, SlotModel) or self.memory == ALL
+
+    def _frame(self, model: Any) -> ModeFrame:
+        """Return the coordinates of evidence."""
+        if not isinstance(model, SlotModel):
+            return flow_frame(model.A)
+        return slot_frame(model.F) if self.memory == ALL else still_frame(len(model.F))
+
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return what a node knows: evidence ``prior``, ``own`` and ``received`` by link, relative
+        to the state ``base``, as an e ``centre``. Where messages are kept, ``frame`` is W, ``step``
+        the way from the centre to the belief, as an e, ``heard_at`` the time ``elapsed`` at which
+        the evidence of a link was sent.
         """
-        keeps, H, n = self.memory == ALL, len(states), len(states[0].xhat)
-        frame = states[0].frame
-        # W directed links; D: the most that lead to one node.
-        W, D = sum(info.degree for info in infos), max(info.degree for info in infos)
-        blocks = blocks_of(runs) if keeps else 1
-        part = n, n + 1, LANES
-        shapes = [(H, *part), (W, *part), (D + 1, *part), part, part]
-        shapes += [(1, 1, n, n, LANES), (1, 1, n, LANES), (1, n, LANES)]
-        return (
-            BeliefArrays(
-                self.steps,
-                keeps,
-                frame.inverse,
-                frame.growing,
-                frame.back,
-                np.array([states[0].W]),
-                in_lanes(np.stack([state.centre for state in states]), blocks),
-                in_lanes(np.stack([state.prior for state in states]), blocks),
-                aligned((blocks, H, *part)),
-                aligned((blocks, W, *part)),
-                BeliefScratch(*(aligned(shape) for shape in shapes)),
-            ),
+        n, model, keeps = len(models[0].information), models[0], self._keeps(models[0])
+        frame, clocked = self._frame(model), not isinstance(model, SlotModel)
+        # Exponentials are computed of generators with a minus.
+        sign = -1.0 if clocked else 1.0
+        part, kept = (n, n + 1), n if keeps else 0
+        node = {"prior": part, "own": part, "base": (n,), "centre": (n,)}
+        return Record(
+            node={**node, "frame": (kept, kept), "step": (kept,), "elapsed": ()},
+            link={"received": part, "heard_at": ()},
+            payload={"evidence": part, "xhat": (n,), "centre": (n,)},
+            scratch={"suffix": (1 + max(info.degree for info in infos), *part)},
+            settings={
+                "steps": self.steps,
+                "keeps": int(keeps),
+                "clocked": int(clocked),
+                "growing": frame.growing,
+                "inverse": np.ascontiguousarray(frame.inverse),
+                "forward": np.ascontiguousarray(sign * frame.forward),
+                "back": np.ascontiguousarray(sign * frame.back),
+                "W": np.eye(n),
+                "zeros": np.zeros((n, n)),
+                "maps": np.zeros((3, n, n)),
+            },
         )
 
-    def slot_gains(
-        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
-    ) -> tuple[BeliefArrays]:
-        """Return ``arrays`` with the coordinates W of evidence in ``count`` slots from number
-        ``first`` on, if messages are kept.
-        """
-        if self.memory == SLOT:
-            return arrays
-        return (arrays[0]._replace(W=states[0].frame.slots(first, count)),)
+    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
+        """Begin with a prior only: nothing was read or heard."""
+        frame = self._frame(model)
+        node["base"][:], node["centre"][:] = node["xhat"], frame.inverse @ node["xhat"]
+        # [Z, 0] with Z' Z = W' P^-1 W, both triangles turned round for a lower Z.
+        weighted = np.linalg.solve(node["root"], frame.basis)
+        node["prior"][:, :-1] = lower_root(weighted.T[::-1]).T[::-1, ::-1]
+        if self._keeps(model):
+            node["frame"][:] = frame.basis
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if messages are kept (``memory`` "all", or clocks) and the plant of a
@@ -464,94 +501,7 @@ class BeliefPropagation(Filter):
         """Return ``steps``, the number of steps of the only exchange of a slot."""
         return self.steps
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BeliefState:
-        """Return the first state of a node, with estimate ``mean`` (n,) and covariance ``cov``
-        (n, n), in which nothing was read or heard.
-        """
-        root, n = first_root(cov), len(mean)
-        if isinstance(model, SlotModel):
-            frame = still_frame(n) if self.memory == SLOT else slot_frame(model.F)
-        else:
-            frame = flow_frame(model.A)
-        return BeliefState(
-            xhat=mean,
-            root=root,
-            model=model,
-            frame=frame,
-            W=frame.basis,
-            centre=frame.inverse @ mean,
-            prior=transform_evidence(evidence_of(root), frame.basis),
-            own=np.zeros((n, n + 1)),
-            senders=(),
-            received=(),
-            node=node.node,
-        )
-
-    def predict(self, state: BeliefState, gap: float) -> BeliefState:
-        """Return the state ``gap`` seconds later: with the belief predicted, and the evidence if
-        messages are kept; otherwise the predicted belief is the prior, and all other evidence is
-        dropped.
-        """
-        model, frame = state.model, state.frame
-        xhat, root = model.predict(state.xhat, state.root, gap)
-        state = state._replace(xhat=xhat, root=root)
-        if not isinstance(model, SlotModel):
-            state = state._replace(W=state.W @ inverse_transition(-frame.forward, gap))
-            return pull_back(state, gap)
-        if self.memory == SLOT:
-            no_evidence = np.zeros_like(state.own)
-            return state._replace(prior=evidence_of(root), own=no_evidence, senders=(), received=())
-        for _ in range(round(gap / model.period)):
-            state = pull_back(state._replace(W=state.W @ frame.forward), model.period)
-        return state
-
-    def update(self, state: BeliefState, reading: Reading) -> BeliefState:
-        """Return the state after a sample: its evidence is added to that of the node's own
-        readings, and the belief follows from all evidence.
-        """
-        if not len(reading.y):
-            return state
-        return compute_belief(state._replace(own=add_to_own_evidence(state, reading)))
-
-    def emit(self, state: BeliefState, exchange: Exchange) -> tuple[BeliefState, Beliefs]:
-        """Return the state, unchanged, and the payload: the evidence of the node's own readings and
-        of each neighbour, of which a receiver leaves out its own.
-        """
-        heard = tuple(one.evidence for one in state.received)
-        return state, Beliefs(state.xhat, state.centre, state.own, state.senders, heard)
-
-    def absorb(
-        self, state: BeliefState, messages: Sequence[Message], exchange: Exchange
-    ) -> BeliefState:
-        """Return the state in which the evidence of each sender is replaced by that of its message,
-        unless the one it has was sent later, with the belief that follows from all evidence.
-        """
-        if not messages:
-            return state
-        received = dict(zip(state.senders, state.received, strict=True))
-        for message in messages:
-            # Messages may overtake each other: an older one holds nothing that the newer lacks.
-            sent = exchange.time - message.age
-            if message.sender in received and received[message.sender].sent > sent:
-                continue
-            payload = message.payload
-            evidence = evidence_for(state.node, payload)
-            # In slots a message is used in the slot in which it was sent.
-            if message.age > 0.0 and not isinstance(state.model, SlotModel):
-                evidence = transform_evidence(evidence, backward(state, message.age))
-            # The sender's belief, predicted to now, is the centre of its evidence.
-            xhat, _ = state.model.extrapolate(payload.xhat, state.root, message.age)
-            before = centre_at(payload.centre, xhat, state.frame)
-            after = centre_at(state.centre, state.xhat, state.frame)
-            evidence = recentre_evidence(evidence, before, after)
-            received[message.sender] = HeardEvidence(evidence, sent)
-        senders = tuple(sorted(received))
-        return compute_belief(
-            state._replace(senders=senders, received=tuple(received[j] for j in senders))
-        )
-
     shift = Filter.shift  # evidence is relative to the belief
-    shift_payload = Filter.shift_payload
 
 
 def is_forest(scenario: Any) -> bool:
@@ -562,121 +512,3 @@ def is_forest(scenario: Any) -> bool:
     # A graph is a forest if and only if it has as many links as nodes less components.
     pairs = {frozenset(link) for link in topology.directions}
     return len(pairs) == len(topology.nodes) - len(topology.components)
-
-
-def merge_evidence(parts: Sequence[FloatArray]) -> FloatArray:
-    """Return the sum (n, n + 1) of several pieces of independent evidence, ``parts`` (n, n + 1)
-    each, as a root [Z, z] of information; all are relative to one centre.
-    """
-    # The kernel adds the other pieces to the first one; the stack is a copy.
-    stack = np.stack(parts)[..., None]
-    add_part_single(stack[1:], stack[0], np.empty(stack.shape[1:]))
-    return np.ascontiguousarray(stack[0, ..., 0])
-
-
-def add_to_own_evidence(state: BeliefState, reading: Reading) -> FloatArray:
-    """Return the evidence (n, n + 1) of a node's own readings plus that of a new ``reading``,
-    relative to ``state.xhat``.
-    """
-    y, H = whiten_reading(reading.y, reading.H, reading.R)
-    n = len(state.xhat)
-    # The kernel takes blocks, slots, nodes and lanes: one of each here.
-    y = y.reshape(1, 1, 1, -1, 1)
-    H = H.reshape(1, 1, 1, -1, n, 1)
-    xhat = np.array(state.xhat).reshape(1, n, 1)
-    total = np.array(state.own)[..., None]
-    add_reading_single(y, H, xhat, state.W, total, np.empty(total.shape))
-    return np.ascontiguousarray(total[..., 0])
-
-
-def evidence_for(node: int, payload: Beliefs) -> FloatArray:
-    """Return the evidence (n, n + 1) of a payload for the receiver ``node``, an id: all but what
-    the sender has from the receiver itself, relative to ``payload.xhat``.
-    """
-    others = zip(payload.senders, payload.heard, strict=True)
-    return merge_evidence([payload.own, *(one for sender, one in others if sender != node)])
-
-
-def evidence_of(root: FloatArray) -> FloatArray:
-    """Return an estimate whose covariance has the lower triangular ``root`` S (n, n) as evidence
-    (n, n + 1) relative to itself: [S^-1, 0].
-    """
-    n = len(root)
-    part = np.zeros((n, n + 1, 1))
-    write_prior_single(np.array(root).reshape(1, 1, n, n, 1), 0, part)
-    return np.ascontiguousarray(part[..., 0])
-
-
-def compute_belief(state: BeliefState) -> BeliefState:
-    """Return the state with the belief, ``xhat`` (n,) and ``root`` (n, n), that follows from its
-    prior and all evidence; the centre of the evidence moves to the new ``xhat``.
-    """
-    # From all evidence, and not as an update of the old belief: on an unstable plant the old one
-    # may be so far off that digits are lost.
-    total = merge_evidence([state.prior, state.own, *(one.evidence for one in state.received)])
-    n = len(total)
-    step, root, origin = np.zeros((1, 1, n, 1)), np.zeros((1, 1, n, n, 1)), np.zeros(n)
-    finish_single(root, step, origin.reshape(1, n, 1), total[..., None], np.empty((n, n + 1, 1)))
-    move = step.reshape(n)
-    state = state._replace(
-        xhat=state.xhat + state.W @ move,
-        root=predict_root_alone(root.reshape(n, n), state.W, np.zeros((n, n))),
-        centre=state.centre + move,
-    )
-    return map_evidence(state, lambda evidence: recentre_evidence(evidence, origin, move))
-
-
-def centre_at(centre: FloatArray, xhat: FloatArray, frame: ModeFrame) -> FloatArray:
-    """Return the belief ``xhat`` (n,) as an e (n,): its first entries, of growing modes, are those
-    of the present; the others, of time 0, are those of ``centre`` (n,).
-    """
-    return np.concatenate([frame.inverse[: frame.growing] @ xhat, centre[frame.growing :]])
-
-
-def map_evidence(state: BeliefState, change: Callable[[FloatArray], FloatArray]) -> BeliefState:
-    """Return the state with ``change``, a function from evidence (n, n + 1) to evidence, applied to
-    its prior, its own and all received evidence.
-    """
-    received = tuple(one._replace(evidence=change(one.evidence)) for one in state.received)
-    return state._replace(prior=change(state.prior), own=change(state.own), received=received)
-
-
-def pull_back(state: BeliefState, gap: float) -> BeliefState:
-    """Return the state with all evidence predicted over a ``gap`` in seconds, a slot's if there are
-    slots; only that about growing modes changes.
-    """
-    if state.frame.growing == 0:
-        return state
-    back = backward(state, gap)
-    return map_evidence(state, lambda evidence: transform_evidence(evidence, back))
-
-
-def backward(state: BeliefState, gap: float) -> FloatArray:
-    """Return the inverse (n, n) of the transition of e over a ``gap`` in seconds, a slot's if there
-    are slots, with which evidence is predicted.
-    """
-    if isinstance(state.model, SlotModel):
-        return state.frame.back
-    return inverse_transition(-state.frame.back, gap)
-
-
-def transform_evidence(evidence: FloatArray, back: FloatArray) -> FloatArray:
-    """Return ``evidence`` (n, n + 1), a root [Z, z] of information about some e, as that about the
-    e' (n,) of ``e = back e'``, such as a later one of a plant without noise: Z times ``back``
-    (n, n).
-    """
-    predicted = np.array(evidence)[..., None]
-    back = np.ascontiguousarray(back)
-    predict_part_single(predicted, back, np.empty(predicted.shape), np.empty(predicted.shape))
-    return np.ascontiguousarray(predicted[..., 0])
-
-
-def recentre_evidence(evidence: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return ``evidence`` (n, n + 1), a root [Z, z] of information relative to the centre
-    ``before`` (n,), relative to ``after`` (n,) instead.
-    """
-    result, old_centre, new_centre = (
-        np.array(values)[..., None] for values in (evidence, before, after)
-    )
-    recentre_part_single(result, old_centre, new_centre)
-    return np.ascontiguousarray(result[..., 0])

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -30,8 +30,6 @@ ROUNDING = 1e-9
 """Rates up to this (in slots; under clocks relative to the largest entry of A) count as 0."""
 SAME_RATE = 1e-6
 """Rates that differ by less, relative to the largest entry of A, are one."""
-CHECKPOINT = 1024
-"""Slots between two stored frames."""
 
 
 class ModeSplit(NamedTuple):
@@ -112,26 +110,6 @@ class ModeFrame:
     back: FloatArray
     forward: FloatArray
     excess: float
-
-    @cached_property
-    def _stored(self) -> list[FloatArray]:
-        """W of slots 0, CHECKPOINT, 2 CHECKPOINT, ..., as far as they were needed."""
-        return [self.basis]
-
-    def slots(self, first: int, count: int) -> FloatArray:
-        """Return W (count, n, n) of ``count`` slots from number ``first`` on."""
-        # From stored ones, so that W of a slot does not depend on the slots asked for before.
-        start = first // CHECKPOINT
-        while len(self._stored) <= start:
-            self._stored.append(self._advance(self._stored[-1], CHECKPOINT)[-1])
-        return self._advance(self._stored[start], first - start * CHECKPOINT + count - 1)[-count:]
-
-    def _advance(self, W: FloatArray, steps: int) -> FloatArray:
-        """Return W of a slot and those of the ``steps`` after it, (steps + 1, n, n)."""
-        frames = [W]
-        for _ in range(steps):
-            frames.append(frames[-1] @ self.forward)
-        return np.array(frames)
 
 
 @lru_cache(maxsize=8)

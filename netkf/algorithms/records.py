@@ -61,6 +61,10 @@ class Kernels:
     remembers : the record has a ``past``
     counts_sends : ``emit`` changes the record, so that it is called even if no message arrives
     slotwise : ``prepare`` is called for one slot at a time
+    addressed : each receiver gets a payload of its own: ``emit`` writes payload m + k for the
+                sender of its incoming link number k, and one after these for all nodes that it does
+                not hear; where ``run.receiver`` is not ALL, only payload m, for the sender of that
+                link, or where it is -1 for a node that it does not hear
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
     under_clocks : the verbs under clocks, where they are others than in slots
@@ -80,6 +84,7 @@ class Kernels:
     remembers: bool = False
     counts_sends: bool = False
     slotwise: bool = False
+    addressed: bool = False
     unrolled: bool = True
     under_clocks: Kernels | None = None
     depends_on_data: bool | None = None

@@ -15,6 +15,7 @@ import numpy as np
 from netkf.algorithms.kernels.gains import Gains, no_gains, stack_gains
 from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
+    ALL,
     ClockRun,
     ClockTables,
     SingleSlotRun,
@@ -159,6 +160,7 @@ class Surroundings:
             model=_clock_tables(model, size) if self.clocked else slot_tables(model),
             first=np.array([0, info.degree]),
             sender=np.arange(degree),
+            opposite=np.full(degree, -1),
             weight=np.zeros(degree),
             y=np.zeros((1, 1, 1)),
             H=np.zeros((1, 1, n, 1)),
@@ -176,6 +178,7 @@ class Surroundings:
             first_y=0,
             first_H=0,
             count=0,
+            receiver=ALL,
             slot=-1,
             phase=-1,
             step=-1,
@@ -311,7 +314,9 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     surroundings.set_exchange(exchange)
     surroundings.prepare(record, exchange.slot)
     surroundings.set_readings([new.reading or _NO_READING])
-    payload = _payload_struct(record, 1)
+    # An addressed filter writes one for each node that it hears, and one more.
+    count = surroundings.info.degree + 1 if state.kernels.addressed else 1
+    payload = _payload_struct(record, count)
     record.payload = payload
     state.kernels.emit(record, 0, 0, run)
     has_reading = new.reading is not None
@@ -334,7 +339,9 @@ def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeStat
     if messages:
         names = type(record.payload).struct_fields
         fields = {
-            name: np.concatenate([_field(message.payload, name) for message in messages])
+            name: np.concatenate(
+                [_field(message.payload, name, surroundings.info.node) for message in messages]
+            )
             for name in names
         }
         record.payload = type(record.payload)(**fields)
@@ -364,17 +371,22 @@ def shift_payload(payload: Payload, offset: FloatArray) -> Payload:
     run.offset[:, 0] = offset
     fields = {name: array.copy() for name, array in payload.fields.items()}
     record.payload = type(record.payload)(**fields)
-    new.kernels.shift_payload(record, 0, run)
+    for m in range(len(next(iter(fields.values())))):
+        new.kernels.shift_payload(record, m, run)
     # A reading keeps the coordinates of its time.
     return Payload(fields, payload.reading, payload.sender)
 
 
-def _field(payload: Any, name: str) -> np.ndarray:
+def _field(payload: Any, name: str, receiver: int) -> np.ndarray:
     """Return a field of a payload with axes of messages and lanes; a user's own payload may be any
     object that has it.
     """
     if isinstance(payload, Payload):
-        return payload.fields[name]
+        rows = payload.fields[name]
+        # The last is for nodes that the sender does not hear, or the only one.
+        last = len(rows) - 1
+        k = min(payload.sender.run.links.get(receiver, last), last)
+        return rows[k : k + 1]
     return np.asarray(getattr(payload, name), dtype=np.float64)[None, ..., None]
 
 

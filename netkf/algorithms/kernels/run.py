@@ -47,6 +47,8 @@ from netkf.linalg.structs import Size, Struct, sized
 
 MAX_RELATIVE_GAIN = 1.0
 """Largest integral of trace(P G), G = H' R^-1 H, over the increments that one update uses."""
+ALL = -2
+"""``run.receiver`` where a message is for all receivers."""
 
 
 class SlotTables(Struct):
@@ -63,6 +65,7 @@ class SlotRun(Struct):
     model : SlotTables
     first, sender, weight : links to node h are ``first[h]`` to ``first[h + 1]`` - 1: the index of
                             the sender, and the weight that the receiver gives it
+    opposite : the link from the receiver of each link to its sender, -1 if there is none
     y, H, rows, matrix : whitened readings: reading r has ``rows[r]`` rows ``y[first_y + r]``
                          (p, L) with ``H[first_H + matrix[r]]`` (p, n, L)
     reading : number r of the reading of ``update``
@@ -70,6 +73,7 @@ class SlotRun(Struct):
         each its number in the payloads, its link, weight and age in seconds, the number of the
         reading that the sender had at the time of sending (-1: none), and flags (L,) of the runs in
         which it has arrived
+    receiver : for ``emit`` of an addressed filter, ``records.Kernels``
     sends : (L,), 1 on entry of ``emit``; it writes 0 where the node sends nothing
     uniform : (L,), uniform numbers for ``emit`` of a randomised filter
     offset : (n, L), by which ``shift`` moves estimates
@@ -83,6 +87,7 @@ class SlotRun(Struct):
     model: SlotTables
     first: IntArray
     sender: IntArray
+    opposite: IntArray
     weight: FloatArray
     y: FloatArray
     H: FloatArray
@@ -108,6 +113,7 @@ class SlotRun(Struct):
     first_y: int
     first_H: int
     count: int
+    receiver: int
     slot: int
     phase: int
     step: int
@@ -166,6 +172,16 @@ def size_of(n: int, unrolled: bool) -> Size:
     """
     # Loops over one state need no unrolling.
     return sized(n) if unrolled and n > 1 else np.zeros(n)
+
+
+def opposite_links(first: IntArray, sender: IntArray) -> IntArray:
+    """Return for each of W links by receiver the one in the opposite direction, -1 for none."""
+    receiver = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    ends, turned = receiver * len(first) + sender, sender * len(first) + receiver
+    order = np.argsort(ends)
+    place = np.searchsorted(ends[order], turned)
+    place[place == len(ends)] = 0
+    return np.where(ends[order[place]] == turned, order[place], -1).astype(np.int64)
 
 
 def clock_tables(size: Size, table: FlowTable, models: IntArray, gains: Gains) -> ClockTables:

@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.run import ClockRun, clock_tables, scratch_of, size_of
+from netkf.algorithms.kernels.run import (
+    ALL,
+    ClockRun,
+    clock_tables,
+    opposite_links,
+    scratch_of,
+    size_of,
+)
 from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_loop import BatchArrays
 from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
@@ -69,6 +76,7 @@ class ClockFilters:
             first_y=0,
             first_H=0,
             count=0,
+            receiver=ALL,
             slot=-1,
             phase=-1,
             step=-1,
@@ -170,9 +178,11 @@ def _links_by_receiver(scenario: Scenario) -> dict[str, Any]:
     directions = scenario.topology.directions if scenario.node_filter.talks else ()
     ends = sorted((index[receiver], index[sender]) for sender, receiver in directions)
     receivers = np.array([receiver for receiver, _ in ends], dtype=np.int64)
-    nodes = scenario.nodes
+    nodes, senders = scenario.nodes, np.array([sender for _, sender in ends], dtype=np.int64)
+    first = np.searchsorted(receivers, np.arange(len(nodes) + 1)).astype(np.int64)
     return {
-        "first": np.searchsorted(receivers, np.arange(len(nodes) + 1)).astype(np.int64),
-        "sender": np.array([sender for _, sender in ends], dtype=np.int64),
+        "first": first,
+        "sender": senders,
+        "opposite": opposite_links(first, senders),
         "weight": np.array([scenario.weight(nodes[r], nodes[s]) for r, s in ends], dtype=float),
     }

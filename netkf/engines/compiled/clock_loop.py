@@ -201,7 +201,7 @@ def sampling_of(kernels: Kernels) -> Any:
 
 def ticking_of(kernels: Kernels, predict_node: Any) -> Any:  # noqa: ARG001
     """Return the kernel of the ticks of clocks, and of transmissions after samples."""
-    emit, decides = kernels.emit, kernels.decides
+    emit, decides, addressed = kernels.emit, kernels.decides, kernels.addressed
     sends_readings, counts_sends = kernels.sends_readings, kernels.counts_sends
 
     @kernel
@@ -218,7 +218,7 @@ def ticking_of(kernels: Kernels, predict_node: Any) -> Any:  # noqa: ARG001
         for k in range(after - first):
             arrives = arrives or ticks.delay[outcome + k] >= 0.0
         run.sends[0] = 1
-        if arrives:
+        if arrives and not addressed:
             emit(record, h, m, run)
         if decides and run.sends[0] == 0:
             release(state, m)
@@ -227,12 +227,11 @@ def ticking_of(kernels: Kernels, predict_node: Any) -> Any:  # noqa: ARG001
             record_event(state, now, TRANSMIT, state.nodes[h].id, -1, state.nodes[h].sent)
             state.nodes[h].sent += 1
         # The reading of this instant goes with the message.
-        tag = -1
+        tag, used = -1, False
         if sends_readings:
             reading = state.nodes[h].reading
             if reading >= 0 and state.instants.t[reading] == now:
                 tag = reading
-        used = False
         for k in range(first, after):
             w = state.outgoing[k]
             delay = snapped(ticks.delay[outcome + k - first], state.per_second)
@@ -240,8 +239,12 @@ def ticking_of(kernels: Kernels, predict_node: Any) -> Any:  # noqa: ARG001
                 copy = m
                 if used:
                     copy = take(state)
-                    copy_row(record.payload, copy, m)
+                    if not addressed:
+                        copy_row(record.payload, copy, m)
                 used = True
+                if addressed:
+                    run.receiver = run.opposite[state.incoming[w]]
+                    emit(record, h, copy, run)
                 dispatch(state, w, copy, tag, delay, now)
         if not used:
             release(state, m)

@@ -1,8 +1,7 @@
 """Extra state of some combinations in the event loop, besides estimates and messages.
 
-These are fusion with the optimal weight (BEST, INVERSE), constant gains (GAINS), consensus on
-predictions (PREDICTIONS) and belief propagation (BELIEFS). For other combinations it is None, and
-none of this is compiled.
+These are fusion with the optimal weight (BEST, INVERSE), constant gains (GAINS) and consensus on
+predictions (PREDICTIONS). For other combinations it is None, and none of this is compiled.
 """
 
 from __future__ import annotations
@@ -23,11 +22,9 @@ from netkf.algorithms.kernels.root_flow import (
     stack_tables,
 )
 from netkf.algorithms.kernels.slots import predict_root
-from netkf.engines.compiled.evidence import EvidenceArrays, empty_evidence
 from netkf.engines.compiled.increments import fill_readings, next_interval
 from netkf.engines.compiled.instant_updates import copy_state, use_instant
 from netkf.engines.compiled.state import (
-    BELIEFS,
     BEST,
     GAINS,
     INVERSE,
@@ -44,7 +41,7 @@ from netkf.scenario.scenario import Scenario
 class CombinationState(Struct):
     """Arrays of one run, for N nodes, n states and p rows of readings.
 
-    kind    : combination of the Simulation (BEST, INVERSE, GAINS, PREDICTIONS or BELIEFS)
+    kind    : combination of the Simulation (BEST, INVERSE, GAINS or PREDICTIONS)
     trace   : 1 where the best weight minimises the trace, 0 where it minimises the determinant
 
     Consensus on predictions:
@@ -63,7 +60,7 @@ class CombinationState(Struct):
     lanes   : (1, N, n, n, 1), a view of the roots of the Simulation
 
     Scratch: ``pair`` (2 n + 2, n), ``x`` (1, n), ``root`` (1, n, n), ``maps`` (6, n, n), ``work``
-    (2, n, n, 1), ``flow_scratch``. Belief propagation has its own ``evidence``.
+    (2, n, n, 1), ``flow_scratch``.
     """
 
     kind: int
@@ -90,16 +87,14 @@ class CombinationState(Struct):
     maps: FloatArray
     work: FloatArray
     flow_scratch: FlowScratch
-    evidence: EvidenceArrays
 
 
 def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationState | None:
     """Return the arrays that the filter's way of combining estimates needs besides those of the
-    event loop ``state``, at time 0; None for most combinations, which need none. ``lanes``, and
-    parts of ``evidence`` (of belief propagation), are views of ``state.xhat`` and ``state.root``:
-    the loop and the combination see the same estimates.
+    event loop ``state``, at time 0; None for most combinations, which need none. ``lanes``
+    is a view of ``state.root``: the loop and the combination see the same estimates.
     """
-    if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS, BELIEFS):
+    if state.combination_kind not in (BEST, INVERSE, GAINS, PREDICTIONS):
         return None
     algorithm: Any = scenario.node_filter
     # ``lanes`` must be a view of the roots: a copy would miss what the loop changes.
@@ -123,7 +118,6 @@ def combination_state_of(scenario: Scenario, state: Simulation) -> CombinationSt
         maps=np.zeros((6, n, n)),
         work=np.zeros((2, n, n, 1)),
         flow_scratch=flow_scratch(gains["table"]),
-        evidence=empty_evidence(state, scenario.models[0].A, root.reshape(1, N, n, n, 1)),
         **gains,
     )
 

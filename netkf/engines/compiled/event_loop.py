@@ -31,19 +31,12 @@ from netkf.engines.compiled.combination_state import (
     send_prediction,
     use_readings_heard,
 )
-from netkf.engines.compiled.evidence import (
-    absorb_evidence,
-    add_samples,
-    predict_node_evidence,
-    send_evidence,
-)
 from netkf.engines.compiled.increments import predict_with_increments
 from netkf.engines.compiled.instant_updates import copy_state, use_instant
 from netkf.engines.compiled.message_queue import pop, push, put, release, sort_indices, take
 from netkf.engines.compiled.running_totals import Totals, add_reading, hear, offer_round
 from netkf.engines.compiled.state import (
     AFTER_READINGS,
-    BELIEFS,
     CONVEX,
     GAINS,
     INTERSECTION,
@@ -303,7 +296,7 @@ def predict_node(
     """Predict node ``h`` (index in ``state.nodes``) from ``state.now[h]`` to ``time`` (seconds),
     using its increments, unless it is there already. Changes ``state.xhat[h]``, ``root[h]`` and
     ``now[h]``, and in ``combination`` (None for most filters) the prediction that consensus on
-    predictions sends, or the evidence of belief propagation.
+    predictions sends.
     """
     node, now = state.nodes[h], state.now[h]
     # ``not <`` also returns for a time that is nan.
@@ -321,8 +314,6 @@ def predict_node(
         propagate_root(state.table, node.model, state.root, state.xhat, h, gap, state.flow_scratch)
     if combination is not None and combination.kind == PREDICTIONS:
         keep_prediction(state, combination, h)
-    elif combination is not None and combination.kind == BELIEFS:
-        predict_node_evidence(combination.evidence, h, time - now)
 
 
 @kernel
@@ -364,8 +355,6 @@ def on_sample(
         add_reading(state, totals, h, instant)
     elif combination is not None and combination.kind == GAINS:
         sample_with_gain(state, combination, h, instant)
-    elif combination is not None and combination.kind == BELIEFS:
-        add_samples(state, combination.evidence, h, instant)
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
     # The newest sample, which a filter of readings sends after this event.
@@ -442,8 +431,6 @@ def send(
             totals.offered[m, k] = totals.sent[h, k]
     elif combination is not None and combination.kind == PREDICTIONS:
         send_prediction(state, combination, m, h)
-    elif combination is not None and combination.kind == BELIEFS:
-        send_evidence(state, combination.evidence, m, h)
     else:
         # A copy: the sender's estimate changes while the message is under way.
         copy_state(state.size, state.pool_x, state.pool_root, m, state.xhat, state.root, h)
@@ -577,7 +564,7 @@ def combine_with_state(
 ) -> None:
     """Combine node ``h`` (index in ``state.nodes``) with its inbox at ``now`` (seconds), for
     filters that need the extra arrays of a CombinationState: consensus on predictions, constant
-    gains, belief propagation, and fusion with the best weight. Changes ``state.xhat[h]`` and
+    gains, and fusion with the best weight. Changes ``state.xhat[h]`` and
     ``root[h]``.
     """
     if combination.kind == PREDICTIONS:
@@ -587,8 +574,6 @@ def combine_with_state(
         add_consensus(state, combination, h)
     elif combination.kind == GAINS:
         combine_convex(state, h, max(0.0, 1.0 - received_weight))
-    elif combination.kind == BELIEFS:
-        absorb_evidence(state, combination.evidence, h, now)
     else:
         fuse_inbox(state, combination, h)
 

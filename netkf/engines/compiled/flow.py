@@ -31,7 +31,6 @@ from netkf.engines.compiled.event_loop import (
     WANT_TICKS,
     event_loop,
 )
-from netkf.engines.compiled.evidence import enlarge_evidence
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.origins import move_origin
 from netkf.engines.compiled.running_totals import Totals, empty_totals
@@ -479,8 +478,6 @@ class FlowRun:
             grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
             grown[: len(self._totals.offered)] = self._totals.offered
             self._totals.offered = grown
-        if self._combination is not None:
-            enlarge_evidence(self._combination.evidence, len(self._state.pool))
 
     def _enlarge_rows(self) -> None:
         """Make the buffer of event rows long enough for one more event."""

@@ -6,7 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.run import SlotRun, SlotTables, scratch_of, size_of
+from netkf.algorithms.kernels.run import (
+    ALL,
+    SlotRun,
+    SlotTables,
+    opposite_links,
+    scratch_of,
+    size_of,
+)
 from netkf.algorithms.records import Kernels, make_records
 from netkf.engines.compiled.slot_loop import (
     EXCHANGE,
@@ -39,7 +46,7 @@ class SlotFilters:
             setup.infos,
             setup.models,
             links=W,
-            messages=H,
+            messages=H + W if kernels.addressed else H,
             blocks=blocks,
             lanes=LANES,
         )
@@ -53,6 +60,7 @@ class SlotFilters:
             model=SlotTables(F=setup.F, root_Q=setup.root_Q),
             first=setup.links.first,
             sender=setup.links.sender,
+            opposite=opposite_links(setup.links.first, setup.links.sender),
             weight=setup.links.weight,
             y=np.zeros((1, 1, LANES)),
             H=np.zeros((1, 1, 1, LANES)),
@@ -70,6 +78,7 @@ class SlotFilters:
             first_y=0,
             first_H=0,
             count=0,
+            receiver=ALL,
             slot=0,
             phase=0,
             step=0,

@@ -97,6 +97,7 @@ class SlotSamples(NamedTuple):
 def exchange_of(kernels: Kernels) -> Any:
     """Return the kernel of one step of an exchange, composed of ``emit`` and ``absorb``."""
     emit, absorb, decides = kernels.emit, kernels.absorb, kernels.decides
+    addressed = kernels.addressed
 
     @kernel
     def exchange(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
@@ -110,7 +111,7 @@ def exchange_of(kernels: Kernels) -> Any:
                     if plan.uniform.shape[0] > 0:
                         store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
                 run.reading = h
-                emit(record, h, h, run)
+                emit(record, h, h + run.first[h] if addressed else h, run)
                 if decides:
                     store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
             if decides:
@@ -118,7 +119,7 @@ def exchange_of(kernels: Kernels) -> Any:
         if e != plan.stop:
             for h in range(nodes):
                 run.reading = h
-                fill_inbox(run, plan, b, s, e, h)
+                fill_inbox(run, plan, b, s, e, h, addressed)
                 absorb(record, h, run)
 
     return exchange
@@ -193,7 +194,9 @@ def slot_loop(kernels: Kernels) -> Any:
 
 
 @kernel
-def fill_inbox(run: SlotRun, plan: SlotPlan, b: int, s: int, e: int, h: int) -> None:
+def fill_inbox(
+    run: SlotRun, plan: SlotPlan, b: int, s: int, e: int, h: int, addressed: bool
+) -> None:
     """Write the messages that node ``h`` hears in step ``e`` of slot ``s`` into the inbox."""
     count, lanes = 0, run.lanes
     up, direction, sender, weight = plan.up, plan.direction, run.sender, run.weight
@@ -205,6 +208,10 @@ def fill_inbox(run: SlotRun, plan: SlotPlan, b: int, s: int, e: int, h: int) -> 
             # Messages and readings have the number of their sender.
             run.message[count], run.link[count], run.heard[count] = sender[m], m, sender[m]
             run.message_weight[count] = weight[m]
+            if addressed:
+                # Each node j has a payload for each link to it, and one more.
+                j, turned = sender[m], run.opposite[m]
+                run.message[count] = j + (turned if turned >= 0 else run.first[j + 1])
             count += 1
     run.count = count
 

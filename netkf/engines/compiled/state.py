@@ -69,12 +69,12 @@ sent, arrival : seconds
 """
 
 (CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT, BEST, INVERSE, GAINS,
- PREDICTIONS, BELIEFS) = range(12)  # fmt: skip
+ PREDICTIONS) = range(11)  # fmt: skip
 COMBINATIONS = (
     *("convex", "intersection", "swap", "shares", "readings", "sums", "none"),
-    *("best intersection", "inverse intersection", "constant gain", "predictions", "beliefs"),
+    *("best intersection", "inverse intersection", "constant gain", "predictions"),
 )
-"""The values of ``Filter.combination`` in the order of the constants CONVEX to BELIEFS."""
+"""The values of ``Filter.combination`` in the order of the constants CONVEX to PREDICTIONS."""
 
 SPECIAL = ("readings", "sums", *COMBINATIONS[BEST:])
 """Combinations whose state is not in a Simulation alone (Totals, History, CombinationState)."""
