@@ -11,8 +11,6 @@ Exponentials and their integrals are power series over a short step, doubled unt
 
 from __future__ import annotations
 
-import numpy as np
-
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import multiply_square
@@ -127,15 +125,6 @@ def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None
         for i in range(n):
             for j in range(n):
                 out[i, j] = product[i, j]
-
-
-def inverse_transition(A: FloatArray, gap: float) -> FloatArray:
-    """Return ``e^{-A gap}`` (n, n) for a ``gap`` in seconds, for one A (n, n) in Python: the same
-    bits as in kernels.
-    """
-    maps = np.empty((3, *A.shape))
-    fill_inverse_transition(A, gap, maps)
-    return np.asarray(maps[0])
 
 
 @kernel

@@ -1,28 +1,24 @@
-"""Exact errors of belief propagation along the messages of a run, in information form.
+"""Exact errors of belief propagation under clocks along the messages of a run, in information form.
 
 Readings ``y = H x + v`` that were put together say ``u = U x + s``, with the sums U and s of
-``H' R^-1 H`` and ``H' R^-1 v``. A node with the prior error e_0 that knows them has the error
-``e = (I - P U) e_0 - P s``, ``P = (P_0^-1 + U)^-1``, whatever was counted twice in U and s.
+``H' R^-1 H`` and ``H' R^-1 v``, whatever was counted twice. The prior is one more piece, with
+``s = -P_0^-1 e_0``, and a node that knows them has the error ``e = -P s``, ``P = U^-1``.
 
-Information that is kept is about the coordinates of a ``ModeFrame``, ``x = W e``, so that none of
-it is pulled back through a mode that decays; there the prior is one more piece of it, with
-``s = -P_0^-1 e_0``.
+Information is about the coordinates of a ``ModeFrame``, ``x = W e``, so that none of it is pulled
+back through a mode that decays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import Any
 
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.belief_propagation import ALL
-from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
+from netkf.algorithms.modes import flow_frame
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.arrivals import arrivals_by_step
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.observations import EstimatorObservations
 from netkf.theory.common.stacked_errors import StackedErrors
@@ -38,41 +34,22 @@ class BeliefRule(ErrorRule):
     covers; in the stack of errors it is a vector s, whose matrix is U.
     """
 
-    takes_messages = False
-
-    def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
-        """Take the errors at time 0 and, in slots, the messages of the run that arrived; each
-        estimate is copied as the prior of its node.
-        """
+    def __init__(self, scenario: Scenario, errors: StackedErrors) -> None:
+        """Take the errors at time 0; each estimate is the prior of its node."""
         super().__init__(scenario, errors)
-        algorithm: Any = scenario.filter.algorithm
-        self._keeps = not scenario.slotted or algorithm.memory == ALL
-        if self._keeps and errors.follows:
+        if errors.follows:
             raise TheoryError("the filters' plant is not the true one: messages follow the state")
-        self._steps = algorithm.steps
-        self._arrivals = arrivals_by_step(scenario, run) if scenario.slotted else {}
         self._received: dict[int, dict[int, float]] = {
             estimator: {} for estimator in range(errors.estimators)
         }
         self._evidence: set[Hashable] = set()
-        self._frame = self._make_frame()
+        self._frame = flow_frame(scenario.belief[0])
         self._W = self._frame.basis
         for estimator in range(errors.estimators):
-            if not self._keeps:
-                errors.copy(estimator, _prior_name(estimator), estimator)
-                continue
             # S^-1 W for the root S of P_0.
             Z = np.linalg.solve(errors.roots[estimator], self._W)
             weighted = np.linalg.solve(errors.roots[estimator], errors.stack.form(estimator))
             self._put_evidence(_prior_name(estimator), Z.T @ Z, -Z.T @ weighted)
-
-    def _make_frame(self) -> ModeFrame:
-        """Return the coordinates of evidence."""
-        if not self._keeps:
-            return still_frame(self.errors.n)
-        if self.scenario.slotted:
-            return slot_frame(self.scenario.slot_belief[0])
-        return flow_frame(self.scenario.belief[0])
 
     def _put_evidence(self, name: Hashable, U: FloatArray, s: FloatArray) -> None:
         """Set an item of evidence ``name`` in the stack of errors: its information U (n, n), and
@@ -117,25 +94,10 @@ class BeliefRule(ErrorRule):
             U = stack.matrices[stack.index(name)]
             self._put_evidence(name, back.T @ U @ back, back.T @ stack.form(name))
 
-    def _begin_slot(self) -> None:
-        """Prepare a slot: predict the evidence (U, s) that is kept from earlier slots; or, if the
-        filter keeps none, drop it and take the present estimates as priors.
-        """
-        if self._keeps:
-            self._W = self._W @ self._frame.forward
-            self._predict_evidence(self._frame.back)
-            return
-        self._drop_evidence(list(self._evidence))
-        for estimator, received in self._received.items():
-            received.clear()
-            self.errors.copy(estimator, _prior_name(estimator), estimator)
-
     def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Add the readings of ``time`` (seconds, or the slot) to the nodes' own evidence, and
-        update the beliefs of the nodes that read. Called by the replay at every time of readings.
+        """Add the readings of ``time`` (seconds) to the nodes' own evidence, and update the beliefs
+        of the nodes that read. Called by the replay at every time of readings.
         """
-        if self.scenario.slotted:
-            self._begin_slot()
         columns = self.errors.reading_noises(observations)
         for estimator, observation in observations.items():
             # A reading adds U = H' R^-1 H and, in errors, s = H' R^-1 v.
@@ -156,23 +118,11 @@ class BeliefRule(ErrorRule):
         U, s = self._sum_evidence(
             [_own_name(estimator), *((estimator, j) for j in self._received[estimator])]
         )
-        if self._keeps:
-            prior, stack = _prior_name(estimator), errors.stack
-            spread = np.linalg.cholesky(U + stack.matrices[stack.index(prior)])
-            root = self._W @ scipy.linalg.solve_triangular(spread, eye, lower=True).T
-            s = scipy.linalg.solve_triangular(spread, s + stack.form(prior), lower=True)
-            errors.stack.put(estimator, -root @ s)
-            errors.roots[estimator] = triangular_root(root)
-            return
-        # P = (P_prior^-1 + U)^-1 = S (I + S' U S)^-1 S', with P_prior = S S' that may be singular.
-        S = errors.roots[_prior_name(estimator)]
-        spread = np.linalg.cholesky(eye + S.T @ U @ S)
-        root = scipy.linalg.solve_triangular(spread, S.T, lower=True).T
-        P = root @ root.T
-        # e = P (P_prior^-1 e_prior - s) = (I - P U) e_prior - P s
-        errors.stack.put(
-            estimator, (eye - P @ U) @ errors.stack.form(_prior_name(estimator)) - P @ s
-        )
+        prior, stack = _prior_name(estimator), errors.stack
+        spread = np.linalg.cholesky(U + stack.matrices[stack.index(prior)])
+        root = self._W @ scipy.linalg.solve_triangular(spread, eye, lower=True).T
+        s = scipy.linalg.solve_triangular(spread, s + stack.form(prior), lower=True)
+        errors.stack.put(estimator, -root @ s)
         errors.roots[estimator] = triangular_root(root)
 
     def _evidence_for(self, sender: int, receiver: int) -> tuple[FloatArray, FloatArray]:
@@ -182,24 +132,6 @@ class BeliefRule(ErrorRule):
         """
         others = [(sender, j) for j in self._received[sender] if j != receiver]
         return self._sum_evidence([_own_name(sender), *others])
-
-    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Pass the messages of all steps of exchange number ``phase`` of a ``slot`` that arrived;
-        changes the evidence and the beliefs of all nodes. Called by the replay for each exchange of
-        a slot.
-        """
-        estimators = self.errors.estimators
-        no_arrivals = np.zeros((estimators, estimators))
-        for step in range(self._steps):
-            arrived = self._arrivals.get((slot, phase, step), no_arrivals)
-            pairs = [(i, j) for i, j in np.argwhere(arrived).tolist()]
-            # Contents first: all messages of a step are sent at the same time.
-            contents = {(i, j): self._evidence_for(j, i) for i, j in pairs}
-            for (i, j), (U, s) in contents.items():
-                self._put_evidence((i, j), U, s)
-                self._received[i][j] = slot
-        for estimator in range(estimators):
-            self._update_belief(estimator)
 
     def send(self, messages: Sequence[SentMessage]) -> None:
         """Store the contents of each message that arrives later. Called by the replay when messages
@@ -244,11 +176,7 @@ def _own_name(estimator: int) -> Hashable:
 def error_rule(
     scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
 ) -> ErrorRule:
-    """Return the rule by which the filter by belief propagation uses the readings and messages of a
-    run. The replay of the run, which computes its exact errors from its events, calls the rule at
-    each event; it changes ``errors``, the stacked errors of all nodes.
-
-    ``messages`` are those of the run that arrived (none in slots, where the rule gets them slot by
-    slot).
+    """Return the rule of belief propagation under clocks for ``errors``, the stacked errors of all
+    nodes.
     """
-    return BeliefRule(scenario, errors, run)
+    return BeliefRule(scenario, errors)
