@@ -88,9 +88,11 @@ def _simulate(
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
             return _run_by_run(scenario, workspace, sources, replicas, rows)
         draws = BatchDraws(scenario, seed, replicas)
-        # simulate_batch() handles neither state outside the Simulation (SPECIAL) nor moves of the
-        # origin, which Python does run by run.
+        # simulate_batch() handles neither state outside the Simulation (SPECIAL) nor conserved sums
+        # nor moves of the origin, which Python does run by run.
+        clocked = workspace.clocked
         alone = scenario.node_filter.combination in SPECIAL
+        alone = alone or (clocked is not None and clocked.conserves)
         if alone or (len(draws.paths.frame_times) and not is_immediate(scenario)):
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
         return _all_at_once(scenario, workspace, draws)

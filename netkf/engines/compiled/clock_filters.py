@@ -101,6 +101,11 @@ class ClockFilters:
         arrays = self.records.arrays
         return arrays["xhat"][0, ..., 0], arrays["root"][0, ..., 0]
 
+    @property
+    def conserves(self) -> bool:
+        """Whether exchanges conserve sums over all nodes."""
+        return bool(self._at_start)
+
     def sums(self) -> dict[str, tuple[float, float]]:
         """Return by name the sums over all nodes that exchanges conserve, at the start and at the
         last sample.

@@ -34,7 +34,6 @@ from netkf.engines.compiled.combination_state import (
 from netkf.engines.compiled.increments import predict_with_increments
 from netkf.engines.compiled.instant_updates import copy_state, use_instant
 from netkf.engines.compiled.message_queue import pop, push, put, release, sort_indices, take
-from netkf.engines.compiled.running_totals import Totals, add_reading, hear, offer_round
 from netkf.engines.compiled.state import (
     AFTER_READINGS,
     CONVEX,
@@ -69,17 +68,13 @@ NEVER = math.inf
 @kernel
 def event_loop(
     state: Simulation,
-    totals: Totals | None,
     combination: CombinationState | None,
 ) -> int:
     """Simulate the run ``state`` until the loop needs something from Python; return the request
-    (WANT_... or DONE), after which Python calls the loop again. ``totals`` (running sums)
-    and ``combination`` (see CombinationState) hold the extra state that some filters need, None for
-    the others; all of these are changed.
+    (WANT_... or DONE), after which Python calls the loop again.
+    ``combination`` (see CombinationState) holds the extra state that some filters need, None for
+    the others.
     """
-    # With running sums a sender must be predicted even if all of its messages are lost, since its
-    # totals grow.
-    absorbs_at_once = totals is None
     while True:
         # Check first that the event has everything it needs: if not, nothing has changed, and the
         # next call finds the same event again.
@@ -89,26 +84,26 @@ def event_loop(
             return request
         seek_piece(state, now)
         # Participants are predicted first.
-        lost = event == ON_TICK and absorbs_at_once and is_lost(state)
+        lost = event == ON_TICK and is_lost(state)
         predict_participants(state, combination, event, lost, now)
         if event == ON_TICK:
-            on_tick(state, totals, combination, now)
+            on_tick(state, combination, now)
             # Absorptions come next, unless there are other events at this instant.
-            if absorbs_at_once and ends_instant(state, now):
-                absorb_messages(state, totals, combination, now)
+            if ends_instant(state, now):
+                absorb_messages(state, combination, now)
         elif event == ON_ABSORB:
-            on_absorb(state, totals, combination, now)
+            on_absorb(state, combination, now)
         elif event == ON_SENSE:
             on_sense(state, now)
         elif event == ON_SAMPLE:
-            on_sample(state, totals, combination, now)
+            on_sample(state, combination, now)
         elif event == ON_DELIVER:
             on_deliver(state, now)
         elif event == ON_REBASE:
             # Python moves the origin and goes to the next frame.
             return WANT_REBASE
         # The sample is stored, but there is no space for another one.
-        elif not on_probe(state, totals):
+        elif not on_probe(state):
             return WANT_SAMPLES
 
 
@@ -334,13 +329,12 @@ def on_sense(state: Simulation, now: float) -> None:
 @kernel
 def on_sample(
     state: Simulation,
-    totals: Totals | None,
     combination: CombinationState | None,
     now: float,
 ) -> None:
     """Update a node with all its samples of the next instant, ``now`` (seconds), and advance
     ``state.instant_at``. Changes the row of ``state.xhat`` and ``state.root`` of that node, its
-    newest ``reading``, and what ``totals`` or ``combination`` (None if unused) hold of
+    newest ``reading``, and what ``combination`` (None if unused) holds of
     it.
     """
     instants, instant = state.instants, state.instant_at
@@ -350,10 +344,7 @@ def on_sample(
         if instants.node[s] != last_node:
             last_node = instants.node[s]
             record_event(state, now, SENSE, last_node, -1, -1)
-    # Running sums weight the reading, and filters of readings remember it.
-    if totals is not None:
-        add_reading(state, totals, h, instant)
-    elif combination is not None and combination.kind == GAINS:
+    if combination is not None and combination.kind == GAINS:
         sample_with_gain(state, combination, h, instant)
     else:
         use_instant(state, instant, state.root, state.xhat, h, 1.0)
@@ -363,12 +354,10 @@ def on_sample(
 
 
 @kernel
-def on_tick(
-    state: Simulation, totals: Totals | None, combination: CombinationState | None, now: float
-) -> None:
+def on_tick(state: Simulation, combination: CombinationState | None, now: float) -> None:
     """Handle the next tick of a clock at ``now`` (seconds), or a transmission after a sample: send
     one message on each directed link of its entity (a link, a directed link or a node with a
-    clock), and advance ``state.tick_at``. ``totals`` and ``combination``, None if unused, have the
+    clock), and advance ``state.tick_at``. ``combination``, None if unused, has the
     contents of messages for some filters.
     """
     ticks, nodes, k = state.ticks, state.nodes, state.tick_at
@@ -378,10 +367,6 @@ def on_tick(
     if state.clock_kind != AFTER_READINGS:
         record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
     state.tick_at += 1
-    # Filters of running sums add a share to their totals first. A node without receivers does not
-    # transmit.
-    if totals is not None and not offer_round(state, totals, i, now):
-        return
     # A node's clock makes one transmission, which each receiver hears or loses.
     if state.clock_kind >= NODES:
         record_event(state, now, TRANSMIT, nodes[i].id, -1, nodes[i].sent)
@@ -389,13 +374,12 @@ def on_tick(
     # Outcomes of a tick lie one after the other in the order of its directed links.
     first = state.first_delay + ticks.first_outcome[k] - entity.first
     for m in range(entity.first, entity.after):
-        send(state, totals, combination, state.outgoing[m], ticks.delay[first + m], now)
+        send(state, combination, state.outgoing[m], ticks.delay[first + m], now)
 
 
 @kernel
 def send(
     state: Simulation,
-    totals: Totals | None,
     combination: CombinationState | None,
     w: int,
     delay: float,
@@ -404,7 +388,7 @@ def send(
     """Send one message on directed link ``w`` (index in ``state.directions``) at ``now`` (seconds):
     record it, copy what it carries from its sender into a free message of ``state.pool``, and
     deliver it at once or put it on the heap. ``delay`` (seconds) is LOST or nan if it is lost.
-    ``totals`` and ``combination``: None if unused.
+    ``combination``: None if unused.
     """
     direction, pool = state.directions[w], state.pool
     number, h = direction.messages, direction.sender
@@ -424,12 +408,7 @@ def send(
     m = take(state)
     message = pool[m]
     message.direction, message.number, message.sent = w, number, now
-    # The total after this round; rounds are numbered from 0.
-    if totals is not None:
-        message.tag = totals.rounds[h] - 1
-        for k in range(totals.sent.shape[1]):
-            totals.offered[m, k] = totals.sent[h, k]
-    elif combination is not None and combination.kind == PREDICTIONS:
+    if combination is not None and combination.kind == PREDICTIONS:
         send_prediction(state, combination, m, h)
     else:
         # A copy: the sender's estimate changes while the message is under way.
@@ -470,18 +449,17 @@ def ends_instant(state: Simulation, now: float) -> bool:
 @kernel
 def absorb_messages(
     state: Simulation,
-    totals: Totals | None,
     combination: CombinationState | None,
     now: float,
 ) -> None:
     """Let all nodes in ``state.waiting``, which have messages of this instant ``now`` (seconds),
     absorb these: predict each node, update its estimate in ``state.xhat`` and ``root``, and empty
-    its inbox. ``totals``, ``combination``: extra state of the filter, None if unused.
+    its inbox. ``combination``: extra state of the filter, None if unused.
     """
     sort_indices(state.waiting, state.receivers)
     while state.receivers > 0:
         predict_node(state, combination, state.waiting[state.absorbing], now)
-        on_absorb(state, totals, combination, now)
+        on_absorb(state, combination, now)
 
 
 @kernel
@@ -521,14 +499,13 @@ def arrive(state: Simulation, m: int, now: float) -> None:
 @kernel
 def on_absorb(
     state: Simulation,
-    totals: Totals | None,
     combination: CombinationState | None,
     now: float,
 ) -> None:
     """Let the next node, ``state.waiting[state.absorbing]``, absorb all messages of this instant
     ``now`` (seconds), in the order of senders: combine its estimate with theirs in the way of its
     filter. Changes its estimate in ``state.xhat`` and ``root``, empties its inbox, and advances
-    ``absorbing``. ``totals``, ``combination``: extra state of the filter, None if
+    ``absorbing``. ``combination``: extra state of the filter, None if
     unused.
     """
     pool, h = state.pool, state.waiting[state.absorbing]
@@ -538,9 +515,7 @@ def on_absorb(
     while m != -1:
         oldest, m = max(oldest, now - pool[m].sent), pool[m].next
     oldest = snapped(oldest, state.per_second)
-    if totals is not None:
-        hear(state, totals, h, now)
-    elif combination is not None:
+    if combination is not None:
         combine_with_state(state, combination, h, now)
     else:
         combine(state, h, now)
@@ -663,20 +638,11 @@ def intersect(state: Simulation, h: int, own: float, total: float) -> None:
 
 
 @kernel
-def on_probe(state: Simulation, totals: Totals | None) -> bool:
-    """Store a sample of all nodes in ``state.buffer`` at a time at which the scenario asks for one,
-    and for push-sum the terms of the total weight, which exchanges conserve (``totals`` is not
-    None). Return False if there is no space for another one.
+def on_probe(state: Simulation) -> bool:
+    """Store a sample of all nodes in ``state.buffer`` at a time at which the scenario asks for
+    one. Return False if there is no space for another one.
     """
     store_sample(state, state.run, 0, state.samples)
-    # Terms of the weight of the network: held by nodes, sent, and (to subtract) heard.
-    if totals is not None:
-        buffer, count, k = state.buffer, len(state.nodes), state.samples
-        for h in range(count):
-            buffer.terms[k, h] = totals.weight[h]
-            buffer.terms[k, count + h] = totals.sent[h, 0]
-        for w in range(len(state.directions)):
-            buffer.terms[k, 2 * count + w] = totals.heard[w, 0]
     return count_sample(state)
 
 

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.models import FlowModel
 from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.agenda import advance_alone, is_immediate
@@ -33,7 +32,6 @@ from netkf.engines.compiled.event_loop import (
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.origins import move_origin
-from netkf.engines.compiled.running_totals import Totals, empty_totals
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.schedule import ReadingsSchedule, Window
@@ -42,7 +40,6 @@ from netkf.engines.compiled.state import (
     CLOCKS,
     COMBINATIONS,
     SPECIAL,
-    SUMS,
     Filters,
     Instants,
     PathBlock,
@@ -59,7 +56,6 @@ from netkf.engines.compiled.state import (
 from netkf.engines.compiled.ticks import schedule
 from netkf.engines.compiled.truth import CompleteStates, PathStates, States
 from netkf.engines.compiled.visits import Visits, empty_visits
-from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
 from netkf.plants.paths import BLOCK
@@ -207,12 +203,9 @@ class Workspace:
         size, n = self._start.xhat.shape
         self._pool = empty_pool(FIRST_MESSAGES, n)
         self._probes = np.array(scenario.times, dtype=np.float64)
-        kind = _kind_of(scenario)
-        # Terms of conserved sums: weights held, totals sent and totals heard.
-        terms = 2 * size + len(self._senders.directions) if kind == SUMS else 0
         # Space for many samples, within a budget of floats.
         samples = max(1, min(MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS // (size * n * n)))
-        self._buffer = empty_samples((1, samples, size, n), terms)
+        self._buffer = empty_samples((1, samples, size, n))
         self._visits: Visits | None = None
         self._scratch: tuple[Any, ...] = ()
         # Code compiled for each n makes filters that combine estimates 1.5 times faster. It does
@@ -347,11 +340,10 @@ def ticks_of(window: Window) -> TickArrays:
 
 
 def empty_samples(
-    shape: tuple[int, int, int, int], terms: int = 0, make: Callable[..., Any] = np.zeros
+    shape: tuple[int, int, int, int], make: Callable[..., Any] = np.zeros
 ) -> SampleBuffer:
-    """Return space for B samples of N filters in R runs of n states, ``shape`` being (R, B, N, n),
-    and for ``terms`` terms of conserved sums (push-sum; 0 for other filters). ``make`` (np.zeros or
-    np.empty) creates the arrays of estimates and covariances.
+    """Return space for B samples of N filters in R runs of n states, ``shape`` being (R, B, N, n).
+    ``make`` (np.zeros or np.empty) creates the arrays of estimates and covariances.
     """
     runs, count, _, n = shape
     return SampleBuffer(
@@ -360,7 +352,6 @@ def empty_samples(
         rows=np.zeros((runs, count), dtype=np.int64),
         counts=np.zeros((runs, count, len(schema.KINDS)), dtype=np.int64),
         piece=np.zeros((runs, count), dtype=np.int64),
-        terms=np.zeros((count, terms)),
     )
 
 
@@ -387,9 +378,8 @@ class FlowRun:
         self._visits = workspace.visits() if is_immediate(scenario) else None
         self._clocked = workspace.clocked
         if self._clocked is not None:
-            self._totals = self._combination = None
+            self._combination = None
             return
-        self._totals = _make_totals(scenario, self._state)
         self._combination = combination_state_of(scenario, self._state)
 
     def to_the_end(self) -> str:
@@ -426,7 +416,7 @@ class FlowRun:
             return advance_alone(self._state, self._visits)
         if self._scenario.node_filter.combination not in SPECIAL:
             return run_alone(self._state)
-        return int(event_loop(self._state, self._totals, self._combination))
+        return int(event_loop(self._state, self._combination))
 
     def _fulfil(self, request: int) -> None:
         """Fulfil a ``request`` (WANT_...) of the event loop, before the loop goes on: put the next
@@ -463,7 +453,7 @@ class FlowRun:
             self._clocked.shift(self._scenario, state, offset)
             state.frame_at = k + 1
             return
-        move_origin(self._scenario, state, self._totals, self._combination, k, offset)
+        move_origin(self._scenario, state, self._combination, k, offset)
         state.frame_at = k + 1
 
     def _enlarge_pool(self) -> None:
@@ -473,11 +463,6 @@ class FlowRun:
         add_messages(self._state, self._state.most_messages)
         if self._clocked is not None:
             self._clocked.grow(len(self._state.pool))
-        # ``offered`` has a row for each message: the total that it carries.
-        if self._totals is not None:
-            grown = np.zeros((len(self._state.pool), self._totals.sent.shape[1]))
-            grown[: len(self._totals.offered)] = self._totals.offered
-            self._totals.offered = grown
 
     def _enlarge_rows(self) -> None:
         """Make the buffer of event rows long enough for one more event."""
@@ -534,34 +519,4 @@ class FlowRun:
         finite = record_samples(*run, samples, pass_rows_on)
         if self._clocked is not None:
             self._recorder.sums = self._clocked.sums()
-        elif self._totals is not None:
-            self._recorder.sums = _sums(buffer.terms[last[0]], self._totals.receivers)
         return finite
-
-
-def _sums(terms: FloatArray, receivers: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Return the total weight of push-sum at the start and now, as {"weight": (start, now)}: the
-    weights that nodes hold, plus the totals sent, minus the totals heard.
-
-    Nodes send the total of all shares of their weight so far, so that a later message makes up for
-    a lost one; what was sent and not heard yet is under way. The sum stays N if none is lost for
-    good, which the trace reports.
-
-    ``terms`` (2 N + W,) are these for N nodes, N nodes and W directed links; ``receivers`` (N,) is
-    the number of nodes that hear each node.
-    """
-    count = len(receivers)
-    # A total counts once for each receiver of its node.
-    sent = np.repeat(terms[count : 2 * count], receivers)
-    # fsum: rounding of this sum would look like a loss of weight.
-    now = math.fsum([*terms[:count].tolist(), *sent.tolist(), *(-terms[2 * count :]).tolist()])
-    return {"weight": (float(count), now)}
-
-
-def _make_totals(scenario: Scenario, state: Simulation) -> Totals | None:
-    """Return the arrays of running sums, or None for filters that send none."""
-    if scenario.node_filter.combination != "sums":
-        return None
-    receivers = np.array([info.receivers for info in scenario.node_infos], dtype=np.int64)
-    model: FlowModel = scenario.models[0]
-    return empty_totals(state, receivers, model.groups)

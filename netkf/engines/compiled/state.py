@@ -64,20 +64,20 @@ MESSAGE = _record_type("direction number next order tag", "sent arrival")
 direction, number : directed link, and number on it
 next : next message in the same inbox, or among the free ones
 order : number of the message on the heap, which orders simultaneous arrivals
-tag : instant of the reading that is sent, or number of a running sum
+tag : instant of the reading that is sent
 sent, arrival : seconds
 """
 
-(CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SUMS, SILENT, BEST, INVERSE, GAINS,
- PREDICTIONS) = range(11)  # fmt: skip
+(CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SILENT, BEST, INVERSE, GAINS,
+ PREDICTIONS) = range(10)  # fmt: skip
 COMBINATIONS = (
-    *("convex", "intersection", "swap", "shares", "readings", "sums", "none"),
+    *("convex", "intersection", "swap", "shares", "readings", "none"),
     *("best intersection", "inverse intersection", "constant gain", "predictions"),
 )
 """The values of ``Filter.combination`` in the order of the constants CONVEX to PREDICTIONS."""
 
-SPECIAL = ("readings", "sums", *COMBINATIONS[BEST:])
-"""Combinations whose state is not in a Simulation alone (Totals, History, CombinationState)."""
+SPECIAL = ("readings", *COMBINATIONS[BEST:])
+"""Combinations whose state is not in a Simulation alone (History, CombinationState)."""
 
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")
@@ -217,7 +217,6 @@ class SampleBuffer(Struct):
     xhat, P : (R, B, N, n) and (R, B, N, n, n)
     rows, counts : rows (R, B) of events, or events by kind (R, B, len(KINDS)), before each sample
     piece : piece (R, B) of the path that each sample is in
-    terms : (B, T), terms of conserved sums, for one run
     """
 
     xhat: FloatArray
@@ -225,7 +224,6 @@ class SampleBuffer(Struct):
     rows: IntArray
     counts: IntArray
     piece: IntArray
-    terms: FloatArray
 
 
 class Simulation(Struct):
