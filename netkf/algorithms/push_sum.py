@@ -540,7 +540,7 @@ class PushSum(Filter):
 
     def stopped(self, state: Any) -> bool:
         """Return True if the node's estimate of the network, G^(i) and N^(i), is frozen."""
-        return hasattr(state, "stopped") and state.stopped < NEVER_STOPPED
+        return hasattr(state, "stopped") and bool(state.stopped < NEVER_STOPPED)
 
     def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
         """Return the weight w and the number n~ of a node by name, whose sums over all nodes are 1
