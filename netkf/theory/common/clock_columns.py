@@ -37,8 +37,8 @@ SPARE = 8
 def has_clock_columns(scenario: Scenario) -> bool:
     """Return True if the errors of a scenario under clocks follow from the verbs of its filter."""
     kernels = compiled_kernels(scenario.node_filter, clocked=True)
-    # The past of nodes would have to grow here, too.
-    if kernels is None or not kernels.affine or kernels.remembers:
+    # The past of nodes would have to grow here, too, and each link have a payload.
+    if kernels is None or not kernels.affine or kernels.remembers or kernels.addressed:
         return False
     if not commutes(scenario.node_filter):
         return False
