@@ -323,8 +323,8 @@ class SwapsTooMuch(Gossip):
 
     def absorb(self, state, messages, exchange):
         for message in messages:
-            xhat, root = message.payload
-            state = state._replace(xhat=xhat, root=1.4 * root)
+            sent = message.payload
+            state = state._replace(xhat=sent.xhat, root=1.4 * sent.root)
         return state
 
 
