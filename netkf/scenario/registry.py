@@ -226,6 +226,9 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
         for name in dir(cls)
         if getattr(getattr(cls, name, None), "__isabstractmethod__", False)
     )
+    # A filter has kernels, or says in Python what it does with messages.
+    if family == "filter" and getattr(cls, "kernels", None) is None:
+        missing += ["absorb"] * (vars(base)["absorb"] is getattr(cls, "absorb", None))
     if missing:
         raise ScenarioError(
             "kind", f"must define {', '.join(missing)}", kind, "write what the contract asks for"

@@ -713,6 +713,7 @@ CLASSES = [
     ("class-clock", clock("refusal_things:Plain"), f"{C}.kind", "subclass of netkf's LinkClock"),
     ("class-loss", loss("refusal_things:Plain"), f"{L}.kind", "subclass of netkf's Loss"),
     ("class-delay", delay("refusal_things:Plain"), f"{D}.kind", "subclass of netkf's Delay"),
+    ("abstract-filter", custom("netkf.algorithms.filter:Filter"), "filter.kind", "filter:Filter'"),
     ("abstract-graph", graph("netkf.network.graphs:Graph"), f"{G}.kind", "graphs:Graph'"),
     ("abstract-clock", clock("netkf.network.clocks:LinkClock"), f"{C}.kind", "clocks:LinkClock'"),
     ("abstract-loss", loss("netkf.network.channels:Loss"), f"{L}.kind", "channels:Loss'"),

@@ -92,6 +92,7 @@ MISTAKES = {
                      r"F\.absorb \(FILE, line 6\) called exit"),
     "it cannot be made": ("FILTER", f"def __post_init__(self): raise RuntimeError('no')\n{SAME}",
                           r"F could not be made \(RuntimeError: no; FILE, line 6\)"),
+    "nothing is defined": ("FILTER", "pass", "must define absorb"),
     "h returns nothing": ("SENSOR", "def h(self, x, node): pass\n"
                           "def jacobian(self, x, node): return np.eye(1)",
                           rf"F\.h \(FILE, line 6\) {NO_RESULT}"),

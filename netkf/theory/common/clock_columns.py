@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class ClockColumns(ErrorColumns):
         self._readings: dict[tuple[float, int], tuple[FloatArray, FloatArray]] = {}
         self._sent: dict[tuple[int, int, int], tuple[int, float, int]] = {}
         self._free: list[int] = []
-        plant = scenario.plant
+        plant = cast(Any, scenario.plant)
         self._transitions = Transitions(plant.A, plant.B)
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._records, self._payload = self._make(self._x.shape[1], 64)
@@ -185,7 +185,8 @@ class ClockColumns(ErrorColumns):
         scenario, run = self._scenario, self._run
         self._samples = timed_observations(scenario, run)
         self._index = scenario.topology.index
-        self._broadcasts = scenario.network.activation.at in ("nodes", "readings")
+        clock = cast(Any, scenario.network.activation)
+        self._broadcasts = clock.at in ("nodes", "readings")
         self._delivered = self._arrivals()
         log, k = run.log, 0
         times = log["t"].tolist()
@@ -227,7 +228,8 @@ class ClockColumns(ErrorColumns):
     @property
     def _inboxes(self) -> dict[int, list[tuple[int, float, int, int]]]:
         """Messages of this instant by receiver: payload, time of sending, number, sender."""
-        return self.__dict__.setdefault("_inbox", {})
+        found: dict[int, list[tuple[int, float, int, int]]] = self.__dict__.setdefault("_inbox", {})
+        return found
 
     def _move_truth(self, time: float) -> None:
         """Move the true state to ``time``, with a column for each noise of the plant."""
