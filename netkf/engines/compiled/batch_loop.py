@@ -104,8 +104,8 @@ def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, resumed: 
     """
     # The batch comes as an array, since numba dispatches on arrays much faster than on structs.
     if run == ALONE:
-        # No running sums or combination: filters that need these have a loop of their own.
-        return event_loop(state, None, None)
+        # No combination: filters that need one have a loop of their own.
+        return event_loop(state, None)
     return simulate_from(state, struct_at(batch_memory, BatchArrays), run, resumed)
 
 
@@ -124,7 +124,7 @@ def simulate_from(state: Simulation, batch: BatchArrays, run: int, resumed: bool
             begin(state, batch, run)
         resumed, request = False, -1
         while request != DONE:
-            request = event_loop(state, None, None)
+            request = event_loop(state, None)
             if request == WANT_MESSAGES:
                 return run
         finish(state, batch, run)
