@@ -16,7 +16,6 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
-from netkf.theory.common.clock_columns import ClockColumns, has_clock_columns
 from netkf.theory.common.columns import ErrorColumns, SlotColumns, has_columns
 from netkf.theory.common.error_rules import ErrorRule, SentMessage
 from netkf.theory.common.evidence import NONLINEAR
@@ -88,9 +87,6 @@ def _begin_replay(
         if has_columns(scenario):
             columns = SlotColumns(scenario, run)
             return columns, columns.replay()
-    elif has_clock_columns(scenario):
-        clocked = ClockColumns(scenario, run)
-        return clocked, clocked.replay()
     require_known_filter(scenario)
     errors = StackedErrors(scenario, len(nodes_by_estimator(scenario)))
     replay = _replay_slots if scenario.slotted else _replay_instants
