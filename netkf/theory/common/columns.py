@@ -211,6 +211,12 @@ class SlotColumns(ErrorColumns):
         self._fit(columns)
         blocks = len(self._filters.records.arrays["xhat"])
         width = blocks * LANES
+        # The origin follows the true state, so that errors on unstable plants keep their digits.
+        framed = self._scenario.filters_know_the_truth
+        state = np.pad(self._x, ((0, 0), (0, width - columns))).reshape(n, 1, blocks, LANES)
+        local = np.ascontiguousarray(np.moveaxis(state, 2, 0).swapaxes(1, 2))
+        if framed and setup.algorithm.predicts:
+            self._x[:] = 0.0
         y = np.zeros((setup.estimators, setup.p, width))
         H = np.zeros((1, 1, setup.estimators, setup.p, n, LANES))
         for h, observation in observations.items():
@@ -231,18 +237,20 @@ class SlotColumns(ErrorColumns):
         self._filters.simulate(
             np.ascontiguousarray(y),
             H,
-            _no_samples(setup, blocks, self._filters),
+            _no_samples(local, blocks, self._filters),
             first=slot,
             sensed=~nothing,
             exchanged=np.array([algorithm.talks and slot >= algorithm.first_slot]),
             sample=np.full(1, -1),
-            rebased=nothing,
+            rebased=~nothing if framed else nothing,
             up=np.ascontiguousarray(np.broadcast_to(up[None, None, :, :, None], shape)),
             sent=np.zeros((0,) * 5, dtype=np.uint8),
             uniform=np.zeros((0,) * 5),
             begin=WHOLE,
             stop=WHOLE,
         )
+        if framed:
+            self._x[:] = 0.0
 
     def _matrices(self) -> dict[str, FloatArray]:
         """Return all arrays of the filters as matrices (entries, C), by name."""
@@ -267,11 +275,11 @@ class SlotColumns(ErrorColumns):
             array[:] = np.moveaxis(full.reshape(shape), -2, 0)
 
 
-def _no_samples(setup: SlotSetup, blocks: int, filters: SlotFilters) -> SlotSamples:
-    """Return room for no sample."""
-    nothing, states = np.zeros((1, 0, 1)), np.zeros((blocks, 1, setup.n, LANES))
+def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSamples:
+    """Return room for no sample, with the true states (B, 1, n, L) of the slot."""
+    nothing = np.zeros((1, 0, 1))
     return SlotSamples(
-        nothing, nothing, nothing, nothing, states, states, False, np.zeros((blocks, LANES)),
+        nothing, nothing, nothing, nothing, local, local, False, np.zeros((blocks, LANES)),
         *filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
     )  # fmt: skip
 
