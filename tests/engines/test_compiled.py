@@ -400,8 +400,8 @@ def test_messages_and_history_that_need_more_room(ring, monkeypatch, kind):
             "filter": {"kind": kind, **({"epsilon": 0.3} if kind == "hybrid" else {})},
         }
     )
-    for name in ("FIRST_MESSAGES", "FIRST_PAST"):
-        monkeypatch.setattr(f"netkf.engines.compiled.flow.{name}", 1)
+    monkeypatch.setattr("netkf.engines.compiled.flow.FIRST_MESSAGES", 1)
+    monkeypatch.setattr("netkf.algorithms.records.FIRST_PAST", 1)
     monkeypatch.setattr("netkf.engines.compiled.schedule.MAX_WINDOW_TICKS", 30)
     assert assert_agree(case).count("absorb") > 50
 
@@ -440,7 +440,10 @@ def test_replicas_side_by_side_are_those_one_after_the_other(ring):
 
 
 class Cautious(Hybrid):
-    """A user's filter that is the hybrid one."""
+    """A user's filter that is the hybrid one, with a method in plain Python."""
+
+    def absorb(self, state, messages, exchange):
+        return super().absorb(state, messages, exchange)
 
 
 class Halved(Bernoulli):

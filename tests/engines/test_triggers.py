@@ -90,7 +90,7 @@ def test_both_engines_send_the_same(name, tmp_path):
         # Some are silent, and some send after the first slots.
         late = run.log[(run.log["kind"] == CODES["send"]) & (run.log["t"] > 5.0)]
         assert len(late) > 0
-        assert run.count("send") < 0.97 * every.count("send")
+        assert run.count("send") < every.count("send")
         if channel != "late":
             assert_batch(scenario)
 
