@@ -103,7 +103,6 @@ class Kernels:
 
 FIRST_PAST = 16
 """Past events of a node for which there is room at first."""
-ESTIMATE = ("xhat", "root")
 _classes: dict[tuple[str, ...], Any] = {}
 
 

@@ -18,11 +18,11 @@ for y and H, so that the noise of each row has variance 1 and rows are used one 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.kernels.estimates import reflect_column, rotate, transform_root
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import (
@@ -31,18 +31,13 @@ from netkf.linalg.lanes import (
     Lanes,
     aligned,
     load,
-    magnitude,
-    root_of,
     scatter,
     select,
     spread,
     store,
-    with_sign,
 )
-from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
+from netkf.linalg.local import local_lanes_vector
 from netkf.linalg.structs import Size, sized
-
-TINY = 1e-290  # below any squared length of a row that counts, yet above underflow
 
 
 class SlotNodes(NamedTuple):
@@ -209,35 +204,6 @@ def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatAr
     return np.ascontiguousarray(whitened[:, 0]), np.ascontiguousarray(whitened[:, 1:])
 
 
-def block_of_reading(y: FloatArray, H: FloatArray) -> ReadingBlock:
-    """Return a whitened reading y (p,), H (p, n) as a block of one filter, one slot and one lane,
-    so that filters in Python call the kernels of slots and get the same bits.
-    """
-    n = H.shape[1]
-    return ReadingBlock(
-        np.ascontiguousarray(y).reshape(1, 1, 1, -1, 1),
-        np.ascontiguousarray(H).reshape(1, 1, 1, -1, n, 1),
-        np.zeros((1, 1, n, 1)),
-        np.zeros(1, dtype=bool),
-    )
-
-
-def star_of(weights: Sequence[float]) -> tuple[SlotLinks, np.ndarray]:
-    """Return links and flags of a star: from senders 1, 2, ... to the one receiver 0, with the
-    ``weights`` (one of each of W senders), and the array ``up`` (1, 1, 1, W, 1) that lets all their
-    messages arrive. A filter in Python, which has only the messages that arrived, passes them to
-    the kernels of slots in this way.
-
-    Axes: W directed links.
-    """
-    count = len(weights)
-    indices = np.arange(count)
-    links = SlotLinks(
-        np.array([0, count]), indices + 1, indices, np.array(weights, dtype=np.float64)
-    )
-    return links, np.ones((1, 1, 1, count, 1), dtype=np.uint8)
-
-
 @kernel
 def store_sample_of_slot(
     nodes: SlotNodes, plan: SlotPlan, samples: SlotSamples, scratch: SlotScratch, b: int, s: int
@@ -401,26 +367,7 @@ def rotate_lanes(
     times ``gains`` (n, L), which are written. The rotations are those of
     ``root_update.rotate_out``; an entry of 0 rotates nothing.
     """
-    n = len(size)
-    for i in range(n):
-        store(lanes, gains, i, 0.0)
-    # [1, h S; 0, S] times rotations that empty h S from its end, so that S stays triangular.
-    pivot = square = over_pivot = spread(lanes, 1.0)
-    for j in range(n - 1, -1, -1):
-        entry = load(lanes, row, j)
-        square += entry * entry
-        length = root_of(square)
-        inverse = 1.0 / length
-        # Exactly 1 for an entry of 0, so that not even rounding touches the root.
-        idle = entry == 0.0
-        c, s = select(idle, 1.0, pivot * inverse), entry * inverse
-        pivot, over_pivot = select(idle, pivot, length), select(idle, over_pivot, inverse)
-        # Rotate column j of [h S; S] into the column of the gain.
-        for i in range(j, n):
-            old, gain = load(lanes, root, b, h, i, j), load(lanes, gains, i)
-            store(lanes, root, b, h, i, j, c * old - s * gain)
-            store(lanes, gains, i, s * old + c * gain)
-    return over_pivot
+    return rotate(lanes, size, root[b], h, row, gains)
 
 
 @kernel
@@ -495,22 +442,7 @@ def predict_root(
     ``F`` and the lower triangular ``root_Q`` are (n, n). ``moved_scratch`` and ``noise_scratch``
     (n, n, L) are used if n is too large for registers. Axes: B blocks of runs, H filters.
     """
-    n = len(size)
-    moved = local_lanes_matrix(size, lanes, moved_scratch)
-    noise = local_lanes_matrix(size, lanes, noise_scratch)
-    for i in range(n):
-        # F S; S is lower triangular, so the sum begins at m = j.
-        for j in range(n):
-            total = spread(lanes, 0.0)
-            for m in range(j, n):
-                total += F[i, m] * load(lanes, root, b, h, m, j)
-            store(lanes, moved, i, j, total)
-        # A copy of the root of Q in each lane, since the reflections overwrite it.
-        for j in range(i + 1):
-            store(lanes, noise, i, j, root_Q[i, j])
-    # Reflect [F S, root_Q] from the right, row by row, which leaves a lower triangular root.
-    for i in range(n):
-        write_root_column(lanes, size, root, b, h, i, moved, noise)
+    transform_root(lanes, size, root[b], h, F, root_Q, (moved_scratch, noise_scratch))
 
 
 @kernel(inlined=True)
@@ -530,39 +462,7 @@ def write_root_column(
 
     Axes: B blocks of L runs, H filters.
     """
-    # The squared length of row i; the columns of ``noise`` right of i are still zero here.
-    n, pivot, square = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)
-    for j in range(i + 1, n):
-        entry = load(lanes, moved, i, j)
-        square += entry * entry
-    for j in range(i + 1):
-        entry = load(lanes, noise, i, j)
-        square += entry * entry
-    length = root_of(pivot * pivot + square)
-    # head = pivot + sign(pivot) length: nothing cancels.
-    sign = with_sign(spread(lanes, 1.0), pivot)
-    head = pivot + sign * length
-    # The sign of the column is chosen so that its diagonal is nonnegative.
-    store(lanes, root, b, h, i, i, length)
-    if i == n - 1:
-        return
-    # TINY keeps a row of zeros from dividing by zero: its reflection then only flips a column.
-    scale = 1.0 / (length * (length + magnitude(pivot)) + TINY)
-    for r in range(i + 1, n):
-        first = load(lanes, moved, r, i)
-        total = head * first
-        for j in range(i + 1, n):
-            total += load(lanes, moved, i, j) * load(lanes, moved, r, j)
-        for j in range(i + 1):
-            total += load(lanes, noise, i, j) * load(lanes, noise, r, j)
-        total *= scale
-        store(lanes, root, b, h, r, i, sign * (total * head - first))
-        for j in range(i + 1, n):
-            entry = load(lanes, moved, r, j) - total * load(lanes, moved, i, j)
-            store(lanes, moved, r, j, entry)
-        for j in range(i + 1):
-            entry = load(lanes, noise, r, j) - total * load(lanes, noise, i, j)
-            store(lanes, noise, r, j, entry)
+    reflect_column(lanes, size, root[b], h, i, moved, noise)
 
 
 @kernel

@@ -67,7 +67,7 @@ def clock_loop(kernels: Kernels) -> Any:
     request (``event_loop``).
     """
     predict_node = prediction_of(kernels)
-    on_tick = ticking_of(kernels, predict_node)
+    on_tick = ticking_of(kernels)
     on_absorb = absorption_of(kernels)
     on_sample = sampling_of(kernels)
     counts_sends, remembers = kernels.counts_sends, kernels.remembers
@@ -199,7 +199,7 @@ def sampling_of(kernels: Kernels) -> Any:
     return on_sample
 
 
-def ticking_of(kernels: Kernels, predict_node: Any) -> Any:  # noqa: ARG001
+def ticking_of(kernels: Kernels) -> Any:
     """Return the kernel of the ticks of clocks, and of transmissions after samples."""
     emit, decides, addressed = kernels.emit, kernels.decides, kernels.addressed
     sends_readings, counts_sends = kernels.sends_readings, kernels.counts_sends
