@@ -450,11 +450,13 @@ class BeliefPropagation(Filter):
         """Begin with a prior only: nothing was read or heard."""
         frame = self._frame(model)
         node["base"][:], node["centre"][:] = node["xhat"], frame.inverse @ node["xhat"]
+        if not self._keeps(model):
+            # The first prediction writes the prior; before it P may be singular.
+            return
         # [Z, 0] with Z' Z = W' P^-1 W, both triangles turned round for a lower Z.
         weighted = np.linalg.solve(node["root"], frame.basis)
         node["prior"][:, :-1] = lower_root(weighted.T[::-1]).T[::-1, ::-1]
-        if self._keeps(model):
-            node["frame"][:] = frame.basis
+        node["frame"][:] = frame.basis
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if messages are kept (``memory`` "all", or clocks) and the plant of a

@@ -440,9 +440,9 @@ class PushSum(Filter):
         m, running = 2 + n * n, self.running_sums and not self.asymptotic
         limit = np.zeros((n, n))
         if self.asymptotic:
-            # Every node knows G, of all sensors.
+            # Every node knows G, of all sensors. check_scenario() refuses where there is no P_inf.
             found = asymptotic_root(models[0].F, models[0].Q, infos[0].information)
-            limit = np.full((n, n), np.nan) if found is None else found
+            limit = limit if found is None else found
         shapes: dict[str, tuple[int, ...]] = {"mass": (m,), "before": (m,), "work": (n, n)}
         shapes |= dict.fromkeys(("information", "former"), (n, n))
         shapes |= dict.fromkeys(("number", "former_number"), (1,))

@@ -125,8 +125,9 @@ def record_class(name: str, values: Mapping[str, Any]) -> Any:
     """Return the class of records with these fields: one for each name and set of fields, so that
     filters of equal layout share compiled code.
     """
-    kinds = tuple(f"{key}:{_kind(value)}" for key, value in values.items())
-    key = (name, *kinds)
+    # Structs of equal names may have other fields.
+    kinds = ((type(v) if isinstance(v, Struct) else _kind(v)) for v in values.values())
+    key = (name, *values, *kinds)
     if key not in _classes:
         annotations = {key: _kind(value) for key, value in values.items()}
         _classes[key] = StructClass(name, (Struct,), {"__annotations__": annotations})

@@ -1,18 +1,26 @@
 """check_filter runs a class beside the built-in filter that it derives from."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from netkf import parts
+from netkf.algorithms.kernels.estimates import transform_mean
+from netkf.algorithms.push_sum import SLOTS
 from netkf.algorithms.registry import own_attributes
+from netkf.kernels import kernel
 from netkf.testing import check_filter
 from netkf.testing.parents import check_parent
 from netkf.testing.watching import WatchedPart
 
 ADJUSTED, DEFINED, SAME = {}, {}, {}
+
+
+@kernel
+def predict_mean(record, h, run):
+    transform_mean(run.lanes, run.size, record.xhat, h, run.model.F, run.moved_mean)
 
 
 def keep(table, words="", **settings):
@@ -54,11 +62,11 @@ class Unfair(parts.DiffusionFilter):
         node["own"][...] = 1.2 * info.own_weight
 
 
-@keep(ADJUSTED, "Forgetful._learn_network: must have the numbers of PushSum", gamma=3, delta=4.0)
-class Forgetful(parts.PushSum):
-    def _learn_network(self, state, before, whole):
-        new = super()._learn_network(state, before, whole)
-        return new._replace(mass=before) if hasattr(new, "mass") else new
+@keep(ADJUSTED, "Certain.kernels: must have the numbers of PushSum", gamma=3, delta=4.0)
+class Certain(parts.PushSum):
+    """It predicts without process noise."""
+
+    kernels = replace(SLOTS, predict=predict_mean)
 
 
 @keep(ADJUSTED, "Deaf.accepts: must have the numbers of CovarianceIntersection", epsilon=0.25)

@@ -59,11 +59,12 @@ def test_errors_on_recorded_links_have_the_exact_covariance(tmp_path):
     [
         {},
         {"filter.stop": "safe"},
+        {"filter.stop": "paper"},
         {"filter.asymptotic": True},
         {"filter.running_sums": True},
         {"filter.model": {"F": [[1.0, 0.1], [0.0, 0.9]]}},
     ],
-    ids=["for ever", "safe", "asymptotic", "running sums", "another F"],
+    ids=["for ever", "safe", "paper", "asymptotic", "running sums", "another F"],
 )
 def test_errors_are_the_linear_map_of_the_engine(changes, tmp_path):
     """Also at the horizon, where a slot begins whose exchanges the run does not have."""
@@ -71,9 +72,3 @@ def test_errors_are_the_linear_map_of_the_engine(changes, tmp_path):
     expected, run = engine_covariance(scenario, "simpy")
     found = theory.error_covariance(scenario, run)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
-
-
-def test_nodes_that_decide_whether_to_send_are_refused(tmp_path):
-    scenario = from_table({**TABLE, "filter": {**TABLE["filter"], "stop": "paper"}}, tmp_path)
-    with pytest.raises(netkf.TheoryError, match="mass is exchanged in every slot"):
-        theory.error_covariance(scenario, netkf.simulate(scenario))
