@@ -3,8 +3,8 @@
 Given the events of a run, estimates are linear in the first state and in all noises: one *column*
 for each. The filter's own kernels run on the columns side by side, as on so many runs, in each of
 which one noise is 1 and all others are 0; the covariance of all errors is the sum of the products
-of the columns. A filter needs no rule of its own for that. After each slot the columns are turned
-into as few as their rank allows, which leaves the sum of products as it is.
+of the columns. A filter needs no rule of its own for that. When there are many columns they are
+turned into as few as their rank allows, which leaves the sum of products as it is.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ ZERO, MEAN, NOISE = range(3)
 """The first columns: no noise at all, whose entries are those that do not depend on noise; the
 means; from NOISE on the noises.
 """
+
+FEW = 64
+"""Columns that cost no more time than fewer do."""
 
 
 def has_columns(scenario: Scenario) -> bool:
@@ -76,7 +79,7 @@ class ErrorColumns:
             matrix[rows, NOISE:] - matrix[rows, ZERO : ZERO + 1] for matrix, rows in linear.values()
         ]
         # Columns that came after a time are zero there.
-        kept = [np.pad(form, ((0, 0), (1, columns - 1 - form.shape[1]))) for form in self._kept]
+        kept = [_padded(form, columns - 1 - form.shape[1], 1) for form in self._kept]
         forms = [self._x, *others, *kept]
         stack = np.concatenate([*(form[:, NOISE:] for form in forms), *parts])
         if len(stack) < stack.shape[1]:
@@ -128,7 +131,7 @@ class ErrorColumns:
         at which ``keep`` was called.
         """
         width = max(form.shape[1] for form in self._kept)
-        padded = [np.pad(form, ((0, 0), (0, width - form.shape[1]))) for form in self._kept]
+        padded = [_padded(form, width - form.shape[1]) for form in self._kept]
         forms = np.concatenate(padded)
         noises = forms[:, 1:]
         return forms[:, 0], np.asarray(noises @ noises.T)
@@ -147,6 +150,7 @@ class SlotColumns(ErrorColumns):
         self._F, self._noise = plant.F, square_root(plant.Q)
         self._kernels = replace(kernels, decides=False)
         self._kept = []
+        self._fewest = 0
         # The true state (n, columns).
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._filters = self._begin()
@@ -178,7 +182,9 @@ class SlotColumns(ErrorColumns):
                 else:
                     self._move_truth()
                     self._simulate(slot, observe(slot), arrivals)
-                self._compress()
+                if self._x.shape[1] > max(FEW, 2 * self._fewest):
+                    self._compress()
+                    self._fewest = self._x.shape[1]
                 processed += 1
             yield
 
@@ -188,17 +194,19 @@ class SlotColumns(ErrorColumns):
         self._fit(self._x.shape[1])
 
     def _fit(self, columns: int) -> None:
-        """Give the filters so many columns; new ones are as the column without noise."""
-        arrays = self._filters.records.arrays
-        old, blocks = len(arrays["xhat"]), blocks_of(columns)
-        if blocks == old:
+        """Give the filters room for so many columns; all that are not used are as the column
+        without noise.
+        """
+        former = self._filters.records.arrays
+        old, blocks = len(former["xhat"]), blocks_of(columns)
+        if blocks <= old:
             return
-        former = self._filters
-        self._filters = SlotFilters(self._setup, self._kernels, blocks, with_means=False)
+        # Making filters takes longer than a slot of a few columns more.
+        room = blocks + blocks // 4
+        self._filters = SlotFilters(self._setup, self._kernels, room, with_means=False)
         for name, array in self._filters.records.arrays.items():
-            array[:] = arrays[name][:1, ..., ZERO : ZERO + 1]
-            kept = min(old, blocks)
-            array[:kept] = former.records.arrays[name][:kept]
+            array[:] = former[name][:1, ..., ZERO : ZERO + 1]
+            array[:old] = former[name]
 
     def _simulate(
         self, slot: int, observations: dict[int, Observation], arrivals: dict[int, np.ndarray]
@@ -213,7 +221,7 @@ class SlotColumns(ErrorColumns):
         width = blocks * LANES
         # The origin follows the true state, so that errors on unstable plants keep their digits.
         framed = self._scenario.filters_know_the_truth
-        state = np.pad(self._x, ((0, 0), (0, width - columns))).reshape(n, 1, blocks, LANES)
+        state = _padded(self._x, width - columns).reshape(n, 1, blocks, LANES)
         local = np.ascontiguousarray(np.moveaxis(state, 2, 0).swapaxes(1, 2))
         if framed and setup.algorithm.predicts:
             self._x[:] = 0.0
@@ -273,6 +281,14 @@ class SlotColumns(ErrorColumns):
             full[:, :columns] = whole
             shape = (*array.shape[1:-1], len(array), LANES)
             array[:] = np.moveaxis(full.reshape(shape), -2, 0)
+
+
+def _padded(form: FloatArray, after: int, before: int = 0) -> FloatArray:
+    """Return a form with so many columns of zeros added: np.pad takes ten times as long."""
+    rows, columns = form.shape
+    whole = np.zeros((rows, before + columns + after))
+    whole[:, before : before + columns] = form
+    return whole
 
 
 def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSamples:
