@@ -6,148 +6,120 @@ never better than Riccati gains.
 for increments; a sample or a reading in slots moves the estimate by ``L (y - H xhat)`` and P to
 ``(I - L H) P (I - L H)' + L R L'``. Messages reset estimate and P to convex combinations with
 those of the senders, paper H (7) and (9).
-
-``constant_gain_slots`` simulates many runs in the compiled engine, in place of the methods of
-``ConstantGain``; the types of its arguments are described in ``kernels.slots``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from netkf.algorithms.closed_loops import closed_loop, gain_rate, sample_maps
-from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo
-from netkf.algorithms.kernels.constant_gains import correct_by_innovation, correct_by_moments
-from netkf.algorithms.kernels.neighbours import combine_convex_roots, copy_pairs
-from netkf.algorithms.kernels.root_update import combine_roots
-from netkf.algorithms.kernels.run import usable
-from netkf.algorithms.kernels.slots import (
-    ReadingBlock,
-    SlotLinks,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    SlotScratch,
-    move_root,
-    predict_all,
-    predict_root_alone,
-    rebase,
-    store_sample_of_slot,
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.constant_gains import correct_by_moments
+from netkf.algorithms.kernels.estimates import copy_vector, transform_root
+from netkf.algorithms.kernels.neighbours import combine_convex
+from netkf.algorithms.kernels.root_flow import (
+    FlowScratch,
+    FlowTable,
+    flow_scratch,
+    propagate_root,
+    stack_tables,
 )
-from netkf.algorithms.models import FlowModel, SlotModel, first_root
-from netkf.algorithms.pairs import weighted_pairs
+from netkf.algorithms.kernels.run import carry_mean, predict_estimate, usable
+from netkf.algorithms.models import FlowModel
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, either, field, has_depth, list_of, matrix
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.generic import drop_lane
 from netkf.linalg.lanes import load, store
+from netkf.linalg.structs import Struct
 
 
-class ConstantGainState(NamedTuple):
-    """The state of a node.
+class ClosedLoops(Struct):
+    """The closed loops of H nodes that read increments of at most p rows.
 
-    xhat, root : estimate (n,) and root (n, n) of P
-    model : of the plant and the node's sensors
-    gain : L (n, p)
-    loop : model of the closed loop where sensors give increments, else None
+    A : the plant (n, n)
+    L, H : gains (H, n, p) and rows (H, p, n)
+    closed, rate : A - L H (H, n, n), and the rate (H,) in 1/s at which its error changes
+    table, models : A - L H tabulated, and the row (H,) of each node in it, -1: no increments
+    scratch, maps : scratch of predictions, and (6, n, n)
     """
 
-    xhat: FloatArray
-    root: FloatArray
-    model: Any
-    gain: FloatArray
-    loop: FlowModel | None
-
-    @property
-    def P(self) -> FloatArray:
-        """The covariance ``root root'`` (n, n) of the estimate."""
-        return self.root @ self.root.T
-
-
-class ConstantGainArrays(NamedTuple):
-    """Constant matrices of H filters of p rows at most, for whitened readings (noise variance 1).
-
-    closed : (H, n, n), I - L H
-    noise : (H, n, n), lower triangular root of L R L'
-    gain : (H, n, p), L times the Cholesky factor of R
-    """
-
+    A: FloatArray
+    L: FloatArray
+    H: FloatArray
     closed: FloatArray
-    noise: FloatArray
-    gain: FloatArray
+    rate: FloatArray
+    table: FlowTable
+    models: IntArray
+    scratch: FlowScratch
+    maps: FloatArray
 
 
 @kernel
-def constant_gain_slots(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    plan: SlotPlan,
-    links: SlotLinks,
-    samples: SlotSamples,
-    scratch: SlotScratch,
-    arrays: ConstantGainArrays,
-) -> None:
-    """Simulate H filters with constant gains, which ``arrays`` holds, over the S slots of a plan,
-    in B blocks of L runs: in each slot they predict, correct by their readings and form convex
-    combinations.
-
-    Changes ``nodes.xhat`` (B, H, n, L) and ``nodes.root`` (B, H, n, n, L) in place and writes
-    ``samples`` in the slots that have one.
+def use_sample(record: Any, h: int, run: Any) -> None:
+    """Update node ``h`` by its reading: ``x += L (y - H x)``, and P to the covariance
+    ``(I - L H) P (I - L H)' + L R L'``.
     """
-    for b in range(plan.up.shape[0]):
-        for s in range(plan.up.shape[1]):
-            if plan.sensed[s]:
-                predict_all(nodes, scratch, b)
-                for h in range(len(nodes.rows)):
-                    if nodes.rows[h] > 0:
-                        correct_by_gain(nodes, readings, scratch, arrays, b, s, h)
-                # Messages are copies from before the exchange: all resets are simultaneous.
-                copy_pairs(nodes, scratch, b)
-                for h in range(len(nodes.rows)):
-                    combine_convex_roots(nodes, plan, links, scratch, b, s, h)
-            store_sample_of_slot(nodes, plan, samples, scratch, b, s)
-            # Keep the estimates relative to an origin near the true state.
-            rebase(nodes, readings, scratch, b, s)
-
-
-@kernel
-def correct_by_gain(
-    nodes: SlotNodes,
-    readings: ReadingBlock,
-    scratch: SlotScratch,
-    arrays: ConstantGainArrays,
-    b: int,
-    s: int,
-    h: int,
-) -> None:
-    """Update filter ``h`` of block ``b`` by its reading of slot ``s`` and its gain L,
-    ``arrays.gain[h]`` (n, p): changes ``nodes.xhat[b, h]`` (n, L) by ``xhat += L (y - H xhat)``,
-    and ``nodes.root[b, h]`` (n, n, L) to the root of ``P = (I - L H) P (I - L H)' + L R L'``. The
-    last axis of both is that of the runs side by side.
-    """
-    lanes, n = scratch.lanes, nodes.xhat.shape[2]
-    # L (y - H xhat) in ``moved_mean``: all innovations refer to the estimate before the reading,
-    # since L is the gain of all its rows together.
-    for i in range(n):
-        store(lanes, scratch.moved_mean, i, 0.0)
-    for k in range(nodes.rows[h]):
-        innovation = load(lanes, readings.y, b, s, h, k)
+    lanes, n, r = run.lanes, len(run.size), run.reading
+    first, matrix = run.first_y + r, run.first_H + run.matrix[r]
+    if run.rows[r] == 0:
+        return
+    # All innovations refer to the estimate before the reading: L is the gain of all its rows.
+    copy_vector(lanes, run.size, record.mean, 0, record.xhat, h, True)
+    for i in range(run.rows[r]):
+        innovation = load(lanes, run.y, first, i)
         for j in range(n):
-            weight = load(lanes, readings.H, 0, 0, h, k, j)
-            innovation -= weight * load(lanes, nodes.xhat, b, h, j)
-        for i in range(n):
-            correction = load(lanes, scratch.moved_mean, i) + arrays.gain[h, i, k] * innovation
-            store(lanes, scratch.moved_mean, i, correction)
-    for i in range(n):
-        total = load(lanes, nodes.xhat, b, h, i) + load(lanes, scratch.moved_mean, i)
-        store(lanes, nodes.xhat, b, h, i, total)
-    # (I - L H) P (I - L H)' + L R L' has the form of a prediction F P F' + Q.
-    move_root(scratch, nodes.root, b, h, arrays.closed[h], arrays.noise[h])
+            innovation -= load(lanes, run.H, matrix, i, j) * load(lanes, record.mean, 0, j)
+        for j in range(n):
+            moved = load(lanes, record.xhat, h, j) + record.gain[h, j, i] * innovation
+            store(lanes, record.xhat, h, j, moved)
+    scratch = run.moved, run.noise
+    transform_root(lanes, run.size, record.root, h, record.remaining[h], record.noise[h], scratch)
+
+
+@kernel
+def predict_closed_loop(record: Any, h: int, run: Any) -> None:
+    """Predict node ``h``: with increments the estimate moves open loop, and P by ``A - L H``, which
+    counts their noise already.
+    """
+    loops = record.loops
+    if loops.models[h] < 0:
+        predict_estimate(run.model, run, record.xhat, record.root, h, h)
+        return
+    copy_vector(run.lanes, run.size, record.mean, 0, record.xhat, h, True)
+    carry_mean(run.model, run, record.mean, 0, run.gap)
+    root, x = drop_lane(record.root), drop_lane(record.xhat)
+    propagate_root(loops.table, loops.models[h], root, x, h, run.gap, loops.scratch)
+    copy_vector(run.lanes, run.size, record.xhat, h, record.mean, 0, True)
+
+
+@kernel
+def use_sample_or_increments(record: Any, h: int, run: Any) -> None:
+    """Update node ``h`` by a sample, or by the increments of the gap."""
+    if run.model.increments == 0:
+        use_sample(record, h, run)
+        return
+    loops = record.loops
+    moments = run.model.moments[: run.model.gains.moments[run.model.models[h]]]
+    correct_by_moments(
+        drop_lane(record.xhat), h, loops.A, loops.closed[h], loops.H[h], loops.L[h], moments,
+        run.gap, loops.maps,
+    )  # fmt: skip
+
+
+@kernel
+def closed_loop_interval(record: Any, h: int, run: Any) -> float:
+    """Return the seconds of increments for one update: 1 / |L H|, the time scale on which the gain
+    moves the estimate.
+    """
+    return usable(record.loops.rate[h])
 
 
 @built_in("constant-gain")
@@ -174,96 +146,47 @@ class ConstantGain(Filter):
     one_way: ClassVar[bool] = True
     fixed_sensors: ClassVar[bool] = True
     every_reading: ClassVar[bool] = True
-    slot_kernel = staticmethod(constant_gain_slots)
+    kernels = Kernels(
+        update=use_sample,
+        absorb=combine_convex,
+        unrolled=False,
+        under_clocks=Kernels(
+            predict=predict_closed_loop,
+            update=use_sample_or_increments,
+            absorb=combine_convex,
+            interval=closed_loop_interval,
+            unrolled=False,
+        ),
+    )
 
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[ConstantGainArrays]:
-        """Return the last argument of ``constant_gain_slots``: the constant matrices of the H nodes
-        that start in these ``states``, which all ``runs`` share.
+    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+        """Return the constant matrices of all nodes: for readings, and under clocks the closed
+        loops of those with increments.
         """
-        n = len(states[0].xhat)
-        max_rows = max(1, *(state.gain.shape[1] for state in states))
-        closed, noise = np.zeros((len(states), n, n)), np.zeros((len(states), n, n))
-        gain = np.zeros((len(states), n, max_rows))
-        for k, state in enumerate(states):
-            p = len(state.model.H)
-            if p:
-                closed[k], noise[k] = sample_maps(state.gain, state.model.H, state.model.R)
-                # L times the Cholesky factor of R, because readings come whitened.
-                gain[k, :, :p] = state.gain @ np.linalg.cholesky(state.model.R)
-        return (ConstantGainArrays(closed, noise, gain),)
-
-    def init(
-        self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo
-    ) -> ConstantGainState:
-        """Return the first state of a node, with estimate ``mean`` (n,), covariance ``cov`` (n, n)
-        and the node's gain.
-        """
-        gain = self.gain_of(node.place)
-        increments = not isinstance(model, SlotModel) and len(model.H)
-        loop = closed_loop(model, gain) if increments else None
-        return ConstantGainState(mean, first_root(cov), model, gain, loop)
+        N, n = len(infos), len(models[0].information)
+        gains = [self.gain_of(info.place) for info in infos]
+        settings: dict[str, Any] = {
+            "gain": np.zeros((N, n, max(1, *(gain.shape[1] for gain in gains)))),
+            "remaining": np.zeros((N, n, n)),
+            "noise": np.zeros((N, n, n)),
+        }
+        for k, (info, L) in enumerate(zip(infos, gains, strict=True)):
+            H, R = info.sampled
+            if len(H):
+                settings["remaining"][k], settings["noise"][k] = sample_maps(L, H, R)
+                # Readings come whitened, with the inverse of the root of R.
+                settings["gain"][k, :, : len(H)] = L @ np.linalg.cholesky(R)
+        if isinstance(models[0], FlowModel):
+            settings["loops"] = _closed_loops(models, gains)
+        return Record(
+            payload={"xhat": (n,), "root": (n, n)}, scratch={"mean": (1, n)}, settings=settings
+        )
 
     def gain_of(self, index: int) -> FloatArray:
         """Return the gain (n, p) of the node with this ``index`` in the order of ids, from 0."""
         return self.gain[index] if isinstance(self.gain, tuple) else self.gain
 
-    def predict(self, state: ConstantGainState, gap: float) -> ConstantGainState:
-        """Return the state ``gap`` seconds later; with increments P counts the readings of the gap
-        already, the estimate does not.
-        """
-        if state.loop is None:
-            xhat, root = state.model.predict(state.xhat, state.root, gap)
-            return state._replace(xhat=xhat, root=root)
-        # The estimate moves without readings, which update() adds; P is that of the closed loop,
-        # dP/dt = (A - L H) P + P (A - L H)' + L R L' + Q.
-        xhat, _ = state.model.extrapolate(state.xhat, state.root, gap)
-        _, root = state.loop.predict(state.xhat, state.root, gap)
-        return state._replace(xhat=xhat, root=root)
-
-    def update(self, state: ConstantGainState, reading: Any) -> ConstantGainState:
-        """Return the state after a sample, or after the increments of the gap that just passed, by
-        the node's constant gain.
-        """
-        if isinstance(reading, Increments):
-            assert state.loop is not None
-            model, n = state.model, len(state.xhat)
-            # The kernel changes x[0] and the moments in place; its last argument is scratch.
-            x = state.xhat.reshape(1, n).copy()
-            correct_by_moments(
-                x, 0, model.A, state.loop.A, model.H, state.gain, reading.moments.copy(),
-                reading.gap, np.empty((6, n, n)),
-            )  # fmt: skip
-            return state._replace(xhat=x[0])
-        if not len(reading.y):
-            return state
-        # P+ = (I - L H) P (I - L H)' + L R L' has the form of a prediction F P F' + Q.
-        closed, noise = sample_maps(state.gain, reading.H, reading.R)
-        x, H = state.xhat.reshape(1, -1).copy(), np.ascontiguousarray(reading.H)
-        # x[0] <- x[0] + L (y - H x[0]), in place; the last argument is scratch.
-        correct_by_innovation(x, 0, H, state.gain, reading.y, np.empty(len(state.xhat)))
-        return state._replace(xhat=x[0], root=predict_root_alone(state.root, closed, noise))
-
-    def absorb(
-        self, state: ConstantGainState, messages: Sequence[Message], exchange: Exchange
-    ) -> ConstantGainState:
-        """Return the state after a reset by paper H (7) and (9): the convex combination of the
-        node's estimate and covariance with those of all messages.
-        """
-        if not messages:
-            return state
-        weights, means, roots = weighted_pairs(state, messages)
-        xhat, root = combine_roots(weights, means, roots)
-        return state._replace(xhat=xhat, root=root)
-
     shift = Filter.shift  # affine: the weights sum to one
-
-    def max_measurement_interval(self, state: ConstantGainState) -> float:
-        """Return the seconds of increments that ``update`` may use at once: 1 / |L H|, the time
-        scale on which the gain moves the estimate; infinity without increments.
-        """
-        return usable(gain_rate(state.gain, state.model.H) if state.loop is not None else 0.0)
 
     def check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``: recorded sensors
@@ -309,3 +232,30 @@ def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
             None,
             "give it one sensor, or another filter",
         )
+
+
+def _closed_loops(models: Sequence[FlowModel], gains: Sequence[FloatArray]) -> ClosedLoops:
+    """Return the closed loops of the nodes with these models and gains (n, p)."""
+    N, n = len(models), len(models[0].A)
+    p = max(1, *(gain.shape[1] for gain in gains))
+    L, H, closed = np.zeros((N, n, p)), np.zeros((N, p, n)), np.zeros((N, n, n))
+    rate, rows, tables = np.zeros(N), np.full(N, -1, dtype=np.int64), []
+    for k, (model, gain) in enumerate(zip(models, gains, strict=True)):
+        if len(model.H):
+            loop = closed_loop(model, gain)
+            L[k, :, : gain.shape[1]], H[k, : len(model.H)], closed[k] = gain, model.H, loop.A
+            rate[k], rows[k] = gain_rate(gain, model.H), len(tables)
+            tables.append(loop.flow)
+    # Without closed loops any table will do, as no node uses it.
+    table = stack_tables(tables or [models[0].unobserved_flow])
+    return ClosedLoops(
+        A=np.array(models[0].A),
+        L=L,
+        H=H,
+        closed=closed,
+        rate=rate,
+        table=table,
+        models=rows,
+        scratch=flow_scratch(table),
+        maps=np.zeros((6, n, n)),
+    )

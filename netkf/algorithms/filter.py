@@ -90,6 +90,8 @@ class NodeInfo(NamedTuple):
     senders : ids of the nodes that it can hear, sorted
     network : the whole network, if the filter ``needs_network``
     rows : the most rows that a reading of any node has
+    sampled : H (p, n) and R (p, p) of its sensors that take samples (in slots: of all) together, as
+              the node believes them, where they are fixed; p = 0 without such sensors
     """
 
     node: int
@@ -103,6 +105,7 @@ class NodeInfo(NamedTuple):
     senders: tuple[int, ...] = ()
     network: NetworkInfo | None = None
     rows: int = 1
+    sampled: tuple[FloatArray, FloatArray] = (np.zeros((0, 0)), np.zeros((0, 0)))
 
 
 class Exchange(NamedTuple):

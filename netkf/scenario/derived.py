@@ -99,10 +99,12 @@ class DerivedScenario(ScenarioModel):
             for node, sensors in self.placed_sensors.items()
         ]
         most_rows = max([1, *rows])
+        sampled = self.placed_sensors if self.slotted else self.sampled_sensors
         return tuple(
             NodeInfo(
                 node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
                 total_information, max_delay, k, tuple(sorted(senders[node])), network, most_rows,
+                self._stack_sensors(sampled.get(node, ()), believed=True),
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip

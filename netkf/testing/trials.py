@@ -92,6 +92,7 @@ class Trial(ABC):
             senders=neighbours[node],
             network=NetworkInfo(information, neighbours),
             rows=max(1, *(len(model.H) for model in models)),
+            sampled=self.matrices(node != 1),
         )
         mean = self.system.mean + node * self.system.spread
         state = self.watched.call("init", models[node], mean, self.system.cov, info)
