@@ -115,7 +115,7 @@ def use_sample_or_increments(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
-def closed_loop_interval(record: Any, h: int, run: Any) -> float:
+def closed_loop_interval(record: Any, h: int, _run: Any) -> float:
     """Return the seconds of increments for one update: 1 / |L H|, the time scale on which the gain
     moves the estimate.
     """
@@ -239,7 +239,8 @@ def _closed_loops(models: Sequence[FlowModel], gains: Sequence[FloatArray]) -> C
     N, n = len(models), len(models[0].A)
     p = max(1, *(gain.shape[1] for gain in gains))
     L, H, closed = np.zeros((N, n, p)), np.zeros((N, p, n)), np.zeros((N, n, n))
-    rate, rows, tables = np.zeros(N), np.full(N, -1, dtype=np.int64), []
+    rate, rows = np.zeros(N), np.full(N, -1, dtype=np.int64)
+    tables: list[FlowTable] = []
     for k, (model, gain) in enumerate(zip(models, gains, strict=True)):
         if len(model.H):
             loop = closed_loop(model, gain)

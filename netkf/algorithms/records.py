@@ -103,7 +103,7 @@ class Kernels:
 
 FIRST_PAST = 16
 """Past events of a node for which there is room at first."""
-_classes: dict[tuple[str, ...], Any] = {}
+_classes: dict[tuple[Any, ...], Any] = {}
 
 
 def make_arrays(shapes: Shapes, leading: tuple[int, ...], lanes: int) -> dict[str, np.ndarray]:
