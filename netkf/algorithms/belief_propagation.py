@@ -33,9 +33,9 @@ from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.estimates import copy_vector, transform_root
 from netkf.algorithms.kernels.intersection import finish_lanes, merge_lanes
-from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.run import ALL as ALL_RECEIVERS
 from netkf.algorithms.kernels.run import carry_mean, predict_estimate, shift_vector
+from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
 from netkf.algorithms.records import Kernels, Record

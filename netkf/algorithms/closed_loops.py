@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.algorithms.kernels.root_update import lower_root
+from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import FlowModel
 from netkf.linalg.arrays import FloatArray
 

@@ -30,9 +30,9 @@ import numpy as np
 
 from netkf.algorithms.filter import Filter, NetworkInfo, NodeInfo
 from netkf.algorithms.kernels.estimates import transform_mean
-from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.kernels.run import shift_vector
+from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.linalg.arrays import FloatArray, square_root

@@ -231,6 +231,7 @@ class Filter(Component):
     unrolled       ``slot_kernel`` is compiled for each n up to 4, with unrolled loops: only where
                    that makes runs a tenth faster
     newest_only    of several messages of one sender at one instant the newest counts
+    max_age        seconds beyond which a message that arrives is too late to use, under clocks
     fixed_sensors  it computes with H before there are readings, so H must not vary: no nonlinear
                    sensors, regressors or columns phi
     every_reading  in slots its gains and P count a reading of every sensor in every slot, so that
@@ -262,6 +263,7 @@ class Filter(Component):
     pooled: ClassVar[bool] = False
     needs_samples: ClassVar[bool] = False
     newest_only: ClassVar[bool] = True
+    max_age: ClassVar[float] = math.inf
     fixed_sensors: ClassVar[bool] = False
     every_reading: ClassVar[bool] = False
     common_start: ClassVar[bool] = False
@@ -272,9 +274,7 @@ class Filter(Component):
     paper: ClassVar[str] = ""
     combination: ClassVar[str] = ""
     P_by_design: ClassVar[tuple[str, str]] = ("", "")
-    slot_kernel: ClassVar[Any] = None
     kernels: ClassVar[Kernels | None] = None
-    unrolled: ClassVar[bool] = False
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return the arrays of nodes, links and messages that ``kernels`` need, for nodes with
@@ -376,9 +376,9 @@ class Filter(Component):
 
     def accepts(self, payload: Any, age: float) -> bool:
         """Return False if a message with this ``payload``, ``age`` seconds old under clocks, is too
-        late to use.
+        late to use: by default if it is older than ``max_age``.
         """
-        return True
+        return age <= self.max_age
 
     def max_measurement_interval(self, state: Any) -> float:
         """Return the seconds of increments that ``update`` may use at once from this state on.
@@ -435,45 +435,9 @@ class Filter(Component):
         """
         return -1
 
-    def moves_estimates(self, phase: int) -> bool:
-        """Return False if exchange number ``phase`` of a slot leaves all estimates as they are.
-
-        A stochastic trigger that wraps this filter asks: the innovation may then be computed before
-        or after that exchange.
-        """
-        return True
-
     def decides_in_slots(self) -> bool:
         """Return True if a node may decide to send nothing."""
         return self.kernels is not None and self.kernels.decides
-
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[Any, ...]:
-        """Return the arrays that ``slot_kernel``, the compiled simulation of slots, is given
-        besides, for ``runs`` runs of H nodes: ``states`` are those in which each node starts, and
-        ``infos`` what each knows at time 0.
-        """
-        return ()
-
-    def slot_gains(
-        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
-    ) -> tuple[Any, ...]:
-        """Return the ``arrays`` of ``slot_arrays`` as ``slot_kernel`` is given them for ``count``
-        slots from number ``first`` on: with gains of these slots, where they are known before the
-        run. ``states`` are those that runs start in.
-        """
-        return arrays
-
-    def carried_estimates(self, reported: FloatArray, arrays: tuple[Any, ...]) -> FloatArray:
-        """Return the estimates (B, H, n, L) with which nodes go on to the next slot, B blocks of L
-        runs, H nodes: a stochastic trigger that wraps this filter computes innovations from them.
-
-        By default they are the ``reported`` ones (B, H, n, L), which samples hold; a filter whose
-        samples show something else, as fused tracks, takes them from its ``arrays``, those of
-        ``slot_arrays``.
-        """
-        return reported
 
     def stopped(self, state: Any) -> bool:
         """Return True once the node has permanently frozen its network estimate: what it computes
@@ -540,13 +504,13 @@ def commutes(algorithm: Filter) -> bool:
 
 def compiled_kernels(algorithm: Filter, clocked: bool) -> Kernels | None:
     """Return the kernels of a filter under clocks or in slots; None if it has none, or if its class
-    defines one of STEPS in Python after them, so that they do not say what it does.
+    defines one of STEPS or ``accepts`` in Python after them, so that they do not say what it does.
     """
     kernels = algorithm.kernels
     if kernels is None:
         return None
     order = type(algorithm).__mro__
     first = next((k for k, cls in enumerate(order) if "kernels" in vars(cls)), len(order))
-    if any(name in vars(cls) for cls in order[:first] for name in STEPS):
+    if any(name in vars(cls) for cls in order[:first] for name in (*STEPS, "accepts")):
         return None
     return kernels.of(clocked)

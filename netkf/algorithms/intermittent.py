@@ -315,7 +315,7 @@ class Intermittent(Filter):
         return rows * (1 + n) + rows * (rows + 1) // 2
 
     @property
-    def max_age(self) -> float:
+    def max_age(self) -> float:  # type: ignore[override]
         """Seconds beyond which a reading that arrives is too old to use: 0 if late ones are
         dropped, infinity without a window.
         """
@@ -328,11 +328,5 @@ class Intermittent(Filter):
         takes longer than ``max_delay`` seconds.
         """
         return SLACK * min(self.max_age, max_delay)
-
-    def accepts(self, payload: Any, age: float) -> bool:
-        """Return False if the message, ``age`` seconds old, took longer than the window, or if late
-        readings are dropped.
-        """
-        return age <= self.max_age
 
     shift = Filter.shift  # affine in the readings

@@ -11,34 +11,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
+from netkf.algorithms.kernels.estimates import transform_root, update_by_row
 from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
-from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
 from netkf.algorithms.kernels.run import usable
-from netkf.algorithms.kernels.slots import predict_root_alone
+from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.modes import RateGroups, rate_groups
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
 
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
-
-
-class Backward(NamedTuple):
-    """Transition of information about the state over a gap, which lets it fade so that it stays
-    bounded (algorithms.running_sums): ``U <- inverse' U inverse``, and ``fading[g] inverse' u`` of
-    the part u = U P_g x of each of G groups of modes.
-
-    inverse : (n, n), e^{-A gap} times ``fading`` in each group
-    fading : (G,), e^{-rate gap} with the rate of decay of each group, 1 where it does not decay
-    """
-
-    inverse: FloatArray
-    fading: FloatArray
 
 
 def _shared_flow_table(
@@ -107,16 +94,6 @@ class FlowModel:
     def groups(self) -> RateGroups:
         """Parts of the state that decay at one rate each."""
         return rate_groups(self.A)
-
-    def backward(self, gap: float) -> Backward:
-        """Return the transition that turns information about the state now into information about
-        the state ``gap`` seconds later, in which what is about a mode that decays stays as it is.
-        """
-        # A constant state: the exponential would be I up to rounding, and nothing fades.
-        if not self.A.any():
-            return Backward(np.eye(len(self.A)), np.ones(1))
-        inverse = np.asarray(scipy.linalg.expm(-gap * self.groups.kept))
-        return Backward(inverse, np.exp(-self.groups.rates * gap))
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float
@@ -192,7 +169,7 @@ class SlotModel:
         """
         # round: a gap of whole periods may be off by rounding of clock times.
         for _ in range(round(gap / self.period)):
-            xhat, root = self.F @ xhat, predict_root_alone(root, self.F, self.root_Q)
+            xhat, root = self.F @ xhat, predict_root(root, self.F, self.root_Q)
         return xhat, root
 
     def extrapolate(
@@ -224,12 +201,52 @@ def first_root(cov: FloatArray) -> FloatArray:
     return lower_root(square_root(cov))
 
 
+@kernel
+def _transform(
+    root: FloatArray, F: FloatArray, root_Q: FloatArray, scratch: tuple[FloatArray, FloatArray]
+) -> None:
+    """Predict ``root`` (1, n, n, 1) by a slot."""
+    transform_root(ONE, F[0], root, 0, F, root_Q, scratch)
+
+
+def predict_root(root: FloatArray, F: FloatArray, root_Q: FloatArray) -> FloatArray:
+    """Return the lower triangular root (n, n) of ``F S S' F' + Q`` for the lower triangular
+    ``root`` S and ``root_Q`` (n, n each), for one filter in Python.
+    """
+    n = len(F)
+    moved = np.array(root).reshape(1, n, n, 1)
+    _transform(moved, F, root_Q, (np.empty((n, n, 1)), np.empty((n, n, 1))))
+    return np.asarray(moved.reshape(n, n))
+
+
+def whiten_reading(y: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the whitened reading ``L^-1 y`` (p,) and ``L^-1 H`` (p, n) of a reading y (p,) with H
+    (p, n) and noise covariance ``R = L L'`` (p, p), so that the noise of its rows is white with
+    variance 1.
+    """
+    # One solve for y and H together.
+    whitened = np.linalg.solve(np.linalg.cholesky(R), np.column_stack([y, H]))
+    return np.ascontiguousarray(whitened[:, 0]), np.ascontiguousarray(whitened[:, 1:])
+
+
+@kernel
+def _use_rows(
+    x: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray,
+    scratch: tuple[FloatArray, FloatArray],
+) -> None:  # fmt: skip
+    """Update ``x`` (1, n, 1) and ``root`` (1, n, n, 1) with whitened rows y (1, p, 1)."""
+    for i in range(y.shape[1]):
+        update_by_row(ONE, x[0], x, root, 0, y, H, (0, 0, i), True, scratch)
+
+
 def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the estimate (n,) and the root (n, n) of its covariance after a sample ``y = H x + v``
     (p,) of p > 0 rows, H (p, n), cov(v) = R (p, p), from ``xhat`` (n,) and ``root`` (n, n) before.
     """
-    noise = np.asarray(np.linalg.cholesky(R), dtype=np.float64)
-    root, xhat, _ = update_with_sample(root, xhat, y, H, noise)
-    return xhat, root
+    (p, n), (white_y, white_H) = H.shape, whiten_reading(y, H, R)
+    x, S = np.array(xhat).reshape(1, n, 1), np.array(root).reshape(1, n, n, 1)
+    scratch = np.empty((n, 1)), np.empty((n, 1))
+    _use_rows(x, S, white_y.reshape(1, p, 1), white_H.reshape(1, p, n, 1), scratch)
+    return x.reshape(n), S.reshape(n, n)

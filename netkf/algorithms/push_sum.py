@@ -34,8 +34,8 @@ import numpy as np
 from netkf.algorithms import running_sums
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.estimates import copy_vector, rotate, transform_mean
-from netkf.algorithms.kernels.root_update import lower_root
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector
+from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, MassStep, has_stopped
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
@@ -512,12 +512,6 @@ class PushSum(Filter):
         """
         # Without exchanges of mass there is nothing to stop.
         return MASS if not self.asymptotic and self.stop != "never" else -1
-
-    def moves_estimates(self, phase: int) -> bool:
-        """Return True for the exchange of estimates, False for that of mass; ``phase`` is the
-        number of the exchange in a slot.
-        """
-        return phase == AVERAGE
 
     def decides_in_slots(self) -> bool:
         """Return True under the paper's stop rule, by which a node that has stopped sends no

@@ -24,8 +24,7 @@ from netkf.algorithms.kernels.run import (
     scratch_of,
     size_of,
 )
-from netkf.algorithms.kernels.slots import whiten_reading
-from netkf.algorithms.models import FlowModel, first_root
+from netkf.algorithms.models import FlowModel, first_root, whiten_reading
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE

@@ -34,8 +34,7 @@ from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.records import Kernels, Record
-from netkf.algorithms.registry import built_in, built_in_filters
-from netkf.algorithms.triggered_slots import TriggeredSlots, trigger_arrays, trigger_plan
+from netkf.algorithms.registry import built_in
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -414,30 +413,6 @@ class TriggeredMessages(Filter):
         """Begin as the wrapped filter does, without a reading."""
         self.inner.begin(node, info, model)
         node["trigger_news"][...], node["trigger_undecided"][...] = NO_READING, 1
-
-    @cached_property
-    def slot_kernel(self) -> Any:
-        """The compiled simulation of slots with the trigger, where the wrapped filter has one."""
-        inner, plan = self.inner, trigger_plan(self.inner)
-        # A user's class inherits the kernel of its base, which ignores what it overrides.
-        is_compiled = type(inner) in built_in_filters().values() and inner.slot_kernel is not None
-        return TriggeredSlots(inner, plan) if is_compiled and plan is not None else None
-
-    def slot_arrays(
-        self, states: Sequence[Any], infos: Sequence[NodeInfo], runs: int
-    ) -> tuple[Any, ...]:
-        """Return the arguments of ``slot_kernel`` for ``runs`` runs of H nodes."""
-        inner = [state.inner for state in states]
-        models = [state.model for state in inner]
-        trigger = whitened_triggers(models, max(1, *(len(one.R) for one in models)), self.Y)
-        arrays = trigger_arrays(models, trigger, runs)
-        return (arrays, inner, *self.inner.slot_arrays(inner, infos, runs))
-
-    def slot_gains(
-        self, states: Sequence[Any], arrays: tuple[Any, ...], first: int, count: int
-    ) -> tuple[Any, ...]:
-        """Return the ``arrays`` unchanged: ``slot_kernel`` asks for the gains of each slot."""
-        return arrays
 
     def decides_in_slots(self) -> bool:
         """Return True: a node may send nothing after a reading."""

@@ -30,16 +30,13 @@ from netkf.algorithms.kernels.run import (
     shift_vector,
     update_estimate,
 )
-from netkf.algorithms.kernels.slots import (
-    whiten_reading,
-)
 from netkf.algorithms.kernels.tracks import (
     combine_tracks,
     predict_joint,
     track_scratch,
     update_joint,
 )
-from netkf.algorithms.models import SlotModel
+from netkf.algorithms.models import SlotModel, whiten_reading
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import field, one_of
@@ -49,7 +46,6 @@ from netkf.linalg.lanes import load, store
 from netkf.linalg.small import copy_matrix
 
 TRACE, DETERMINANT = "trace", "determinant"
-INTERSECTION = 'rule = "ci"'  # the filter that error messages recommend
 COMBINATIONS, MAX_DIRECTION_BITS = 32, 62
 """Combinations of tracks in the cache of a node, and incoming links that have a bit of their own in
 its keys.

@@ -14,10 +14,11 @@ from netkf.algorithms.kernels.root_flow import (
     propagate_root,
     stack_tables,
 )
-from netkf.algorithms.kernels.root_update import lower_root, update_with_sample
+from netkf.algorithms.kernels.square_root import lower_root
+from netkf.algorithms.models import sample_update
 from netkf.linalg.lanes import ONE
 from tests import reference
-from tests.algorithms.test_root_update import distance, wide_root
+from tests.algorithms.test_estimates import distance, wide_root
 
 LONGEST = 100.0
 
@@ -119,7 +120,7 @@ def test_hundreds_of_short_gaps_mixed_with_samples(kind, noise, n, R, size, samp
     for k, gap in enumerate(random.choice([1e-6, 1e-3, 0.017, 0.1], size=300)):
         if k % 5 == 4:
             y = C @ x + root_R @ random.normal(size=2)
-            root, x, _ = update_with_sample(root, x, y, C, root_R)
+            x, root = sample_update(x, root, y, C, cov)
             with reference.precisely():
                 P, mean = reference.sample_update(P, mean, reference.exactly(y), c, r)
         else:

@@ -9,7 +9,7 @@ import scipy.optimize
 
 import netkf
 from netkf import theory
-from netkf.algorithms.kernels.pair_fusion import fuse_tracks
+from netkf.algorithms.kernels.pair_fusion import fuse_pair
 from netkf.algorithms.track_fusion import best_combination
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.theory.common.errors import error_law
@@ -28,6 +28,14 @@ INVERSE = "ici"
 PAIRS = list(itertools.product((BEST, INVERSE), ("trace", "determinant")))
 CROSS = "cross-covariance"
 TRACKS = {"kind": "track-fusion", "rule": CROSS}
+
+
+def fuse_tracks(first, second, inverse, trace):
+    """Estimate and root of two pairs of these by the kernel."""
+    x, root = (np.array(values, dtype=np.float64) for values in first)
+    other_x, other = (np.ascontiguousarray(values) for values in second)
+    fuse_pair(x, root, other_x, other, inverse, trace, np.empty((2 * len(x) + 2, len(x))))
+    return x, root
 
 
 def fused(a, b, kind, minimise):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.algorithms.kernels.root_update import intersect_roots
 from netkf.checks import exact, statistics
 from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
@@ -74,9 +73,10 @@ class Intersection(Filter):
         moved = [state.model.extrapolate(*m.payload, m.age) for m in messages]
         weights = np.array([1.0 - self.epsilon * len(messages), *[self.epsilon] * len(messages)])
         means = np.array([state.xhat, *(x for x, _ in moved)])
-        roots = np.array([state.root, *(root for _, root in moved)])
-        xhat, root = intersect_roots(weights, means, roots)
-        return state._replace(xhat=xhat, root=root)
+        inverses = np.array([np.linalg.inv(r @ r.T) for r in (state.root, *(r for _, r in moved))])
+        P = np.linalg.inv(np.tensordot(weights, inverses, 1))
+        xhat = P @ np.einsum("j,jab,jb->a", weights, inverses, means)
+        return state._replace(xhat=xhat, root=np.linalg.cholesky(P))
 
 
 @dataclass(frozen=True, eq=False)

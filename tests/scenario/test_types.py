@@ -238,8 +238,7 @@ def test_mypy_accepts_classes_of_ones_own_and_finds_mistakes(tmp_path):
 
 
 OF_KERNELS = {
-    *("sends_in_slots", "slot_stopping", "decides_in_slots", "moves_estimates", "slot_arrays"),
-    *("carried_estimates", "slot_gains", "record", "begin", "prepare"),
+    *("sends_in_slots", "slot_stopping", "decides_in_slots", "record", "begin", "prepare"),
 }
 
 

@@ -165,27 +165,3 @@ def correct_by_moments(
             L_m1 += L[j, i] * moments[p + i]
         for i in range(n):
             x[k, i] += (first[i, j] * L_m0 + 3.0 * second[i, j] * L_m1) / gap
-
-
-@kernel
-def correct_by_innovation(
-    x: FloatArray, k: int, H: FloatArray, L: FloatArray, y: FloatArray, updated: FloatArray
-) -> None:
-    """Add ``L (y - H x)`` to ``x[k]`` (n,), entry ``k`` of x (K, n), for a sample y (p,) with H
-    (>= p, n) and gain L (n, >= p), of which the first p rows and columns count; ``updated`` (n,) is
-    scratch.
-
-    Axes: K estimates.
-    """
-    # All rows use the old x, since L is a gain for all rows together.
-    n = x.shape[1]
-    for i in range(n):
-        updated[i] = x[k, i]
-    for r in range(len(y)):
-        innovation = y[r]
-        for j in range(n):
-            innovation -= H[r, j] * x[k, j]
-        for i in range(n):
-            updated[i] += L[i, r] * innovation
-    for i in range(n):
-        x[k, i] = updated[i]

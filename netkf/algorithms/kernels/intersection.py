@@ -3,7 +3,7 @@
 ``P^-1 = sum w_j P_j^-1`` and ``P^-1 x = sum w_j P_j^-1 x_j``: ``invert_lanes`` and ``whiten`` make
 the terms, ``merge_lanes`` adds them, and ``finish_lanes`` writes P and x. Information is carried as
 a root too, ``P^-1 = Z' Z``. Diffusion, consensus on information, event-triggered consensus and
-belief propagation use these kernels; ``root_update`` has the same formulas for one run.
+belief propagation use these kernels.
 
 ``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
 and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
@@ -13,10 +13,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from netkf.algorithms.kernels.root_update import NEGLIGIBLE, SINGULAR, TINY
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, store, with_sign
+
+SINGULAR = 2.0**-25
+"""Least pivot of a root that is inverted, relative to the length of its row: the square root of
+2^-50, at which a pivot of the covariance itself would be rounding.
+"""
+NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the rows below it
+TINY = 1e-200  # the same for a pivot of 0, yet above underflow
 
 
 @kernel(inlined=True)
@@ -79,7 +85,7 @@ def whiten(
 def merge_lanes(lanes: Lanes, total: FloatArray, whitened: FloatArray) -> None:
     """Replace ``total`` (n, n + 1, L), a root [Z, z] of information (Z lower triangular,
     information Z' Z, z = Z times the mean), by a root of the sum of it and ``whitened``
-    (n, n + 1, L), which is overwritten; as ``root_update.merge_information`` does for one run.
+    (n, n + 1, L), which is overwritten.
     """
     # Reflections from the left zero the columns of ``whitened`` from the last one on, so that both
     # stay lower triangular.

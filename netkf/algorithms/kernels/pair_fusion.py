@@ -16,9 +16,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from netkf.algorithms.kernels.root_update import NEGLIGIBLE, SINGULAR, TINY
+from netkf.algorithms.kernels.intersection import NEGLIGIBLE, SINGULAR, TINY
 from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -246,23 +244,3 @@ def other_gain(p: float, w: float, b: float, inverse: bool) -> float:
     if inverse:
         return p * (1.0 / b - (1.0 - w) / (w + (1.0 - w) * b))
     return p * (1.0 - w) / b
-
-
-def fuse_tracks(
-    first: tuple[FloatArray, FloatArray],
-    second: tuple[FloatArray, FloatArray],
-    inverse: bool,
-    trace: bool,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the fused estimate (n,) and lower triangular root (n, n) of two estimates of unknown
-    correlation, ``first`` and ``second``, each a pair of the estimate (n,) and its lower triangular
-    root (n, n).
-
-    ``inverse``: inverse covariance intersection, else covariance intersection; ``trace``: the
-    weight minimises the trace of P, else its determinant.
-    """
-    x, root = (np.array(values, dtype=np.float64) for values in first)
-    n = len(x)
-    other_x, other = (np.ascontiguousarray(values) for values in second)
-    fuse_pair(x, root, other_x, other, inverse, trace, np.empty((2 * n + 2, n)))
-    return x, root

@@ -6,7 +6,7 @@ noise`` of covariance Q per second and sensors ``dy = H x dt + dv`` with noise o
 Over a gap g, ``P(g) = Q_g + F P (I + G_g P)^-1 F'`` and ``x(g) = exp(A g) x``, where G_g is the
 information that the sensors give during the gap. With ``G_g = Gamma' Gamma`` and ``Q_g = T T'``
 the root moves in three steps that subtract nothing: each row of Gamma is a scalar observation of
-unit noise (root_update.rotate_out), F multiplies the root, and one elimination adds the columns
+unit noise (estimates.rotate), F multiplies the root, and one elimination adds the columns
 of T.
 
 If P is 1e12, rounding errors of G times P would act like information that no sensor gave. So Gamma
@@ -47,9 +47,9 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.kernels.estimates import rotate
 from netkf.algorithms.kernels.gains import GainTable
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
-from netkf.algorithms.kernels.root_update import rotate_out
 from netkf.algorithms.kernels.square_root import reflect_row
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
@@ -613,7 +613,7 @@ def propagate_level(
                 for i in range(max(r, j), n):
                     total += levels[m, level, 2, r, i] * root[k, i, j]
                 observed[0, j] = total
-            rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
+            rotate(ONE, scratch.size, root, k, observed[0], scratch.gain[0])
     # Without observation F = exp(A g).
     flow = 0 if table.sizes[m, 1] == 0 else 1
     # A copy, since transform_root() overwrites T.
@@ -854,7 +854,7 @@ def use_information(
                 for i in range(j, n):
                     total += rows[r * n + i] * root[k, i, j]
                 observed[0, j] = factor * total
-            rotate_out(scratch.size, root, k, observed, 0, scratch.gain, 1.0)
+            rotate(ONE, scratch.size, root, k, observed[0], scratch.gain[0])
         # sqrt(g) g^j for the next j.
         factor *= gap
 

@@ -28,6 +28,18 @@ def lower_triangular(array: FloatArray) -> FloatArray:
     return np.asarray(np.swapaxes(np.linalg.qr(np.swapaxes(array, -1, -2), mode="r"), -1, -2))
 
 
+def lower_root(root: FloatArray) -> FloatArray:
+    """Return the lower triangular S (n, n) with a nonnegative diagonal and ``S S' = root root'``,
+    for any ``root`` (n, c).
+    """
+    n, columns = root.shape
+    # QR of the transpose needs at least as many columns as rows.
+    wide = np.concatenate([root, np.zeros((n, max(n - columns, 0)))], axis=1)
+    L = np.tril(lower_triangular(wide))
+    # Column signs are free in S S'; a nonnegative diagonal makes the root unique.
+    return np.asarray(L * np.where(np.diag(L) < 0.0, -1.0, 1.0))
+
+
 @kernel
 def reflect(work: FloatArray, i: int, rows: int, columns: int) -> None:
     """Apply, from the right and in place, the Householder reflection of the columns ``i`` to

@@ -1,16 +1,20 @@
 """The event loop for messages that take no time: it queues visits of filters, see ``visits``.
 
-The order of events, their rows and the requests are those of ``event_loop``. Clocks are Poisson, so
+The order of events, their rows and the requests are those of ``clock_loop``. Clocks are Poisson, so
 that no two ticks are at one time: all messages of a tick are absorbed before the next event.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
+from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels.neighbours import combine_convex
+from netkf.algorithms.records import Kernels
 from netkf.engines.compiled.batch_loop import BatchArrays, begin, finish, no_batch, reset_filters
 from netkf.engines.compiled.event_loop import (
     ABSORB,
@@ -63,6 +67,9 @@ full.
 MAX_LINKS_OF_CLOCK = 62
 """Directed links that one clock may send on: each of them has an arrival bit."""
 
+CONVEX = Kernels(absorb=combine_convex, unrolled=True)
+"""The verbs of Kalman filters that form convex combinations, and do nothing else."""
+
 MAX_FILTERS = 200
 """Filters that are simulated together at most, unless one run has more."""
 
@@ -86,14 +93,16 @@ def is_immediate(scenario: Scenario) -> bool:
     and no sensors that take samples. Then no event depends on an estimate.
     """
     node_filter, network = scenario.node_filter, scenario.network
+    kernels = compiled_kernels(node_filter, clocked=True)
     return (
-        node_filter.combination == "convex"
+        kernels is not None
+        and replace(kernels, unrolled=True) == CONVEX
         and node_filter.talks
         and not scenario.sampled_sensors
         and type(network.activation) is Poisson
         and delay_is_zero(network.channel)
         # A negative max_age makes even messages of age 0 too old.
-        and getattr(node_filter, "max_age", math.inf) >= 0.0
+        and node_filter.max_age >= 0.0
         # Each message of a tick has a bit of one integer.
         and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
     )

@@ -1,4 +1,4 @@
-"""Batches of runs in the event loop, one run after the other in one compiled call.
+"""Batches of runs: where each begins, and its results.
 
 One Simulation holds the draws of all runs and space for all of their samples.
 """
@@ -9,11 +9,10 @@ from functools import cache
 
 import numpy as np
 
-from netkf.engines.compiled.event_loop import DONE, WANT_MESSAGES, event_loop
-from netkf.engines.compiled.state import NODE, Simulation, add_messages
+from netkf.engines.compiled.state import NODE, Simulation
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.structs import Struct, struct_at
+from netkf.linalg.structs import Struct
 from netkf.trace.schema import CODES, KINDS
 
 DIVERGED = CODES["diverged"]
@@ -46,32 +45,6 @@ class BatchArrays(Struct):
     has_bits: int
 
 
-ALONE = -1
-"""In place of the number of a run: the Simulation is not a run of a batch."""
-
-
-def simulate_batch(state: Simulation, batch: BatchArrays) -> None:
-    """Simulate all R runs of a batch up to the horizon, or until an estimate is no longer finite.
-    Writes the numbers of samples and of events of each run and whether it diverged into
-    ``batch`` (``lengths``, ``counts``, ``diverged``), and the samples into ``state.buffer``.
-    """
-    run, resumed = 0, False
-    while run < len(batch.lengths):
-        run = int(simulate_runs(state, batch.memory, run, resumed))
-        # A run stops only if the pool of messages is too small; then it goes on with a larger one.
-        if run < len(batch.lengths):
-            add_messages(state, state.most_messages)
-            resumed = True
-
-
-def run_alone(state: Simulation) -> int:
-    """Simulate the run ``state`` until it needs something from Python, and return that request
-    (WANT_... or DONE). It takes the kernel of batches, so that ``event_loop`` is compiled only
-    once.
-    """
-    return int(simulate_runs(state, no_batch().memory, ALONE, True))
-
-
 @cache
 def no_batch() -> BatchArrays:
     """Return a batch of R = 0 runs, which a kernel for batches takes in place of one when it
@@ -92,44 +65,6 @@ def no_batch() -> BatchArrays:
         carriers=1,
         has_bits=0,
     )
-
-
-@kernel
-def simulate_runs(state: Simulation, batch_memory: IntArray, run: int, resumed: bool) -> int:
-    """Simulate the runs of a batch from number ``run`` on, which goes on where it stopped if
-    ``resumed``. Return the number of the run that needs a larger pool of messages, or the number of
-    runs at the end. For ``run`` = ALONE simulate ``state``, which is no run of a batch, until it
-    needs something from Python, and return the request (WANT_... or DONE). ``batch_memory`` is the
-    block of memory (int64 words) of a BatchArrays.
-    """
-    # The batch comes as an array, since numba dispatches on arrays much faster than on structs.
-    if run == ALONE:
-        # No combination: filters that need one have a loop of their own.
-        return event_loop(state, None)
-    return simulate_from(state, struct_at(batch_memory, BatchArrays), run, resumed)
-
-
-@kernel
-def simulate_from(state: Simulation, batch: BatchArrays, run: int, resumed: bool) -> int:
-    """Simulate the runs of a batch from number ``run`` on, each from time 0, except that the first
-    of them goes on where it stopped if ``resumed``; store their results in ``batch``. Return the
-    number of the run that needs a larger pool of messages, or the number of runs at the end.
-    """
-    while run < len(batch.lengths):
-        # A resumed run keeps its state: only its pool of messages has been enlarged.
-        if not resumed:
-            state.first_run = run
-            reset_filters(state, batch, 0)
-            reset_messages(state)
-            begin(state, batch, run)
-        resumed, request = False, -1
-        while request != DONE:
-            request = event_loop(state, None)
-            if request == WANT_MESSAGES:
-                return run
-        finish(state, batch, run)
-        run += 1
-    return run
 
 
 @kernel

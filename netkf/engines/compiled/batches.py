@@ -17,13 +17,13 @@ import numpy as np
 from netkf.core.memory import keep_freed_memory
 from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
-from netkf.engines.compiled.batch_loop import BatchArrays, simulate_batch
+from netkf.engines.compiled.batch_loop import BatchArrays
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_samples
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.state import SPECIAL, Filters, PathBlock, Sensing
+from netkf.engines.compiled.state import Filters, PathBlock, Sensing
 from netkf.engines.compiled.ticks import all_ticks, window_of
 from netkf.engines.compiled.truth import PathStates, States
 from netkf.linalg.arrays import FloatArray
@@ -88,12 +88,9 @@ def _simulate(
             sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
             return _run_by_run(scenario, workspace, sources, replicas, rows)
         draws = BatchDraws(scenario, seed, replicas)
-        # simulate_batch() handles neither state outside the Simulation (SPECIAL) nor conserved sums
-        # nor moves of the origin, which Python does run by run.
+        # Conserved sums, longer pasts and moves of the origin need Python, run by run.
         clocked = workspace.clocked
-        alone = scenario.node_filter.combination in SPECIAL
-        alone = alone or (clocked is not None and clocked.conserves)
-        if alone or (len(draws.paths.frame_times) and not is_immediate(scenario)):
+        if clocked is not None and (clocked.needs_python or len(draws.paths.frame_times)):
             return _run_by_run(scenario, workspace, draws.runs(), replicas)
         return _all_at_once(scenario, workspace, draws)
 
@@ -130,10 +127,9 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
         group = together(len(start.nodes), runs)
         state = workspace.begin(draws, traced=False, buffer=buffer, together=group)
         simulate_together(state, workspace.visits(group), arrays, group)
-    elif workspace.clocked is not None:
-        workspace.clocked.simulate(workspace.begin(draws, traced=False, buffer=buffer), arrays)
     else:
-        simulate_batch(workspace.begin(draws, traced=False, buffer=buffer), arrays)
+        assert workspace.clocked is not None
+        workspace.clocked.simulate(workspace.begin(draws, traced=False, buffer=buffer), arrays)
     if len(draws.paths.frame_times):
         local = arrays.x.copy()
         arrays.x += draws.origins(scenario.times)

@@ -102,9 +102,9 @@ class ClockFilters:
         return arrays["xhat"][0, ..., 0], arrays["root"][0, ..., 0]
 
     @property
-    def conserves(self) -> bool:
-        """Whether exchanges conserve sums over all nodes."""
-        return bool(self._at_start)
+    def needs_python(self) -> bool:
+        """Whether a run must stop for sums that exchanges conserve, or for a longer past."""
+        return bool(self._at_start) or self.kernels.remembers
 
     def sums(self) -> dict[str, tuple[float, float]]:
         """Return by name the sums over all nodes that exchanges conserve, at the start and at the
@@ -139,7 +139,9 @@ class ClockFilters:
         return int(self._loop(state, self.record, self.run))
 
     def simulate(self, state: Simulation, batch: BatchArrays) -> None:
-        """Simulate all runs of a batch up to the horizon, as ``batch_loop.simulate_batch``."""
+        """Simulate all runs of a batch up to the horizon, or until an estimate is not finite; the
+        results are in ``batch``, the samples in ``state.buffer``.
+        """
         simulate, run, resumed = batch_loop(self.kernels), 0, False
         while run < len(batch.lengths):
             arguments = self.record, self.start, self.run, batch.memory, run, resumed

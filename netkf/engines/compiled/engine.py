@@ -11,18 +11,15 @@ from functools import partial
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.registry import built_in_filters
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
 from netkf.engines.compiled.agenda import is_immediate, simulate_agenda
-from netkf.engines.compiled.batch_loop import simulate_runs
 from netkf.engines.compiled.batches import flow_batches, quick_runs
 from netkf.engines.compiled.clock_loop import clock_loop
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.slot_loop import slot_loop
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
-from netkf.engines.compiled.state import COMBINATIONS
 from netkf.linalg import compiling
 from netkf.linalg.plain import announce_plain, has_numba, is_plain
 from netkf.plants.diffusion import Diffusion
@@ -49,18 +46,6 @@ BUILT_IN_PARTS = (
 )
 
 
-def _has_code(scenario: Scenario) -> bool:
-    """Return True if there are kernels for the filter of a scenario."""
-    node_filter = scenario.node_filter
-    if compiled_kernels(node_filter, not scenario.slotted) is not None:
-        return True
-    if type(scenario.filter.algorithm) not in built_in_filters().values():
-        return False
-    if scenario.slotted:
-        return node_filter.slot_kernel is not None
-    return node_filter.combination in COMBINATIONS
-
-
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
     """Runs all built-in plants, sensors and filters; clocks and channels may be a user's own, since
@@ -82,7 +67,7 @@ class CompiledEngine(Engine):
                 return (
                     f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
                 )
-        if not _has_code(scenario):
+        if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)
             return (
                 f'engine "compiled" has no code for the filter {name!r}, whose methods are plain '
@@ -95,16 +80,12 @@ class CompiledEngine(Engine):
         if is_plain():
             announce_plain()
             return
-        node_filter = scenario.node_filter
-        kernels = compiled_kernels(node_filter, not scenario.slotted)
-        # Slots and continuous time are compiled separately.
-        if kernels is not None and not (not scenario.slotted and is_immediate(scenario)):
-            loop = slot_loop(kernels) if scenario.slotted else clock_loop(kernels)
-            compiling.announce(loop)
-        elif scenario.slotted:
-            compiling.announce(node_filter.slot_kernel)
+        kernels = compiled_kernels(scenario.node_filter, not scenario.slotted)
+        assert kernels is not None
+        if scenario.slotted:
+            compiling.announce(slot_loop(kernels))
         else:
-            compiling.announce(simulate_agenda if is_immediate(scenario) else simulate_runs)
+            compiling.announce(simulate_agenda if is_immediate(scenario) else clock_loop(kernels))
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

@@ -13,12 +13,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels.root_flow import FlowScratch
 from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.agenda import advance_alone, is_immediate
-from netkf.engines.compiled.batch_loop import run_alone
 from netkf.engines.compiled.clock_filters import ClockFilters
-from netkf.engines.compiled.combination_state import combination_state_of
 from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path
 from netkf.engines.compiled.event_loop import (
     DONE,
@@ -28,22 +27,19 @@ from netkf.engines.compiled.event_loop import (
     WANT_ROWS,
     WANT_STEPS,
     WANT_TICKS,
-    event_loop,
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
-from netkf.engines.compiled.origins import move_origin
 from netkf.engines.compiled.sample_tables import SampleTables
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.schedule import ReadingsSchedule, Window
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
     CLOCKS,
-    COMBINATIONS,
-    SPECIAL,
     Filters,
     Instants,
     PathBlock,
     SampleBuffer,
+    Scratch,
     Sensing,
     Simulation,
     TickArrays,
@@ -201,21 +197,19 @@ class Workspace:
         self._incoming = np.argsort(order, kind="stable")
         self._waiting = np.zeros(len(self._start.nodes), dtype=np.int64)
         size, n = self._start.xhat.shape
-        self._pool = empty_pool(FIRST_MESSAGES, n)
+        self._pool = empty_pool(FIRST_MESSAGES)
         self._probes = np.array(scenario.times, dtype=np.float64)
         # Space for many samples, within a budget of floats.
         samples = max(1, min(MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS // (size * n * n)))
         self._buffer = empty_samples((1, samples, size, n))
         self._visits: Visits | None = None
-        self._scratch: tuple[Any, ...] = ()
-        # Code compiled for each n makes filters that combine estimates 1.5 times faster. It does
-        # not help filters of sums and of readings: these share one event loop for all n.
-        self._unrolled = scenario.node_filter.combination not in SPECIAL
+        self._scratch: tuple[Scratch, FlowScratch] | None = None
         kernels = compiled_kernels(scenario.node_filter, clocked=True)
+        assert kernels is not None
+        self._unrolled = kernels.unrolled
         self.clocked: ClockFilters | None = None
-        if kernels is not None and not is_immediate(scenario):
+        if not is_immediate(scenario):
             self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)
-            self._unrolled = kernels.unrolled
 
     @property
     def filters(self) -> Filters:
@@ -248,11 +242,9 @@ class Workspace:
         # All messages are free: a linked list in the order of the pool.
         pool["next"] = np.arange(1, len(pool) + 1)
         path = draws.path(together)
-        # Scratch depends on the sizes of samples: runs without samples share one Instants.
-        if not self._scratch or self._scratch[0] is not instants:
-            arrays = scratch_arrays(start.table, start.gains, instants, self._unrolled)
-            self._scratch = instants, *arrays
-        _, scratch, flow_arrays, update_arrays = self._scratch
+        if self._scratch is None:
+            self._scratch = scratch_arrays(start.table, start.gains, self._unrolled)
+        scratch, flow_arrays = self._scratch
         nodes, n = start.xhat.shape
         if self.clocked is not None:
             self.clocked.begin(instants)
@@ -274,9 +266,7 @@ class Workspace:
             directions=directions,
             incoming=self._incoming,
             pool=pool,
-            pool_x=self._pool[1],
-            pool_root=self._pool[2],
-            heap=self._pool[3],
+            heap=self._pool[1],
             waiting=self._waiting,
             instants=instants,
             sensing=draws.sensing,
@@ -291,7 +281,6 @@ class Workspace:
             counts=np.zeros(len(schema.KINDS), dtype=np.int64),
             scratch=scratch,
             flow_scratch=flow_arrays,
-            update_scratch=update_arrays,
             traced=traced,
             **self._scalar_fields(instants),
             **dict.fromkeys(AT_START, 0),
@@ -300,16 +289,14 @@ class Workspace:
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
         """Return by name those scalar fields of a Simulation that are not 0 at the start of a run:
-        the filter's kind and limits, and the largest number of messages and rows that one event may
+        the filter's limits, and the largest number of messages and rows that one event may
         need, by which the loop asks for space in time. ``instants`` are the samples of the run.
         """
-        algorithm: Any = self._scenario.node_filter
+        algorithm = self._scenario.node_filter
         max_messages = int(np.diff(self._senders.first).max(initial=0))
         return {
-            "combination_kind": _kind_of(self._scenario),
             "clock_kind": CLOCKS.index(self._senders.at),
             "newest_only": algorithm.newest_only,
-            "keep_own": getattr(algorithm, "on_loss", "") == "keep-own",
             "most_messages": max_messages,
             "free_count": len(self._pool[0]),
             # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
@@ -318,15 +305,9 @@ class Workspace:
             "most_rows": 2 + 3 * max_messages + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
             "per_second": self._scenario.time_grid.per_second,
-            "age_limit": getattr(algorithm, "max_age", math.inf),
+            "age_limit": algorithm.max_age,
             "inbox_time": 0.0,
         }
-
-
-def _kind_of(scenario: Scenario) -> int:
-    """Return the index of the filter's combination; -1 for one whose verbs are composed."""
-    combination = scenario.node_filter.combination
-    return COMBINATIONS.index(combination) if combination in COMBINATIONS else -1
 
 
 def ticks_of(window: Window) -> TickArrays:
@@ -369,18 +350,13 @@ class FlowRun:
         progress: Progress,
     ) -> None:
         """Set up the state of a run at time 0 from its random numbers ``draws``, in the arrays of
-        ``workspace``, with the extra arrays that its filter needs; ``progress`` is called with the
-        simulated seconds.
+        ``workspace``; ``progress`` is called with the simulated seconds.
         """
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         recorder.exact_errors = scenario.exact_errors
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
         self._visits = workspace.visits() if is_immediate(scenario) else None
         self._clocked = workspace.clocked
-        if self._clocked is not None:
-            self._combination = None
-            return
-        self._combination = combination_state_of(scenario, self._state)
 
     def to_the_end(self) -> str:
         """Simulate up to the horizon, or until an estimate is no longer finite, and record events
@@ -407,16 +383,12 @@ class FlowRun:
 
     def _advance(self) -> int:
         """Run the compiled loop that fits the filter until it needs something from Python; return
-        its request (WANT_... or DONE): visits in SIMD lanes, the loop of batches, which needs no
-        extra state, or the loop with extra state.
+        its request (WANT_... or DONE).
         """
         if self._clocked is not None:
             return self._clocked.advance(self._state)
-        if self._visits is not None:
-            return advance_alone(self._state, self._visits)
-        if self._scenario.node_filter.combination not in SPECIAL:
-            return run_alone(self._state)
-        return int(event_loop(self._state, self._combination))
+        assert self._visits is not None
+        return advance_alone(self._state, self._visits)
 
     def _fulfil(self, request: int) -> None:
         """Fulfil a ``request`` (WANT_...) of the event loop, before the loop goes on: put the next
@@ -451,9 +423,9 @@ class FlowRun:
         offset = -self._draws.states.offset(k, state.path, state.piece)
         if self._clocked is not None:
             self._clocked.shift(self._scenario, state, offset)
-            state.frame_at = k + 1
-            return
-        move_origin(self._scenario, state, self._combination, k, offset)
+        else:
+            # No message is under way, and covariances refer to no origin.
+            state.xhat[:] += offset
         state.frame_at = k + 1
 
     def _enlarge_pool(self) -> None:

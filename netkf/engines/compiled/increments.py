@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from netkf.algorithms.kernels.root_flow import gain_root, information_rate, propagate_root
+from netkf.algorithms.kernels.root_flow import gain_root, propagate_root
 from netkf.algorithms.kernels.run import interval_end, usable
 from netkf.engines.base import LONGER, MIN_GAP_SHARE
 from netkf.engines.compiled.state import PathBlock, Sensing, Simulation
@@ -186,24 +186,3 @@ def advance_over_interval(
     fill_readings(state, run, h, piece, now, end, readings)
     gains, reach = state.gains.series[m], state.gains.reach[m]
     gain_root(state.size, readings, gains, reach, 0, root, xhat, k, gap, scratch.values)
-
-
-@kernel
-def predict_with_increments(
-    state: Simulation, run: int, h: int, k: int, piece: int, now: float, time: float
-) -> None:
-    """Predict node ``h`` (index in ``state.nodes``) of run number ``run`` from ``now`` to ``time``
-    (seconds) and use its increments on the way. Changes row ``k`` of ``state.xhat`` and
-    ``state.root``, where the node's estimate is; ``time`` lies in piece ``piece`` (index) of the
-    path.
-
-    Each update uses the increments of one interval, which must be short enough that P changes
-    little over it; the larger P, the shorter the interval (``next_interval``).
-    """
-    whitened_H, least = state.table.whitened_H[state.nodes[h].model], 0.0
-    while now < time:
-        # The length of the interval follows from the rate of information trace(P G), G = H' R^-1 H.
-        rate = information_rate(ONE, state.size, whitened_H, state.root[k])
-        end, least = next_interval(rate, now, time, least)
-        advance_over_interval(state, run, h, k, piece, now, end)
-        now = end

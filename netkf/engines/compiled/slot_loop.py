@@ -12,12 +12,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.kernels.run import SlotRun
-from netkf.algorithms.kernels.slots import scatter_sample
 from netkf.algorithms.records import Kernels
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import struct_like
-from netkf.linalg.lanes import any_lane, load, load_flags, spread, store, store_flags
+from netkf.linalg.lanes import (
+    Lanes,
+    any_lane,
+    load,
+    load_flags,
+    scatter,
+    spread,
+    store,
+    store_flags,
+)
 
 PREDICT, SENSE, EXCHANGE = range(3)
 WHOLE = -1
@@ -276,3 +284,16 @@ def store_sample(
     scatter_sample(lanes, samples.sampled_xhat, samples.xhat[:, k], samples.runs)
     scatter_sample(lanes, samples.sampled_error, samples.error[:, k], samples.runs)
     scatter_sample(lanes, samples.sampled_P, samples.P[:, k], samples.runs)
+
+
+@kernel
+def scatter_sample(
+    lanes: Lanes, values: FloatArray, samples: FloatArray, indices: np.ndarray
+) -> None:
+    """Write one sample of L lanes (runs side by side) into the arrays of all R runs: the first C
+    rows of ``values`` (>= C, L) into ``samples`` (R, C), lane q into row ``indices[q]`` (L,); -1:
+    no run.
+    """
+    count = samples.shape[1]
+    for c in range(0, count, len(lanes)):
+        scatter(lanes, values, c, samples, indices, min(count - c, len(lanes)))

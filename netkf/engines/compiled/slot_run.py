@@ -16,22 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.kernels.slots import (
-    ARRIVING,
-    SENDING,
-    WHOLE,
-    ReadingBlock,
-    SlotNodes,
-    SlotPlan,
-    SlotSamples,
-    slot_scratch,
-)
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
-from netkf.engines.compiled import slot_loop as loop
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_filters import SlotFilters
+from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
     Channels,
     Matchings,
@@ -79,6 +69,21 @@ class SampledStates(NamedTuple):
     error: FloatArray
 
 
+class ReadingBlock(NamedTuple):
+    """Whitened readings ``y = H x + v`` of S slots in B blocks of L runs; H filters have at most p
+    rows each. A recorded sensor without a reading in a slot has rows of zeros, which change
+    nothing.
+
+    y : (B, S, H, p, L)
+    H : (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is fixed
+    rebased : flags (S,) of the slots in which the origin of coordinates moves
+    """
+
+    y: FloatArray
+    H: FloatArray
+    rebased: np.ndarray
+
+
 class SlotBlock(NamedTuple):
     """Results of S slots of R runs: indices ``sampled`` (T,) of the slots with a sample, the
     ``samples`` of these slots or of all slots so far, the times of the slots, and their messages.
@@ -112,25 +117,13 @@ class SlotRuns:
         self.samples = self._empty_samples(len(setup.samples)) if store_all else None
         self._blocks = blocks = blocks_of(runs)
         self._total = aligned((blocks, LANES))
-        self._nodes = SlotNodes(
-            xhat=in_lanes(setup.xhat, blocks),
-            root=in_lanes(setup.root, blocks),
-            F=setup.F,
-            root_Q=setup.root_Q,
-            rows=setup.rows,
-        )
         kernels = compiled_kernels(setup.algorithm, clocked=False)
-        self._filters = SlotFilters(setup, kernels, blocks) if kernels is not None else None
-        if self._filters is None:
-            self._scratch = slot_scratch(setup.estimators, setup.n, setup.algorithm.unrolled)
-            self._filter_arrays = setup.algorithm.slot_arrays(setup.states, setup.infos, runs)
+        assert kernels is not None
+        self._filters = SlotFilters(setup, kernels, blocks)
+        arrays, never = self._filters.records.arrays, (blocks, setup.estimators, LANES)
         # NEVER: a slot that no run reaches, for a node that never stops.
-        self._stopped = np.full((blocks, setup.estimators, LANES), NEVER)
-        self._conserved = aligned((blocks, setup.estimators, 2, LANES))
-        if self._filters is not None:
-            arrays = self._filters.records.arrays
-            self._stopped = arrays.get("stopped", self._stopped)
-            self._conserved = arrays.get("conserved", self._conserved)
+        self._stopped = arrays.get("stopped", np.full(never, NEVER))
+        self._conserved = arrays.get("conserved", aligned((blocks, setup.estimators, 2, LANES)))
         self._sent = np.zeros(len(setup.directions), dtype=np.int64)
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
@@ -248,56 +241,11 @@ class SlotRuns:
         x, xhat, P, error = (
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
-        if self._filters is not None:
-            runs = np.zeros(LANES, dtype=np.int64)
-            kernel_output = loop.SlotSamples(
-                x, xhat, P, error, absolute, local, setup.frame > 0, self._total,
-                *self._filters.sample_scratch, runs,
-            )  # fmt: skip
-            self._simulate(times, messages, readings, kernel_output)
-            return SlotBlock(sampled, samples, times, messages)
         kernel_samples = SlotSamples(
-            x=x,
-            xhat=xhat,
-            P=P,
-            error=error,
-            stopped=self._stopped,
-            conserved=self._conserved,
-            absolute=absolute,
-            local=local,
-            framed=setup.frame > 0,
-            total=self._total,
-        )
-        plan = SlotPlan(
-            first=self._slot,
-            sensed=times.sensed,
-            exchanged=times.exchanged,
-            sample=times.sample,
-            up=messages.up,
-            sent=messages.sent,
-            uniform=self._draw_uniforms(messages.sent),
-            part=WHOLE,
-        )
-        count, algorithm = len(times.start), setup.algorithm
-        extra = algorithm.slot_gains(setup.states, self._filter_arrays, self._slot, count)
-        kernel_arguments, slot_kernel = (
-            (setup.links, kernel_samples, self._scratch, *extra),
-            algorithm.slot_kernel,
-        )
-        unread = self._missed_readings(messages, count)
-        # Filters decide who sends, and Python makes the messages: the kernel runs in two parts, up
-        # to the sending, and from the arrivals on.
-        if self._events is not None and setup.decides:
-            slot_kernel(self._nodes, readings, plan._replace(part=SENDING), *kernel_arguments)
-            messages.sent[:, unread] = 0
-            sent = messages.sent[0, 0, :, :, 0]
-            _, up = self._events.following(max_events, lambda step, _: sent[step])
-            messages.up[..., 0], plan = up, plan._replace(part=ARRIVING)
-        slot_kernel(self._nodes, readings, plan, *kernel_arguments)
-        if len(messages.sent):
-            # Only now, since the kernel decides for all nodes that are asked, readings or not.
-            messages.sent[:, unread] = 0
-        self._slot += count
+            x, xhat, P, error, absolute, local, setup.frame > 0, self._total,
+            *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
+        )  # fmt: skip
+        self._simulate(times, messages, readings, kernel_samples)
         return SlotBlock(sampled, samples, times, messages)
 
     def _simulate(
@@ -305,13 +253,12 @@ class SlotRuns:
         times: SlotTimes,
         messages: SlotMessages,
         readings: ReadingBlock,
-        samples: loop.SlotSamples,
+        samples: SlotSamples,
     ) -> None:
         """Simulate the filters in the slots of ``times``, write ``samples``, and which nodes send
         into ``messages``.
         """
         filters, count = self._filters, len(times.start)
-        assert filters is not None
         drawn: dict[str, Any] = {
             "first": self._slot,
             "sensed": times.sensed,
@@ -322,7 +269,7 @@ class SlotRuns:
             "sent": messages.sent,
             "uniform": self._draw_uniforms(messages.sent),
         }
-        unread, begin = self._missed_readings(messages, count), loop.WHOLE
+        unread, begin = self._missed_readings(messages, count), WHOLE
 
         def decided(step: int, up: np.ndarray) -> np.ndarray:
             """Return the nodes (N,) that send in a step, given ``up`` (E, W) of those before it."""
@@ -337,7 +284,7 @@ class SlotRuns:
         if self._events is not None and self.setup.decides:
             _, up = self._events.following(self._max_events, decided)
             messages.up[..., 0] = up
-        filters.simulate(readings.y, readings.H, samples, **drawn, begin=begin, stop=loop.WHOLE)
+        filters.simulate(readings.y, readings.H, samples, **drawn, begin=begin, stop=WHOLE)
         if len(messages.sent):
             # Only now, since the kernel decides for all nodes that are asked, readings or not.
             messages.sent[:, unread] = 0
@@ -574,7 +521,7 @@ class SlotRuns:
             MANY, setup.sensors, noise, normal_ziggurat(), x, regressor_states, scratch, y, H
         )
         if not self._recorded or not times.sensed.any():
-            return ReadingBlock(y, H, local, rebased)
+            return ReadingBlock(y, H, rebased)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
         for s, path in self._recorded:
             rows = slice(s.row, s.row + s.rows)
@@ -582,7 +529,7 @@ class SlotRuns:
             whitened_y, whitened_H = path.whitened(slots, s.R, s.rows)
             y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
             H[:, times.sensed, s.estimator, rows] = whitened_H[..., None]
-        return ReadingBlock(y, H, local, rebased)
+        return ReadingBlock(y, H, rebased)
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows (K,) of the table of events, of dtype EVENT, of a block of slots of one

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels.root_update import lower_root
-from netkf.algorithms.kernels.slots import SlotLinks
+from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel
 from netkf.engines.compiled.slot_messages import (
     INDEPENDENT,
@@ -45,6 +44,21 @@ def slot_setup(scenario: Scenario) -> SlotSetup:
         vars(scenario)["_slot_setup"] = SlotSetup(scenario)
     setup: SlotSetup = vars(scenario)["_slot_setup"]
     return setup
+
+
+class SlotLinks(NamedTuple):
+    """W directed links by receiver: those to filter h are ``first[h]`` to ``first[h + 1]`` - 1.
+
+    first : (H + 1,)
+    sender : index (W,) of the sending filter
+    direction : index (W,) in the axis W of ``SlotPlan.up``
+    weight : (W,) that the receiver gives to the sender
+    """
+
+    first: np.ndarray
+    sender: np.ndarray
+    direction: np.ndarray
+    weight: FloatArray
 
 
 class AssignedSensor(NamedTuple):

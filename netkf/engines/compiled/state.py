@@ -17,7 +17,6 @@ from netkf.algorithms.kernels.root_flow import (
     flow_scratch,
     stack_tables,
 )
-from netkf.algorithms.kernels.root_update import UpdateScratch, update_scratch
 from netkf.algorithms.models import FlowModel, first_root
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.senders import senders_of
@@ -36,7 +35,7 @@ def _record_type(integers: str, floats: str = "") -> np.dtype:
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
 
 
-NODE = _record_type("model id sensor sensors inbox last sent reading", "own")
+NODE = _record_type("model id sensor sensors inbox last sent reading")
 """One filter.
 
 model : index of its model
@@ -45,7 +44,6 @@ sensor, sensors : its increment sensors are those with indices ``sensor`` to ``s
 inbox, last : first and last message of its inbox, -1: none
 sent : number of transmissions so far
 reading : index of the instant of its newest sample
-own : the weight that it gives to itself when all messages arrive
 """
 
 DIRECTED_LINK = _record_type("sender receiver messages", "weight")
@@ -68,17 +66,6 @@ tag : instant of the reading that is sent
 sent, arrival : seconds
 """
 
-(CONVEX, INTERSECTION, SWAP, SHARES, READINGS, SILENT, BEST, INVERSE, GAINS,
- PREDICTIONS) = range(10)  # fmt: skip
-COMBINATIONS = (
-    *("convex", "intersection", "swap", "shares", "readings", "none"),
-    *("best intersection", "inverse intersection", "constant gain", "predictions"),
-)
-"""The values of ``Filter.combination`` in the order of the constants CONVEX to PREDICTIONS."""
-
-SPECIAL = ("readings", *COMBINATIONS[BEST:])
-"""Combinations whose state is not in a Simulation alone (History, CombinationState)."""
-
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")
 """The values of ``Senders.at`` in the order of these constants. From NODES on nodes broadcast: one
@@ -87,13 +74,12 @@ transmission to all receivers.
 
 
 class Scratch(Struct):
-    """Scratch arrays; p is the largest number of increment rows of a node, q that of a sample.
+    """Scratch arrays; p is the largest number of increment rows of a node.
 
     moments : (2 p,), of a reading
     early, cut : (2, p), noise of the first part of a divided step, and the normals that divide it
     state_moments, total : (2, n), moments of x over an interval, and their sum over pieces
     values : values of the longest series at a gap
-    y, H, root_R : (q,), (q, n), (q, q), all samples of an instant
     """
 
     moments: FloatArray
@@ -102,9 +88,6 @@ class Scratch(Struct):
     state_moments: FloatArray
     total: FloatArray
     values: FloatArray
-    y: FloatArray
-    H: FloatArray
-    root_R: FloatArray
 
 
 class Sensing(Struct):
@@ -235,16 +218,13 @@ class Simulation(Struct):
     xhat, root : (G N, n) and (G N, n, n)
     now : time (G N,) in seconds that each estimate refers to
     table, gains : tables of all models, the last without sensors, for messages under way
-    combination_kind : the filter's combination, an index in COMBINATIONS
     clock_kind : kind of its clocks, an index in CLOCKS
-    keep_own : 1 if its ``on_loss`` is "keep-own"
 
     Links and messages
 
     entities, directions : ENTITY records (E,) and DIRECTED_LINK records (W,)
     outgoing : indices of directed links, those of each entity together
-    pool, pool_x, pool_root : MESSAGE records (C,), and the estimates (C, n) and roots (C, n, n)
-                              that they carry
+    pool : MESSAGE records (C,)
     first_free, free_count : first free message of the pool, and number of free ones
     most_messages : largest number of messages that one event may send
     incoming : (W,), number of each directed link among all links sorted by receiver and sender
@@ -276,7 +256,7 @@ class Simulation(Struct):
 
     Scratch
 
-    scratch, flow_scratch, update_scratch : arrays for computations.
+    scratch, flow_scratch : arrays for computations.
     """
 
     size: Size
@@ -291,8 +271,6 @@ class Simulation(Struct):
     directions: np.ndarray
     incoming: IntArray
     pool: np.ndarray
-    pool_x: FloatArray
-    pool_root: FloatArray
     heap: IntArray
     waiting: IntArray
     instants: Instants
@@ -306,10 +284,7 @@ class Simulation(Struct):
     counts: IntArray
     scratch: Scratch
     flow_scratch: FlowScratch
-    update_scratch: UpdateScratch
-    combination_kind: int
     clock_kind: int
-    keep_own: int
     newest_only: int
     traced: int
     run: int
@@ -373,7 +348,6 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # ``sensor`` of the first node stays 0.
     nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
     nodes["inbox"] = nodes["reading"] = -1
-    nodes["own"] = [scenario.own_weights[node] for node in filtering_nodes]
     # One table for each distinct model.
     table, gains = _stack_model_tables(distinct)
     xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
@@ -425,19 +399,12 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     return entities, directions
 
 
-def scratch_arrays(
-    table: FlowTable, gains: Gains, instants: Instants, unrolled: bool
-) -> tuple[Scratch, FlowScratch, UpdateScratch]:
-    """Return scratch arrays for all computations of a run whose sampled sensors have these
-    ``instants``, in models with these tables. ``unrolled``: they have types that know n, so that
-    kernels are compiled for just this n, which is faster.
+def scratch_arrays(table: FlowTable, gains: Gains, unrolled: bool) -> tuple[Scratch, FlowScratch]:
+    """Return scratch arrays for all computations of a run in models with these tables.
+    ``unrolled``: they have types that know n, so that kernels are compiled for just this n, which
+    is faster.
     """
     n, max_moments, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
-    # Rows of the reading of each sample, then the largest sum over one instant.
-    # The 0 allows for runs without any sampled sensor.
-    rows = np.concatenate([instants.rows, [0]])[instants.sensor]
-    totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
-    q = max(1, int(np.diff(totals).max(initial=0)))
     scratch = Scratch(
         moments=np.zeros(max_moments),
         # Two moments for each row.
@@ -447,35 +414,30 @@ def scratch_arrays(
         total=np.zeros((2, n)),
         # fill_state_moments() needs two rows of a course.
         values=np.zeros(max(width, 2 * course_width(n))),
-        y=np.zeros(q),
-        H=np.zeros((q, n)),
-        root_R=np.zeros((q, q)),
     )
-    return scratch, flow_scratch(table, unrolled), update_scratch(n, q, unrolled)
+    return scratch, flow_scratch(table, unrolled)
 
 
-def empty_pool(capacity: int, n: int) -> tuple[np.ndarray, FloatArray, FloatArray, np.ndarray]:
+def empty_pool(capacity: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the pool of C = ``capacity`` messages that the event loop sends: MESSAGE records (C,),
-    all free, the estimates (C, n) and roots (C, n, n) that they carry, and the heap (C,) of
-    messages under way, ordered by arrival.
+    all free, and the heap (C,) of messages under way, ordered by arrival.
     """
     pool = np.zeros(capacity, dtype=MESSAGE)
     pool["next"] = np.arange(1, capacity + 1)
-    return pool, np.zeros((capacity, n)), np.zeros((capacity, n, n)), np.zeros(capacity, np.int64)
+    return pool, np.zeros(capacity, np.int64)
 
 
 def add_messages(state: Simulation, at_least: int) -> None:
-    """Enlarge the pool of messages of ``state`` (``pool``, ``pool_x``, ``pool_root`` and ``heap``)
-    when the loop has used it up: to twice as many messages, or by ``at_least`` messages if these
-    are more.
+    """Enlarge the pool of messages of ``state`` (``pool`` and ``heap``) when the loop has used it
+    up: to twice as many messages, or by ``at_least`` messages if these are more.
     """
     # Doubling keeps the cost of copies proportional to the messages.
-    capacity, n = len(state.pool), state.xhat.shape[1]
+    capacity = len(state.pool)
     added = max(capacity, at_least)
-    new_pool = empty_pool(added, n)
-    new_pool[0]["next"] = np.arange(capacity + 1, capacity + added + 1)
+    pool, heap = empty_pool(added)
+    pool["next"] = np.arange(capacity + 1, capacity + added + 1)
     # The new messages come first in the list of free ones.
-    new_pool[0]["next"][-1], state.first_free = state.first_free, capacity
+    pool["next"][-1], state.first_free = state.first_free, capacity
     state.free_count += added
-    for name, new_part in zip(("pool", "pool_x", "pool_root", "heap"), new_pool, strict=True):
-        setattr(state, name, np.concatenate([getattr(state, name), new_part]))
+    state.pool = np.concatenate([state.pool, pool])
+    state.heap = np.concatenate([state.heap, heap])
