@@ -32,7 +32,7 @@ class Hybrid(Filter):
     combination: ClassVar[str] = "convex"
     P_by_design: ClassVar[tuple[str, str]] = ("", "larger")
     schedule: ClassVar[tuple[str, ...] | None] = None  # continuous time only
-    kernels = Kernels(absorb=combine_convex)
+    kernels = Kernels(absorb=combine_convex, unrolled=True)
 
     def weight(self, degree: int, peer_degree: int) -> float:
         """Return ``epsilon``, the weight of every link, whatever the degrees of the nodes at its

@@ -85,7 +85,7 @@ class Kernels:
     counts_sends: bool = False
     slotwise: bool = False
     addressed: bool = False
-    unrolled: bool = True
+    unrolled: bool = False
     under_clocks: Kernels | None = None
     depends_on_data: bool | None = None
 
