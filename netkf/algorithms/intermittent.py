@@ -131,11 +131,16 @@ def use_late(record: Any, h: int, run: Any, k: int) -> None:
     forget(record, h, run)
     time, moves = record.time[h, 0] - run.age[k], record.payload.moves[run.message[k], 0]
     last = record.kept[h, 0]
-    # The order of events at one time is that of moves, and does not matter for readings.
+    # The order of events at one time is that of moves, and does not matter for readings. A reading
+    # of the time of a move comes after it, however its age is rounded.
     e = last
     while e > 1 and (
         record.past_moves[h, e - 1, 0] > moves
-        or (record.past_moves[h, e - 1, 0] == moves and record.past_time[h, e - 1, 0] > time)
+        or (
+            record.past_moves[h, e - 1, 0] == moves
+            and record.past_time[h, e - 1, 0] > time
+            and record.past_rows[h, e - 1, 0] != MOVE
+        )
     ):
         copy_event(record, h, run, e, e - 1)
         e -= 1

@@ -9,7 +9,7 @@ import netkf
 from netkf import theory
 from netkf.rng.streams import Streams
 from netkf.theory.common.errors import error_law
-from netkf.theory.common.replay import delivered_messages
+from netkf.trace.schema import CODES
 from tests.algorithms.test_literature import (
     CENTRAL,
     LOSSY,
@@ -164,18 +164,23 @@ def batch(scenario, run):
             rows += [(float(t), node, sensor.H, sensor.R) for t in times]
     known = {node: {j: set() for j in scenario.nodes} for node in scenario.nodes}
     sent_at = {node: {} for node in scenario.nodes}
-    messages = delivered_messages(scenario, run)
-    events = [(m.time, 0, k, m) for k, m in enumerate(messages)]
-    events += [(m.arrives, 1, k, m) for k, m in enumerate(messages)]
+    log, sent, arrived = run.log, {}, []
+    for t, kind, node, peer, k in log[["t", "kind", "node", "peer", "message"]].tolist():
+        if kind == CODES["send"]:
+            sent[node, peer, k] = t
+        elif kind == CODES["deliver"]:
+            arrived.append((peer, node, sent[peer, node, k], t))
+    events = [(m[2], 0, k, m) for k, m in enumerate(arrived)]
+    events += [(m[3], 1, k, m) for k, m in enumerate(arrived)]
     content = {}
-    for time, kind, k, m in sorted(events, key=lambda e: e[:3]):
+    for time, kind, k, (sender, receiver, left, _) in sorted(events, key=lambda e: e[:3]):
         if kind == 0:
-            own = {r for r, row in enumerate(rows) if row[1] == m.sender and row[0] <= time}
-            others = [s for j, s in known[m.sender].items() if j != m.receiver]
+            own = {r for r, row in enumerate(rows) if row[1] == sender and row[0] <= time}
+            others = [s for j, s in known[sender].items() if j != receiver]
             content[k] = own.union(*others)
-        elif sent_at[m.receiver].get(m.sender, -1.0) <= m.time:
-            sent_at[m.receiver][m.sender] = m.time
-            known[m.receiver][m.sender] = content[k]
+        elif sent_at[receiver].get(sender, -1.0) <= left:
+            sent_at[receiver][sender] = left
+            known[receiver][sender] = content[k]
     T, found = run.times[-1], []
     for node in scenario.nodes:
         own = {r for r, row in enumerate(rows) if row[1] == node and row[0] <= T}

@@ -16,7 +16,7 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.laws.losses import share_of_bounded_runs
 from netkf.parts import Bernoulli, ExponentialDelay, Filter, Hybrid, Poisson, number, setting
 from netkf.scenario.reading import from_table
-from netkf.theory.common.stacked_errors import integration_steps
+from netkf.theory.common.increments import integration_steps
 from netkf.theory.intermittent.scalar_law import scalar_law
 from tests.checks.any_scenario import draw_any
 from tests.checks.calibration import accusations

@@ -1,18 +1,13 @@
-"""Kernels for square roots of covariances, and the stack of errors that they move."""
+"""Square roots of covariances, forms of noises, and the exponentials between them."""
 
 import numpy as np
 import pytest
 import scipy.linalg
 
-from netkf.theory.numerics.prediction import Predictor, triangular_root
-from netkf.theory.numerics.stack import GaussianStack
-from netkf.theory.numerics.updates import (
-    Observation,
-    add_information_to_root,
-    average_covariances,
-    intersect_covariances,
-    update_covariance_root,
-)
+from netkf.theory.common.forms import Forms
+from netkf.theory.numerics.observations import Observation
+from netkf.theory.numerics.prediction import LinearSDE, triangular_root
+from netkf.theory.stochastic_trigger.errors import measurement_update
 
 SIZES = (1, 2, 3, 5)
 
@@ -44,71 +39,41 @@ def test_updates_are_those_of_a_kalman_filter(n):
     (root,), H = roots(n, 1), random.standard_normal((2, n))
     R = square(random.standard_normal((2, 2))) + np.eye(2)
     R.flags.writeable = False  # as those of a scenario
-    closed, K, after = update_covariance_root(root, Observation(H, R, np.eye(2)))
+    K, after = measurement_update(root, Observation(H, R, np.eye(2)))
     P = square(root)
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     assert np.allclose(K, gain, atol=1e-12)
-    assert np.allclose(closed, np.eye(n) - gain @ H, atol=1e-12)
     assert np.allclose(square(after), P - gain @ H @ P, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", SIZES)
-def test_means_of_covariances_and_of_information(n):
-    parts, weights = roots(n, 3), [0.2, 0.3, 0.5]
-    covariances = [square(part) for part in parts]
-    root, factors = average_covariances(weights, parts)
-    expected = sum(w * P for w, P in zip(weights, covariances, strict=True))
-    assert np.allclose(square(root), expected, rtol=1e-12)
-    assert np.allclose(factors, np.multiply.outer(weights, np.eye(n)))
-    root, factors = intersect_covariances(weights, parts)
-    inverses = [np.linalg.inv(P) for P in covariances]
-    P = np.linalg.inv(sum(w * V for w, V in zip(weights, inverses, strict=True)))
-    assert np.allclose(square(root), P, rtol=1e-8, atol=1e-8 * np.abs(P).max())
-    expected = [w * P @ V for w, V in zip(weights, inverses, strict=True)]
-    assert np.allclose(factors, expected, rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.parametrize("n", SIZES)
-def test_information_adds_up(n):
-    (root, other), (U,) = roots(n, 2), [square(roots(n, 1, 7)[0])]
-    after = square(add_information_to_root(root, U))
-    assert np.allclose(np.linalg.inv(after), np.linalg.inv(square(root)) + U, rtol=1e-8)
-    singular = other.copy()
-    singular[:, 0] = 0.0  # an estimate that is certain in some direction
-    P = square(singular)
-    expected = P @ np.linalg.inv(np.eye(n) + U @ P)
-    assert np.allclose(square(add_information_to_root(singular, U)), expected, atol=1e-10)
 
 
 @pytest.mark.parametrize("gap", [1e-6, 0.3, 20.0])
 def test_predictions_are_those_of_van_loan(gap):
     A, B = np.array([[0.0, 1.0], [-1.0, -0.1]]), np.array([[0.0], [1.0]])
-    step = Predictor(A, B, A, B)(gap)
+    found, root = LinearSDE(A, B).discretise(gap)
     big = np.zeros((4, 4))
     big[:2, :2], big[:2, 2:], big[2:, 2:] = -A, B @ B.T, A.T
     F = scipy.linalg.expm(big * gap)[2:, 2:].T
     Q = F @ scipy.linalg.expm(big * gap)[:2, 2:]
-    assert np.allclose(step.error, F, rtol=1e-12, atol=1e-14)
-    assert np.allclose(square(step.error_noise), Q, rtol=1e-9, atol=1e-12 * Q.max())
-    assert np.array_equal(step.error_noise, step.root)
+    assert np.allclose(found, F, rtol=1e-12, atol=1e-14)
+    assert np.allclose(square(root), Q, rtol=1e-9, atol=1e-12 * Q.max())
 
 
 def test_settled_forms_stay_valid_while_inputs_are_reduced():
     # Random walks x and y with some common noise: C(s, t) = C(s, s) for s < t.
-    n, stack, random = 2, GaussianStack(2), np.random.default_rng(3)
-    stack.put("x", np.zeros((n, 0)))
-    stack.put("y", np.zeros((n, 0)))
+    forms, random = Forms(1), np.random.default_rng(3)
+    rows = forms.take(4)
     kept, covariances, total = [], [], np.zeros((4, 4))
     for step in range(200):
-        parts = random.standard_normal((2, n, 3))
-        columns = stack.inputs(3)
-        for name, part in zip("xy", parts, strict=True):
-            stack.add(name, columns, part)
-        total += square(parts.reshape(4, 3))
+        parts = random.standard_normal((4, 3))
+        first = forms.inputs(3)
+        forms.table[rows, first : first + 3] += parts
+        total += square(parts)
         if step % 40 == 7:
-            kept.append(stack.freeze(["y", "x"]).reshape(4, -1))
-            covariances.append(total[np.ix_([2, 3, 0, 1], [2, 3, 0, 1])])
-    assert np.allclose(stack.covariance(["x", "y"]), total, rtol=1e-12)
+            kept.append(forms.freeze(forms.table[rows[::-1], : forms.used]))
+            covariances.append(total[::-1, ::-1].copy())
+    assert forms.used < 150
+    found = forms.table[rows, : forms.used]
+    assert np.allclose(square(found), total, rtol=1e-12)
     for i, one in enumerate(kept):
         for j, other in enumerate(kept):
             width = min(one.shape[1], other.shape[1])
@@ -116,21 +81,13 @@ def test_settled_forms_stay_valid_while_inputs_are_reduced():
             assert np.allclose(found, covariances[min(i, j)], rtol=1e-10, atol=1e-10)
 
 
-def test_names_move_copies_stay_and_places_are_clean():
-    stack = GaussianStack(1)
-    columns = stack.inputs(2)
-    stack.put("a", np.zeros((1, 0)))
-    stack.add("a", columns, np.array([[1.0, 2.0]]))
-    stack.matrices[stack.index("a")] = 3.0
-    stack.copy("a", "b")
-    stack.rename("a", "c")
-    assert sorted(stack.names) == ["b", "c"]
-    assert "a" not in stack
-    stack.put("c", np.array([[5.0]]))
-    assert stack.form("b").tolist() == [[1.0, 2.0]]
-    assert stack.form("c").tolist() == [[5.0, 0.0]]
-    assert stack.matrices[stack.index("b")].item() == 3.0
-    stack.drop(["b"])
-    stack.put("d", np.zeros((1, 0)))
-    assert not stack.form("d").any()
-    assert np.array_equal(stack.mix(["c", "d"], np.array([[[2.0]], [[1.0]]])), [[10.0, 0.0]])
+def test_rows_that_come_back_are_clean():
+    forms = Forms(1)
+    kept, given = forms.take(1), forms.take(2)
+    first = forms.inputs(2)
+    forms.table[given, first:] = 7.0
+    forms.table[kept, first] = 3.0
+    forms.give(given)
+    again = forms.take(5)
+    assert not forms.table[again, : forms.used].any()
+    assert forms.table[kept, : forms.used].tolist() == [[0.0, 3.0, 0.0]]

@@ -1,110 +1,43 @@
-"""Exact errors of affine filters in slots, from their own verbs.
+"""Errors of filters as columns: one for each independent noise.
 
-Given the events of a run, estimates are linear in the first state and in all noises: one *column*
-for each. The filter's own kernels run on the columns side by side, as on so many runs, in each of
-which one noise is 1 and all others are 0; the covariance of all errors is the sum of the products
-of the columns. A filter needs no rule of its own for that. When there are many columns they are
-turned into as few as their rank allows, which leaves the sum of products as it is.
+Given the events of a run, errors of affine filters are linear in the first state and in all noises.
+The covariance of all errors is the sum of the products of the columns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import cast
+from collections.abc import Iterator
 
 import numpy as np
 
-from netkf.algorithms.filter import commutes, compiled_kernels
-from netkf.algorithms.records import make_records
-from netkf.engines.compiled.slot_filters import SlotFilters
-from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
-from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
-from netkf.linalg.arrays import FloatArray, square_root
-from netkf.linalg.lanes import LANES, blocks_of
-from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observations import slot_observations
-from netkf.theory.numerics.updates import Observation
-from netkf.trace.run import Run
-from netkf.trace.schema import CODES
-
-ZERO, MEAN, NOISE = range(3)
-"""The first columns: no noise at all, whose entries are those that do not depend on noise; the
-means; from NOISE on the noises.
-"""
-
-FEW = 64
-"""Columns that cost no more time than fewer do."""
-
-
-def has_columns(scenario: Scenario) -> bool:
-    """Return True if the filter of a scenario is affine and its verbs are kernels: then its errors
-    follow from the verbs. A filter that commutes with a shift of the truth says that it is affine.
-    """
-    kernels = compiled_kernels(scenario.node_filter, clocked=False)
-    return kernels is not None and kernels.affine and commutes(scenario.node_filter)
+from netkf.linalg.arrays import FloatArray
 
 
 class ErrorColumns:
     """The errors of M estimators as columns: derived classes have the filters.
 
-    ``_x`` (n, C) is the true state; its columns are ZERO, MEAN and the noises. ``_kept`` are the
-    errors (M n, C - 1) at earlier times.
+    ``_kept`` are the errors (M n, C) at earlier times: their means, and a column for each noise.
     """
 
     estimators: int
     n: int
-    _x: FloatArray
     _kept: list[FloatArray]
 
-    def _matrices(self) -> dict[str, FloatArray]:
-        """Return all arrays of the filters as matrices (entries, C), by name."""
+    def replay(self) -> Iterator[None]:
+        """Replay the events of the run; yield at each of ``run.times``."""
         raise NotImplementedError
-
-    def _write(self, values: dict[str, FloatArray], columns: int) -> None:
-        """Give the filters so many columns, with these matrices (entries, columns)."""
-        raise NotImplementedError
-
-    def _compress(self, others: Sequence[FloatArray] = ()) -> list[FloatArray]:
-        """Turn the columns of noises into as few as their rank allows; return ``others`` (rows, C),
-        what else depends on noises, in the new columns.
-        """
-        columns = self._x.shape[1]
-        linear = {}
-        for name, matrix in self._matrices().items():
-            rows = (matrix[:, NOISE:] != matrix[:, ZERO : ZERO + 1]).any(axis=1)
-            if rows.any():
-                linear[name] = matrix, rows
-        parts = [
-            matrix[rows, NOISE:] - matrix[rows, ZERO : ZERO + 1] for matrix, rows in linear.values()
-        ]
-        # Columns that came after a time are zero there.
-        kept = [_padded(form, columns - 1 - form.shape[1], 1) for form in self._kept]
-        forms = [self._x, *others, *kept]
-        stack = np.concatenate([*(form[:, NOISE:] for form in forms), *parts])
-        if len(stack) < stack.shape[1]:
-            # stack' = Q R, and stack Q = R' has the same products.
-            stack = cast(FloatArray, np.linalg.qr(stack.T, mode="r")).T
-        count = NOISE + stack.shape[1]
-        pieces = np.split(stack, np.cumsum([len(form) for form in (*forms, *parts)])[:-1])
-        forms = [
-            np.column_stack([form[:, :NOISE], piece])
-            for form, piece in zip(forms, pieces, strict=False)
-        ]
-        self._x, self._kept = forms[0], [form[:, MEAN:] for form in forms[1 + len(others) :]]
-        values = {}
-        for (name, (matrix, rows)), part in zip(linear.items(), pieces[len(forms) :], strict=True):
-            whole = np.repeat(matrix[:, ZERO : ZERO + 1], count, axis=1)
-            whole[:, MEAN] = matrix[:, MEAN]
-            whole[rows, NOISE:] += part
-            values[name] = whole
-        self._write(values, count)
-        return forms[1 : 1 + len(others)]
 
     def _forms(self) -> FloatArray:
-        """Return the errors (M n, C - 1): the mean, and the columns of noises."""
-        estimates = self._matrices()["xhat"]
-        return np.asarray(np.tile(self._x, (self.estimators, 1)) - estimates)[:, MEAN:]
+        """Return the errors (M n, C): the means, and the columns of noises."""
+        raise NotImplementedError
+
+    def covariances(self) -> FloatArray:
+        """Return P (M, n, n) of the estimators."""
+        raise NotImplementedError
+
+    def keep(self) -> None:
+        """Store the present errors for ``law``."""
+        self._kept.append(self._forms())
 
     def covariance(self) -> FloatArray:
         """Return the joint covariance (M n, M n) of the errors of the estimators."""
@@ -116,212 +49,20 @@ class ErrorColumns:
         forms = self._forms()
         return np.asarray(forms @ forms.T)
 
-    def covariances(self) -> FloatArray:
-        """Return P (M, n, n) of the estimators."""
-        roots = self._matrices()["root"][:, ZERO]
-        S = np.tril(roots.reshape(self.estimators, self.n, self.n))
-        return np.asarray(S @ np.swapaxes(S, 1, 2))
-
-    def keep(self) -> None:
-        """Store the present errors for ``law``."""
-        self._kept.append(self._forms())
-
     def law(self) -> tuple[FloatArray, FloatArray]:
         """Return the mean (K M n,) and the covariance (K M n, K M n) of the errors at the K times
         at which ``keep`` was called.
         """
         width = max(form.shape[1] for form in self._kept)
-        padded = [_padded(form, width - form.shape[1]) for form in self._kept]
-        forms = np.concatenate(padded)
+        # Columns that came after a time are zero there.
+        forms = np.concatenate([padded(form, width - form.shape[1]) for form in self._kept])
         noises = forms[:, 1:]
         return forms[:, 0], np.asarray(noises @ noises.T)
 
 
-class SlotColumns(ErrorColumns):
-    """The errors of M estimators in slots, as columns."""
-
-    def __init__(self, scenario: Scenario, run: Run) -> None:
-        kernels = compiled_kernels(scenario.node_filter, clocked=False)
-        assert kernels is not None
-        self._scenario, self._run = scenario, run
-        self._setup: SlotSetup = slot_setup(scenario)
-        self.estimators, self.n = self._setup.estimators, self._setup.n
-        plant = scenario.slot_plant
-        self._F, self._noise = plant.F, square_root(plant.Q)
-        self._kernels = replace(kernels, decides=False)
-        self._kept = []
-        self._fewest = 0
-        # The true state (n, columns).
-        self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
-        self._filters = self._begin()
-
-    def _begin(self) -> SlotFilters:
-        """Return the filters at time 0: those of the column of means have theirs."""
-        setup = self._setup
-        columns = self._x.shape[1]
-        filters = SlotFilters(setup, self._kernels, blocks_of(columns), with_means=False)
-        starts = list(zip(setup.xhat, setup.root, strict=True))
-        means = make_records(
-            setup.algorithm, starts, setup.infos, setup.models, len(setup.links.sender), 1
-        )
-        for name, array in filters.records.arrays.items():
-            array[0, ..., MEAN] = means.arrays[name][0, ..., 0]
-        return filters
-
-    def replay(self) -> Iterator[None]:
-        """Replay the events of the run; yield at each of ``run.times``."""
-        scenario, run, setup = self._scenario, self._run, self._setup
-        observe, arrivals = slot_observations(scenario, run), _arrivals(scenario, run, setup)
-        predicts, processed = scenario.node_filter.predicts, 0
-        for until in scenario.slot_plant.slots_of(run.times).tolist():
-            while processed < until:
-                slot = processed if predicts else processed + 1
-                if predicts:
-                    self._simulate(slot, observe(slot), arrivals)
-                    self._move_truth()
-                else:
-                    self._move_truth()
-                    self._simulate(slot, observe(slot), arrivals)
-                if self._x.shape[1] > max(FEW, 2 * self._fewest):
-                    self._compress()
-                    self._fewest = self._x.shape[1]
-                processed += 1
-            yield
-
-    def _move_truth(self) -> None:
-        """Move the true state by one slot, with a column for each noise of the plant."""
-        self._x = np.column_stack([self._F @ self._x, self._noise])
-        self._fit(self._x.shape[1])
-
-    def _fit(self, columns: int) -> None:
-        """Give the filters room for so many columns; all that are not used are as the column
-        without noise.
-        """
-        former = self._filters.records.arrays
-        old, blocks = len(former["xhat"]), blocks_of(columns)
-        if blocks <= old:
-            return
-        # Making filters takes longer than a slot of a few columns more.
-        room = blocks + blocks // 4
-        self._filters = SlotFilters(self._setup, self._kernels, room, with_means=False)
-        for name, array in self._filters.records.arrays.items():
-            array[:] = former[name][:1, ..., ZERO : ZERO + 1]
-            array[:old] = former[name]
-
-    def _simulate(
-        self, slot: int, observations: dict[int, Observation], arrivals: dict[int, np.ndarray]
-    ) -> None:
-        """Simulate a slot: each reading has a column for its noise."""
-        setup, n = self._setup, self.n
-        first = self._x.shape[1]
-        columns = first + sum(o.root.shape[1] for o in observations.values())
-        self._x = np.column_stack([self._x, np.zeros((n, columns - first))])
-        self._fit(columns)
-        blocks = len(self._filters.records.arrays["xhat"])
-        width = blocks * LANES
-        # The origin follows the true state, so that errors on unstable plants keep their digits.
-        framed = self._scenario.filters_know_the_truth
-        state = _padded(self._x, width - columns).reshape(n, 1, blocks, LANES)
-        local = np.ascontiguousarray(np.moveaxis(state, 2, 0).swapaxes(1, 2))
-        if framed and setup.algorithm.predicts:
-            self._x[:] = 0.0
-        y = np.zeros((setup.estimators, setup.p, width))
-        H = np.zeros((1, 1, setup.estimators, setup.p, n, LANES))
-        for h, observation in observations.items():
-            rows, noises = observation.root.shape
-            whitened = np.linalg.solve(
-                np.linalg.cholesky(observation.R),
-                np.column_stack([observation.H, observation.root]),
-            )
-            y[h, :rows, :columns] = whitened[:, :n] @ self._x
-            y[h, :rows, first : first + noises] += whitened[:, n:]
-            H[0, 0, h, :rows] = whitened[:, :n, None]
-            first += noises
-        y = np.moveaxis(y.reshape(*y.shape[:2], blocks, LANES), 2, 0)[:, None]
-        algorithm, steps = setup.algorithm, len(setup.fresh)
-        up = arrivals.get(slot, np.zeros((steps, len(setup.directions)), dtype=np.uint8))
-        shape = (blocks, 1, *up.shape, LANES)
-        nothing = np.zeros(1, dtype=bool)
-        self._filters.simulate(
-            np.ascontiguousarray(y),
-            H,
-            _no_samples(local, blocks, self._filters),
-            first=slot,
-            sensed=~nothing,
-            exchanged=np.array([algorithm.talks and slot >= algorithm.first_slot]),
-            sample=np.full(1, -1),
-            rebased=~nothing if framed else nothing,
-            up=np.ascontiguousarray(np.broadcast_to(up[None, None, :, :, None], shape)),
-            sent=np.zeros((0,) * 5, dtype=np.uint8),
-            uniform=np.zeros((0,) * 5),
-            begin=WHOLE,
-            stop=WHOLE,
-        )
-        if framed:
-            self._x[:] = 0.0
-
-    def _matrices(self) -> dict[str, FloatArray]:
-        """Return all arrays of the filters as matrices (entries, C), by name."""
-        arrays, columns = self._filters.records.arrays, self._x.shape[1]
-        width = len(arrays["xhat"]) * LANES
-        return {
-            name: np.moveaxis(array, 0, -2).reshape(-1, width)[:, :columns]
-            for name, array in arrays.items()
-            if array.dtype == np.float64
-        }
-
-    def _write(self, values: dict[str, FloatArray], columns: int) -> None:
-        """Give the filters so many columns, with these matrices (entries, columns)."""
-        self._fit(columns)
-        arrays = self._filters.records.arrays
-        width = len(arrays["xhat"]) * LANES
-        for name, whole in values.items():
-            array = arrays[name]
-            full = np.repeat(whole[:, ZERO : ZERO + 1], width, axis=1)
-            full[:, :columns] = whole
-            shape = (*array.shape[1:-1], len(array), LANES)
-            array[:] = np.moveaxis(full.reshape(shape), -2, 0)
-
-
-def _padded(form: FloatArray, after: int, before: int = 0) -> FloatArray:
+def padded(form: FloatArray, after: int, before: int = 0) -> FloatArray:
     """Return a form with so many columns of zeros added: np.pad takes ten times as long."""
     rows, columns = form.shape
     whole = np.zeros((rows, before + columns + after))
     whole[:, before : before + columns] = form
     return whole
-
-
-def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSamples:
-    """Return room for no sample, with the true states (B, 1, n, L) of the slot."""
-    nothing = np.zeros((1, 0, 1))
-    return SlotSamples(
-        nothing, nothing, nothing, nothing, local, local, False, np.zeros((blocks, LANES)),
-        *filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
-    )  # fmt: skip
-
-
-def _arrivals(scenario: Scenario, run: Run, setup: SlotSetup) -> dict[int, np.ndarray]:
-    """Return by slot which messages were used, (E, W) in the order of exchanges of a slot and of
-    the directed links.
-    """
-    log, index = run.log, setup.index_of_direction
-    sends, delivers = (log[log["kind"] == CODES[kind]] for kind in ("send", "deliver"))
-    slots, phases = scenario.slot_plant.slots_of(sends["t"]), np.maximum(sends["phase"], 0)
-    first_step = {phase: setup.phases.index(phase) for phase in set(setup.phases)}
-    counts: dict[tuple[int, int, int], int] = {}
-    places: dict[tuple[int, int], tuple[int, int]] = {}
-    columns = (slots, phases, *(sends[name] for name in ("node", "peer", "message")))
-    for slot, phase, node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
-        w = index[node, peer]
-        # A link sends once in each repetition of an exchange.
-        step = counts.get((slot, phase, w), 0)
-        counts[slot, phase, w] = step + 1
-        places[w, number] = slot, first_step[phase] + step
-    shape = len(setup.fresh), len(setup.directions)
-    arrivals: dict[int, np.ndarray] = {}
-    columns = tuple(delivers[name] for name in ("node", "peer", "message"))
-    for node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
-        w = index[peer, node]
-        slot, step = places[w, number]
-        arrivals.setdefault(slot, np.zeros(shape, dtype=np.uint8))[step, w] = 1
-    return arrivals

@@ -1,9 +1,8 @@
 """The exact covariance of all errors of one run, given when its messages arrived.
 
 Given the events, covariances P_i and gains are deterministic, and the errors e_i = x - xhat_i are
-linear in the noises. Their joint covariance Sigma therefore follows without simulation, from one
-recursion for slots and for clocks (theory/common/replay.py) with the rule of each filter
-(theory/<paper>/errors.py).
+linear in the noises. Their joint covariance Sigma therefore follows without simulation, from the
+filter's own verbs (theory/common/slot_columns.py, theory/common/clock_columns.py).
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     block stays below P_i, which this shows without Monte Carlo. Regressors are those of the run;
     delays, losses and filter models that differ from the truth are included; recorded states and
     readings are treated as if they had the law that the scenario gives them. Raises TheoryError for
-    a user's subclass that overrides more than the weights, and for the push-sum filter with frozen
-    or asymptotic gains.
+    filters that are not affine and for those whose verbs are plain Python, also where a user's
+    subclass overrides one.
     """
     joint = _replay_nodes(scenario, run)
     return joint if stacked else diagonal_blocks(joint, len(scenario.nodes))

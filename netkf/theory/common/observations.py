@@ -19,7 +19,7 @@ from netkf.scenario.sampling import (
     sample_times,
 )
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.updates import Observation, stack_observations
+from netkf.theory.numerics.observations import Observation, stack_observations
 from netkf.trace.run import Run
 
 EstimatorObservations = dict[int, Observation]

@@ -23,7 +23,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.taylor import StiffError, solve_by_taylor_series
-from netkf.theory.numerics.updates import Observation
+from netkf.theory.numerics.observations import Observation
 
 TOLERANCE = 1e-10  # relative, of the solver
 DEFECT_TOLERANCE = 1e-7  # relative, of the finished solution

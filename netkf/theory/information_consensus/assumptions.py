@@ -9,13 +9,16 @@ weight, omega a_ij <= 1 (derived; at omega = N that needs all a_ij = 1/N).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import model_and_start_rows
 from netkf.theory.common.random_links import nothing_is_lost
-from netkf.theory.information_consensus.errors import effective_weights, step_weights
 
 SOURCE = "Battistelli and Chisci 2014"
 ONCE = "no reading counts more than once"
@@ -46,3 +49,35 @@ def _judge_counts(scenario: Scenario) -> tuple[bool, str]:
     _, counts = effective_weights(scenario, [weights] * steps)
     max_count = float(np.max(counts))
     return max_count <= 1.0 + TOLERANCE, f"a node counts a reading up to {max_count:.4g} times"
+
+
+def step_weights(scenario: Scenario) -> FloatArray:
+    """Return the weights (N, N) that nodes (rows) give to the messages of others (columns)."""
+    index = scenario.topology.index
+    weights = np.zeros((len(index), len(index)))
+    for sender, receiver in scenario.topology.directions:
+        weights[index[receiver], index[sender]] = scenario.weight(receiver, sender)
+    return weights
+
+
+def effective_weights(
+    scenario: Scenario, weights: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the weights (N, N) of the predictions and those of the readings (N, N) in the
+    estimates after an exchange, in which nodes average pairs (information vector and matrix).
+
+    Entry (i, j) is the number of times that node i counts the information of node j. ``weights``
+    (N, N) of each step are those of the messages that arrived in it, 0 for others.
+    """
+    algorithm: Any = scenario.node_filter
+    N = len(scenario.nodes)
+    mixing = np.eye(N)
+    for heard in weights:
+        # A node gives the weight of lost messages to its own pair.
+        mixing = (heard + np.diag(np.maximum(1.0 - heard.sum(axis=1), 0.0))) @ mixing
+    # A node averages K pairs, each a multiple (``shares``) of the information of its prediction and
+    # of its reading. The estimate is the sum of these pairs and of the node's own prediction, each
+    # times its entry of ``counts``.
+    shares, counts = algorithm.recipe(N)
+    times = counts[:-1] @ shares
+    return times[0] * mixing + counts[-1] * np.eye(N), times[1] * mixing

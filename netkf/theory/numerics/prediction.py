@@ -1,8 +1,5 @@
-"""Propagation of the state, of errors and of covariances over a gap between events.
-
-Without increments all errors obey the same ``e+ = F e + D x + w``, with the F of the filters and D
-the difference of the plant's F to it; :class:`Predictor` computes this :class:`Prediction` from a
-stochastic differential equation.
+"""Propagation of the state, of errors and of covariances between events of nodes that read
+increments.
 
 With increments each error has a transition of its own, computed by :class:`ErrorFlow`. Let M be the
 Hamiltonian of the Riccati equation, ``E(s) = exp(M s)`` and ``[X; Y](s) = E(s) [I; P]``. Over a gap
@@ -18,39 +15,17 @@ the QR factorisation ``[I; Gamma S] = Z U`` it is ``I - (S Z_1)(Z_2' Gamma)``.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.theory.numerics.roots import discretise, flow_estimates, triangular
-from netkf.theory.numerics.stack import GaussianStack
 
 # Eight nodes integrate e^{A s} to rounding within one unit; mapped from [-1, 1] to [0, 1].
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
 MAX_NORM, TERMS = 0.5, 22  # largest |M| s, and terms, of exp(M s); the remainder is 0.5^22 / 22!
-MAX_CACHED = 256  # predictions cached by their gap; periodic clocks have few different gaps
-
-
-class Prediction(NamedTuple):
-    """One prediction of the state and of all errors, over k common inputs.
-
-    state       : (n, n) F of the plant
-    error       : (n, n) F of the filters
-    follow      : (n, n) factor of the state in the errors, the difference of the two
-    state_noise : (n, k) factor of the inputs in the state
-    error_noise : (n, k) factor of the inputs in the errors
-    root        : (n, r) with ``root root' = Q`` as the filters assume it
-    """
-
-    state: FloatArray
-    error: FloatArray
-    follow: FloatArray
-    state_noise: FloatArray
-    error_noise: FloatArray
-    root: FloatArray
 
 
 class ShortExponential:
@@ -88,50 +63,6 @@ def triangular_root(factor: FloatArray) -> FloatArray:
         return triangular(factor)
     # factor' = Z U, so factor factor' = U' U: U' is the root, with arbitrary signs of its columns.
     return np.swapaxes(np.linalg.qr(np.swapaxes(factor, -1, -2), mode="r"), -1, -2)
-
-
-class Predictor:
-    """Predictions without increments, for the plant dx = A x dt + B dw and filters that assume A_f
-    and B_f instead.
-
-    A and A_f are (n, n), B and B_f (n, m), for m independent noises w of variance 1 per second.
-    """
-
-    def __init__(self, A: FloatArray, B: FloatArray, A_f: FloatArray, B_f: FloatArray) -> None:
-        """Take the plant's A (n, n) and B (n, m), and those that the filters assume, A_f and B_f of
-        the same shapes.
-        """
-        self._n = n = len(A)
-        self._belief = LinearSDE(A_f, B_f)
-        # State and error together, driven by the same noise: de = (A_f e + (A - A_f) x) dt + B dw.
-        self._truth = None
-        if not (np.array_equal(A, A_f) and np.array_equal(B, B_f)):
-            joint_drift = np.block([[A, np.zeros((n, n))], [A - A_f, A_f]])
-            self._truth = LinearSDE(joint_drift, np.concatenate([B, B], axis=0))
-        self._known: dict[float, Prediction] = {}
-
-    def __call__(self, gap: float) -> Prediction:
-        """Return the prediction over ``gap`` seconds: the transitions (n, n) of the state and of
-        all errors, and the factors (n, k) of the plant's noise in them.
-
-        Up to MAX_CACHED predictions are cached by their gap.
-        """
-        prediction = self._known.get(gap)
-        if prediction is None:
-            prediction = self._discretise(gap)
-            if len(self._known) >= MAX_CACHED:
-                self._known.clear()
-            self._known[gap] = prediction
-        return prediction
-
-    def _discretise(self, gap: float) -> Prediction:
-        """Compute the prediction of the state and of all errors over ``gap`` seconds."""
-        F_f, root = self._belief.discretise(gap)
-        if self._truth is None:
-            return Prediction(F_f, F_f, np.zeros_like(F_f), root, root, root)
-        F, noise = self._truth.discretise(gap)
-        n = self._n
-        return Prediction(F[:n, :n], F[n:, n:], F[n:, :n], noise[:n], noise[n:], root)
 
 
 class LinearSDE:
@@ -260,23 +191,44 @@ class ErrorFlow:
         )
 
     def move(
-        self, stack: GaussianStack, names: Sequence[Hashable], gap: float, columns: tuple[int, int]
+        self, errors: FloatArray, roots: FloatArray, gap: float, columns: tuple[int, int]
     ) -> None:
-        """Propagate errors, which do not depend on the state, and the roots of their P over ``gap``
-        seconds, at most ``unit``: as :meth:`transition`, in compiled code.
+        """Propagate the forms of K ``errors`` (K, n, C), which do not depend on the state, and the
+        ``roots`` (K, n, n) of their P over ``gap`` seconds, at most ``unit``: as
+        :meth:`transition`, in compiled code.
 
-        Changes ``stack.table`` and ``stack.matrices`` of the vectors ``names``. ``columns``: the
-        first of the plant's 8 m inputs, and the first of n inputs of each error.
+        Changes both. ``columns``: the first of the plant's 8 m inputs, and the first of n inputs of
+        each error.
         """
         flow_estimates(
-            stack.arrays,
-            stack.indices(names),
+            errors,
+            roots,
             columns,
             self._tables,
             (self._exp.terms, self._exp.unit, self._scale),
             gap,
             (NODES, WEIGHTS),
         )
+
+    def follow(
+        self,
+        errors: FloatArray,
+        roots: FloatArray,
+        state: FloatArray,
+        gap: float,
+        columns: tuple[int, int],
+    ) -> None:
+        """Do the same for ``errors`` that depend on the ``state``, whose form (n, C) is that at the
+        start of the gap.
+        """
+        step, (first, own) = self.transition(roots, gap), columns
+        width, noises = step.response.shape[2], step.reading_noise.shape[2]
+        errors[:] = step.transition @ errors + step.follow @ state
+        errors[:, :, first : first + width] += step.response
+        for k in range(len(errors)):
+            begin = own + k * self._n
+            errors[k, :, begin : begin + noises] += step.reading_noise[k]
+        roots[:] = step.root
 
     def _update_gramian(
         self, roots: FloatArray, gamma_rows: FloatArray
@@ -328,20 +280,27 @@ class ErrorFlow:
         return np.stack(responses, axis=1)
 
 
-def propagate_state(
-    plant: tuple[FloatArray, FloatArray], gap: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the state's transition (n, n) and its response (n, 8 m) to the plant's inputs, over a
-    ``gap`` in seconds.
+class StateFlow:
+    """The true state dx = A x dt + B dw over gaps; A is (n, n), B (n, m).
 
-    ``plant`` is the pair A (n, n), B (n, m). The inputs are independent with variance 1: the m of
-    the noise at each of 8 quadrature nodes (instants of the gap), those of one instant side by
-    side, so that response times its transpose is the covariance of the noise over the gap.
+    inputs : 8 m, the m of the noise at each of 8 quadrature nodes (instants of the gap)
     """
-    A, B = plant
-    E = ShortExponential(A)(np.append((1.0 - NODES) * gap, gap))
-    root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]
-    return E[-1], _side_by_side((root_weights * (E[:-1] @ B))[None])[0]
+
+    def __init__(self, A: FloatArray, B: FloatArray) -> None:
+        """Take A (n, n), per second, and B (n, m) of m noises of variance 1 per second."""
+        self._exp, self._B = ShortExponential(A), B
+        self.inputs = len(NODES) * B.shape[1]
+
+    def __call__(self, gap: float) -> tuple[FloatArray, FloatArray]:
+        """Return the state's transition (n, n) and its response (n, 8 m) to the plant's inputs,
+        over a ``gap`` in seconds, at most MAX_NORM / |A|.
+
+        The inputs are independent with variance 1, those of one instant side by side, so that
+        response times its transpose is the covariance of the noise over the gap.
+        """
+        E = self._exp(np.append((1.0 - NODES) * gap, gap))
+        root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]
+        return E[-1], _side_by_side((root_weights * (E[:-1] @ self._B))[None])[0]
 
 
 def _side_by_side(matrices: FloatArray) -> FloatArray:

@@ -1,36 +1,20 @@
 """Kernels for square roots of covariances, ``P = S S'``, and for the linear forms of errors.
 
-An error is a linear form of independent standard normal inputs: ``forms`` (vectors, n, width) holds
-the coefficients of all errors, of which the first ``used`` columns are in use. ``matrices``
-(vectors, n, n) holds the root of P that belongs to each error. Roots are updated by orthogonal
-triangularisation (Kailath, Sayed and Hassibi 2000, Linear Estimation, chapter 12), in which no
-subtraction cancels digits.
+An error is a linear form of independent standard normal inputs, its coefficients (n, C). Roots are
+updated by orthogonal triangularisation (Kailath, Sayed and Hassibi 2000, Linear Estimation, chapter
+12), in which no subtraction cancels digits.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.kernels.square_root import reflect
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import copy_matrix, solve_inplace
-
-
-class ErrorTable(NamedTuple):
-    """The arrays of a GaussianStack of errors, which kernels modify.
-
-    forms    : (vectors, n, width) linear forms of the errors
-    matrices : (vectors, n, n) a matrix of each error, such as the root of its P
-    used     : number of columns of forms in use
-    """
-
-    forms: FloatArray
-    matrices: FloatArray
-    used: int
 
 
 @kernel
@@ -59,21 +43,6 @@ def triangular(factor: FloatArray) -> FloatArray:
     root = np.empty((n, n))
     _keep_root(root, scratch)
     return root
-
-
-@kernel
-def cholesky_into(L: FloatArray, matrix: FloatArray, n: int) -> None:
-    """Write the lower triangular Cholesky factor of a positive definite ``matrix`` (n, n) into the
-    first n rows and columns of L, zeros above the diagonal included.
-    """
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = math.sqrt(total) if i == j else total / L[j, j]
-        for j in range(i + 1, n):
-            L[i, j] = 0.0
 
 
 @kernel
@@ -112,45 +81,6 @@ def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: Floa
 
 
 @kernel
-def add_columns(form: FloatArray, first: int, matrix: FloatArray, sign: float) -> None:
-    """Add ``sign matrix`` (n, k) times k random inputs to an error: to the k columns from ``first``
-    on of its ``form`` (n, width), the coefficients of the inputs, in place.
-    """
-    for i in range(matrix.shape[0]):
-        for k in range(matrix.shape[1]):
-            form[i, first + k] += sign * matrix[i, k]
-
-
-@kernel(allocates=True)
-def predict_estimates(
-    errors: ErrorTable,
-    indices: IntArray,
-    F: FloatArray,
-    noise: FloatArray,
-    root: FloatArray,
-    first: int,
-) -> None:
-    """Predict in place the errors at ``indices`` of the table and the roots of their P.
-
-    ``e+ = F e + noise w`` and ``P+ = F P F' + root root'``. F is (n, n), ``noise`` (n, k)
-    multiplies the inputs w, whose coefficients in the errors are the columns from ``first`` on, and
-    ``root`` is (n, r).
-    """
-    forms, matrices, used = errors
-    n, r = F.shape[0], root.shape[1]
-    scratch, factor = np.empty((n, used)), np.empty((n, n + r))
-    for index in indices:
-        multiply_form(forms[index], F, used, scratch)
-        add_columns(forms[index], first, noise, 1.0)
-        _multiply_into(factor, F, matrices[index])
-        for i in range(n):
-            for k in range(r):
-                factor[i, n + k] = root[i, k]
-        triangularise(factor, n, n + r)
-        _keep_root(matrices[index], factor)
-
-
-@kernel
 def _multiply_into(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
     """Write ``a b`` (r, c) over the first c columns of ``out``, for a (r, k) and b (k, c)."""
     for i in range(a.shape[0]):
@@ -168,207 +98,6 @@ def _keep_root(root: FloatArray, factor: FloatArray) -> None:
     for i in range(n):
         for j in range(n):
             root[i, j] = factor[i, j] if j <= i else 0.0
-
-
-@kernel(allocates=True)
-def update_root(
-    root: FloatArray, H: FloatArray, R: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ``I - K H`` (n, n), the Kalman gain K (n, p) and the root (n, n) of P after a reading
-    ``y = H x + v``.
-
-    ``root`` (n, n) is that of P before it, H (p, n), and R (p, p) the covariance of v that the
-    filter assumes.
-    """
-    p, n = H.shape
-    array = np.zeros((p + n, p + n))
-    # L = [[V^1/2, 0], [K V^1/2, P+^1/2]] of [[R^1/2, H S], [0, S]], with V = H P H' + R.
-    cholesky_into(array, R, p)
-    _multiply_into(array[:, p:], H, root)
-    for i in range(n):
-        for j in range(n):
-            array[p + i, p + j] = root[i, j]
-    triangularise(array, p + n, p + n)
-    K, new_root, closed = np.empty((n, p)), np.zeros((n, n)), np.zeros((n, n))
-    for i in range(n):
-        for j in range(p - 1, -1, -1):
-            total = array[p + i, j]
-            for k in range(j + 1, p):
-                total -= K[i, k] * array[k, j]
-            K[i, j] = total / array[j, j]
-        for j in range(i + 1):
-            new_root[i, j] = array[p + i, p + j]
-    for i in range(n):
-        closed[i, i] = 1.0
-        for j in range(n):
-            for k in range(p):
-                closed[i, j] -= K[i, k] * H[k, j]
-    return closed, K, new_root
-
-
-@kernel(allocates=True)
-def update_estimate(
-    errors: ErrorTable,
-    index: int,
-    H: FloatArray,
-    R: FloatArray,
-    noise: FloatArray,
-    first: int,
-) -> None:
-    """Update the error ``index`` of the table and the root of its P in place by a reading:
-    ``e+ = (I - K H) e - K noise w``, with the Kalman gain K of H (p, n) and the assumed R (p, p).
-
-    ``noise`` (p, p) is a root of the true covariance, and belongs to the p inputs from column
-    ``first`` on.
-    """
-    forms, matrices, used = errors
-    n, p = H.shape[1], H.shape[0]
-    closed, K, root = update_root(matrices[index], H, R)
-    multiply_form(forms[index], closed, used, np.empty((n, used)))
-    gain_noise = np.empty((n, p))
-    _multiply_into(gain_noise, K, noise)
-    add_columns(forms[index], first, gain_noise, -1.0)
-    _keep_root(matrices[index], root)
-
-
-@kernel(allocates=True)
-def average_roots(weights: FloatArray, roots: FloatArray) -> FloatArray:
-    """Return a root (n, n) of ``sum_j w_j P_j`` from ``roots`` (J, n, n) of the P_j and ``weights``
-    (J,); negative weights count as 0.
-    """
-    count, n = roots.shape[0], roots.shape[1]
-    factor = np.empty((n, count * n))
-    for k in range(count):
-        # sum w P = [w^1/2 S, ...] [w^1/2 S, ...]', a triangular root of which has n columns
-        scale = math.sqrt(max(weights[k], 0.0))
-        for i in range(n):
-            for j in range(n):
-                factor[i, k * n + j] = scale * roots[k, i, j]
-    triangularise(factor, n, count * n)
-    out = np.empty((n, n))
-    _keep_root(out, factor)
-    return out
-
-
-@kernel(allocates=True)
-def mixed_form(forms: FloatArray, sources: IntArray, factors: FloatArray, used: int) -> FloatArray:
-    """Return the form (n, used) of the error ``sum_j W_j e_j``: its coefficients of the first
-    ``used`` random inputs, of which all errors are linear functions.
-
-    ``factors`` are W (J, n, n); the e_j are the ``forms`` (vectors, n, width) at the indices
-    ``sources`` (J,).
-    """
-    n = factors.shape[1]
-    out = np.zeros((n, used))
-    for k in range(len(sources)):
-        form = forms[sources[k]]
-        for i in range(n):
-            for j in range(n):
-                factor = factors[k, i, j]
-                if factor == 0.0:
-                    continue
-                for c in range(used):
-                    out[i, c] += factor * form[j, c]
-    return out
-
-
-@kernel(allocates=True)
-def add_information(root: FloatArray, U: FloatArray) -> FloatArray:
-    """Return a root (n, n) of ``(P^-1 + U)^-1`` for ``root`` (n, n) of P and positive semidefinite
-    U (n, n).
-    """
-    n = root.shape[0]
-    half, inner = np.zeros((n, n)), np.zeros((n, n))
-    # (P^-1 + U)^-1 = S (I + S' U S)^-1 S' with P = S S'; P itself is never inverted.
-    for i in range(n):
-        for j in range(n):
-            for k in range(n):
-                half[i, j] += 0.5 * (U[i, k] + U[k, i]) * root[k, j]
-    for i in range(n):
-        for j in range(i + 1):
-            total = 1.0 if i == j else 0.0
-            for k in range(n):
-                total += root[k, i] * half[k, j]
-            inner[i, j] = total
-    L, out = np.empty((n, n)), root.copy()
-    cholesky_into(L, inner, n)
-    divide_by_transpose(out, L, n, n)
-    return out
-
-
-@kernel(allocates=True)
-def fade_totals(
-    totals: ErrorTable,
-    indices: IntArray,
-    inverse: FloatArray,
-    fading: float,
-    noise: FloatArray,
-    first: int,
-) -> None:
-    """Predict the running totals of push-sum (the sums of all masses that a node has ever sent) at
-    ``indices`` to a later time; changes their matrices and forms, those of one part of u each.
-
-    The matrices of ``totals`` are their information U, the forms the errors u_g - U P_g x of a part
-    of u as linear functions of random inputs. ``U+ = M' U M`` and ``(u_g - U P_g x)+ = s M' (u_g -
-    U P_g x) - U+ P_g w``, with ``inverse`` M (n, n), s = ``fading``, and ``noise`` (n, k), the part
-    P_g w of the plant's noise, times the inputs from column ``first`` on. Totals without
-    information are left alone.
-    """
-    forms, matrices, used = totals
-    n = inverse.shape[0]
-    transform, faded, half = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    noise_term, scratch = np.empty(noise.shape), np.empty((n, used))
-    for i in range(n):
-        for j in range(n):
-            transform[i, j], faded[i, j] = inverse[j, i], fading * inverse[j, i]
-    for index in indices:
-        empty = True
-        for i in range(n):
-            for j in range(n):
-                empty = empty and matrices[index, i, j] == 0.0
-        if empty:
-            continue
-        _multiply_into(half, transform, matrices[index])
-        _multiply_into(matrices[index], half, inverse)
-        multiply_form(forms[index], faded, used, scratch)
-        _multiply_into(noise_term, matrices[index], noise)
-        add_columns(forms[index], first, noise_term, -1.0)
-
-
-@kernel(allocates=True)
-def intersect_with_factors(weights: FloatArray, roots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the root (n, n) of P and the factors (J, n, n) ``w_j P P_j^-1`` of the errors, where
-    ``P^-1 = sum_j w_j P_j^-1``.
-
-    ``weights`` (J,) and ``roots`` (J, n, n) of the P_j; negative weights count as 0. The results
-    are nan if one of the roots is singular.
-    """
-    count, n = roots.shape[0], roots.shape[1]
-    factor, inverses = np.empty((n, count * n)), np.zeros((count, n, n))
-    for k in range(count):
-        for i in range(n):
-            inverses[k, i, i] = 1.0
-        solve_inplace(roots[k].copy(), inverses[k], n)
-        scale = math.sqrt(max(weights[k], 0.0))
-        for i in range(n):
-            for j in range(n):
-                factor[i, k * n + j] = scale * inverses[k, j, i]
-    # L L' = P^-1, so L^-T is a root of P.
-    triangularise(factor, n, count * n)
-    root, P, factors = np.zeros((n, n)), np.empty((n, n)), np.empty((count, n, n))
-    for i in range(n):
-        root[i, i] = 1.0
-    divide_by_transpose(root, factor, n, n)
-    _multiply_into(P, root, root.T)
-    half = np.empty((n, n))
-    for k in range(count):
-        _multiply_into(half, P, inverses[k].T)
-        _multiply_into(factors[k], half, inverses[k])
-        for i in range(n):
-            for j in range(n):
-                factors[k, i, j] *= max(weights[k], 0.0)
-    triangularise(root, n, n)
-    return root, factors
 
 
 @kernel(allocates=True)
@@ -570,16 +299,17 @@ def flow_over_gap(
 
 @kernel(allocates=True)
 def flow_estimates(
-    errors: ErrorTable,
-    indices: IntArray,
+    errors: FloatArray,
+    roots: FloatArray,
     columns: tuple[int, int],
     flow: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
     exponential: tuple[FloatArray, float, float],
     gap: float,
     quadrature: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Propagate errors of filters with the same continuous readings, and their roots of P, over a
-    ``gap`` of at most one unit, in seconds; changes both in ``errors`` at ``indices``.
+    """Propagate the forms of K ``errors`` (K, n, C) of filters with the same continuous readings,
+    and the ``roots`` (K, n, n) of their P, over a ``gap`` of at most one unit, in seconds; changes
+    both.
 
     flow        : R^-1/2 H (p, n), the filters' gain factors H' R^-1/2 and H' R^-1 times a root of
                   the true noise (n, p), the filters' B and the plant's B (n, m)
@@ -589,7 +319,7 @@ def flow_estimates(
     columns     : the first of the K m inputs of the plant, and the first of the n inputs of each
                   error's own noise, which are there if p > 0
     """
-    forms, matrices, used = errors
+    used = errors.shape[2]
     whitened, gain, noise, B, plant = flow
     nodes, weights = quadrature
     root_weights = np.sqrt(weights * gap)
@@ -599,9 +329,9 @@ def flow_estimates(
     count, n, p = len(nodes), F.shape[0], whitened.shape[0]
     scratch, phi = np.empty((n, used)), np.empty((n, n))
     reading_noise = np.zeros((n, max(n, count * p)))
-    for e in range(len(indices)):
-        form = forms[indices[e]]
-        FJ, FC, root = flow_over_gap(F, Gamma, start, matrices[indices[e]])
+    for e in range(len(errors)):
+        form = errors[e]
+        FJ, FC, root = flow_over_gap(F, Gamma, start, roots[e])
         multiply_form(form, FJ, used, scratch)
         for i in range(n):
             for j in range(reading_noise.shape[1]):
@@ -619,4 +349,4 @@ def flow_estimates(
             for i in range(n):
                 for j in range(i + 1):
                     form[i, columns[1] + e * n + j] += reading_noise[i, j]
-        _keep_root(matrices[indices[e]], root)
+        _keep_root(roots[e], root)

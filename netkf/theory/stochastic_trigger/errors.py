@@ -8,20 +8,21 @@ reading: neither depends on what was read (Han et al. 2015, Theorem 2).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, cast
 
 import numpy as np
 
 from netkf.algorithms.stochastic_trigger import silence_noise
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.error_rules import ErrorRule, SentMessage
-from netkf.theory.common.observations import EstimatorObservations
+from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.forms import MEAN, Forms
+from netkf.theory.common.observations import slot_observations
 from netkf.theory.common.random_links import all_messages_arrive
-from netkf.theory.common.stacked_errors import StackedErrors
-from netkf.theory.numerics.updates import Observation
+from netkf.theory.numerics.observations import Observation
+from netkf.theory.numerics.prediction import triangular_root
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -56,36 +57,83 @@ def decisions(scenario: Scenario, run: Run) -> Decisions:
     return {(slot, index[node]) for slot, node in zip(slots, rows["node"].tolist(), strict=True)}
 
 
-class ScheduleRule(ErrorRule):
-    """Rule of the stochastic trigger: updates by readings that were sent and by the silence of all
-    other sensors.
+class ScheduleColumns(ErrorColumns):
+    """The error of the one estimate that all nodes have, as a form of the noises."""
+
+    # Who sends depends on readings, so that the filter is not affine: it has equations of its own.
+
+    def __init__(self, scenario: Scenario, run: Run) -> None:
+        self._scenario, self._run, self._kept = scenario, run, []
+        self.estimators, self.n = len(scenario.nodes), scenario.plant.n
+        mean, cov = scenario.initial_estimate(scenario.nodes[0])
+        plant: Any = scenario.plant
+        self._table = Forms(self.n)
+        self._e, self._root = self._table.take(self.n), square_root(np.asarray(cov))
+        first = square_root(np.asarray(plant.start_cov))
+        self._add(first)
+        self._table.table[self._e, MEAN] = plant.start_mean - mean
+
+    def _add(self, noise: FloatArray) -> None:
+        """Add ``noise`` (n, k) times k new inputs to the error."""
+        column, width = self._table.inputs(noise.shape[1]), noise.shape[1]
+        self._table.table[self._e, column : column + width] += noise
+
+    def replay(self) -> Iterator[None]:
+        """Replay the decisions of the run; yield at each of ``run.times``."""
+        scenario, slot = self._scenario, 0
+        sent, observe = decisions(scenario, self._run), slot_observations(scenario, self._run)
+        (F, Q), Y = scenario.slot_belief, cast(Any, scenario.filter.algorithm).Y
+        noise = square_root(Q)
+        for until in scenario.slot_plant.slots_of(self._run.times).tolist():
+            while slot < until:
+                slot += 1
+                self._change(F, noise)
+                self._root = triangular_root(np.column_stack([F @ self._root, noise]))
+                for h, observation in observe(slot).items():
+                    # Silence counts as a reading that equals its prediction, with the noise
+                    # R + Y^-1.
+                    self._use(observation if (slot, h) in sent else silence(observation, Y))
+            yield
+
+    def _change(self, matrix: FloatArray, noise: FloatArray) -> None:
+        """Multiply the error by a ``matrix`` (n, n) and add ``noise`` (n, k) times new inputs."""
+        table, used = self._table.table, self._table.used
+        table[self._e, :used] = matrix @ table[self._e, :used]
+        self._add(noise)
+
+    def _use(self, observation: Observation) -> None:
+        """Update the error and the root of P by a reading."""
+        if not len(observation.H):
+            return
+        gain, self._root = measurement_update(self._root, observation)
+        self._change(np.eye(self.n) - gain @ observation.H, -gain @ observation.root)
+
+    def _forms(self) -> FloatArray:
+        """Return the errors (N n, C): the means, and the columns of inputs."""
+        return np.tile(self._table.table[self._e, : self._table.used], (self.estimators, 1))
+
+    def covariances(self) -> FloatArray:
+        """Return P (N, n, n) of the estimators."""
+        return np.tile(self._root @ self._root.T, (self.estimators, 1, 1))
+
+    def keep(self) -> None:
+        """Store the present errors for ``law``."""
+        error = self._table.freeze(self._table.table[self._e, : self._table.used])
+        self._kept.append(np.tile(error, (self.estimators, 1)))
+
+
+def measurement_update(root: FloatArray, observation: Observation) -> tuple[FloatArray, FloatArray]:
+    """Return the Kalman gain (n, p) and the root (n, n) of P after a reading, for the ``root``
+    before it, by one orthogonal triangularisation, in which no subtraction loses digits.
     """
-
-    takes_messages = False
-
-    def __init__(self, scenario: Scenario, errors: StackedErrors, run: Run) -> None:
-        super().__init__(scenario, errors)
-        algorithm: Any = scenario.filter.algorithm
-        self._Y, self._sent = algorithm.Y, decisions(scenario, run)
-        self._observations: EstimatorObservations = {}
-
-    def sense(self, time: float, observations: EstimatorObservations) -> None:
-        """Store the readings of the slot for ``exchange``. Called by the replay at every time of
-        readings.
-        """
-        self._observations = observations
-
-    def exchange(self, slot: int, phase: int, messages: Sequence[SentMessage]) -> None:
-        """Update the estimates of all nodes by every sensor of this ``slot``, whether it sent or
-        not; changes their errors and roots of P. Called by the replay once in a slot; who sent is
-        known from the log, so that ``messages`` are not used.
-        """
-        columns = self.errors.reading_noises(self._observations)
-        for estimator, observation in self._observations.items():
-            # Silence counts as a reading that equals its prediction, with the noise R + Y^-1.
-            used = observation if (slot, estimator) in self._sent else silence(observation, self._Y)
-            for hearer in range(self.errors.estimators):
-                self.errors.update(hearer, used, columns[estimator])
+    p, n = observation.H.shape
+    # [[R^1/2, H S], [0, S]] times an orthogonal matrix is [[C, 0], [K C, S+]], C C' = H P H' + R.
+    rows = np.block(
+        [[np.linalg.cholesky(observation.R), observation.H @ root], [np.zeros((n, p)), root]]
+    )
+    lower = triangular_root(rows)
+    gain = np.linalg.solve(lower[:p, :p].T, lower[p:, :p].T).T
+    return np.asarray(gain), lower[p:, p:]
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:
@@ -101,15 +149,9 @@ def silence(reading: Observation, Y: float | FloatArray) -> Observation:
     return Observation(reading.H, R, root)
 
 
-def error_rule(
-    scenario: Scenario, errors: StackedErrors, run: Run, messages: Sequence[SentMessage]
-) -> ErrorRule:
-    """Return the rule by which filters under the stochastic trigger use the readings, sent or not,
-    of a run. The replay of the run, which computes its exact errors from its events, calls the rule
-    at each event; it changes ``errors``, the stacked errors of all nodes.
-
-    Raises TheoryError where silence may be a loss, or the filters do not know the law of
-    innovations.
+def error_columns(scenario: Scenario, run: Run) -> ErrorColumns:
+    """Return the errors of all nodes under the stochastic trigger, for the replay of a run. Raises
+    TheoryError where silence may be a loss, or the filters do not know the law of innovations.
     """
     if not all_hear_all(scenario):
         raise TheoryError(UNHEARD)
@@ -120,4 +162,4 @@ def error_rule(
             "the filters start with different estimates: silence is about the sender's prediction, "
             "and hearers take it to be about their own"
         )
-    return ScheduleRule(scenario, errors, run)
+    return ScheduleColumns(scenario, run)

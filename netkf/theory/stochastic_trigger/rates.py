@@ -11,8 +11,8 @@ from netkf.linalg.arrays import ArrayLike, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
 from netkf.theory.numerics.matrices import as_covariance
-from netkf.theory.numerics.updates import Observation, update_covariance_root
-from netkf.theory.stochastic_trigger.errors import decisions, silence
+from netkf.theory.numerics.observations import Observation
+from netkf.theory.stochastic_trigger.errors import decisions, measurement_update, silence
 from netkf.trace.run import Run
 
 
@@ -57,6 +57,6 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
         root = square_root(P)
         for k, observation in sensors.items():
             used = observation if (slot, k) in sent else silence(observation, Y)
-            root = update_covariance_root(root, used)[2]
+            root = measurement_update(root, used)[1]
         P, slot = root @ root.T, slot + 1
     return count, expected

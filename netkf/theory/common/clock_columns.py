@@ -1,0 +1,334 @@
+"""Exact errors of affine filters under clocks, from their own verbs.
+
+The log of a run is repeated row by row. Given its events, all that filters compute is affine in the
+first state and in all noises: their verbs, as linear maps (``linear_verbs``), are applied to forms
+of these (``forms``). A filter needs no rule of its own for that.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from netkf.algorithms.filter import commutes, compiled_kernels
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.plants.transitions import Transitions
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.forms import MEAN, Forms
+from netkf.theory.common.increments import IncrementFlows, increment_flows
+from netkf.theory.common.linear_verbs import LinearVerbs
+from netkf.theory.common.observations import timed_observations
+from netkf.theory.numerics.observations import Observation
+from netkf.trace.run import Run
+from netkf.trace.schema import CODES
+
+SENSE, SEND, DELIVER, ABSORB, TRANSMIT = (
+    CODES[kind] for kind in ("sense", "send", "deliver", "absorb", "transmit")
+)
+
+LARGE, CHECKS = 1e4, 256
+"""Size of the true state, in standard deviations of an error, from which on the origin moves, and
+how often that is checked at least.
+"""
+
+
+class Sent(NamedTuple):
+    """A message under way: its number among the payloads, when and by whom (index) it was sent, its
+    number on its link, and H (p, n) and the rows (p,) of the reading that goes with it, if any.
+    """
+
+    payload: int
+    time: float
+    sender: int
+    number: int
+    reading: tuple[FloatArray, IntArray] | None
+
+
+class ClockColumns(ErrorColumns):
+    """The errors of M estimators under clocks; the first n rows of the forms are the true state."""
+
+    def __init__(self, scenario: Scenario, run: Run) -> None:
+        self._scenario, self._run, self._log = scenario, run, _columns_of(run)
+        self._forms_of_all = forms = Forms(scenario.plant.n * (len(scenario.nodes) + 1))
+        plant = cast(Any, scenario.plant)
+        self.n = plant.n
+        self._x = forms.take(self.n)
+        first = forms.inputs(plant.start_root.shape[1])
+        forms.table[self._x, MEAN] = plant.start_mean
+        forms.table[self._x, first : forms.used] = plant.start_root
+        self._samples = timed_observations(scenario, run)
+        rows = max((len(o.H) for s in self._samples.values() for o in s.values()), default=0)
+        self._delivered = _delivered(self._log)
+        self._filters = LinearVerbs(
+            scenario, forms, _most_messages(self._log, self._delivered), rows
+        )
+        self.estimators = self._filters.estimators
+        self._times = [0.0] * self.estimators
+        self._now, self._kept = 0.0, []
+        self._free = list(range(self._filters.messages))[::-1]
+        self._uses: Counter[int] = Counter()
+        self._source: int | None = None
+        self._sent: dict[tuple[int, int, int], Sent] = {}
+        self._inboxes: dict[int, list[Sent]] = {}
+        self._read: dict[int, tuple[float, FloatArray, IntArray]] = {}
+        self._transitions = Transitions(plant.A, plant.B)
+        # The state grows by less than e in between; other filters do not commute with a shift.
+        rate = max(np.abs(plant.A).sum(axis=0).max(), CHECKS / scenario.horizon)
+        movable = np.array_equal(scenario.belief[0], plant.A)
+        self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
+        self._laws = self._laws_of_gaps()
+        self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators)
+        index = scenario.topology.index
+        self._index = index
+        clock = cast(Any, scenario.network.activation)
+        broadcasts = clock is not None and clock.at in ("nodes", "readings")
+        self._shared = broadcasts and not self._filters.kernels.addressed
+        links = self._filters.run
+        self._link = {
+            (int(links.sender[w]), h): w
+            for h in range(len(links.first) - 1)
+            for w in range(links.first[h], links.first[h + 1])
+        }
+
+    def _laws_of_gaps(self) -> dict[float, tuple[FloatArray, FloatArray]]:
+        """Return F and the root of the noise of the plant, by gap between readings or samples."""
+        times = np.unique([0.0, *self._samples, *self._run.times.tolist()])
+        gaps = np.unique(np.diff(times))
+        return dict(
+            zip(gaps.tolist(), zip(*self._transitions.laws(gaps), strict=True), strict=True)
+        )
+
+    def replay(self) -> Iterator[None]:
+        """Repeat the log of the run; yield at each of ``run.times``."""
+        rows = iter(zip(*self._log, strict=True))
+        row = next(rows, None)
+        for until in self._run.times.tolist():
+            while row is not None and row[0] <= until:
+                self._apply(*row)
+                row = next(rows, None)
+            self._move_truth(until)
+            self._move_increments(until)
+            for h in range(self.estimators):
+                gap = self._gap(h, until)
+                if gap > 0.0:
+                    self._filters.predict(h, gap)
+            yield
+
+    def _apply(self, time: float, kind: int, node: int, peer: int, message: int) -> None:
+        """Repeat one row of the log."""
+        if kind == SENSE:
+            self._sense(0 if self._scenario.node_filter.pooled else self._index[node], time)
+        elif kind == TRANSMIT and self._shared:
+            h = self._index[node]
+            gap = self._gap(h, time)
+            self._release(self._source)
+            self._source = self._take()
+            self._filters.emit(h, gap, self._source)
+        elif kind == SEND:
+            self._send((node, peer, message), time)
+        elif kind == DELIVER:
+            self._inboxes.setdefault(node, []).append(self._sent.pop((peer, node, message)))
+        elif kind == ABSORB and node in self._inboxes:
+            self._absorb(node, time)
+
+    def _move_truth(self, time: float) -> None:
+        """Move the true state to ``time``, with an input for each noise of the plant."""
+        gap, forms = time - self._now, self._forms_of_all
+        if gap <= 0.0 or self._flows is not None:
+            return
+        law = self._laws.get(gap)
+        F, root = (
+            law if law is not None else (a[0] for a in self._transitions.laws(np.array([gap])))
+        )
+        first = forms.inputs(self.n)
+        forms.table[self._x, : forms.used] = F @ forms.table[self._x, : forms.used]
+        forms.table[self._x, first : first + self.n] = root
+        self._now = time
+
+    def _keep_digits(self, nodes: Sequence[int]) -> None:
+        """Move the origin if the true state has become so large that errors of ``nodes`` would lose
+        digits.
+        """
+        if not self._now >= self._checked + self._unit:
+            return
+        self._checked, forms = self._now, self._forms_of_all
+        x = forms.table[self._x, : forms.used]
+        size, variance = (x * x).sum(axis=1), (self._filters.roots[nodes] ** 2).sum(axis=-1)
+        if (size > LARGE**2 * variance).any():
+            self._move_origin()
+
+    def _move_origin(self) -> None:
+        """Make the true state the origin of all estimates."""
+        forms, scenario = self._forms_of_all, self._scenario
+        offset = -forms.table[self._x, : forms.used]
+        for h in range(self.estimators):
+            self._filters.shift(h, self._gap(h, self._now), offset)
+        under_way = [*self._sent.values(), *(m for inbox in self._inboxes.values() for m in inbox)]
+        for payload, time in {m.payload: m.time for m in under_way}.items():
+            back = [scenario.move_back(e, self._now - time) for e in np.eye(self.n)]
+            self._filters.shift_message(payload, np.column_stack(back) @ offset)
+        forms.table[self._x, : forms.used] = 0.0
+
+    def _move_increments(self, time: float) -> None:
+        """Move nodes that read increments, and the true state, to ``time``."""
+        flows, filters, forms = self._flows, self._filters, self._forms_of_all
+        if flows is None or time <= self._now:
+            return
+        flows.advance(forms, self._x, filters.xhat_rows, filters.roots, time - self._now)
+        self._now = time
+        for h in flows.reading:
+            self._times[h] = time
+        self._keep_digits(flows.reading)
+
+    def _gap(self, h: int, time: float) -> float:
+        """Return by how many seconds node h has to be predicted to ``time``, where it is then."""
+        self._move_increments(time)
+        gap, self._times[h] = time - self._times[h], time
+        return gap
+
+    def _sense(self, h: int, time: float) -> None:
+        """Update node h with all its samples of this instant, once."""
+        observation: Observation | None = self._samples.get(time, {}).pop(h, None)
+        if observation is None or not len(observation.H):
+            return
+        self._move_truth(time)
+        self._move_increments(time)
+        self._keep_digits([h])
+        forms = self._forms_of_all
+        first = forms.inputs(observation.root.shape[1])
+        root = np.linalg.cholesky(observation.R)
+        H, noise = np.split(
+            np.linalg.solve(root, np.column_stack([observation.H, observation.root])),
+            [self.n],
+            axis=1,
+        )
+        y = H @ forms.table[self._x, : forms.used]
+        y[:, first:] += noise
+        if self._filters.kernels.sends_readings:
+            _, _, old = self._read.pop(h, (0.0, H, self._x[:0]))
+            forms.give(old)
+            rows = forms.take(len(H))
+            forms.table[rows, : forms.used] = y
+            self._read[h] = time, H, rows
+        self._filters.update(h, self._gap(h, time), H, y)
+
+    def _send(self, key: tuple[int, int, int], time: float) -> None:
+        """Send one message, if it will arrive."""
+        node, peer, number = key
+        h, filters, forms = self._index[node], self._filters, self._forms_of_all
+        arrives = key in self._delivered
+        if not (arrives or (filters.kernels.counts_sends and not self._shared)):
+            return
+        if self._shared:
+            assert self._source is not None
+            m = self._source
+        else:
+            gap, m = self._gap(h, time), self._take()
+            if filters.kernels.addressed:
+                filters.run.receiver = self._link.get((self._index[peer], h), -1)
+            filters.emit(h, gap, m)
+        if not arrives:
+            self._release(m)
+            return
+        if self._shared:
+            self._uses[m] += 1
+        reading = None
+        if h in self._read and self._read[h][0] == time:
+            _, H, rows = self._read[h]
+            copied = forms.take(len(rows))
+            forms.table[copied, : forms.used] = forms.table[rows, : forms.used]
+            reading = H, copied
+        self._sent[key] = Sent(m, time, h, number, reading)
+
+    def _take(self) -> int:
+        """Return a free message."""
+        m = self._free.pop()
+        self._uses[m] = 1
+        return m
+
+    def _release(self, m: int | None) -> None:
+        """Give back a message if nobody else waits for it."""
+        if m is None:
+            return
+        self._uses[m] -= 1
+        if self._uses[m] == 0:
+            self._filters.forget(m)
+            self._free.append(m)
+
+    def _absorb(self, node: int, time: float) -> None:
+        """Let a node absorb all messages of this instant."""
+        h, filters, scenario = self._index[node], self._filters, self._scenario
+        run, forms, grid = filters.run, self._forms_of_all, scenario.time_grid
+        gap = self._gap(h, time)
+        all_heard = sorted(self._inboxes.pop(node), key=lambda m: (m.sender, m.time, m.number))
+        inbox = all_heard
+        if scenario.node_filter.newest_only:
+            inbox = list({message.sender: message for message in inbox}.values())
+        readings = []
+        for k, message in enumerate(inbox):
+            run.message[k], run.age[k] = message.payload, grid.instant(time - message.time)
+            run.link[k] = self._link[message.sender, h]
+            run.message_weight[k] = run.weight[run.link[k]]
+            run.heard[k] = -1
+            if message.reading is not None:
+                readings.append(message.reading)
+                run.heard[k] = len(readings)
+        run.count = len(inbox)
+        filters.absorb(h, gap, [message.payload for message in inbox], readings)
+        for message in all_heard:
+            self._release(message.payload)
+            if message.reading is not None:
+                forms.give(message.reading[1])
+
+    def _forms(self) -> FloatArray:
+        """Return the errors (M n, C): the means, and the columns of inputs."""
+        table, used = self._forms_of_all.table, self._forms_of_all.used
+        estimates = table[self._filters.xhat_rows.reshape(-1), :used]
+        return np.asarray(np.tile(table[self._x, :used], (self.estimators, 1)) - estimates)
+
+    def covariances(self) -> FloatArray:
+        """Return P (M, n, n) of the estimators."""
+        S = np.tril(self._filters.roots)
+        return np.asarray(S @ np.swapaxes(S, 1, 2))
+
+    def keep(self) -> None:
+        """Store the present errors for ``law``."""
+        self._kept.append(self._forms_of_all.freeze(self._forms()))
+
+
+def has_clock_columns(scenario: Scenario) -> bool:
+    """Return True if the errors of a scenario under clocks follow from the verbs of its filter."""
+    kernels = compiled_kernels(scenario.node_filter, clocked=True)
+    return kernels is not None and kernels.affine and commutes(scenario.node_filter)
+
+
+def _columns_of(run: Run) -> list[list[Any]]:
+    """Return the columns of the log that are used."""
+    return [run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message")]
+
+
+def _delivered(log: list[list[Any]]) -> set[tuple[int, int, int]]:
+    """Return the messages that arrive: sender, receiver and number of each."""
+    return {
+        (peer, node, message)
+        for _, kind, node, peer, message in zip(*log, strict=True)
+        if kind == DELIVER
+    }
+
+
+def _most_messages(log: list[list[Any]], delivered: set[tuple[int, int, int]]) -> int:
+    """Return a number of messages that are never under way at once."""
+    under_way, most, waiting = 0, 0, Counter[int]()
+    for _, kind, node, peer, message in zip(*log, strict=True):
+        if kind == SEND and (node, peer, message) in delivered:
+            under_way += 1
+            most = max(most, under_way)
+        elif kind == DELIVER:
+            waiting[node] += 1
+        elif kind == ABSORB:
+            under_way -= waiting.pop(node, 0)
+    return most + 3

@@ -1,0 +1,115 @@
+"""Errors of nodes that read increments between events, as forms (``theory.common.forms``).
+
+Between events the exact Kalman filter of such a node is a flow (``numerics.prediction``), in which
+the verbs of filters go in short steps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels import run as standard
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray, IntArray, square_root
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.forms import Forms
+from netkf.theory.common.observations import increment_observations
+from netkf.theory.numerics.prediction import ErrorFlow, StateFlow
+
+
+class IncrementFlows(NamedTuple):
+    """Flows of errors in a run with increment sensors.
+
+    groups : flows, each with the indices (K,) of the estimators that share it, so that they are
+             propagated together
+    reading : the estimators in them, which read increments
+    plant : the flow of the true state
+    follows : whether errors depend on the state, because the filters' A is not the plant's
+    """
+
+    groups: list[tuple[ErrorFlow, IntArray]]
+    reading: list[int]
+    plant: StateFlow
+    follows: bool
+
+    @property
+    def unit(self) -> float:
+        """The time (seconds) over which series and quadrature of all flows hold."""
+        return min(flow.unit for flow, _ in self.groups)
+
+    def advance(
+        self, forms: Forms, state: IntArray, estimates: IntArray, roots: FloatArray, gap: float
+    ) -> None:
+        """Move the true state, rows (n,) of ``forms``, and the estimates that read increments, of
+        rows (M, n), with their ``roots`` (M, n, n), over ``gap`` seconds.
+        """
+        steps = math.ceil(gap / self.unit)
+        for _ in range(steps):
+            self._step(forms, state, estimates, roots, gap / steps)
+
+    def _step(
+        self, forms: Forms, state: IntArray, estimates: IntArray, roots: FloatArray, gap: float
+    ) -> None:
+        """Advance over ``gap`` seconds, at most the ``unit``."""
+        # The plant's noise at the 8 nodes of the quadrature enters all errors; the noises of the
+        # increments take n inputs for each estimate.
+        n, common = len(state), self.plant.inputs
+        first = forms.inputs(common + n * len(self.reading))
+        used, noise = forms.used, first + common
+        x = forms.table[state, :used]
+        F, response = self.plant(gap)
+        moved = F @ x
+        moved[:, first:noise] += response
+        for flow, members in self.groups:
+            errors = x - forms.table[estimates[members].reshape(-1), :used].reshape(-1, n, used)
+            own = np.ascontiguousarray(roots[members])
+            if self.follows:
+                flow.follow(errors, own, x, gap, (first, noise))
+            else:
+                flow.move(errors, own, gap, (first, noise))
+            roots[members] = own
+            forms.table[estimates[members].reshape(-1), :used] = (moved - errors).reshape(-1, used)
+            noise += n * len(members)
+        forms.table[state, :used] = moved
+
+
+def integration_steps(scenario: Scenario) -> int:
+    """Return the least number of steps in which the errors of a run are propagated, by which its
+    cost is estimated; 0 if no sensor senses increments.
+    """
+    if scenario.slotted:
+        return 0
+    flows = increment_flows(scenario, len(scenario.nodes))
+    return 0 if flows is None else math.ceil(scenario.horizon / flows.unit)
+
+
+def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | None:
+    """Return how errors of the first ``estimators`` nodes evolve between messages, or None if no
+    sensor senses increments.
+    """
+    observations = increment_observations(scenario)
+    if not any(len(observation.H) for observation in observations):
+        return None
+    kernels = compiled_kernels(scenario.node_filter, clocked=True)
+    if kernels and (kernels.predict, kernels.update) != (standard.predict, standard.update):
+        raise TheoryError("the exact errors of this filter are known for sampled sensors")
+    A, Q = scenario.belief
+    plant = (scenario.diffusion.A, scenario.diffusion.B)
+    B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
+    members: dict[bytes, list[int]] = {}
+    flows: dict[bytes, ErrorFlow] = {}
+    for h, observation in enumerate(observations[:estimators]):
+        if not len(observation.H):
+            continue
+        # Estimators with equal sensors share a flow.
+        key = b"|".join(part.tobytes() for part in observation)
+        members.setdefault(key, []).append(h)
+        if key not in flows:
+            flows[key] = ErrorFlow(A, B, observation.H, observation.R, observation.root, plant)
+    groups = [(flows[key], np.array(members[key])) for key in flows]
+    reading = [h for indices in members.values() for h in indices]
+    return IncrementFlows(groups, reading, StateFlow(*plant), not np.array_equal(A, plant[0]))

@@ -1,0 +1,476 @@
+"""The verbs of an affine filter as linear maps, found by running its kernels.
+
+Given the events of a run, everything that filters compute is affine in readings and means. A verb
+of one node changes only what that node, its incoming links and its messages hold: it is run once as
+things are without noise, and once more for each number that depends on noise, with 1 added to that.
+The differences are the columns of its linear map, which is applied to the *forms* of these numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels import run as standard
+from netkf.algorithms.records import Kernels, make_records, record_class
+from netkf.core.errors import TheoryError
+from netkf.engines.compiled.clock_filters import ClockFilters
+from netkf.engines.compiled.state import filters_at_start
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.generic import struct_like
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.forms import MEAN, Forms
+
+PAYLOAD = "payload "
+"""Prefix of names of arrays of messages."""
+NO_PLACES, NO_FORMS = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))
+
+
+@kernel
+def find_inputs(words: IntArray, written: int, row: IntArray, inputs: IntArray) -> int:
+    """Write the places of ``words`` (w,) that depend on noise, but the last ``written``, into
+    ``inputs``; return how many there are.
+    """
+    number = 0
+    for i in range(len(words) - written):
+        if row[words[i]] >= 0:
+            inputs[number] = i
+            number += 1
+    return number
+
+
+@kernel
+def fill_blocks(
+    run: Any, blocks: FloatArray, stored: FloatArray, words: IntArray, count: int, changes: int
+) -> None:
+    """Copy ``words`` (w,) of the ``stored`` filters into ``changes`` + 1 blocks, and give each the
+    first ``count`` readings.
+    """
+    for b in range(changes + 1):
+        for i in range(len(words)):
+            blocks[b, words[i]] = stored[words[i]]
+        for r in range(count):
+            for i in range(run.rows[r]):
+                run.y[b * count + r, i, 0] = 0.0
+                for j in range(len(run.size) if b > 0 else 0):
+                    run.H[b * count + r, i, j, 0] = run.H[r, i, j, 0]
+
+
+@kernel
+def change(
+    run: Any, block: FloatArray, words: IntArray, inputs: IntArray, number: int, places: IntArray,
+    count: int, b: int,
+) -> None:  # fmt: skip
+    """Add 1 to what is different in ``block`` number b (W,); block 0 is as things are."""
+    for i in range(len(run.size)):
+        run.offset[i, 0] = 0.0
+    if b > number:
+        r, i = places[b - 1 - number, 0], places[b - 1 - number, 1]
+        if r < 0:
+            run.offset[i, 0] = 1.0
+        else:
+            run.y[b * count + r, i, 0] = 1.0
+    elif b > 0:
+        block[words[inputs[b - 1]]] += 1.0
+    run.first_y = run.first_H = b * count
+
+
+@kernel
+def read_map(
+    blocks: FloatArray, stored: FloatArray, is_float: np.ndarray, words: IntArray, row: IntArray,
+    keep: int, changes: int, out: FloatArray, found: IntArray,
+) -> int:  # fmt: skip
+    """Store the first ``keep`` words as things are, and write the linear map into ``out``. Return
+    the number of words that depend on noise without a row, whose places go into ``found``.
+    """
+    number = 0
+    for i in range(keep):
+        word, depends = words[i], False
+        stored[word] = blocks[0, word]
+        for b in range(changes):
+            out[i, b] = 0.0
+            if is_float[word] == 1:
+                out[i, b] = blocks[b + 1, word] - blocks[0, word]
+                depends = depends or out[i, b] != 0.0
+        if depends and row[word] < 0:
+            found[number] = i
+            number += 1
+    return number
+
+
+@kernel
+def move_forms(
+    table: FloatArray, used: int, words: IntArray, row: IntArray, keep: int, inputs: IntArray,
+    number: int, others: FloatArray, out: FloatArray, moved: FloatArray,
+) -> None:  # fmt: skip
+    """Apply a linear map ``out`` to the first ``used`` columns of the forms of its ``number``
+    inputs, and of ``others`` (k, C).
+    """
+    for i in range(keep):
+        if row[words[i]] < 0:
+            continue
+        for c in range(used):
+            moved[i, c] = 0.0
+        for k in range(number):
+            factor, source = out[i, k], row[words[inputs[k]]]
+            for c in range(used if factor != 0.0 else 0):
+                moved[i, c] += factor * table[source, c]
+        for k in range(len(others)):
+            factor = out[i, number + k]
+            for c in range(used if factor != 0.0 else 0):
+                moved[i, c] += factor * others[k, c]
+    for i in range(keep):
+        target = row[words[i]]
+        for c in range(used if target >= 0 else 0):
+            table[target, c] = moved[i, c]
+
+
+@cache
+def prober(predict: Any, verb: Any, sends: bool = False) -> Any:
+    """Return a kernel that runs ``predict`` over ``gap`` seconds, if that is not 0, and
+    ``verb(record, h, run)``, or if it ``sends`` ``verb(record, h, m, run)``, on the numbers
+    ``words`` (w,) of the ``stored`` filters (W,), and applies their linear map to the forms, rows
+    ``row`` (W,) of ``table``. The first ``keep`` words are what may change; the last ``written``
+    are only written.
+
+    The verb depends on further numbers, whose forms are ``others`` (k, C): ``places`` (k, 2) say
+    row i of reading r, or entry i of the offset for r = -1; there are ``count`` readings. They run
+    in ``blocks`` (B, W). Columns of the linear map are written into ``out``; ``moved`` is scratch.
+
+    The kernel returns 0; a negative number if it needs so many blocks; or how many words depend on
+    noise now that did not: their places are written into ``found``, and no form has changed.
+    """
+
+    @kernel
+    def probe(
+        record: Any, memories: np.ndarray, run: Any, blocks: FloatArray, stored: FloatArray,
+        is_float: np.ndarray, words: IntArray, row: IntArray, keep: int, written: int,
+        places: IntArray, others: FloatArray, count: int, table: FloatArray, used: int,
+        h: int, m: int, gap: float, inputs: IntArray, out: FloatArray, moved: FloatArray,
+        found: IntArray,
+    ) -> int:  # fmt: skip
+        number = find_inputs(words, written, row, inputs)
+        changes = number + len(places)
+        if changes + 1 > len(blocks) or (changes + 1) * count > len(run.y):
+            return -(changes + 1)
+        fill_blocks(run, blocks, stored, words, count, changes)
+        for b in range(changes + 1):
+            change(run, blocks[b], words, inputs, number, places, count, b)
+            if gap > 0.0:
+                run.gap = gap
+                predict(struct_like(record, memories[b]), h, run)
+            if sends:
+                verb(struct_like(record, memories[b]), h, m, run)
+            else:
+                verb(struct_like(record, memories[b]), h, run)
+        new = read_map(blocks, stored, is_float, words, row, keep, changes, out, found)
+        if new == 0:
+            move_forms(table, used, words, row, keep, inputs, number, others, out, moved)
+        return int(new)
+
+    return probe
+
+
+class LinearVerbs:
+    """The filters of a run: what they hold without noise, and the forms of what depends on it.
+
+    Arrays of all nodes, links and messages lie in one row of 8-byte words; ``_row`` (W,) is the row
+    of each word in ``forms``, -1 for those that do not depend on noise.
+    """
+
+    def __init__(self, scenario: Scenario, forms: Forms, messages: int, rows: int) -> None:
+        """Make the filters at time 0, with room for some ``messages`` and readings of up to
+        ``rows`` rows.
+        """
+        kernels = compiled_kernels(scenario.node_filter, clocked=True)
+        assert kernels is not None
+        self.kernels: Kernels = kernels
+        self.forms, start = forms, filters_at_start(scenario)
+        self.estimators, self.n = start.xhat.shape
+        with_means = ClockFilters(scenario, kernels, start, messages)
+        self.run, self._p = with_means.run, max(1, rows)
+        self.messages = len(self.run.message)
+        pooled = scenario.node_filter.pooled
+        records = make_records(
+            scenario.node_filter,
+            [(np.zeros(self.n), root) for root in start.root],
+            scenario.node_infos[:1] if pooled else scenario.node_infos,
+            (scenario.pooled_model,) if pooled else scenario.models,
+            links=len(self.run.sender),
+            messages=messages,
+        )
+        self._template, self._links, self._past = records.struct, records.links, records.past
+        arrays = {name: array[0] for name, array in records.arrays.items()}
+        payload = self._template.payload
+        for name in type(payload).struct_fields:
+            arrays[PAYLOAD + name] = getattr(payload, name)
+        if any(array.dtype.itemsize != 8 for array in arrays.values()):
+            raise TheoryError("exact errors need records of int64 and float64")
+        self._lay_out(arrays, {})
+        self._set_means(with_means.records.arrays)
+        self._offset_places = np.column_stack([np.full(self.n, -1), np.arange(self.n)])
+        self._own_places = np.column_stack([np.zeros(self._p, dtype=np.int64), np.arange(self._p)])
+        self._y, self._H = np.zeros((0, self._p, 1)), np.zeros((0, self._p, self.n, 1))
+        self._rows = np.zeros(1 + self.messages, dtype=np.int64)
+        self.run.rows, self.run.matrix = self._rows, np.arange(len(self._rows))
+        self._out = self._moved = np.zeros((0, 0))
+        self._inputs = self._found = np.zeros(0, dtype=np.int64)
+
+    def _lay_out(self, arrays: dict[str, np.ndarray], rows: dict[str, np.ndarray]) -> None:
+        """Store these ``arrays``; ``rows`` are rows in the forms by name, by default none."""
+        sizes = [array.size for array in arrays.values()]
+        ends = np.cumsum(sizes).tolist()
+        self._begin = dict(zip(arrays, [0, *ends], strict=False))
+        self._shapes = {name: array.shape for name, array in arrays.items()}
+        self._row = np.full(ends[-1], -1, dtype=np.int64)
+        self._stored = np.zeros(ends[-1])
+        self._is_float = np.zeros(ends[-1], dtype=np.uint8)
+        self._dtypes = {name: array.dtype for name, array in arrays.items()}
+        for name, array in arrays.items():
+            self._view(name)[...] = array
+            place = slice(self._begin[name], self._begin[name] + array.size)
+            self._is_float[place] = array.dtype == np.float64
+            if name in rows:
+                self._row[place] = rows[name].reshape(-1)
+        self._node_words: dict[int, IntArray] = {}
+        self._message_words: dict[int, IntArray] = {}
+        self._blocks = np.zeros((0, 0))
+        self._fit_blocks(8)
+
+    def _view(self, name: str) -> np.ndarray:
+        """Return the view of an array in the store."""
+        shape, begin = self._shapes[name], self._begin[name]
+        words = self._stored[begin : begin + math.prod(shape)]
+        return words.view(self._dtypes[name]).reshape(shape)
+
+    def _set_means(self, arrays: dict[str, np.ndarray]) -> None:
+        """Give the forms the means of what filters start with."""
+        for name, array in arrays.items():
+            difference = (array[0] - self._view(name)).reshape(-1)
+            words = self._begin[name] + np.flatnonzero(difference)
+            rows = self._row[words] = self.forms.take(len(words))
+            self.forms.table[rows, MEAN] = difference[difference != 0]
+        begin = self._begin["xhat"]
+        words = np.arange(begin, begin + self.estimators * self.n)
+        missing = words[self._row[words] < 0]
+        self._row[missing] = self.forms.take(len(missing))
+        self.xhat_rows = self._row[words].reshape(self.estimators, self.n)
+
+    @property
+    def roots(self) -> FloatArray:
+        """Roots (M, n, n) of the covariances, a view."""
+        view: FloatArray = self._view("root")[..., 0]
+        return view
+
+    def _fit_blocks(self, count: int) -> None:
+        """Make the records of ``count`` blocks."""
+        if count <= len(self._blocks):
+            return
+        self._blocks = blocks = np.zeros((2 * count, len(self._stored)))
+        first, views = self._template, {}
+        for name, begin in self._begin.items():
+            shape = self._shapes[name]
+            words = blocks[0, begin : begin + math.prod(shape)]
+            views[name] = words.view(self._dtypes[name]).reshape(shape)
+        payload = {k.removeprefix(PAYLOAD): v for k, v in views.items() if k.startswith(PAYLOAD)}
+        made = record_class(type(first.payload).__name__, payload)(**payload)
+        values = {name: views.get(name, getattr(first, name)) for name in type(first).struct_fields}
+        self._record = type(first)(**values | {"payload": made})
+        steps = np.arange(len(blocks), dtype=np.int64) * blocks.strides[0]
+        self._payloads = _memories(made, payload, steps)
+        own = {name: view for name, view in views.items() if not name.startswith(PAYLOAD)}
+        self._memories = _memories(self._record, own, steps)
+        places = np.arange(len(blocks)) * self._payloads.strides[0]
+        offset = self._record.struct_offsets["payload"]
+        self._memories[:, offset] = self._payloads.ctypes.data + places
+
+    def node_words(self, h: int, events: int = 0) -> IntArray:
+        """Return the words of node ``h`` and its incoming links; its past with room for so many
+        more ``events``.
+        """
+        if h not in self._node_words:
+            first, parts = self.run.first, []
+            for name, begin in self._begin.items():
+                if name in self._past or name.startswith(PAYLOAD):
+                    continue
+                is_link = name in self._links
+                ends = (first[h], first[h + 1]) if is_link else (h, h + 1)
+                size = math.prod(self._shapes[name][1:])
+                parts.append(np.arange(begin + ends[0] * size, begin + ends[1] * size))
+            self._node_words[h] = np.concatenate(parts)
+        words = self._node_words[h]
+        if not self._past:
+            return words
+        last, parts = int(self._view("kept")[h, 0]) + events, [words]
+        if last > self._record_room:
+            self._double_past()
+            return self.node_words(h, events)
+        for name in self._past:
+            _, room, *shape = self._shapes[name]
+            size = math.prod(shape)
+            begin = self._begin[name] + h * room * size
+            parts.append(np.arange(begin, begin + last * size))
+        return np.concatenate(parts)
+
+    @property
+    def _record_room(self) -> int:
+        """Past events for which there is room."""
+        return int(self._shapes[self._past[0]][1])
+
+    def _double_past(self) -> None:
+        """Make room for twice as many past events."""
+        arrays = {name: self._view(name).copy() for name in self._begin}
+        rows = {
+            name: self._row[begin : begin + math.prod(self._shapes[name])].reshape(
+                self._shapes[name]
+            )
+            for name, begin in self._begin.items()
+        }
+        for name in self._past:
+            arrays[name] = np.concatenate([arrays[name], np.zeros_like(arrays[name])], axis=1)
+            rows[name] = np.concatenate([rows[name], np.full_like(rows[name], -1)], axis=1)
+        self._template.room *= 2
+        self._lay_out(arrays, rows)
+
+    def message_words(self, m: int) -> IntArray:
+        """Return the words of message ``m``."""
+        if m not in self._message_words:
+            parts = []
+            for name, begin in self._begin.items():
+                if name.startswith(PAYLOAD):
+                    size = math.prod(self._shapes[name][1:])
+                    parts.append(np.arange(begin + m * size, begin + (m + 1) * size))
+            self._message_words[m] = np.concatenate(parts)
+        return self._message_words[m]
+
+    def forget(self, m: int) -> None:
+        """Give back the rows of message ``m``."""
+        words = self.message_words(m)
+        rows = self._row[words]
+        self.forms.give(rows[rows >= 0])
+        self._row[words] = -1
+
+    def _set_readings(self, matrices: Sequence[FloatArray], blocks: int) -> None:
+        """Make readings with these H (p, n) those of the run, with room for so many ``blocks``."""
+        run, count = self.run, len(matrices)
+        if blocks * count > len(self._y):
+            size = 2 * blocks * count
+            self._y, self._H = np.zeros((size, self._p, 1)), np.zeros((size, self._p, self.n, 1))
+            run.y, run.H = self._y, self._H
+        for r, H in enumerate(matrices):
+            self._H[r, : len(H), :, 0] = H
+            self._rows[r] = len(H)
+
+    def predict(self, h: int, gap: float) -> None:
+        """Predict node ``h`` by ``gap`` seconds."""
+        self._apply(standard.absorb, self.node_words(h), h, gap)
+
+    def update(self, h: int, gap: float, H: FloatArray, y: FloatArray) -> None:
+        """Predict node ``h`` and update it with a reading ``y`` (p, C), whitened with ``H``."""
+        self.run.reading = 0
+        words, places = self.node_words(h, 1), self._own_places[: len(H)]
+        self._apply(self.kernels.update, words, h, gap, places=places, others=y, readings=[H])
+
+    def emit(self, h: int, gap: float, m: int) -> None:
+        """Predict node ``h`` and write its payload into message ``m``."""
+        self.run.sends[0] = 1
+        words, sent = self.node_words(h), self.message_words(m)
+        words, written = np.concatenate([words, sent]), len(sent)
+        self._apply(self.kernels.emit, words, h, gap, m=m, written=written)
+
+    def absorb(self, h: int, gap: float, messages: Sequence[int], readings: Sequence[Any]) -> None:
+        """Predict node ``h`` and let it absorb ``messages``, with their ``readings``, pairs of H
+        (p, n) and rows (p,); the inbox of the run is set.
+        """
+        words, heard = self.node_words(h, len(readings)), map(self.message_words, set(messages))
+        # Reading 0 is the own one.
+        matrices = [np.zeros((0, self.n)), *(H for H, _ in readings)]
+        places, others = NO_PLACES, NO_FORMS
+        if readings:
+            pairs = [(r, i) for r, H in enumerate(matrices) for i in range(len(H))]
+            places = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+            others = self.forms.table[np.concatenate([rows for _, rows in readings])]
+        keep, words = len(words), np.concatenate([words, *heard])
+        self._apply(
+            self.kernels.absorb, words, h, gap, keep=keep, places=places, others=others,
+            readings=matrices,
+        )  # fmt: skip
+
+    def shift(self, h: int, gap: float, offset: FloatArray) -> None:
+        """Predict node ``h`` and move it with the origin, by ``offset`` (n, C)."""
+        words, places = self.node_words(h, 1), self._offset_places
+        self._apply(self.kernels.shift, words, h, gap, places=places, others=offset)
+
+    def shift_message(self, m: int, offset: FloatArray) -> None:
+        """Move message ``m`` with the origin, by ``offset`` (n, C) at the time of sending."""
+        words, places = self.message_words(m), self._offset_places
+        self._apply(self.kernels.shift_payload, words, m, 0.0, places=places, others=offset)
+
+    def _apply(
+        self,
+        verb: Any,
+        words: IntArray,
+        h: int,
+        gap: float,
+        m: int = 0,
+        keep: int | None = None,
+        written: int = 0,
+        places: IntArray = NO_PLACES,
+        others: FloatArray = NO_FORMS,
+        readings: Sequence[FloatArray] = (),
+    ) -> None:
+        """Predict, and run a verb on ``words``, see ``prober``."""
+        probe = prober(self.kernels.predict, verb, verb is self.kernels.emit)
+        keep, forms = len(words) if keep is None else keep, self.forms
+        self._fit(len(words), keep)
+        needed, found = 1, -1
+        while found < 0:
+            if readings:
+                self._set_readings(readings, needed)
+            found = probe(
+                self._record, self._memories, self.run, self._blocks, self._stored, self._is_float,
+                words, self._row, keep, written, places, others, len(readings), forms.table,
+                forms.used, h, m, gap, self._inputs, self._out, self._moved, self._found,
+            )  # fmt: skip
+            if found < 0:
+                needed = -found
+                self._fit_blocks(needed)
+                self._fit(len(words), keep)
+        if found == 0:
+            return
+        # Some words depend on noise now that did not before.
+        rows = self._row[words]
+        inputs = np.flatnonzero(rows[: len(words) - written] >= 0)
+        given = forms.table[rows[inputs], : forms.used]
+        if len(others):
+            given = np.concatenate([given, others[:, : forms.used]])
+        new = self._found[:found]
+        rows[new] = self._row[words[new]] = forms.take(found)
+        targets = np.flatnonzero(rows[:keep] >= 0)
+        forms.table[rows[targets], : forms.used] = self._out[targets, : len(given)] @ given
+
+    def _fit(self, words: int, keep: int) -> None:
+        """Make room for the results of a verb on so many words, of which ``keep`` may change."""
+        width, blocks = self.forms.table.shape[1], len(self._blocks)
+        if self._moved.shape[1] < width or len(self._moved) < keep:
+            self._moved = np.zeros((max(2 * keep, len(self._moved)), width))
+        if self._out.shape[1] < blocks or len(self._out) < keep:
+            self._out = np.zeros((max(2 * keep, len(self._out)), blocks))
+        if len(self._inputs) < words:
+            self._inputs, self._found = (np.zeros(2 * words, dtype=np.int64) for _ in range(2))
+
+
+def _memories(struct: Any, arrays: dict[str, np.ndarray], steps: IntArray) -> np.ndarray:
+    """Return the memories (B, words) of structs like ``struct`` whose ``arrays`` lie so many bytes
+    further on: ``steps`` (B,).
+    """
+    memories = np.tile(struct.memory, (len(steps), 1))
+    for name in arrays:
+        memories[:, struct.struct_offsets[name]] += steps
+    return memories
