@@ -182,17 +182,13 @@ class GainSequence:
 
     @staticmethod
     def _has_converged(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
-        """Return True if no covariance of any node has changed by more than rounding between the
-        gains of two slots, ``before`` and ``now``.
-        """
+        """Return True if no covariance has changed by more than rounding."""
         roots = (np.stack([one.root for one in gains]) for gains in (before, now))
         former, present = (S @ np.swapaxes(S, 1, 2) for S in roots)
         return bool(np.abs(present - former).max() <= CONVERGED * np.abs(present).max())
 
     def _advance_slot(self) -> tuple[NodeGains, ...]:
-        """Advance ``_errors`` (2 N n, inputs) by one slot, and return the gains of each of N nodes
-        in it.
-        """
+        """Advance ``_errors`` by a slot."""
         nodes = range(len(self._neighbours))
         self._errors = np.hstack([self._predict(), self._driven])
         predicted = [self._covariance_root(i) for i in nodes]
@@ -214,9 +210,7 @@ class GainSequence:
         return predicted.reshape(self._errors.shape)
 
     def _state_error(self, i: int) -> FloatArray:
-        """Return the error (n, inputs) of the xhat of node ``i``, an index from 0: a view that may
-        be written to.
-        """
+        """Return the error (n, inputs) of the xhat of node ``i``: a view to write to."""
         return self._errors[i * self._n : (i + 1) * self._n]
 
     def _pseudo_error(self, i: int) -> FloatArray:
@@ -228,9 +222,7 @@ class GainSequence:
         return lower_root(np.ascontiguousarray(self._state_error(i)))
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Correct the errors of all yhat in ``_errors`` at once; return for each node B (d, n, n)
-        for the d nodes that it hears, and M (n, n).
-        """
+        """Correct the errors of all yhat in ``_errors`` at once."""
         n, N, first = self._n, len(self._neighbours), self._errors.shape[1]
         inputs = sum(noise.shape[1] for noise in self._noises)
         self._errors = np.hstack([self._errors, np.zeros((len(self._errors), inputs))])
@@ -257,9 +249,7 @@ class GainSequence:
         return gains
 
     def _correct_state(self, i: int) -> FloatArray:
-        """Correct the error of xhat of node ``i`` (an index from 0) in ``_errors`` by
-        ``yhat_i - G xhat_i``, which is ``G e - e_y``; return the gain K (n, n).
-        """
+        """Correct the error of xhat of node ``i``, and return the gain K (n, n)."""
         G, e, e_y = self._pseudo.G, self._state_error(i), self._pseudo_error(i)
         theta = G @ e - e_y
         K = optimal_gain(e, theta, np.square(G) @ variances(e) + variances(e_y))

@@ -218,9 +218,7 @@ class ConstantGain(Filter):
 
 
 def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
-    """Raise ScenarioError if ``node``, an id, has readings at several times, which one gain cannot
-    weigh; ``placed`` are its sensors.
-    """
+    """Raise ScenarioError if ``node`` has readings at several times, for one gain."""
     if scenario.slotted or len(placed) < 2:
         return
     if any(

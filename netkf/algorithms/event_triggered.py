@@ -108,10 +108,7 @@ def shift(record: Any, h: int, run: Any) -> None:
 
 
 def _is_information_consensus(value: Any) -> Filter:
-    """Return ``value`` if it is the filter ``Hcmci`` (no derived class) with one step of consensus
-    on information a slot; raises TypeError or ValueError, which the rule of the field turns into a
-    ScenarioError.
-    """
+    """Return ``value`` if it is an ``Hcmci`` with one step; else raise."""
     if not isinstance(value, Hcmci) or type(value) is not Hcmci:
         raise TypeError
     if value.consensus != INFORMATION or value.steps != 1:

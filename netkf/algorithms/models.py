@@ -31,18 +31,14 @@ TABLES = 32
 def _shared_flow_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> FlowTable:
-    """Return the flow table of a model with A and Q (n, n), H (p, n) and R (p, p) for gaps up to
-    ``longest`` seconds; equal models share it, since it takes some 30 ms to compute.
-    """
+    """Return the flow table of a model, shared by equal ones: it takes some 30 ms."""
     parts = (np.asarray(part, dtype=np.float64).tobytes() for part in (A, Q, H, R))
     return _cached_flow_table(len(A), tuple(parts), longest)
 
 
 @lru_cache(maxsize=TABLES)
 def _cached_flow_table(n: int, parts: tuple[bytes, ...], longest: float) -> FlowTable:
-    """Return the flow table of a model with ``n`` states for gaps up to ``longest`` seconds; its A,
-    Q, H and R are the bytes in ``parts``, since the keys of a cache must be hashable.
-    """
+    """Return the flow table of a model whose A, Q, H and R are the bytes in ``parts``."""
     # Bytes have lost their shapes: p follows from the length of H.
     A, Q, H, R = (np.frombuffer(part) for part in parts)
     p = len(H) // n

@@ -580,9 +580,7 @@ class PushSum(Filter):
             self._check_limit(F, Q, scenario.node_infos[0].information)
 
     def _check_limit(self, F: FloatArray, Q: FloatArray, information: FloatArray) -> None:
-        """Raise ScenarioError unless P_inf exists and gives gains to the readings: F and Q (n, n),
-        and the ``information`` (n, n) of all sensors.
-        """
+        """Raise ScenarioError unless P_inf exists and gives gains to the readings."""
         root = asymptotic_root(F, Q, information)
         if root is None:
             raise ScenarioError(
@@ -608,9 +606,7 @@ class PushSum(Filter):
             raise ScenarioError("filter.leader", rule, self.leader, remedy)
 
     def _check_gain(self, radius: float) -> None:
-        """Raise ScenarioError unless averaging with ``delta`` contracts; ``radius`` is rho(L), the
-        largest eigenvalue of the graph's Laplacian.
-        """
+        """Raise ScenarioError unless averaging with ``delta`` contracts."""
         # Averaging contracts if and only if all eigenvalues of I - L / delta but one lie inside
         # (-1, 1).
         if self.delta <= 0.5 * radius * (1.0 + 1e-12):
@@ -679,12 +675,7 @@ def asymptotic_root(F: FloatArray, Q: FloatArray, information: FloatArray) -> Fl
 
 
 def _steady_prediction(F: FloatArray, Q: FloatArray, information: FloatArray) -> FloatArray | None:
-    """Return the steady predicted covariance (n, n) of a filter with F and Q (n, n) that has all
-    the ``information`` (n, n) in each slot; None if the iteration finds none.
-
-    By structure-preserving doubling: k steps give the covariance of 2^k slots (Chu, Fan, Lin and
-    Wang, Int. J. Control 77, 2004).
-    """
+    """Return the steady predicted covariance by doubling (Chu et al. 2004), or None."""
     # With W = (I + G P)^-1: A <- A W A, G <- G + A W G A', P <- P + A' P W A, from F', the
     # information G and P = Q.
     A, G, P = F.T, information, Q

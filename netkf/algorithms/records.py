@@ -9,12 +9,13 @@ node at a time, see ``algorithms.kernels.run``.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.kernels import run as standard
+from netkf.algorithms.kernels.neighbours import combine_convex
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import aligned
 from netkf.linalg.structs import Struct, StructClass
@@ -95,6 +96,11 @@ class Kernels:
         them. By default not where ``emit`` decides.
         """
         return not (self.decides if self.depends_on_data is None else self.depends_on_data)
+
+    @property
+    def is_convex(self) -> bool:
+        """True if nodes are Kalman filters that form convex combinations, and nothing else."""
+        return replace(self, unrolled=False) == Kernels(absorb=combine_convex)
 
     def of(self, clocked: bool) -> Kernels:
         """Return the verbs under clocks, or in slots."""

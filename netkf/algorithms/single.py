@@ -377,9 +377,7 @@ def shift_payload(payload: Payload, offset: FloatArray) -> Payload:
 
 
 def _field(payload: Any, name: str, receiver: int) -> np.ndarray:
-    """Return a field of a payload with axes of messages and lanes; a user's own payload may be any
-    object that has it.
-    """
+    """Return a field of a payload, which may be a user's own, with axes of messages and lanes."""
     if isinstance(payload, Payload):
         rows = payload.fields[name]
         # The last is for nodes that the sender does not hear, or the only one.

@@ -45,10 +45,7 @@ def information_notes(scenario: Any) -> tuple[str, ...]:
 
 
 def _information_condition(scenario: Any) -> float:
-    """Return the largest condition of ``I + S' G S`` over the nodes of a scenario in slots, with
-    ``S S'`` the prediction of the first covariance and G the information H' R^-1 H of all readings
-    together; 1 where H varies.
-    """
+    """Return the largest condition of ``I + S' G S`` over the nodes of a scenario."""
     F, Q = scenario.slot_belief
     try:
         pairs = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]

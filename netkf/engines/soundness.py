@@ -55,10 +55,7 @@ def sound_mask(
 
 
 def _semidefinite(P: FloatArray) -> BoolArray:
-    """Return a mask (...) of the symmetric matrices ``P`` (..., n, n) that are positive
-    semidefinite up to rounding: no eigenvalue is below minus the share INDEFINITE of the largest
-    one.
-    """
+    """Return a mask of the matrices ``P`` that are positive semidefinite but for rounding."""
     # A Cholesky factor of P plus a little is much cheaper than its eigenvalues, and nearly always
     # exists.
     size = np.abs(np.diagonal(P, axis1=-2, axis2=-1)).max(axis=-1, initial=0.0)
@@ -105,9 +102,7 @@ def describe_divergence(
 
 
 def _describe_break(xhat: FloatArray, P: FloatArray, without: bool) -> str:
-    """Return why the last estimate xhat (T, n) or covariance P (T, n, n), unless the filter is
-    ``without``, of a node ends a run, with {} in place of the node.
-    """
+    """Return why the last estimate of a node ends a run, with {} in place of the node."""
     values = {"estimate": xhat} if without else {"covariance": P, "estimate": xhat}
     for name, samples in values.items():
         if np.isinf(samples[-1]).any():

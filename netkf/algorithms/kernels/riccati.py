@@ -126,10 +126,7 @@ def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -
 
 
 def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
-    """Return a table (terms, size + 1) of some power series of matrices, ``parts`` (terms, n, n)
-    each, whose ``size`` entries stand side by side in a row; the last column is the reach of a row:
-    the gap, up to ``unit`` seconds, for which the terms so far suffice.
-    """
+    """Return power series side by side (terms, size + 1), the reach of each row last."""
     rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
     return with_reach(rows, unit)
 
@@ -137,10 +134,7 @@ def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
 def _doubling_tables(
     M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return exp(A t), F, G and Q, each (levels, n, n), over t = 1, 2, 4, ... units of ``unit``
-    seconds: ``P(t) = Q + F P (I + G P)^-1 F'``, by doubling. ``M`` (2 n, 2 n) and ``scale`` are
-    those of ``hamiltonian``, A is (n, n).
-    """
+    """Return exp(A t), F, G and Q (levels, n, n) over 1, 2, 4, ... units."""
     # Doubling also doubles the relative error, so it works in extended precision (where the
     # machine has it): after 2^14 units a table in double would have lost 1e-12.
     n, wide = len(A), np.longdouble
@@ -172,9 +166,7 @@ def _doubling_tables(
 
 
 def _invert_extended(matrix: FloatArray) -> FloatArray:
-    """Return the inverse (n, n) of ``matrix`` (n, n) in its precision, by Newton's iteration from
-    double; nan if it is singular or not finite, as for very long gaps of an unstable plant.
-    """
+    """Return the inverse of ``matrix`` in its precision by Newton's iteration, or nan."""
     if not np.isfinite(matrix).all():
         return np.full_like(matrix, np.nan)
     try:

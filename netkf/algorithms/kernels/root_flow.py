@@ -262,9 +262,7 @@ def transition_series(
 
 
 def _convolved(a: FloatArray, b: FloatArray, k: int) -> FloatArray:
-    """Return coefficient ``k`` (C, r, c) of the product of two power series of matrices, ``a``
-    (C, terms, r, m) and ``b`` (C, terms, m, c).
-    """
+    """Return coefficient ``k`` (C, r, c) of the product of two power series of matrices."""
     return np.asarray((a[:, : k + 1] @ b[:, k::-1]).sum(axis=1))
 
 

@@ -7,14 +7,11 @@ that no two ticks are at one time: all messages of a tick are absorbed before th
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.kernels.neighbours import combine_convex
-from netkf.algorithms.records import Kernels
 from netkf.engines.compiled.batch_loop import BatchArrays, begin, finish, no_batch, reset_filters
 from netkf.engines.compiled.event_loop import (
     ABSORB,
@@ -67,9 +64,6 @@ full.
 MAX_LINKS_OF_CLOCK = 62
 """Directed links that one clock may send on: each of them has an arrival bit."""
 
-CONVEX = Kernels(absorb=combine_convex, unrolled=True)
-"""The verbs of Kalman filters that form convex combinations, and do nothing else."""
-
 MAX_FILTERS = 200
 """Filters that are simulated together at most, unless one run has more."""
 
@@ -96,7 +90,7 @@ def is_immediate(scenario: Scenario) -> bool:
     kernels = compiled_kernels(node_filter, clocked=True)
     return (
         kernels is not None
-        and replace(kernels, unrolled=True) == CONVEX
+        and kernels.is_convex
         and node_filter.talks
         and not scenario.sampled_sensors
         and type(network.activation) is Poisson
@@ -147,9 +141,7 @@ def advance_alone(state: Simulation, visits: Visits) -> int:
 
 @cache
 def _no_progress() -> np.ndarray:
-    """Return an empty array of PROGRESS records, which makes ``simulate_agenda`` simulate one
-    run.
-    """
+    """Return no PROGRESS records: ``simulate_agenda`` then simulates one run."""
     return np.zeros(0, dtype=PROGRESS)
 
 

@@ -78,10 +78,7 @@ def _workspace(scenario: Scenario) -> Workspace:
 def _simulate(
     scenario: Scenario, workspace: Workspace, seed: int, replicas: range, rows: bool = False
 ) -> RunBatch:
-    """Draw the random numbers of the runs ``replicas`` from ``seed``, simulate them, all in one
-    kernel call where the scenario allows it, and return their samples, counts of events and states;
-    with ``rows`` also the fingerprint of the first one's events, whose rows are written for it.
-    """
+    """Draw and simulate the runs ``replicas``; with ``rows`` also fingerprint the first."""
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
         # Runs that are drawn together write no rows.
         if rows or not drawn_together(scenario):
@@ -102,10 +99,7 @@ def _run_by_run(
     replicas: range,
     rows: bool = False,
 ) -> RunBatch:
-    """Simulate runs one after the other, for scenarios that need Python during a run (to draw more
-    numbers, or to move the origin), and return their results; ``draws`` has the random numbers of
-    each of the ``replicas``. ``rows``: write rows of events, of which a fingerprint is made.
-    """
+    """Simulate runs that need Python one after the other, and return their results."""
     sink = batch_sink(scenario, replicas)
     for run_draws in draws:
         recorder = Recorder([sink], counts_only=not rows)
@@ -115,9 +109,7 @@ def _run_by_run(
 
 
 def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
-    """Simulate the R runs of ``draws`` in one call of a kernel, and return their results; it is
-    called again only if its pool of messages is too small.
-    """
+    """Simulate the R runs of ``draws`` in one call of a kernel, and return their results."""
     start, runs = workspace.filters, len(draws.replicas)
     # np.empty: runs that diverge go on to the end, so that all samples are written.
     buffer = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
@@ -153,10 +145,7 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
 
 
 def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
-    """Return the arrays of a batch of R runs, which tell the kernel where each run begins: the
-    filters ``start`` at time 0, the ticks of its runs in ``draws``, and space for results:
-    ``error`` (R, T, N, n), ``lengths`` (R,), ``counts`` (R, kinds), ``diverged`` (R,).
-    """
+    """Return where each run of a batch begins, and space for the results of all."""
     runs, x = len(draws.replicas), draws.sampled_states(scenario.times)
     return BatchArrays(
         nodes=start.nodes,
@@ -219,9 +208,7 @@ def quick_runs(scenario: Scenario) -> int:
 
 
 def _expected_ticks(scenario: Scenario) -> float:
-    """Return the expected number of ticks of all clocks in a run, by which the memory of a batch is
-    estimated: 0 if no clock makes nodes send, a large number if a clock has no finite rate.
-    """
+    """Return the expected number of ticks of a run, large if a clock has no finite rate."""
     clock = scenario.network.activation
     if not (scenario.node_filter.talks and isinstance(clock, LinkClock)):
         return 0.0

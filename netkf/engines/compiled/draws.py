@@ -163,10 +163,7 @@ def no_path(n: int) -> PathBlock:
 
 @once_per_scenario
 def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
-    """Return the fields of a Sensing (increment sensors as arrays) that all runs share, for S
-    sensors of at most p rows (rows (S,), H (S, p, n), ...), and the keys of the random streams of
-    these sensors: (node, number at the node).
-    """
+    """Return the fields of a Sensing (increment sensors as arrays) that all runs share."""
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
     entries = {placed_sensor.entry for _, placed_sensor in placed}

@@ -172,9 +172,7 @@ class Source:
 
 
 def _make_windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
-    """Return the source of ticks, which come in windows of time: Poisson and other clocks of the
-    network, or transmissions after readings.
-    """
+    """Return the source of ticks in windows of time, or of transmissions after readings."""
     senders = senders_of(scenario)
     if senders.at == "readings":
         return ReadingsSchedule(scenario, streams, senders, instants.t, instants.index)
@@ -288,10 +286,7 @@ class Workspace:
         return state
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
-        """Return by name those scalar fields of a Simulation that are not 0 at the start of a run:
-        the filter's limits, and the largest number of messages and rows that one event may
-        need, by which the loop asks for space in time. ``instants`` are the samples of the run.
-        """
+        """Return those numbers of a Simulation that are not 0 at the start of a run, by name."""
         algorithm = self._scenario.node_filter
         max_messages = int(np.diff(self._senders.first).max(initial=0))
         return {
@@ -382,19 +377,14 @@ class FlowRun:
         return "complete"
 
     def _advance(self) -> int:
-        """Run the compiled loop that fits the filter until it needs something from Python; return
-        its request (WANT_... or DONE).
-        """
+        """Run the loop that fits the filter until it wants something, and return its request."""
         if self._clocked is not None:
             return self._clocked.advance(self._state)
         assert self._visits is not None
         return advance_alone(self._state, self._visits)
 
     def _fulfil(self, request: int) -> None:
-        """Fulfil a ``request`` (WANT_...) of the event loop, before the loop goes on: put the next
-        ticks, the next steps of the path or larger arrays into the state of the run, or move the
-        origin. Samples, WANT_SAMPLES, are recorded by the caller.
-        """
+        """Fulfil a ``request`` (WANT_...) of the event loop, before the loop goes on."""
         state = self._state
         if request == WANT_TICKS:
             window = self._draws.window()
@@ -415,10 +405,7 @@ class FlowRun:
             self._rebase()
 
     def _rebase(self) -> None:
-        """Make the present state of the plant the new origin of all states, estimates and messages,
-        so that numbers of an unstable plant stay small and keep their digits, and advance
-        ``frame_at``, the number of the next such move.
-        """
+        """Make the present state of the plant the origin of all states and messages."""
         state, k = self._state, self._state.frame_at
         offset = -self._draws.states.offset(k, state.path, state.piece)
         if self._clocked is not None:
@@ -429,9 +416,7 @@ class FlowRun:
         state.frame_at = k + 1
 
     def _enlarge_pool(self) -> None:
-        """Enlarge the pool of messages, which the event loop has used up, and every array that has
-        an entry for each of them.
-        """
+        """Enlarge the pool of messages and all that has an entry for each of them."""
         add_messages(self._state, self._state.most_messages)
         if self._clocked is not None:
             self._clocked.grow(len(self._state.pool))
@@ -443,10 +428,7 @@ class FlowRun:
             self._state.rows = np.empty(length, dtype=EVENT)
 
     def _record_rows(self, count: int, counts: np.ndarray) -> None:
-        """Pass the first ``count`` event rows on to the recorder, which keeps their array, and
-        continue with an empty one. In a run without rows pass on ``counts`` (kinds,), the number of
-        events by kind.
-        """
+        """Pass ``count`` rows on to the recorder, or ``counts`` in a run without rows."""
         state, recorder = self._state, self._recorder
         if not state.traced:
             recorder.add_counts(counts)
@@ -460,9 +442,7 @@ class FlowRun:
         state.rows = np.empty(len(rows), dtype=EVENT)
 
     def _record_samples(self) -> bool:
-        """Pass the samples in the buffer on to the recorder, with the true states at their times,
-        and empty the buffer; return False if one of them is not finite, at which the run ends.
-        """
+        """Pass the samples in the buffer on; return False at one that is not finite."""
         state, buffer = self._state, self._state.buffer
         count, state.samples = state.samples, 0
         if not count:

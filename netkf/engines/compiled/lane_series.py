@@ -157,13 +157,7 @@ def padded_gains(filters: Filters) -> FloatArray:
 
 
 def _united(series: FloatArray, unit: FloatArray, selected: np.ndarray) -> LaneSeries:
-    """Return the power series ``series`` (M, cells, terms, E) of E values in M models as a table
-    that is quick to evaluate: equal columns are stored once, cells of ``unit`` (M,) seconds are
-    divided into shorter ones, which need fewer terms, terms below rounding are left out, and the
-    width is padded to whole lanes.
-
-    ``selected`` (models of the FlowTable,) is True for the M models of ``series``.
-    """
+    """Return ``series`` with equal columns stored once, in shorter cells of fewer terms."""
     # Number the distinct columns in the order in which they first occur.
     indices: dict[bytes, int] = {}
     # 0.0 and not -0.0: they are the same number.

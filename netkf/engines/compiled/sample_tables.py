@@ -97,10 +97,7 @@ class SampleTables:
 def _add_noises(
     instants: Instants, samples: RecordedSamples, indices: np.ndarray, R: FloatArray
 ) -> None:
-    """Give each sample of a recorded sensor, with the ``indices`` (K,) among all, its number of
-    rows and the root of its noise covariance: some of its values may be missing, or it brings its
-    own R. The sensor has R (p, p).
-    """
+    """Set rows and noise of each sample of a recorded sensor: values may be missing."""
     p, first = instants.root.shape[1], len(instants.rows)
     root = np.zeros((len(indices), p, p))
     rows = np.zeros(len(indices), dtype=np.int64)
@@ -122,11 +119,7 @@ def _no_instants(scenario: Scenario) -> Instants:
 def _make_instants(
     scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
 ) -> Instants:
-    """Return the instants, each a time at which a node takes samples of one or several sensors and
-    uses them in one update: from the sorted times ``t`` (K,) in seconds of all K samples and the
-    ``sensor`` (K,) of each, an index in ``placed``, which pairs each sensor with its node's id.
-    Values ``y`` are 0 until they are read.
-    """
+    """Return the instants: times at which a node uses one or several samples at once."""
     index = scenario.topology.index if placed else {}
     pooled, n = scenario.node_filter.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)

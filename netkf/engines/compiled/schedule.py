@@ -138,9 +138,7 @@ class TickSource:
         return instants[before_horizon], numbers
 
     def _ticks(self, k: int, count: int) -> FloatArray:
-        """Return the times (count,) in seconds of the next ``count`` ticks of entity ``k``, fewer
-        if its clock ends, by calling the clock in Python, which may be a user's own.
-        """
+        """Return the times of the next ``count`` ticks of entity ``k``, from a user's clock."""
         assert isinstance(self._clock, LinkClock)
         origin, index, now = float(self._origins[k]), int(self.drawn[k]), float(self.last[k])
         entity, random = self._entities[k], self._random[k]

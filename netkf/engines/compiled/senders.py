@@ -69,10 +69,7 @@ def senders_of(scenario: Scenario) -> Senders:
 
 
 def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
-    """Return the senders if links have clocks, so that both ends send at each tick of their link:
-    an entity is a link of one direction if ``directed``, else of two, which share one stream of
-    losses and delays if ``symmetric``.
-    """
+    """Return the senders where links have clocks: both ends send at each tick."""
     if directed:
         indices = np.arange(len(links))
         return Senders("links", links, links, np.arange(len(links) + 1), indices, links, indices)

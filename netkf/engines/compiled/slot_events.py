@@ -169,10 +169,7 @@ class SlotEvents:
         return len(arrivals), np.stack(arrivals)[None]
 
     def _one_slot(self) -> np.ndarray:
-        """Make all events of the present slot; return ``up`` (E, W), which is 1 where a message on
-        directed link w arrives in time and is used in step e. There are E exchange steps and W
-        directed links.
-        """
+        """Make all events of the present slot."""
         setup, algorithm, slot = self._setup, self._algorithm, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
         if setup.may_miss:
@@ -195,10 +192,7 @@ class SlotEvents:
         return up
 
     def _make_stage_events(self, slot: int, up: np.ndarray) -> None:
-        """Make the events of the readings and exchanges of slot number ``slot``, in order; sets
-        ``up`` (E, W) to 1 where a message on directed link w is used in step e. There are E
-        exchange steps and W directed links.
-        """
+        """Make the events of the readings and exchanges of slot number ``slot``, in order."""
         steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
@@ -220,9 +214,7 @@ class SlotEvents:
                 self._end_step(exchange_step, up[step])
 
     def _iterate_steps(self, slot: int) -> Iterator[Step]:
-        """Yield the E steps of the exchanges of slot number ``slot`` in order, with their phase and
-        times in seconds; none if nothing is exchanged.
-        """
+        """Yield the exchange steps of ``slot`` with their phase and times in seconds."""
         setup, algorithm, repeats = self._setup, self._algorithm, [0, 0]
         # At the horizon filters that predict are only sampled.
         acts = slot < setup.last or not algorithm.predicts
@@ -274,9 +266,7 @@ class SlotEvents:
             self._rows.append(row)
 
     def _send_all(self, step: Step) -> None:
-        """Send all messages of an exchange step, with a draw of the channel for each: they go into
-        inboxes, under way, or are lost, and their events are recorded.
-        """
+        """Send all messages of an exchange step, with a draw of the channel for each."""
         broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
         pairs, up = self._chosen_pairs.pop(0) if self._chosen_pairs else self._choose_pairs(step)
         if broadcast:
@@ -300,9 +290,7 @@ class SlotEvents:
                     self._send(step, direction, draw if is_up else None)
 
     def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
-        """Return the links (pairs of node ids) that are used in a step, in the order of their
-        messages, and the set of those that are up (None: all); messages on the others are lost.
-        """
+        """Return the links used in a step, and those of them that are up (None: all)."""
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
         if isinstance(activation, Matching):
@@ -324,10 +312,7 @@ class SlotEvents:
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
     def _send(self, step: Step, direction: DirectionDraws, draw: Draw | None) -> None:
-        """Send one message on a directed link in an exchange step: record it, and put it into the
-        receiver's inbox or among those under way. It is lost if ``draw`` (uniform number, bad
-        state, delay) says so or is None (the link is down).
-        """
+        """Send one message; it is lost if ``draw`` says so or is None, its link being down."""
         (sender, receiver), number, now = direction.ends, direction.messages, step.begin
         direction.messages = number + 1
         self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
@@ -363,9 +348,7 @@ class SlotEvents:
             heapq.heappush(self._in_flight, entry)
 
     def _deliver(self, until: float) -> None:
-        """Deliver the messages that arrive up to ``until`` (seconds): in time if the exchange step
-        in which they were sent is still open, else late, which the filter does not use.
-        """
+        """Deliver the messages that arrive up to ``until`` (seconds)."""
         while self._in_flight and self._in_flight[0][0] <= until:
             now, _, _, direction, number, sent, phase, exchange = heapq.heappop(self._in_flight)
             (sender, receiver), in_time = direction.ends, exchange == self._open
@@ -378,10 +361,7 @@ class SlotEvents:
                 self._inbox.setdefault(receiver, {})[sender] = (number, age)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
-        """End an exchange step: set ``up`` (W,) to 1 for those of the W directed links whose
-        messages are in inboxes (the filters' kernel uses these), record one swap for each message
-        or one absorption for each receiver, and empty the inboxes.
-        """
+        """End an exchange step: set ``up`` (W,) and record swaps or absorptions."""
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.
         for node in sorted(self._inbox):

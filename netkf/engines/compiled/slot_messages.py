@@ -126,15 +126,7 @@ def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.nda
 
 @kernel
 def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Draw a matching of run ``r`` for the protocols MAXIMAL and INDEPENDENT, which keep links
-    whose ends are free: write the indices of its links to the front of ``active`` (A,), which has
-    space for the largest one; return their number. ``ends`` (links, 2) are the indices of the nodes
-    at both ends of each link.
-
-    MAXIMAL goes through the links in random order and takes each one whose ends are both free.
-    INDEPENDENT draws each link with a probability and takes those that share no node with another
-    link drawn.
-    """
+    """Draw a matching that keeps links whose ends are free into ``active`` (A,)."""
     count, pairs, states = len(ends), 0, matchings.states
     order, busy = matchings.order, matchings.busy
     for h in range(len(busy)):
@@ -574,11 +566,7 @@ def _slot_rows(
     s: int,
     row: int,
 ) -> int:
-    """Write the events of the first run in slot ``s`` (index) into the event table ``rows`` from
-    row ``row`` on; return the number of the next row. A slot has ``stages``: a reading of sensors
-    and steps of exchanges. Messages are numbered on, by link, from ``traced.sent``. ``pairwise``:
-    nodes swap with a peer, instead of absorbing broadcasts.
-    """
+    """Write the events of the first run in slot ``s``; return the number of the next row."""
     now = times.start[s]
     for k in range(len(stages.step)):
         stage = SlotStage(times.first + s, s, stages.step[k], stages.phase[k], now)
@@ -606,11 +594,7 @@ def _write_sends(
     pairwise: bool,
     row: int,
 ) -> int:
-    """Write the messages that the first run sends in an exchange step (``stage``) into the event
-    table ``rows`` from row ``row`` on: after the "tick" of each pair if exchanges are ``pairwise``,
-    or after one "round" for broadcasts; return the number of the next row. Messages are numbered
-    on, by link, from ``traced.sent``.
-    """
+    """Write what the first run sends in a step; return the number of the next row."""
     # A "round" has no node, peer, message or age.
     if not pairwise:
         row = write_row(rows, stage, ROUND, -1, -1, -1, NAN, row)
@@ -634,11 +618,7 @@ def _link_rows(
     link: int,
     row: int,
 ) -> int:
-    """Write the messages that the first run sends on ``link`` (index) in an exchange step
-    (``stage``) into the event table ``rows`` from row ``row`` on, each followed by its arrival or
-    loss; return the number of the next row. Messages of a direction are numbered on from
-    ``traced.sent``.
-    """
+    """Write what the first run sends on ``link``; return the number of the next row."""
     for end in range(channels.directions_per_link):
         w, i = link * channels.directions_per_link + end, channels.ends[link, end]
         if channels.talks[stage.step, w] == 0 or is_silent(messages, 0, stage, i, 0):
@@ -677,14 +657,7 @@ def _write_step_end(
     stopping: int,
     row: int,
 ) -> int:
-    """Write what happens in the first run when the exchange step of ``stage`` ends into the event
-    table ``rows`` from row ``row`` on: which nodes absorb or swap, and which stop; return the
-    number of the next row.
-
-    Nodes that received something swap states with their peer if exchanges are ``pairwise``, else
-    they absorb it. In step number ``stopping`` (-1: none) nodes may permanently freeze their
-    network estimate.
-    """
+    """Write who absorbs, swaps or stops; return the number of the next row."""
     for i in range(len(traced.nodes)):
         has_received = False
         for k in range(traced.first[i], traced.first[i + 1]):

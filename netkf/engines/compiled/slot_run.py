@@ -132,10 +132,7 @@ class SlotRuns:
         self._begin_messages()
 
     def _begin_truth(self) -> None:
-        """Create what the true states of the plant are drawn from: ``self._path``, with the initial
-        states drawn for all runs; or, for a plant without random numbers (such as a recorded one),
-        load its states as ``self._truth``, one for all runs.
-        """
+        """Create what true states are drawn from, or load those of a plant without noise."""
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
         self._path: Path | None = None
@@ -155,11 +152,7 @@ class SlotRuns:
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
-        """Create what readings are drawn from: ``_noise`` (R K, WIDTH), the random streams of the K
-        sensors whose readings kernels draw, in R runs; ``_regressors``, for each sensor with a
-        random H (regressors), the path of H as a plant of its own and its streams; and
-        ``_recorded``, the readings of recorded sensors.
-        """
+        """Create what readings are drawn from: streams, regressors and recorded sensors."""
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.placed_sensor.ordinal) for s in setup.kernel_sensors]
         # One stream for each drawn sensor of each run.
@@ -177,11 +170,7 @@ class SlotRuns:
         ]
 
     def _begin_messages(self) -> None:
-        """Create what messages are drawn from: ``_channels`` (losses) and ``_matchings`` (which
-        pairs of nodes exchange) of all runs, with their random streams; and, for filters that draw
-        random numbers to decide whether to send, the streams ``_triggers`` (B, N, L, WIDTH) of N
-        nodes in B blocks of L runs.
-        """
+        """Create what messages are drawn from: channels, matchings and triggers."""
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
         # Empty arrays tell the kernels to draw nothing.
         no_streams = np.zeros((0, 0, LANES, WIDTH), dtype=np.uint64)
@@ -215,9 +204,7 @@ class SlotRuns:
         self._matchings = Matchings(protocol, probability, states, first, members, order, busy)
 
     def _in_lanes(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """Return the states (B, K, L, WIDTH) of the random streams of K entities in each run. The
-        runs are side by side in B blocks of L lanes.
-        """
+        """Return the states (B, K, L, WIDTH) of the random streams of K entities in each run."""
         return states_in_lanes(self._streams.states(purpose, entities), self.runs)
 
     @property
@@ -255,9 +242,7 @@ class SlotRuns:
         readings: ReadingBlock,
         samples: SlotSamples,
     ) -> None:
-        """Simulate the filters in the slots of ``times``, write ``samples``, and which nodes send
-        into ``messages``.
-        """
+        """Simulate the slots of ``times``: write ``samples`` and who sends."""
         filters, count = self._filters, len(times.start)
         drawn: dict[str, Any] = {
             "first": self._slot,
@@ -291,11 +276,7 @@ class SlotRuns:
         self._slot += count
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
-        """Return the times and messages of the next slots, with about ``max_events`` events at most
-        (0: no limit). How many slots they are depends on who makes the messages: kernels draw those
-        of many slots, Python (for channels and clocks of a user) those of some, or of one if
-        filters decide who sends.
-        """
+        """Return times and messages of the next slots, of one if filters decide in Python."""
         setup, events = self.setup, self._events
         if events is None:
             # The kernels draw the messages of many slots and runs at once.
@@ -311,9 +292,7 @@ class SlotRuns:
         return self._next_times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
 
     def _empty_samples(self, count: int) -> SampledStates:
-        """Return space for T = ``count`` samples of all R runs, not initialised, in memory that is
-        reused for the next results.
-        """
+        """Return space for ``count`` samples of all R runs, in memory that is reused."""
         runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
         filter_shape = runs, count, estimators, n
         shapes = (runs, count, n), filter_shape, (*filter_shape, n), filter_shape
@@ -332,10 +311,7 @@ class SlotRuns:
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
     def _next_times(self, count: int, timed: bool) -> SlotTimes:
-        """Return, for the next S = ``count`` slots, whether events are recorded, sensors read and
-        messages exchanged, the indices of samples and, if ``timed``, the start times; without
-        ``timed`` these are 0.
-        """
+        """Return what happens in the next ``count`` slots, and, if ``timed``, when they begin."""
         setup, algorithm, plant = self.setup, self.setup.algorithm, self._scenario.slot_plant
         slots = np.arange(self._slot, self._slot + count)
         recorded = slots < setup.last
@@ -364,9 +340,7 @@ class SlotRuns:
         )
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
-        """Draw and return which nodes exchange in the S slots of ``times``, and which messages
-        arrive, for all R runs.
-        """
+        """Draw which nodes exchange in the S slots of ``times``, and what arrives."""
         setup = self.setup
         shape, pairs = (len(times.start), len(setup.fresh)), setup.max_pairs
         decided = setup.decides or setup.may_miss
@@ -402,10 +376,7 @@ class SlotRuns:
     def _deliver_chosen(
         self, deliveries: Deliveries, times: SlotTimes, messages: SlotMessages
     ) -> None:
-        """Write 1 into ``messages.up`` (1, S, E, W, L) for the messages that a replay of one run
-        delivers whatever was drawn: those of ``deliveries.chosen``, or all if it is None. A replay
-        repeats a run with other deliveries.
-        """
+        """Write 1 into ``messages.up`` for the messages that a replay delivers anyway."""
         setup, each = self.setup, self.setup.directions_per_link
         # (S, E, W): in which steps each directed link carries a message.
         is_sent = np.zeros(messages.up.shape[1:4], dtype=bool)
@@ -429,10 +400,7 @@ class SlotRuns:
                 messages.up[0, sent_slots[k], sent_steps[k], w, 0] = 1
 
     def _missed_readings(self, messages: SlotMessages, count: int) -> np.ndarray:
-        """Return (S, E, N) bool: nodes that send nothing in a step of the next S = ``count`` slots
-        because they have no reading to send, as recorded sensors may miss one. Their messages are
-        removed from ``messages.up``. There are E exchange steps in a slot.
-        """
+        """Return (S, E, N) bool: nodes without a reading to send; drop their messages."""
         setup = self.setup
         if not setup.may_miss:
             return np.zeros((count, len(setup.fresh), len(setup.nodes)), dtype=bool)
@@ -442,11 +410,7 @@ class SlotRuns:
         return unread
 
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
-        """Return the uniform numbers (B, S, E, N, L) by which filters that send at random decide:
-        one for each node that is asked for a message in a step, where ``sent`` (B, S, E, N, L) is
-        1, and 0 for the others; empty if the filter needs none. Dimensions: B blocks of L runs, S
-        slots of E exchange steps, N nodes.
-        """
+        """Return uniform numbers (B, S, E, N, L) for decisions; empty if none is needed."""
         if not self.setup.algorithm.randomised or not self.setup.decides:
             # Five dimensions, as kernels are compiled for.
             return np.zeros((0,) * 5)
@@ -455,13 +419,7 @@ class SlotRuns:
         return uniform
 
     def _next_states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return the true states of the next S = ``count`` slots relative to the moving origin and
-        absolute, (B, S, n, L) each, and the slots (S,) bool in which the origin moves. The runs are
-        side by side in B blocks of L lanes.
-
-        States of an unstable plant grow without bound; every ``setup.frame`` slots (a frame) the
-        present state becomes the origin, so that estimation errors keep their digits.
-        """
+        """Return local and absolute states (B, S, n, L), and (S,) where the origin moves."""
         setup = self.setup
         slots = range(self._slot, self._slot + count)
         rebased = np.zeros(count, dtype=bool)
@@ -483,22 +441,14 @@ class SlotRuns:
     def _draw_path(
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
-        """Draw the next S slots of a ``path`` (of the plant, or of random regressors) into
-        ``local`` and ``absolute`` (B, S, n, L), the states relative to the moving origin and
-        absolute, from the random streams ``states`` (R, WIDTH). The R runs are side by side in B
-        blocks of L lanes.
-        """
+        """Draw the next slots of a ``path`` into ``local`` and ``absolute`` (B, S, n, L)."""
         scratch = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
 
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
     ) -> ReadingBlock:
-        """Draw and return the readings of S slots at the states ``local`` (B, S, n, L), whitened
-        (multiplied by the inverse root of R, so that their noise has unit covariance); in the slots
-        ``rebased`` (S,) the origin of all states moves to the present one. The runs are side by
-        side in B blocks of L lanes.
-        """
+        """Draw the whitened readings of S slots at the states ``local`` (B, S, n, L)."""
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
         y: FloatArray = unset((*shape, LANES))
@@ -557,10 +507,7 @@ class SlotRuns:
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
     ) -> np.ndarray:
-        """Return the rows (K,) of the table of events, of dtype EVENT, of the first run in the
-        slots with indices ``first`` to ``stop`` - 1 of a block, in the order of time. Write the
-        number of rows before each of the T samples into ``before_sample`` (T,).
-        """
+        """Return the events of the first run in some slots of a block, in the order of time."""
         setup = self.setup
         # Space for the largest number of rows.
         table = np.empty(setup.rows_of(stop - first), dtype=EVENT)
@@ -583,9 +530,7 @@ class SlotRuns:
         )  # fmt: skip
 
     def _traced_nodes(self) -> TracedNodes:
-        """Return the nodes and incoming links as arrays, for the kernels that write the rows of
-        events or count the events.
-        """
+        """Return the nodes and incoming links as arrays."""
         setup, links = self.setup, self.setup.links
         return TracedNodes(
             nodes=setup.nodes,
@@ -610,10 +555,7 @@ class SlotRuns:
 
 
 def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:
-    """Return the messages ``up`` (1, S, E, W) and senders ``sent`` (1, S, E, N) of one run, which
-    Python made, as kernels expect them: in lane 0 of arrays of L lanes, each of which would hold
-    another run. Dimensions: S slots of E exchange steps, W directed links, N nodes.
-    """
+    """Return messages and senders of one run, which Python made, in lane 0."""
     lane_arrays = [np.zeros((*values.shape, LANES), dtype=np.uint8) for values in (up, sent)]
     for lanes, values in zip(lane_arrays, (up, sent), strict=True):
         lanes[..., 0] = values
@@ -643,9 +585,7 @@ def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress
 def _record_block(
     scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
 ) -> bool:
-    """Simulate the next slots of one run, and pass their events and samples to ``recorder``; return
-    False if an estimate in a sample is not finite or not valid, at which the run ends.
-    """
+    """Simulate the next slots of one run, and pass their events and samples to ``recorder``."""
     # A limited number of rows at a time: memory does not grow with the length of the run.
     block = runs.following(MAX_EVENT_ROWS)
     rows, rows_before = runs.events(block)

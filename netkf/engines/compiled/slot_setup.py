@@ -108,10 +108,7 @@ class SlotSetup:
         self.is_drawn = self._draws_everything(scenario)
 
     def _set_slots(self, scenario: Scenario) -> None:
-        """Set ``slots``, the number of slots of a run (the last one, at the horizon, exists only if
-        it is sampled), ``last``, the slot at the horizon, ``samples`` (T,), the slots with a
-        sample, and ``sample_times`` (T,) in seconds.
-        """
+        """Set ``slots``, the ``last`` one, at the horizon, and ``samples`` with their times."""
         plant = scenario.slot_plant
         # A guess below the last slot: the plant itself decides, free of this division's rounding.
         last = max(0, int(scenario.horizon / plant.period) - 2)
@@ -124,12 +121,7 @@ class SlotSetup:
         self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
 
     def _set_stages(self, scenario: Scenario) -> None:
-        """Set ``stages``, the readings and exchange steps of a slot in order, each with its phase
-        (the number of the exchange that it belongs to) and its end in seconds after the slot
-        begins; of the E exchange steps ``phases`` (E,), and ``fresh`` (E,): whether links draw
-        losses anew in the step, or keep those of the step before; and ``decides``, whether the
-        filter decides which nodes send.
-        """
+        """Set the ``stages`` of a slot, the ``phases`` of exchange steps, and ``fresh`` ones."""
         algorithm, phase, step = self.algorithm, 0, 0
         length = scenario.phase_length if algorithm.talks else 0.0
         stages: list[tuple[int, int, float]] = []
@@ -161,12 +153,7 @@ class SlotSetup:
         self.phases = [phase for step, phase, _ in stages if step >= 0]
 
     def _set_sensors(self, scenario: Scenario) -> None:
-        """Assign each sensor to a filter and to its rows there (``assigned``), and set ``rows``
-        (H,), the number of rows of each of the H filters, and p, the most. A pooled filter reads
-        the sensors of all nodes. Sensors are also listed by what reads them: Python
-        (``recorded_sensors``) or kernels (``kernel_sensors``, among them ``regressor_sensors``);
-        ``varies`` is True if some H is not fixed, ``H`` (1, 1, H, p, n, L) holds those that are.
-        """
+        """Assign each sensor to a filter and to its rows there, and to what reads it."""
         pooled = self.algorithm.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.estimators, dtype=np.int64)
@@ -202,11 +189,7 @@ class SlotSetup:
         self._set_kernel_sensors(scenario)
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
-        """Set ``self.sensors``, by which kernels draw readings: the whitened H = L_b^-1 H (K, p, n)
-        and noise factors L_b^-1 L (K, p, p) of all K sensors that kernels read, with the true R = L
-        L' and the believed R = L_b L_b'; and ``regressors``, the processes (A, drive, start) of
-        those with random H. Copies each fixed H into the rows of its filter in ``self.H``.
-        """
+        """Set the whitened H and noise by which kernels draw readings, and regressors."""
         count, p, n = len(self.kernel_sensors), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         regressor_index = np.full(count, -1, dtype=np.int64)
@@ -250,10 +233,7 @@ class SlotSetup:
         )
 
     def _set_states(self, scenario: Scenario) -> None:
-        """Set the H filters at slot 0: their ``states``, estimates ``xhat`` (H, n) and roots of
-        their covariances ``root`` (H, n, n); and the F and root of Q (n, n) that all of them
-        believe.
-        """
+        """Set the H filters at slot 0, and the F and root of Q that all of them believe."""
         infos: Sequence[NodeInfo] = scenario.node_infos
         models: Sequence[Any] = scenario.slot_models
         if self.algorithm.pooled:
@@ -287,9 +267,7 @@ class SlotSetup:
         }
 
     def _make_links(self, scenario: Scenario) -> SlotLinks:
-        """Return the W directed links sorted by receiver and sender, the order in which filters add
-        up messages, with their weights (W,).
-        """
+        """Return the W directed links sorted by receiver and sender, with their weights."""
         index = scenario.topology.index
         # By receiver and sender: the order in which a filter adds the messages it receives.
         incoming = sorted(
@@ -309,14 +287,7 @@ class SlotSetup:
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
-        """Set the loss model ``loss`` (that of the run, if this is a replay that delivers the
-        messages of ``deliveries``) and whether it is a Markov chain (``is_chain``); ``delivery``
-        (2, W), the delivery probabilities of the W directed links in the good and the bad state of
-        the channel, all 1 unless ``has_known_probabilities``; and ``entities``, the first
-        ``streams_per_link`` directions of each link, from whose streams losses are drawn. Of the E
-        exchange steps set ``talks`` (E, W), which directions send in them, and ``sends_readings``
-        (E,), whether messages are readings.
-        """
+        """Set losses, delivery probabilities (2, W) and who sends in which step."""
         channel, each = scenario.network.channel, self.directions_per_link
         self.loss, bad = channel.loss, (False, True)
         # A replay draws as its run does, and then delivers the chosen messages.
@@ -355,9 +326,7 @@ class SlotSetup:
         self._recorded_slots = self._slots_with_rows(scenario) if self.sends_readings.any() else {}
 
     def _slots_with_rows(self, scenario: Scenario) -> dict[int, set[int]]:
-        """Return, by index of the node, the slots in which a node has a reading, for nodes all of
-        whose sensors are recorded: only these may lack one in some slots.
-        """
+        """Return the slots with a reading of each node all of whose sensors are recorded."""
         slots: dict[int, set[int]] = {}
         for s in self.recorded_sensors:
             sensor: Any = scenario.sensors[s.placed_sensor.entry]
@@ -384,9 +353,7 @@ class SlotSetup:
         return unread
 
     def _draws_everything(self, scenario: Scenario) -> bool:
-        """Return True if kernels can draw all messages of many slots and runs at once; otherwise
-        Python makes them one by one, which is slower but handles any channel.
-        """
+        """Return True if kernels can draw all messages of many slots and runs at once."""
         network = scenario.network
         # Which message has which number is known before the exchange, unless nodes may be silent.
         if self.deliveries is not None and (self.decides or self.may_miss):
@@ -453,10 +420,7 @@ class SlotSetup:
 
 
 def _widened(model: SlotModel, rows: int) -> SlotModel:
-    """Return the model of a filter with H and R of as many ``rows`` as its largest reading has, by
-    which filters size their arrays: a recorded sensor may have several rows in a slot. Rows of
-    zeros and unit noise carry no information.
-    """
+    """Return a model with as many ``rows`` as its largest reading, those added empty."""
     added = rows - len(model.H)
     if added <= 0:
         return model

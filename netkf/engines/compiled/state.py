@@ -27,9 +27,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def _record_type(integers: str, floats: str = "") -> np.dtype:
-    """Return a record type of int64 and float64 fields; blanks separate their names in ``integers``
-    and ``floats``.
-    """
+    """Return a record type of int64 and float64 fields, whose names are given."""
     # int64 fields first, then float64 ones: every field is aligned without padding.
     fields = [(name, np.int64) for name in integers.split()]
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
@@ -355,19 +353,14 @@ def filters_at_start(scenario: Scenario) -> Filters:
 
 
 def _roots_of(covariances: list[FloatArray]) -> FloatArray:
-    """Return the stacked roots (N, n, n) of N covariances (n, n). Many of these are the same array,
-    whose root is computed once.
-    """
+    """Return the roots (N, n, n) of N covariances (n, n), many of which are one array."""
     distinct = {id(cov): cov for cov in covariances}
     roots = {key: first_root(cov) for key, cov in distinct.items()}
     return np.stack([roots[id(cov)] for cov in covariances])
 
 
 def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
-    """Return the tables of M models (matrices by which nodes predict and read) with n states each:
-    for prediction, with one more model without sensors at the end (M + 1), by which messages under
-    way are predicted, and of gains (M).
-    """
+    """Return the tables of M models, with one without sensors at the end, and of gains."""
     n = len(models[0].A)
     # A model without sensors has no gains; its entry keeps the numbering.
     gains = [model.gains if len(model.H) else no_gains(n) for model in models]

@@ -428,24 +428,18 @@ class KernelSchedules:
                 state[:] = copy
 
     def _space(self, ticks: int) -> TickBuffer:
-        """Return space for ``ticks`` ticks and the outcomes of about as many messages as they
-        send.
-        """
+        """Return space for ``ticks`` ticks and the outcomes of their messages."""
         sends = 0.0 if self._channels.bits else self._sends
         return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
 
     def _space_for_all(self, ticks: int) -> AllTicks:
-        """Return space for ``ticks`` ticks of all R runs together, and the outcomes of their
-        messages.
-        """
+        """Return space for ``ticks`` ticks of all R runs and the outcomes of their messages."""
         t, entity, first_outcome, delay = self._space(ticks)
         first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
         return AllTicks(t, entity, first_outcome, delay, first, first_delay, self._channels.bits)
 
     def _window(self, run: int, begin: float, end: float) -> Window:
-        """Draw and return the ticks of run number ``run`` in [begin, end) seconds, in the order of
-        time. The buffer into which they are drawn is enlarged until all of them fit.
-        """
+        """Draw and return the ticks of run number ``run`` in [begin, end) seconds, in order."""
         last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         # Space for the mean plus eight standard deviations of a Poisson count is nearly always
         # enough.
@@ -467,9 +461,7 @@ class KernelSchedules:
         return Window(end, *ordered)
 
     def _enlarge_buffer(self, ticks: int, sends: int) -> None:
-        """Make the buffer large enough for ``ticks`` ticks and ``sends`` outcomes, keeping its
-        contents; it never shrinks.
-        """
+        """Make the buffer large enough, keeping its contents; it never shrinks."""
         if len(self._buffer.t) >= ticks and len(self._buffer.delay) >= sends:
             return
         larger = _empty_buffer(ticks, sends)
@@ -480,9 +472,7 @@ class KernelSchedules:
 
 
 def _space_for_count(expected: float, deviations: float) -> int:
-    """Return a number that a Poisson count with the mean ``expected`` hardly ever exceeds: so many
-    standard ``deviations`` above the mean, and some more for small means.
-    """
+    """Return a number that a Poisson count with mean ``expected`` hardly ever exceeds."""
     return int(expected + deviations * math.sqrt(expected)) + 8
 
 

@@ -116,10 +116,7 @@ class PathStates:
             return local, local + self._origin_at(times)
 
     def _origin_at(self, times: FloatArray) -> FloatArray:
-        """Return the absolute origin (T, n) of the present frame at T ``times`` (T,) in seconds:
-        the state at the beginning of the frame, moved by the plant without noise. States are kept
-        relative to it, so that those of an unstable plant keep their digits.
-        """
+        """Return the origin (T, n) of the present frame at T ``times`` in seconds."""
         # An origin of 0 stays 0, and its transition may overflow.
         if self._moves is None or not self._origin.any():
             return np.broadcast_to(self._origin, (len(times), len(self._origin)))

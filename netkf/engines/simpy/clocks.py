@@ -69,10 +69,7 @@ def _tick_process(
     tick_order: int,
     activate: Activation,
 ) -> Process:
-    """Wait for each tick of the clock of ``entity`` (node ids of a link, or of a node) up to the
-    horizon, and call ``activate``, which lets its nodes send, with its time in seconds: a SimPy
-    process. ``tick_order`` is the index of the entity, which orders simultaneous ticks.
-    """
+    """Wait for each tick of the clock of ``entity``, and call its activation."""
     clock, instant = scenario.network.activation, scenario.time_grid.instant
     assert isinstance(clock, LinkClock)
     # A stream of its own: the ticks of one entity never depend on those of another.
@@ -110,10 +107,7 @@ def _link_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each link (pair of node ids) an activation, a function that the process of its
-    clock calls at each tick with the time in seconds: both ends exchange. ``nodes`` are the nodes
-    by id.
-    """
+    """Return for each link what happens at a tick: both ends exchange."""
 
     # A factory for each link, so that the closure binds these ends and not those of the last link.
     def activation(link: tuple[int, int], entity: int) -> Activation:
@@ -140,10 +134,7 @@ def _direction_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each direction (sender, receiver) of a link an activation, a function that the
-    process of its clock calls at each tick with the time in seconds: the sender pushes a message to
-    its receiver. ``nodes`` are the nodes by id.
-    """
+    """Return for each direction what happens at a tick: the sender sends."""
 
     def activation(link: tuple[int, int], entity: int) -> Activation:
         """Return the activation of the directed ``link`` (sender, receiver): its sender sends one
@@ -213,9 +204,7 @@ def _node_activations(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> Activations:
-    """Return for each node, as (id,), an activation, a function that the process of its clock calls
-    at each tick with the time in seconds: the node broadcasts. ``nodes`` are the nodes by id.
-    """
+    """Return for each node, as (id,), what happens at a tick: it broadcasts."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 
     def activation(node: int) -> Activation:
@@ -239,11 +228,7 @@ def _transmit_after_samples(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> None:
-    """Make every node broadcast after it has used a sample, for networks without clocks in which
-    readings activate the nodes: sets ``after_sample`` of those ``nodes`` (by id) that have sampled
-    sensors, a function that they then call. The broadcast happens at the rank of ticks, after all
-    samples of that instant.
-    """
+    """Make nodes broadcast after each sample that they use, without clocks."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
     # Only nodes with sampled sensors have samples to transmit after.
     for node in scenario.sampled_sensors:

@@ -127,10 +127,7 @@ class _Simulation:
         ]
 
     def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
-        """Record the states of the plant and of all nodes at the probe times, those at which the
-        scenario asks for samples: a SimPy process. ``nodes`` are by id; ``sums`` are conserved sums
-        to record.
-        """
+        """Record plant and ``nodes`` at the probe times: a SimPy process."""
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
             # Events predict only the nodes that take part; a sample needs all nodes at one time.
@@ -139,11 +136,7 @@ class _Simulation:
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
 
     def _moving_origin(self, truth: Any, nodes: dict[int, ClockedNode]) -> Process:
-        """Move the origin of the coordinates of all ``nodes`` (by id) to the state of the plant at
-        every frame time: a SimPy process.
-
-        Otherwise the state of an unstable plant becomes so large that errors lose their digits.
-        """
+        """Move the origin of all ``nodes`` to the true state at every frame time."""
         for k, time in enumerate(truth.frame_times.tolist()):
             yield self.timeline.at(time, Rank.REBASE, 0)
             for node in distinct(nodes):
@@ -191,9 +184,7 @@ class _Simulation:
     def _sampling_slots(
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
-        """Record the states of the plant and of all ``nodes`` (by id) in slots, predictions at
-        their start, filtered states at their end, with the conserved ``sums``: a SimPy process.
-        """
+        """Record plant and ``nodes`` in slots, predictions first or filtered states last."""
         predicts, recorder, slot = self._scenario.node_filter.predicts, self._recorder, 0
 
         def sample() -> None:
@@ -229,13 +220,7 @@ class _Simulation:
             slot += 1
 
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
-        """Record one sample at ``time`` (seconds) of the state ``x`` (n,) of the plant and of all
-        ``nodes``, by id; ``local`` (n,) is x relative to the origin of the estimates, ``sums`` the
-        conserved sums.
-
-        Raises DivergedError, which ends the run, if an estimate is not sound: not finite, or with a
-        P that is not positive semidefinite.
-        """
+        """Record one sample; raises DivergedError if an estimate is not sound."""
         scenario, recorder = self._scenario, self._recorder
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
@@ -261,9 +246,7 @@ class _Simulation:
 
 
 def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any]) -> dict[int, Any]:
-    """Return the node process of every node by id; the nodes of a pooled filter share one. ``make``
-    takes the node's id (-1: pooled), its index, and the ids of the nodes whose sensors it reads.
-    """
+    """Return the node process of every node by id; the nodes of a pooled filter share one."""
     nodes = scenario.nodes
     if scenario.node_filter.pooled:
         return dict.fromkeys(nodes, make(-1, 0, scenario.sensing_nodes))
@@ -271,10 +254,7 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
-    """Return the arguments of Node (filter, id, index, model, start and NodeInfo) for the node with
-    the id ``node`` (-1: the pooled filter, one in place of those of all nodes) and the index
-    ``entity``.
-    """
+    """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``."""
     model, first = scenario.believed_models[entity], scenario.nodes[entity]
     # -1: the pooled filter, which is not a node of the graph.
     if node < 0:
@@ -297,9 +277,7 @@ class _Sums:
         self.start = self._compute()
 
     def _compute(self) -> dict[str, float]:
-        """Return the conserved sums over all nodes by name, quantities that exchanges should not
-        change (such as the total weight of push-sum).
-        """
+        """Return by name the sums over all nodes that exchanges should not change."""
         parts = [_conserved_terms(node.algorithm, node.state) for node in self._nodes]
         # fsum: rounding of this sum would look like a loss.
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}

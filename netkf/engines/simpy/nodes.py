@@ -150,10 +150,7 @@ class ClockedNode(Node):
             self._now = end
 
     def _read(self, start: float, end: float) -> FloatArray:
-        """Return the moments (2 p,) of the increments that all sensors of the node read from
-        ``start`` to ``end``, in seconds: integrals over the interval with the weights 1 and P_1
-        (Legendre).
-        """
+        """Return the moments (2 p,) of the increments of all sensors in [start, end]."""
         truth = self._truth
         x_moments = truth.moments(start, end)
         parts = [sensor.moments(truth, x_moments, start, end) for sensor in self._increments]
@@ -172,10 +169,7 @@ class ClockedNode(Node):
         self._samples.append((node, y, H, R))
 
     def _use_samples(self, _: simpy.Event) -> None:
-        """Update ``self.state`` by all samples of this instant together, and record which nodes
-        sensed: the callback of the event that the first of them schedules. The event itself is not
-        used.
-        """
+        """Update ``self.state`` by all samples of this instant together."""
         time, samples = self._timeline.now, self._samples
         self._samples = []
         self.predict_to(time)
@@ -213,9 +207,7 @@ class ClockedNode(Node):
         self.put(envelope)
 
     def _absorb(self, _: simpy.Event) -> None:
-        """Absorb all messages that have arrived at this instant: the callback of the event that the
-        first of them schedules. The event itself is not used.
-        """
+        """Absorb all messages that have arrived at this instant."""
         time = self._timeline.now
         self.predict_to(time)
         messages = self.take_messages()[1]

@@ -64,10 +64,7 @@ def _increment_process(
     node: int,
     entity: int,
 ) -> Process:
-    """Make ``node`` (id) use its increments at each point of the sensing grid, the times at which
-    increment sensors are read: predict ``carrier``, the filter that uses them, up to that point.
-    ``entity`` is the index of the node, which orders simultaneous events.
-    """
+    """Make ``node`` use its increments at each point of the sensing grid."""
     # From grid point 1 on, since increments need an interval.
     k = 1
     # Half open: the horizon is excluded.

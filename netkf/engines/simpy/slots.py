@@ -105,9 +105,7 @@ class SlotSchedule:
         return (stages[-1].time, stages[-1].rank + 1) if stages else (self.start(slot), FIRST_RANK)
 
     def _stages_of(self, slot: int) -> Generator[Stage, None, None]:
-        """Yield the stages of a slot in order, by the filter's schedule: sends and absorptions of
-        each exchange, readings, updates and predictions.
-        """
+        """Yield the stages of a slot in order, by the filter's schedule."""
         algorithm, start = self._algorithm, self.start(slot)
         now, rank, phase = start, FIRST_RANK + 1, 0
         # In slot 0 a filter that does not predict uses no reading: its sample is the initial state.
@@ -176,9 +174,7 @@ class SlotNode(Node):
             slot += 1
 
     def _perform(self, stage: Stage, slot: int) -> None:
-        """Do one stage of slot number ``slot``: predict, update or absorb, which changes
-        ``self.state``.
-        """
+        """Do one stage of slot number ``slot``."""
         if stage.kind == "predict":
             self.state = self.algorithm.predict(self.state, self._period)
         elif stage.kind == "update":
@@ -193,9 +189,7 @@ class SlotNode(Node):
         self._samples.append((y, H, R))
 
     def _update(self, time: float) -> None:
-        """Update ``self.state`` by all readings of this slot, at ``time`` (seconds), in one update;
-        a node without sensors gets a reading without rows.
-        """
+        """Update ``self.state`` by all readings of this slot; without sensors, by no rows."""
         samples = [linearise(self.algorithm, self.state, y, H) for y, H, _ in self._samples]
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
@@ -231,9 +225,7 @@ class SlotNode(Node):
         self.put(envelope)
 
     def _close(self, stage: Stage, slot: int) -> None:
-        """Close the inbox at the end of an exchange step, absorb its messages into ``self.state``,
-        and record that; ``slot`` is the number of the slot.
-        """
+        """Close the inbox at the end of an exchange step, and absorb its messages."""
         append, now, phase = self._recorder.append, stage.time, stage.phase
         envelopes, messages = self.take_messages()
         # From now on a message of this exchange is late.
@@ -255,9 +247,7 @@ class SlotNode(Node):
 
 
 def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
-    """Return flags (p,) of the rows of a reading ``y`` (p,) with ``H`` (p, n) that have a value,
-    since the filter uses only these; ``y`` may be empty if the whole reading is missing.
-    """
+    """Return flags (p,) of the rows of a reading that have a value."""
     # A sensor without a reading may give an empty y.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
@@ -334,9 +324,7 @@ class SlotClock:
             slot += 1
 
     def _exchange(self, stage: Stage, slot: int) -> None:
-        """Let all nodes send in one step of an exchange of slot number ``slot``, over the links or
-        pairs that are active, and record ticks or the round.
-        """
+        """Let all nodes send in one step of an exchange, and record ticks or the round."""
         now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
         # All inboxes open before any node sends: a message without delay arrives at once.
         for node in self._distinct:
@@ -363,10 +351,7 @@ class SlotClock:
             )
 
     def _pairs(self, stage: Stage, slot: int, broadcast: bool) -> tuple[list[Any], set[Any] | None]:
-        """Return the links (pairs of node ids) that are used in an exchange step (``stage``) of
-        slot number ``slot``, and the subset of them that is up (None for all); messages on the
-        others are lost. ``broadcast``: nodes send on all links, not in pairs.
-        """
+        """Return the links used in an exchange step, and those of them that are up."""
         activation, topology = self._scenario.network.activation, self._scenario.topology
         links = list(topology.links)
         if isinstance(activation, Matching):

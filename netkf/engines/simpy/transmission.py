@@ -132,10 +132,7 @@ class Transmitter:
     def _arrive(
         self, direction: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
-        """Deliver a message to its receiver, or record that it arrives too late for its exchange.
-        ``phase`` is the number of its exchange in the slot, -1 under clocks; ``arrival`` is the
-        SimPy event that calls this, None for a message without delay.
-        """
+        """Deliver a message, or record that it arrives too late for its exchange."""
         now, (sender, receiver) = self._timeline.now, direction.link
         # A message without delay arrives inside the tick, and keeps its age of 0.
         if arrival is not None:
