@@ -74,6 +74,15 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
     return observations
 
 
+def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
+    """Return True if all observations are of the same arrays."""
+    return len(some) == len(others) and all(
+        a is b
+        for one, other in zip(some, others, strict=True)
+        for a, b in zip(one, other, strict=True)
+    )
+
+
 def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
     """Return a function from a slot (0-based) to the readings of that slot (H, the assumed R and a
     root of the true R), by index of the estimator (the filter of a node, or one pooled filter);
@@ -92,6 +101,8 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
         for nodes in nodes_by_estimator(scenario)
     ]
 
+    stacked: dict[int, tuple[list[Observation], Observation]] = {}
+
     def observe(slot: int) -> EstimatorObservations:
         """Return the readings of ``slot``, H (p, n) and R (p, p), by index of the estimator."""
         observations = {}
@@ -105,7 +116,11 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
                 for sensor, path, H in rows
                 if len(H)
             ]
-            observations[estimator] = stack_observations(readings, n)
+            # Sensors that do not vary have the same matrices in all slots, stacked once.
+            known = stacked.get(estimator)
+            if known is None or not _are_the_same(known[0], readings):
+                known = stacked[estimator] = readings, stack_observations(readings, n)
+            observations[estimator] = known[1]
         return observations
 
     return observe
