@@ -68,14 +68,12 @@ class NodeGains(NamedTuple):
 
     B : (d, n, n) for the d nodes that it hears, in the order of their indices
     M, K : (n, n), of the pseudo-observation in yhat, and of the pseudo-state in xhat
-    predicted, root : lower triangular roots (n, n) of the covariance of x - xhat, after the
-                      prediction to the slot and at its end
+    root : lower triangular root (n, n) of the covariance of x - xhat at the end of the slot
     """
 
     B: FloatArray
     M: FloatArray
     K: FloatArray
-    predicted: FloatArray
     root: FloatArray
 
 
@@ -191,15 +189,13 @@ class GainSequence:
         """Advance ``_errors`` by a slot."""
         nodes = range(len(self._neighbours))
         self._errors = np.hstack([self._predict(), self._driven])
-        predicted = [self._covariance_root(i) for i in nodes]
         # The order of the filter: yhat from the exchange, then xhat from the new yhat.
         gains = self._correct_pseudo_states()
         K = [self._correct_state(i) for i in nodes]
         # Only products of rows matter: QR reduces the inputs to as many as there are rows.
         self._errors = np.asarray(np.linalg.qr(self._errors.T, mode="r")).T
         return tuple(
-            NodeGains(B, M, K[i], predicted[i], self._covariance_root(i))
-            for i, (B, M) in enumerate(gains)
+            NodeGains(B, M, K[i], self._covariance_root(i)) for i, (B, M) in enumerate(gains)
         )
 
     def _predict(self) -> FloatArray:

@@ -36,7 +36,6 @@ from netkf.algorithms.kernels.tracks import (
     track_scratch,
     update_joint,
 )
-from netkf.algorithms.models import SlotModel, whiten_reading
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.core.fields import field, one_of
@@ -351,25 +350,6 @@ class BarShalomCampo(Filter):
     shift = Filter.shift  # affine: tracks enter by their differences
 
 
-def whitened_sensors(model: SlotModel) -> FloatArray:
-    """Return the whitened H (p, n) of a node's sensors, ``L^-1 H`` with ``L L' = R``, whose noise
-    has variance 1 in each row.
-    """
-    H: FloatArray = np.asarray(model.H, dtype=np.float64)
-    return whiten_reading(np.zeros(len(H)), H, model.R)[1] if len(H) else H
-
-
-def stacked_sensors(sensors: Sequence[FloatArray]) -> tuple[FloatArray, np.ndarray]:
-    """Return the whitened ``sensors`` of m nodes, (p_i, n) each, as one array (m, p, n) with zeros
-    below, and the number of rows (m,) of each, for kernels.
-    """
-    rows = np.array([len(H) for H in sensors])
-    stack = np.zeros((len(sensors), max(int(rows.max()), 1), sensors[0].shape[1]))
-    for k, H in enumerate(sensors):
-        stack[k, : len(H)] = H
-    return stack, rows
-
-
 def combined_pairs(count: int, heard: Sequence[Sequence[int]]) -> np.ndarray:
     """Return the pairs (K, 2) of indices of ``count`` tracks that some node may combine, in lexical
     order: both orders of each pair, and each track with itself; node h hears ``heard[h]``.
@@ -380,28 +360,6 @@ def combined_pairs(count: int, heard: Sequence[Sequence[int]]) -> np.ndarray:
     codes = [np.add.outer(count * one, one).reshape(-1) for one in groups]
     pairs = np.divmod(np.unique(np.concatenate(codes)), count)
     return np.ascontiguousarray(np.stack(pairs, axis=1))
-
-
-def predicted_joint(joint: FloatArray, model: SlotModel) -> FloatArray:
-    """Return the covariances (m, m, n, n) of the errors of m tracks one slot later, from ``joint``
-    of the same shape: all of them have the same process noise.
-    """
-    predicted, F, Q = (np.array(part, order="C") for part in (joint, model.F, model.Q))
-    predict_joint(predicted.reshape(-1, *F.shape), F, Q, np.empty(F.shape))
-    return predicted
-
-
-def updated_joint(joint: FloatArray, sensors: Sequence[FloatArray]) -> FloatArray:
-    """Return the covariances (m, m, n, n) of the errors of m tracks, from ``joint`` of the same
-    shape, after each has used a reading of its own whitened ``sensors`` (p_i, n), ``P_ij+ = (I -
-    K_i H_i) P_ij (I - K_j H_j)'``.
-    """
-    updated, (H, rows) = np.array(joint, order="C"), stacked_sensors(sensors)
-    m, n = len(H), H.shape[2]
-    pairs = np.ascontiguousarray(np.indices((m, m)).reshape(2, -1).T)
-    work = np.empty((m, n, n)), np.empty((n, n))
-    update_joint(updated.reshape(-1, n, n), pairs, H, rows, *work)
-    return updated
 
 
 def best_combination(

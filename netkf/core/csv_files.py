@@ -32,7 +32,6 @@ STAMPS = ("t", "from", "until")
 """The columns that hold times, in every table."""
 NODES = ("node", "peer", "sender", "receiver", "to")
 """The columns that hold nodes, by id or by name, in every table."""
-SEPARATORS = ",;\t"
 _FOREIGN = {
     b"PK": "it is a zip file or a spreadsheet; save the table as CSV",
     b"\xff\xfe": "it is UTF-16 text; save it as UTF-8",

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,8 +23,6 @@ from netkf.core.instants import as_written
 from netkf.core.printable import MAX_NAME
 from netkf.core.stamps import TimeBase
 from netkf.linalg.arrays import FloatArray, is_semidefinite, readonly_array
-
-Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)

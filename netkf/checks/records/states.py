@@ -103,11 +103,6 @@ def drawn_states(
     return x, allowed
 
 
-def _exponential(A: FloatArray, gap: float) -> FloatArray:
-    """Return exp(A gap) (n, n)."""
-    return np.asarray(scipy.linalg.expm(A * gap))
-
-
 def _error_fault(run: Run) -> str:
     """Return a fault if errors are not x - xhat up to the rounding of these."""
     with np.errstate(over="ignore", invalid="ignore"):
