@@ -40,6 +40,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of
 from netkf.linalg.arrays import FloatArray
@@ -392,9 +393,6 @@ class BeliefPropagation(Filter):
 
     paper: ClassVar[str] = "belief_propagation"
     combination: ClassVar[str] = "beliefs"
-    one_way: ClassVar[bool] = True
-    needs_samples: ClassVar[bool] = True
-    inverts: ClassVar[bool] = True
     kernels = Kernels(
         predict=predict,
         update=update,
@@ -458,7 +456,18 @@ class BeliefPropagation(Filter):
         node["prior"][:, :-1] = lower_root(weighted.T[::-1]).T[::-1, ::-1]
         node["frame"][:] = frame.basis
 
-    def check_scenario(self, scenario: Any) -> None:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return Needs(
+            one_way=True,
+            samples=True,
+            inverts=True,
+            check=self._check_scenario,
+            notes=self._scenario_notes,
+        )
+
+    def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if messages are kept (``memory`` "all", or clocks) and the plant of a
         ``netkf.Scenario`` has process noise, which would make them dependent, or modes whose
         evidence would lose its digits before the horizon.
@@ -488,7 +497,7 @@ class BeliefPropagation(Filter):
                 f"use a horizon below {MAX_LOSS / frame.excess * scenario.horizon / steps:.3g}",
             )
 
-    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note for the user where the graph of a ``netkf.Scenario`` has loops, on which P
         is too small; else nothing.
         """

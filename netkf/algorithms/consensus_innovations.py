@@ -35,6 +35,7 @@ from netkf.algorithms.kernels.run import shift_vector
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, select, spread, store
@@ -436,11 +437,6 @@ class ConsensusInnovations(Filter):
     paper: ClassVar[str] = "consensus_innovations"
     combination: ClassVar[str] = "pseudo-states"
     clocks: ClassVar[tuple[str, ...]] = ()
-    one_way: ClassVar[bool] = True
-    fixed_sensors: ClassVar[bool] = True
-    every_reading: ClassVar[bool] = True
-    common_start: ClassVar[bool] = True
-    needs_network: ClassVar[bool] = True
     kernels = Kernels(
         predict=predict,
         update=nothing,  # a reading is used in the exchange of its slot
@@ -489,7 +485,19 @@ class ConsensusInnovations(Filter):
         record.B, record.M, record.K, record.roots = map(np.ascontiguousarray, gains)
         record.first_slot = first
 
-    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return Needs(
+            one_way=True,
+            fixed_sensors=True,
+            every_reading=True,
+            common_start=True,
+            network=True,
+            notes=self._scenario_notes,
+        )
+
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, or held
         back by a trigger, which makes P too small; else nothing.
         """

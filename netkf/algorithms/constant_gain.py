@@ -32,6 +32,7 @@ from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import FlowModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, either, field, has_depth, list_of, matrix
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -143,9 +144,6 @@ class ConstantGain(Filter):
     combination: ClassVar[str] = "constant gain"
     P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
-    one_way: ClassVar[bool] = True
-    fixed_sensors: ClassVar[bool] = True
-    every_reading: ClassVar[bool] = True
     kernels = Kernels(
         update=use_sample,
         absorb=combine_convex,
@@ -188,7 +186,14 @@ class ConstantGain(Filter):
 
     shift = Filter.shift  # affine: the weights sum to one
 
-    def check_scenario(self, scenario: Any) -> None:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return Needs(
+            one_way=True, fixed_sensors=True, every_reading=True, check=self._check_scenario
+        )
+
+    def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where the gains do not fit a ``netkf.Scenario``: recorded sensors
         in continuous time, another number of gains than of nodes, or a gain that is not n x p for
         the p rows of a node.

@@ -13,6 +13,7 @@ from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.records import Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 
 
 @built_in("covariance-intersection")
@@ -27,8 +28,7 @@ class CovarianceIntersection(Hybrid):
     """
 
     combination: ClassVar[str] = "intersection"
-    inverts: ClassVar[bool] = True
-
+    needs = Needs(inverts=True)
     kernels = DiffusionFilter.kernels
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:

@@ -21,6 +21,7 @@ from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -112,8 +113,7 @@ class DiffusionFilter(Filter):
     schedule: ClassVar[tuple[str, ...]] = ("sense", "predict", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
     predicts: ClassVar[bool] = True
-    one_way: ClassVar[bool] = True
-    inverts: ClassVar[bool] = True
+    needs = Needs(one_way=True, inverts=True)
     kernels = Kernels(emit=emit, absorb=absorb)
 
     def __post_init__(self) -> None:

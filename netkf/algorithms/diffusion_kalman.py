@@ -16,6 +16,7 @@ from netkf.algorithms.kernels.estimates import copy_vector
 from netkf.algorithms.kernels.neighbours import use_readings_heard
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -72,7 +73,7 @@ class DiffusionKalman(Filter):
     combination: ClassVar[str] = "readings, then estimates"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
-    one_way: ClassVar[bool] = True
+    needs = Needs(one_way=True)
     kernels = Kernels(emit=emit, absorb=absorb, sends_readings=True)
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:

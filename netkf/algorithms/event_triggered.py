@@ -28,6 +28,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.core.fields import Rule, field, number, tuple_of
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store_flags
@@ -155,8 +156,6 @@ class EventTriggeredCi(Filter):
     paper: ClassVar[str] = "event_triggered"
     P_by_design: ClassVar[tuple[str, str]] = ("larger", "")
     clocks: ClassVar[tuple[str, ...]] = ()
-    one_way: ClassVar[bool] = True
-    inverts: ClassVar[bool] = True
     kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, decides=True)
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
@@ -186,7 +185,12 @@ class EventTriggeredCi(Filter):
         alpha, delta = self.thresholds
         return (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
 
-    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return Needs(one_way=True, inverts=True, notes=self._scenario_notes)
+
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note for the user where messages of a ``netkf.Scenario`` may be lost or late,
         which makes P too small; else nothing.
         """

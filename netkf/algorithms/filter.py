@@ -20,6 +20,7 @@ import numpy as np
 from netkf.algorithms import single
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.records import Kernels, Record
+from netkf.algorithms.traits import Needs
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 
@@ -88,7 +89,7 @@ class NodeInfo(NamedTuple):
     max_delay : longest time that a message may take, seconds (inf if unbounded)
     place : its index in the order of ids, from 0
     senders : ids of the nodes that it can hear, sorted
-    network : the whole network, if the filter ``needs_network``
+    network : the whole network, if ``Needs.network`` of the filter says so
     rows : the most rows that a reading of any node has
     sampled : H (p, n) and R (p, p) of its sensors that take samples (in slots: of all) together, as
               the node believes them, where they are fixed; p = 0 without such sensors
@@ -220,27 +221,14 @@ class Filter(Component):
                 are the same. By default it is that of built-in filters: 0 for filters that predict
                 and broadcast, else 1
     pairwise  in slots nodes exchange in pairs (a matching), else all with all neighbours
-    one_way   in slots links may go one way, and the graph need not be connected
-    inverts   covariances must never be singular
-    inverts_under_clocks  the same, in continuous time only
     talks     nodes exchange messages
     pooled    one filter reads the sensors of all nodes at once, and its estimate is every node's
-    needs_samples  it cannot use increment sensors
     slot_kernel    the compiled form of the filter in slots (algorithms.kernels.slots), not used for
                    derived classes; None: it runs in the SimPy engine
     unrolled       ``slot_kernel`` is compiled for each n up to 4, with unrolled loops: only where
                    that makes runs a tenth faster
     newest_only    of several messages of one sender at one instant the newest counts
     max_age        seconds beyond which a message that arrives is too late to use, under clocks
-    fixed_sensors  it computes with H before there are readings, so H must not vary: no nonlinear
-                   sensors, regressors or columns phi
-    every_reading  in slots its gains and P count a reading of every sensor in every slot, so that
-                   no row of a recorded sensor may be missing
-    common_start   all nodes must begin with the same mean and the same covariance
-    ways_between_all  a directed graph must lead from every node to every other one
-    reads_what_it_sends  a node uses of its readings only what it sends, so that every node with a
-                   sensor must be heard by another one
-    needs_network  its nodes are given ``NodeInfo.network``
     randomised     in slots ``emit`` is given a number ``Exchange.uniform``, from the stream
                    "trigger" of the node, which nothing else draws from
     paper        name of its packages in netkf.theory and netkf.checks, "" if there are none
@@ -256,25 +244,20 @@ class Filter(Component):
     predicts: ClassVar[bool] = False
     first_slot: ClassVar[int] = FirstSlot()  # type: ignore[assignment]
     pairwise: ClassVar[bool] = False
-    one_way: ClassVar[bool] = False
-    inverts: ClassVar[bool] = False
-    inverts_under_clocks: ClassVar[bool] = False
     talks: ClassVar[bool] = True
     pooled: ClassVar[bool] = False
-    needs_samples: ClassVar[bool] = False
     newest_only: ClassVar[bool] = True
     max_age: ClassVar[float] = math.inf
-    fixed_sensors: ClassVar[bool] = False
-    every_reading: ClassVar[bool] = False
-    common_start: ClassVar[bool] = False
-    ways_between_all: ClassVar[bool] = False
-    reads_what_it_sends: ClassVar[bool] = False
     randomised: ClassVar[bool] = False
-    needs_network: ClassVar[bool] = False
     paper: ClassVar[str] = ""
     combination: ClassVar[str] = ""
     P_by_design: ClassVar[tuple[str, str]] = ("", "")
     kernels: ClassVar[Kernels | None] = None
+
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario; by default nothing. A class may set it as a variable."""
+        return Needs()
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return the arrays of nodes, links and messages that ``kernels`` need, for nodes with
@@ -463,15 +446,6 @@ class Filter(Component):
         that node i gives to a message of node l. None if ``weight`` gives the weights.
         """
         return None
-
-    def check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError where settings of this filter do not fit a ``netkf.Scenario``. What
-        it needs of sensors, start and network it declares by class variables instead.
-        """
-
-    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return notes on this filter in a ``netkf.Scenario`` for the user, one line each."""
-        return ()
 
     def largest_degree(self) -> float:
         """Return the largest number of neighbours for which the weights make sense."""

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -42,6 +42,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
+from netkf.algorithms.traits import Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of, positive
 from netkf.linalg.arrays import FloatArray
@@ -138,7 +139,6 @@ class InformationConsensus(Filter):
     combination: ClassVar[str] = "intersection"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
-    inverts: ClassVar[bool] = True
     kernels = Kernels(
         update=begin_pairs,
         emit=emit_pairs,
@@ -147,14 +147,19 @@ class InformationConsensus(Filter):
         under_clocks=DiffusionFilter.kernels,
     )
 
-    def check_scenario(self, scenario: Any) -> None:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return Needs(inverts=True, check=self._check_scenario, notes=self._scenario_notes)
+
+    def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if rounding of information would take the first covariance of a
         ``netkf.Scenario`` in slots.
         """
         if scenario.slotted:
             check_information(scenario)
 
-    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a line on rounding of information in slots, if there is much."""
         return information_notes(scenario) if scenario.slotted else ()
 
@@ -213,7 +218,6 @@ class Hcmci(InformationConsensus):
     novelty_weight: float | None = field(positive, default=None)
 
     clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")
-    one_way: ClassVar[bool] = True
 
     def recipe(self, nodes: int) -> Recipe:
         """Return the recipe for a network of N ``nodes`` and the variant that was chosen: from
@@ -236,12 +240,17 @@ class Hcmci(InformationConsensus):
         """
         return ("larger", "larger") if self.consensus == INFORMATION else ("", "")
 
-    def check_scenario(self, scenario: Any) -> None:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return replace(super().needs, one_way=True)
+
+    def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if a ``netkf.Scenario`` has clocks and the variant is not
         "information", if a novelty weight is given to that variant, which does not use it, or if
         rounding of information would take the first covariance.
         """
-        super().check_scenario(scenario)
+        super()._check_scenario(scenario)
         if not scenario.slotted and self.consensus != INFORMATION:
             raise ScenarioError(
                 "filter.consensus",

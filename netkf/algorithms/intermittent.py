@@ -32,6 +32,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.core.fields import field, of_time, one_of, positive
 from netkf.linalg.compiling import kernel
 
@@ -275,8 +276,7 @@ class Intermittent(Filter):
     schedule: ClassVar[tuple[str, ...]] = ("sense", "exchange", "predict")
     clocks: ClassVar[tuple[str, ...]] = ("readings",)
     predicts: ClassVar[bool] = True
-    one_way: ClassVar[bool] = True
-    needs_samples: ClassVar[bool] = True
+    needs = Needs(one_way=True, samples=True)
     newest_only: ClassVar[bool] = False
     kernels = Kernels(
         emit=send_reading,

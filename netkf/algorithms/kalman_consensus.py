@@ -24,6 +24,7 @@ from netkf.algorithms.kernels.run import (
 )
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.core.fields import boolean, field, number
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
@@ -123,8 +124,7 @@ class Kcf(Filter):
     combination: ClassVar[str] = "predictions"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
-    one_way: ClassVar[bool] = True
-    needs_samples: ClassVar[bool] = True
+    needs = Needs(one_way=True, samples=True)
     kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, sends_readings=True)
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:

@@ -20,6 +20,7 @@ from netkf.algorithms.kernels.estimates import rotate
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
 
@@ -122,8 +123,7 @@ class OneBit(Filter):
     paper: ClassVar[str] = "one_bit"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
-    one_way: ClassVar[bool] = True
-    reads_what_it_sends: ClassVar[bool] = True
+    needs = Needs(one_way=True, reads_what_it_sends=True)
     kernels = Kernels(
         update=nothing,  # a reading is used as bits, in the turn of its node
         emit=emit_bits,

@@ -41,6 +41,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
+from netkf.algorithms.traits import Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, field, integer, node_id, number, one_of, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
@@ -419,13 +420,8 @@ class PushSum(Filter):
     combination: ClassVar[str] = "sums"
     # Until others hear of its samples, a node counts them as if all nodes had taken them.
     P_by_design: ClassVar[tuple[str, str]] = ("", "smaller")
-    fixed_sensors: ClassVar[bool] = True
-    every_reading: ClassVar[bool] = True
-    inverts_under_clocks: ClassVar[bool] = True
-    ways_between_all: ClassVar[bool] = True
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("nodes",)
-    needs_samples: ClassVar[bool] = True
 
     @property
     def kernels(self) -> Kernels:  # type: ignore[override]
@@ -440,7 +436,7 @@ class PushSum(Filter):
         m, running = 2 + n * n, self.running_sums and not self.asymptotic
         limit = np.zeros((n, n))
         if self.asymptotic:
-            # Every node knows G, of all sensors. check_scenario() refuses where there is no P_inf.
+            # Every node knows G, of all sensors. _check_scenario() refuses where there is no P_inf.
             found = asymptotic_root(models[0].F, models[0].Q, infos[0].information)
             limit = limit if found is None else found
         shapes: dict[str, tuple[int, ...]] = {"mass": (m,), "before": (m,), "work": (n, n)}
@@ -470,7 +466,7 @@ class PushSum(Filter):
                 "limit": np.ascontiguousarray(limit),
                 "rule": RULES.index(self.stop),
                 "tolerance": float(self.tolerance),
-                # In slots check_scenario() demands a delta.
+                # In slots _check_scenario() demands a delta.
                 "factor": 1.0 / (self.delta or math.inf),
                 "asymptotic": int(self.asymptotic),
                 "running": int(running),
@@ -557,7 +553,20 @@ class PushSum(Filter):
 
     shift = Filter.shift  # averaging weights sum to one
 
-    def check_scenario(self, scenario: Any) -> None:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return Needs(
+            fixed_sensors=True,
+            every_reading=True,
+            inverts_under_clocks=True,
+            ways_between_all=True,
+            samples=True,
+            check=self._check_scenario,
+            notes=self._scenario_notes,
+        )
+
+    def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError where the settings do not fit a ``netkf.Scenario`` in slots: the
         leader is no node, gamma or delta is missing or averaging would not contract, rounding of
         information would take the first covariance, or P_inf does not exist.
@@ -617,7 +626,7 @@ class PushSum(Filter):
                 f"give more than rho(L) = {radius:.6g}",
             )
 
-    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return one line each: delta is below rho(L); rounding of information; settings of slots
         are not used under clocks.
         """

@@ -35,6 +35,7 @@ from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_rea
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -221,11 +222,7 @@ class ScheduledReadings(Filter):
     paper: ClassVar[str] = "stochastic_trigger"
     combination: ClassVar[str] = "scheduled readings"
     clocks: ClassVar[tuple[str, ...]] = ()
-    one_way: ClassVar[bool] = True
     randomised: ClassVar[bool] = True
-    fixed_sensors: ClassVar[bool] = True
-    every_reading: ClassVar[bool] = True
-    reads_what_it_sends: ClassVar[bool] = True
     kernels = Kernels(
         predict=predict_prior,
         update=nothing,  # a reading is used in the exchange of its slot, if it is sent
@@ -259,7 +256,18 @@ class ScheduledReadings(Filter):
         """Take the first estimate for a prediction."""
         node["prior"][:] = node["xhat"]
 
-    def scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return Needs(
+            one_way=True,
+            fixed_sensors=True,
+            every_reading=True,
+            reads_what_it_sends=True,
+            notes=self._scenario_notes,
+        )
+
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
         """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, which
         makes P too small; else nothing.
         """
@@ -512,7 +520,12 @@ class StochasticTrigger(Filter):
             return ScheduledReadings(self.Y)
         return TriggeredMessages(self.Y, self.inner)
 
-    def check_scenario(self, scenario: Any) -> None:
+    @property
+    def needs(self) -> Needs:
+        """What it needs of a scenario."""
+        return replace(self.wrapped.needs, check=self._check_scenario)
+
+    def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if the filter that sends does not run in slots, sends nothing or has
         a trigger itself, or if Y is a matrix that does not fit the readings of each node of a
         ``netkf.Scenario``.
@@ -525,7 +538,8 @@ class StochasticTrigger(Filter):
                 type(inner).__name__,
                 'write inner = { kind = "intermittent" }, or another one',
             )
-        inner.check_scenario(scenario)
+        if inner.needs.check is not None:
+            inner.needs.check(scenario)
         # A number fits readings of any number of rows.
         if not isinstance(self.Y, np.ndarray):
             return

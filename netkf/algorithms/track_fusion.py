@@ -38,6 +38,7 @@ from netkf.algorithms.kernels.tracks import (
 )
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Needs
 from netkf.core.fields import field, one_of
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
@@ -100,8 +101,7 @@ class PairFusion(Filter):
 
     paper: ClassVar[str] = "track_fusion"
     clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")
-    one_way: ClassVar[bool] = True
-    inverts: ClassVar[bool] = True
+    needs = Needs(one_way=True, inverts=True)
     inverse: ClassVar[bool] = False
     kernels = Kernels(absorb=fuse_heard, unrolled=False)
 
@@ -263,11 +263,9 @@ class BarShalomCampo(Filter):
     paper: ClassVar[str] = "track_fusion"
     combination: ClassVar[str] = "tracks"
     clocks: ClassVar[tuple[str, ...]] = ()
-    one_way: ClassVar[bool] = True
-    fixed_sensors: ClassVar[bool] = True
-    every_reading: ClassVar[bool] = True
-    common_start: ClassVar[bool] = True
-    needs_network: ClassVar[bool] = True
+    needs = Needs(
+        one_way=True, fixed_sensors=True, every_reading=True, common_start=True, network=True
+    )
     kernels = Kernels(
         predict=predict_track,
         update=update_track,

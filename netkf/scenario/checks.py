@@ -61,7 +61,9 @@ def check_scenario(scenario: DerivedScenario) -> None:
     check_grid(scenario)
     if not scenario.slotted:
         _check_speed(scenario)
-    scenario.node_filter.check_scenario(scenario)
+    check = scenario.node_filter.needs.check
+    if check is not None:
+        check(scenario)
 
 
 def _check_times(scenario: DerivedScenario) -> None:
@@ -220,14 +222,14 @@ def _check_network(scenario: DerivedScenario) -> None:
     if not scenario.slotted:
         check_activation(scenario)
         _check_ticks(scenario)
-    elif topology.directed and not node_filter.one_way:
+    elif topology.directed and not node_filter.needs.one_way:
         raise ScenarioError(
             "network.graph.directed",
             f"must be false for the {name}, whose links work both ways in slots",
             True,
             "give an undirected graph",
         )
-    one_way = node_filter.one_way or topology.directed
+    one_way = node_filter.needs.one_way or topology.directed
     if len(topology.components) > 1 and not one_way:
         smallest_component = sorted(topology.components[-1])
         raise ScenarioError(

@@ -62,7 +62,7 @@ def check_activation(scenario: DerivedScenario) -> None:
     if clock.at not in node_filter.clocks:
         _reject_clock(clock.at, node_filter.clocks, name)
     # A filter that needs samples says so itself, of the sensors that there are.
-    says_so = bool(scenario.sensors) and node_filter.needs_samples
+    says_so = bool(scenario.sensors) and node_filter.needs.samples
     if clock.at == "readings" and not says_so and not any(map(takes_samples, scenario.sensors)):
         raise ScenarioError(
             "network.activation.kind",

@@ -129,7 +129,7 @@ class DerivedScenario(ScenarioModel):
     @property
     def _network_info(self) -> NetworkInfo | None:
         """The information (N, n, n) of each node's sensors, and indices of who hears whom."""
-        if not self.node_filter.needs_network:
+        if not self.node_filter.needs.network:
             return None
         senders: dict[int, list[int]] = {node: [] for node in self.nodes}
         for sender, receiver in self.topology.directions:

@@ -1,7 +1,7 @@
 """What filters need of sensors, start and network, checked before anything runs.
 
-A filter declares its needs as class variables (``algorithms.filter.Filter``), for a user's class
-and a built-in one alike; here is the only place that checks them, in slots and in continuous time.
+A filter declares its needs (``algorithms.traits.Needs``), a user's class and a built-in one alike;
+here is the only place that checks them, in slots and in continuous time.
 ``compatibility`` checks the times, clocks and links that it runs under.
 """
 
@@ -28,20 +28,20 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     """Raise ScenarioError at the first need of the filter that a scenario does not meet; it names
     the key, the filter, the value and a remedy.
     """
-    filtering = scenario.node_filter
+    needs = scenario.node_filter.needs
     if not scenario.slotted:
         _check_increments(scenario)
-    if filtering.fixed_sensors:
+    if needs.fixed_sensors:
         _check_fixed_sensors(scenario)
-    if filtering.every_reading and scenario.slotted:
+    if needs.every_reading and scenario.slotted:
         _check_every_reading(scenario)
-    if filtering.common_start:
+    if needs.common_start:
         _check_common_start(scenario)
-    if filtering.inverts or (filtering.inverts_under_clocks and not scenario.slotted):
+    if needs.inverts or (needs.inverts_under_clocks and not scenario.slotted):
         _check_invertible(scenario)
-    if filtering.ways_between_all and scenario.topology.directed:
+    if needs.ways_between_all and scenario.topology.directed:
         _check_ways(scenario)
-    if filtering.reads_what_it_sends:
+    if needs.reads_what_it_sends:
         _check_heard(scenario)
 
 
@@ -49,7 +49,7 @@ def _check_increments(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a filter over a diffusion can use samples only, and has others."""
     name = filter_name(scenario)
     for k, sensor in enumerate(scenario.sensors):
-        if scenario.node_filter.needs_samples and not takes_samples(sensor):
+        if scenario.node_filter.needs.samples and not takes_samples(sensor):
             raise ScenarioError(
                 f"sensors[{k}].sampling",
                 f"is missing, and the {name} uses samples, no continuous increments",

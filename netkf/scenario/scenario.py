@@ -74,9 +74,10 @@ class Scenario(DerivedScenario):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Remarks for the user before a run, one line each, such as unused rows of a table."""
+        notes = self.node_filter.needs.notes
         return (
             *self.topology.notes,
-            *self.node_filter.scenario_notes(self),
+            *(notes(self) if notes is not None else ()),
             *repeat_notes(self),
             *record_notes(self),
             *sampling_notes(self),

@@ -77,7 +77,7 @@ class ClockTrial(Trial):
         """
         part = watched.part
         yield cls(watched, system, shift, clock, increments=False)
-        if not part.needs_samples and clock != "readings":
+        if not part.needs.samples and clock != "readings":
             yield cls(watched, system, shift, clock, increments=True)
 
     def model(self, has_sensor: bool) -> FlowModel:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.filter import CLOCKS, Filter, commutes
+from netkf.algorithms.traits import Needs
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.parents import check_parent
 from netkf.testing.shifts import check_shift, make_trials
@@ -14,11 +16,7 @@ from netkf.testing.watching import WatchedPart, demand, make_part
 
 MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 PHASES = ("predict", "sense", "exchange")
-FLAGS = (
-    *("predicts", "pairwise", "one_way", "inverts", "talks", "pooled"),
-    *("needs_samples", "newest_only", "inverts_under_clocks", "fixed_sensors", "every_reading"),
-    *("common_start", "ways_between_all", "reads_what_it_sends"),
-)
+FLAGS = ("predicts", "pairwise", "talks", "pooled", "newest_only")
 
 
 def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings: Any) -> None:
@@ -69,6 +67,7 @@ def _check_class_variables(watched: WatchedPart) -> None:
     for flag in FLAGS:
         value = getattr(part, flag)
         demand(isinstance(value, bool), f"{name}.{flag}", "must be True or False", value)
+    _check_flags(part.needs, Needs, f"{name}.needs")
     clocks = part.clocks
     are_clocks = isinstance(clocks, tuple) and set(clocks) <= set(CLOCKS)
     text = ", ".join(f'"{clock}"' for clock in CLOCKS)
@@ -79,6 +78,20 @@ def _check_class_variables(watched: WatchedPart) -> None:
     slot = part.first_slot
     is_count = isinstance(slot, int) and slot >= 0
     demand(is_count, f"{name}.first_slot", "must be a whole number of at least 0", slot)
+
+
+def _check_flags(value: Any, kind: type[Any], where: str) -> None:
+    """Check that ``value`` is a ``kind``, and that its fields which are flags are True or False."""
+    demand(isinstance(value, kind), where, f"must be a {kind.__name__} of netkf.parts", value)
+    for field in dataclasses.fields(kind):
+        got = getattr(value, field.name)
+        is_flag = isinstance(field.default, bool)
+        demand(
+            not is_flag or isinstance(got, bool),
+            f"{where}.{field.name}",
+            "must be True or False",
+            got,
+        )
 
 
 def _check_schedule(watched: WatchedPart) -> None:

@@ -126,7 +126,7 @@ def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Tria
     clocks: list[str | None] = [None]
     if any(part.talks for part in parts):
         clocks = [clock for clock in child.part.clocks if clock in parent.part.clocks]
-    systems = make_systems(any(part.inverts for part in parts))
+    systems = make_systems(any(part.needs.inverts for part in parts))
     if isinstance(getattr(child.part, "weights", None), np.ndarray):
         systems = [system._replace(spread=1.0) for system in systems]
     for system in systems:
@@ -146,7 +146,7 @@ def _clock_trial_pairs(
 ) -> Iterator[tuple[Trial, Trial, str]]:
     """Yield such pairs in continuous time, with samples and with increments."""
     # The clock "readings" ticks when a node has taken a sample.
-    needs_samples = child.part.needs_samples or parent.part.needs_samples or clock == "readings"
+    needs_samples = child.part.needs.samples or parent.part.needs.samples or clock == "readings"
     for increments in (False,) if needs_samples else (False, True):
         first, second = (
             ClockTrial(watched, system, shift=None, clock=clock, increments=increments)

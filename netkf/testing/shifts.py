@@ -26,7 +26,7 @@ def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterat
     ``shift`` (k,), unless that is None.
     """
     part = watched.part
-    systems = make_systems(part.inverts)
+    systems = make_systems(part.needs.inverts)
     clocks: list[str | None] = list(part.clocks) if part.talks else [None]
     for system in systems:
         system_shift = None if shift is None else shift[: len(system.M)]

@@ -269,7 +269,7 @@ class WatchedPart:
             fail(where, f"failed: {error}")
         except Exception as error:
             singular = isinstance(error, np.linalg.LinAlgError)
-            remedy = "; set inverts = True where covariances must not be singular"
+            remedy = "; set inverts in needs where covariances must not be singular"
             text = f"{where}: {describe_failure(error)}{remedy if singular else ''}"
             raise AssertionError(text) from error
         rule = "must not use or seed global generators (numpy.random.*, random.*)"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import netkf
-from netkf.parts import Filter, kinds
+from netkf.parts import Filter, Needs, kinds
 
 LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.6}}
 PLANT = {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
@@ -34,7 +34,7 @@ class Swap(Filter):
 class Average(Filter):
     """Filtered estimates of all neighbours, as kcf has them."""
 
-    one_way: ClassVar[bool] = True
+    needs = Needs(one_way=True)
 
     def absorb(self, state, messages, exchange):
         return state

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 import netkf
 from netkf.parts import (
     Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, Increments,
-    LinearSensor, LinkClock, Loss, Message, NodeInfo, Poisson, Reading, State,
+    LinearSensor, LinkClock, Loss, Message, Needs, NodeInfo, Poisson, Reading, State,
     positive, probability, setting,
 )
 
@@ -36,6 +36,7 @@ class Listen(Filter):
     """Takes the last estimate that arrives; the rest as in the base class."""
 
     clocks = ("nodes", "links")
+    needs = Needs(one_way=True)
     schedule = ("predict", "sense", "exchange")
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
@@ -61,7 +62,10 @@ class Everything(Filter):
 
     schedule = None
     first_slot = 1
-    one_way = True
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(samples=True, check=self.check, notes=self.notes)
 
     def init(self, model: Any, mean: Array, cov: Array, node: NodeInfo) -> Own:
         first: State = super().init(model, mean, cov, node)
@@ -129,10 +133,10 @@ class Everything(Filter):
     def largest_degree(self) -> float:
         return 5.0
 
-    def check_scenario(self, scenario: netkf.Scenario) -> None:
+    def check(self, scenario: netkf.Scenario) -> None:
         assert scenario.nodes
 
-    def scenario_notes(self, scenario: netkf.Scenario) -> tuple[str, ...]:
+    def notes(self, scenario: netkf.Scenario) -> tuple[str, ...]:
         return (f"{len(scenario.nodes)} nodes",)
 
 
@@ -247,7 +251,7 @@ def test_a_class_with_every_method_has_every_method():
     own = OWN[OWN.index("class Everything") : OWN.index("class Regular")]
     methods = [name for name in vars(netkf.parts.Filter) if not name.startswith("_")]
     for name in set(methods) - OF_KERNELS:
-        if callable(getattr(netkf.parts.Filter, name)) or name == "pair_weights":
+        if callable(getattr(netkf.parts.Filter, name)) or name in ("pair_weights", "needs"):
             assert f"def {name}(" in own
 
 

@@ -358,7 +358,7 @@ class Inverts(Hybrid):
 
 @says("SamplesOnly.update: failed with AttributeError", epsilon=0.3)
 class SamplesOnly(Hybrid):
-    """Takes no increments and does not say needs_samples."""
+    """Takes no increments and does not say that it needs samples."""
 
     def update(self, state, reading):
         _ = reading.y

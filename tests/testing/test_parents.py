@@ -102,8 +102,9 @@ class Renamed(parts.Hybrid):
 class OneClock(parts.Hybrid):
     clocks = ("nodes",)
 
-    def scenario_notes(self, scenario):
-        return ("by nodes",)
+    @property
+    def needs(self):
+        return replace(super().needs, notes=lambda scenario: ("by nodes",))
 
 
 @keep(SAME, epsilon=0.3)
@@ -173,6 +174,6 @@ def test_check_filter_compares_with_the_parent():
 
 
 def test_attributes_of_its_own_are_listed_without_fields_and_new_names():
-    assert own_attributes(OneClock(epsilon=0.3)) == ["clocks", "scenario_notes"]
+    assert own_attributes(OneClock(epsilon=0.3)) == ["clocks", "needs"]
     assert own_attributes(Averse(epsilon=0.3)) == ["begin"]
     assert own_attributes(Renamed(epsilon=0.3)) == []

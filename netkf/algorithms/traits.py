@@ -1,0 +1,43 @@
+"""What a filter says of itself beside its methods: small values, each with a default for all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a filter needs of a scenario, which is refused by name before a run where it lacks it.
+
+    inverts : covariances must never be singular
+    inverts_under_clocks : the same, in continuous time only
+    samples : it cannot use increment sensors
+    fixed_sensors : it computes with H before there are readings, so H must not vary: no nonlinear
+                    sensors, regressors or columns phi
+    every_reading : in slots its gains and P count a reading of every sensor in every slot, so that
+                    no row of a recorded sensor may be missing
+    common_start : all nodes must begin with the same mean and the same covariance
+    ways_between_all : a directed graph must lead from every node to every other one
+    reads_what_it_sends : a node uses of its readings only what it sends, so that every node with a
+                          sensor must be heard by another one
+    network : its nodes are given ``NodeInfo.network``
+    one_way : in slots links may go one way, and the graph need not be connected
+    check : ``check(scenario)`` raises ScenarioError where settings of the filter do not fit a
+            ``netkf.Scenario``
+    notes : ``notes(scenario)`` returns notes on the filter for the user, one line each
+    """
+
+    inverts: bool = False
+    inverts_under_clocks: bool = False
+    samples: bool = False
+    fixed_sensors: bool = False
+    every_reading: bool = False
+    common_start: bool = False
+    ways_between_all: bool = False
+    reads_what_it_sends: bool = False
+    network: bool = False
+    one_way: bool = False
+    check: Callable[[Any], None] | None = None
+    notes: Callable[[Any], tuple[str, ...]] | None = None
