@@ -213,11 +213,7 @@ def _make_kernel(
 
 
 def _widen_arguments(function: Any) -> None:
-    """Replace the types of a kernel's arguments in calls by other kernels by more general ones.
-
-    Literal types become their general types and all signed integers int64, so that calls share one
-    compiled version; numba would compile one for each literal and each width.
-    """
+    """Widen literals and integers in calls of kernels, so that they share one compiled version."""
     from numba.core import types
 
     kinds, template_for = cast(Any, types), function.get_call_template
@@ -235,12 +231,8 @@ def _widen_arguments(function: Any) -> None:
 
 
 def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
-    """Let a dispatcher keep its code on disk, and compile with LLVM's optimisation level 2, a
-    larger unroll threshold, and one link step (see linking).
-
-    Level 3 takes a quarter longer and gains nothing here. The settings are global, so that they are
-    set around the compilation of this function only. Its duration is added to _compile_times.
-    """
+    """Keep a dispatcher's code on disk, and compile with LLVM's level 2, one link step."""
+    # Level 3 takes a quarter longer and gains nothing here.
     from llvmlite.binding import set_option
 
     config: Any = import_module("numba.core.config")

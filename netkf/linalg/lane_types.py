@@ -78,10 +78,7 @@ def _are_values(kinds: Any) -> bool:
 def _implement(
     function: Any, result: Callable[..., Any], *signatures: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator of the function that emits a call of ``function``; ``result`` returns the
-    type of the call from those of its arguments (None if they do not fit), and ``signatures`` are
-    the types for which the emitter is meant.
-    """
+    """Return a decorator of the function that emits a call of ``function``."""
 
     class Typing(AbstractTemplate):
         def generic(self, args: Any, _kws: Any) -> Any:
@@ -146,9 +143,7 @@ def _call(builder: Any, name: str, result: Any, args: list[Any]) -> Any:
 
 
 def _pointer(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    """Emit the address of an entry: ``values`` are an array and indices, of numba types ``kinds``;
-    indices that are not given are 0, such as that of the lanes, the last axis.
-    """
+    """Emit the address of an entry of an array; indices that are not given are 0."""
     indices = [
         context.cast(builder, value, kind, types.intp)
         for value, kind in zip(values[1:], kinds[1:], strict=True)

@@ -90,9 +90,7 @@ def eigenvectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _spectral(matrix: FloatArray, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Return ``V f(w) V'`` (n, n) of a symmetric ``matrix`` (n, n) = ``V diag(w) V'``; ``function``
-    f maps the eigenvalues w (n,).
-    """
+    """Return ``V f(w) V'`` (n, n) of a symmetric ``matrix`` (n, n) = ``V diag(w) V'``."""
     values, vectors = eigenvectors(matrix)
     return symmetric(product(vectors * function(values), vectors.T))
 
@@ -170,9 +168,7 @@ def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _legendre(degree: int, x: Decimal) -> tuple[Decimal, Decimal]:
-    """Return, for Newton's method, the Legendre polynomial P of this ``degree`` >= 1 at x, |x| < 1,
-    and its derivative, with the digits of the decimal context.
-    """
+    """Return the Legendre polynomial of this ``degree`` at x, and its derivative."""
     previous, value = Decimal(1), x
     for k in range(2, degree + 1):
         # k P_k = (2 k - 1) x P_(k-1) - (k - 1) P_(k-2)

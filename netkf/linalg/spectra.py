@@ -118,9 +118,7 @@ def outputs_of(information: FloatArray) -> FloatArray:
 
 
 def _largest(A: FloatArray, border: Border) -> float:
-    """Return the largest measure of an eigenvalue of A (n, n), the limit for those that rounding
-    moves onto the ``border``.
-    """
+    """Return the largest measure of an eigenvalue, the limit for those at the ``border``."""
     largest = -math.inf if len(A) else 0.0
     for block in _irreducible_blocks(A):
         values = sorted(_block_eigenvalues(block).tolist(), key=border.measure, reverse=True)
@@ -134,9 +132,7 @@ def _largest(A: FloatArray, border: Border) -> float:
 
 
 def _remaining_eigenvalues(A: FloatArray, border: Border) -> list[complex]:
-    """Return the eigenvalues of A (n, n) whose modes do not decay: beyond the ``border``, or on it
-    but for rounding.
-    """
+    """Return the eigenvalues of A (n, n) whose modes do not decay, but for rounding."""
     remaining = []
     for block in _irreducible_blocks(A):
         for value in _block_eigenvalues(block).tolist():
@@ -147,9 +143,7 @@ def _remaining_eigenvalues(A: FloatArray, border: Border) -> list[complex]:
 
 
 def _irreducible_blocks(A: FloatArray) -> list[FloatArray]:
-    """Return the diagonal blocks of A (n, n) in block triangular form, each balanced: their
-    eigenvalues are those of A, and the rounding of one block is none of another.
-    """
+    """Return the balanced diagonal blocks of A (n, n) in block triangular form."""
     n = len(A)
     reaches = (A != 0.0) | np.eye(n, dtype=bool)
     for _ in range(n.bit_length()):
@@ -161,9 +155,7 @@ def _irreducible_blocks(A: FloatArray) -> list[FloatArray]:
 
 
 def _block_eigenvalues(A: FloatArray) -> ComplexArray:
-    """Return the :func:`eigenvalues` (n,) of A (n, n), which is balanced and not block
-    triangular.
-    """
+    """Return the eigenvalues (n,) of A (n, n), balanced and not block triangular."""
     if len(A) == 1:
         return np.asarray(A[0], dtype=np.complex128)
     values = np.linalg.eigvals(A).astype(complex)
@@ -181,9 +173,7 @@ def _block_eigenvalues(A: FloatArray) -> ComplexArray:
 
 
 def _joined(A: FloatArray, value: complex, other: complex) -> bool:
-    """Return True if changes of the balanced A (n, n) no larger than its rounding move the
-    eigenvalue ``value`` to ``other``: the pseudospectrum joins both.
-    """
+    """Return True if rounding of A (n, n) may move the eigenvalue ``value`` to ``other``."""
     n, size = len(A), float(np.linalg.norm(A))
     tolerance = ROUNDING * n * size
     # No change of that size moves an eigenvalue farther (Elsner 1985).
@@ -199,9 +189,7 @@ def _joined(A: FloatArray, value: complex, other: complex) -> bool:
 
 
 def _balance(A: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ``D^-1 A D`` (n, n), with rows and columns of like size, and the diagonal D (n,) of
-    powers of 2.
-    """
+    """Return ``D^-1 A D`` of like rows and columns, and D (n,) of powers of 2."""
     with np.errstate(invalid="ignore"):  # scipy takes large powers for indices that it then drops
         balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     return np.asarray(balanced, dtype=np.float64), np.asarray(scale, dtype=np.float64)

@@ -84,9 +84,7 @@ class GridLaws:
         return np.concatenate(values).reshape(3, self.n, self.n)
 
     def _impulse_responses(self, gap: float) -> FloatArray:
-        """Return the responses (3 n, 20 m) of the end and the moments of a step of ``gap`` seconds
-        to noise at the quadrature nodes; times their transpose they are a covariance.
-        """
+        """Return responses (3 n, 20 m) of end and moments of a step to noise at the nodes."""
         out = np.empty((3 * self.n, len(_NODES) * self.B.shape[1]))
         self._fill_impulses(out, 0, gap, _NODES * gap, _WEIGHTS * gap)
         return out
@@ -94,10 +92,7 @@ class GridLaws:
     def _fill_impulses(
         self, out: FloatArray, row: int, end: float, instants: FloatArray, weights: FloatArray
     ) -> None:
-        """Write the responses of x(end) and of the two moments over [0, end] to noise at K
-        ``instants`` (K,), with quadrature ``weights`` (K,), all in seconds, into 3 n rows of
-        ``out`` (., K m) from ``row`` on.
-        """
+        """Write responses of x(end) and two moments to noise at K ``instants`` into ``out``."""
         tables = self.to_end, self.to_moments, self.B
         fill_impulses(out, row, *tables, end, instants, weights)
 
@@ -117,10 +112,7 @@ class GridLaws:
         return law
 
     def _conditional(self, length: float, before: float) -> tuple[FloatArray, FloatArray]:
-        """Compute the law of state and moments ``before`` seconds after the start of a piece, given
-        the end and moments of the whole piece of ``length`` seconds: the gain of the conditional
-        mean and a square root of the conditional covariance, both (3 n, 3 n).
-        """
+        """Compute gain and root (3 n, 3 n) of state and moments in a piece, given its end."""
         size, after = 3 * self.n, length - before
         instants = np.concatenate([_NODES * before, before + _NODES * after])
         weights = np.concatenate([_WEIGHTS * before, _WEIGHTS * after])
@@ -178,10 +170,7 @@ def fill_impulses(
 
 
 def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatArray]:
-    """Return power series in the gap g <= ``longest`` (seconds) of ``exp(A g)``, (terms, n n + 1),
-    and of its two moments over the gap, (terms, 2 n n + 1), for ``A`` (n, n) in 1/s. The last
-    column has the longest gap for which the terms so far suffice, see linalg/series.
-    """
+    """Return power series in the gap of ``exp(A g)`` and of its two moments over the gap."""
     n, terms = len(A), exponential_terms(float(np.abs(A).sum(axis=0).max()) * longest)
     exponential = [np.eye(n)]
     for k in range(1, terms):
@@ -229,10 +218,7 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
 
 
 def _nonnegative_factor(noise: FloatArray) -> FloatArray:
-    """Return the lower triangular S (r, r) with ``S S' = noise noise'`` for ``noise`` (r, c).
-
-    The diagonal is not negative; column k is zero if row k of ``noise`` depends on the rows before.
-    """
+    """Return the lower triangular S (r, r) with ``S S' = noise noise'`` for ``noise`` (r, c)."""
     # Gram-Schmidt, each row twice, which suffices (Kahan and Parlett). Householder reflections
     # would give a dependent row a direction made of rounding errors, and later rows a share in it.
     size = len(noise)

@@ -157,9 +157,7 @@ class LinearPath:
         return np.zeros(len(x)) if slot == self._rebased > 0 else x
 
     def _state_at(self, slot: int) -> FloatArray:
-        """Return the local state (n,) of slot number ``slot``, before a rebase; slots must not
-        decrease.
-        """
+        """Return the local state (n,) of slot number ``slot``, before a rebase."""
         while slot >= self._first + len(self._x):
             normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
             noise = product(normals, self._root.T)
@@ -168,10 +166,7 @@ class LinearPath:
         return np.asarray(self._x[slot - self._first])
 
     def _next_states(self, noise: FloatArray) -> FloatArray:
-        """Return the local states (BLOCK + 1, n), each before a rebase, from the last one drawn on.
-
-        ``noise`` (BLOCK, n) is the w of each step. Also notes the origins of new frames.
-        """
+        """Return the next local states (BLOCK + 1, n), and note the origins of new frames."""
         frame, first = self.frame_slots, self._first
         if frame is None:
             return np.asarray(self._steps.states(self._x[-1:], noise[None, None])[0])
@@ -192,10 +187,7 @@ class LinearPath:
         return np.concatenate(parts)
 
     def _origin_at(self, slot: int) -> FloatArray:
-        """Return the position (n,) at ``slot``, in the plant's coordinates, of the origin to which
-        ``_state_at(slot)`` is relative: it moves as x[k+1] = F x[k] from the start of its frame. At
-        a slot that begins a frame it is the old origin.
-        """
+        """Return the origin (n,) at ``slot``, the old one where a frame begins."""
         assert self.frame_slots is not None
         # Slots 1 .. frame_slots belong to the origin of slot 0, and so on.
         frame_start = max(slot - 1, 0) // self.frame_slots * self.frame_slots

@@ -177,9 +177,7 @@ class NonlinearSensor(Sensor):
         return RecordedReadings(self.record.rows(node), slots, self._row_functions(node), 0)
 
     def _row_functions(self, node: int) -> Matrix:
-        """Return the function that gives, for row k of the table of ``node`` (id) and the values of
-        it that are there, what linearises them.
-        """
+        """Return what linearises the values that are there in row k of the table of ``node``."""
         assert self.record is not None
         anchors, has_anchors = self.record.rows(node).anchors, self.record.has_anchors
         return lambda k, present: Linearised(

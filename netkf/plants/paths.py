@@ -184,9 +184,7 @@ class DiffusionPaths:
         return block
 
     def _cut(self, block: Block, times: FloatArray, source: Normals) -> Block:
-        """Return the block cut further at C ``times`` (C,) in seconds, none of which is an end of a
-        piece; states and moments there are drawn from ``source``.
-        """
+        """Return the block cut further at C ``times`` (C,), drawn from ``source``."""
         # owners: the index of the piece that contains each time.
         owners = np.searchsorted(block.end, times)
         normals = source.draw((len(times), 3 * self.laws.n))
@@ -234,12 +232,7 @@ class DiffusionPaths:
         times: FloatArray,
         normals: FloatArray,
     ) -> None:
-        """Cut the C pieces in ``rows`` (C,) of B paths at ``times`` (C,) in seconds, given their
-        ends and moments, in the arrays of ``pieces``.
-
-        All have the same length and are cut at the same position. The row becomes the part before
-        the cut, the rows after it up to ``stops`` (C,) the part after it. ``normals`` (B, C, 3 n).
-        """
+        """Cut the C pieces in ``rows`` (C,) of B paths at ``times`` (C,), all at one position."""
         laws = self.laws
         length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
         before = float(times[0] - pieces.start[rows[0]])
@@ -480,9 +473,7 @@ class DiffusionPath:
         return self.laws.time_grid.instant(k * self.period)
 
     def _at(self, time: float) -> PathStep:
-        """Return the piece that contains ``time`` in seconds (start < time <= end), in the sensing
-        step last asked for or a later one.
-        """
+        """Return the piece that contains ``time``, in the sensing step last asked for or later."""
         while self._block is None or time > self._block.ends[-1]:
             self._block, self._first, self._piece = self._paths.following().of(0), 0, -1
         # Search from the first piece of the present step: nodes ask in any order within a step.
@@ -510,9 +501,7 @@ class DiffusionPath:
         return self._over_pieces(start, end)
 
     def _over_pieces(self, start: float, end: float) -> FloatArray:
-        """Return the moments (2, n) of x over [start, end] seconds, inside one step that sample
-        times of other nodes may have cut into several pieces.
-        """
+        """Return the moments (2, n) of x over [start, end], inside one step."""
         block, k, gap = self._block, self._piece, end - start
         assert block is not None
         total = np.zeros((2, self.laws.n))
@@ -559,9 +548,7 @@ class DiffusionPath:
         return step.x_end
 
     def _origin_after(self, gap: float) -> FloatArray:
-        """Return the position (n,), in the plant's coordinates, of the origin of the present frame
-        ``gap`` seconds after the frame began: it moves as dx = A x dt.
-        """
+        """Return the origin (n,) of the present frame ``gap`` seconds after it began."""
         # An origin at 0 stays there; the product would be nan where the transition overflows.
         if self._moves is None or not self._origin.any():
             return self._origin

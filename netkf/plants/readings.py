@@ -132,11 +132,7 @@ class ReadingTable:
 
     @cached_property
     def _covariances(self) -> FloatArray:
-        """The noise covariance (K, p, p) of each row itself, nan where the sensor's counts; empty
-        (0, p, p) if no row brings its own.
-
-        Raises ScenarioError, with the line, for one that is not positive definite.
-        """
+        """The noise covariance (K, p, p) of each row itself, nan where the sensor's counts."""
         K, p = len(self.columns.lines), self.p
         if not self.has_noise:
             return np.empty((0, p, p))
@@ -162,9 +158,7 @@ class ReadingTable:
         return R
 
     def _require_definite(self, R: FloatArray, checked: np.ndarray) -> None:
-        """Raise ScenarioError, with the line, if the covariances R (K, p, p) of the values that are
-        there are not positive definite in one of the rows ``checked`` (K,).
-        """
+        """Raise ScenarioError, with the line, where an R is not positive definite."""
         # In place of missing values stand independent ones of a middle size, which decide nothing.
         both = self.present[:, :, None] & self.present[:, None, :]
         whole = np.where(both, R, 0.0)[checked]

@@ -233,9 +233,7 @@ class RecordedDiffusion(Diffusion):
 
 
 def _time_keys(times: FloatArray) -> list[int]:
-    """Return the index of each of the ``times`` (K,) among all that differ by more than TOLERANCE
-    seconds, in increasing order.
-    """
+    """Return the index of each time among all that differ by more than TOLERANCE."""
     order = np.argsort(times, kind="stable")
     keys = np.zeros(len(order), dtype=np.int64)
     keys[order[1:]] = np.cumsum(np.diff(times[order]) > TOLERANCE)
@@ -245,10 +243,7 @@ def _time_keys(times: FloatArray) -> list[int]:
 def _recorded_truth(
     columns: Columns, states: FloatArray, n: int, interpolate: str | None
 ) -> RecordedTruth:
-    """Return the truth of a table with ``states`` (K, n) at the times "t" of its ``columns``.
-
-    Raises ScenarioError for two states at one time.
-    """
+    """Return the truth of a table with ``states`` (K, n) at the times "t" of its ``columns``."""
     rule = "there may be one row a time, or equal ones"
     first = first_rows(columns, _time_keys(columns["t"]), states.tolist(), rule)
     rows = [first[key] for key in range(len(first))]
@@ -344,9 +339,7 @@ class RecordedSensor(Sensor):
         return bool(self.record.regressors) or not all(is_uniform)
 
     def _matrix_function(self, node: int) -> Matrix:
-        """Return the function that gives H (p', n) of the values of row k of ``node`` (id) that are
-        there.
-        """
+        """Return the function that gives H (p', n) of the values of row k of ``node``."""
         rows = self.record.rows(node)
         phi = rows.phi if self.record.regressors else None
         return lambda k, present: self.H[present] if phi is None else phi[k : k + 1]

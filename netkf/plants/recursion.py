@@ -37,10 +37,7 @@ class Recursion:
 
 
 def _states_by_steps(start: FloatArray, noise: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return the states (B, K L + 1, n) of B paths of ``x[k+1] = F x[k] + w[k]``, step by step:
-    from ``start`` (B, n) on with the w in ``noise`` (B, K, L, n), K blocks of L steps; F is
-    ``powers[0]`` of ``powers`` (>= 1, n, n).
-    """
+    """Return B paths (B, K L + 1, n) of ``x[k+1] = F x[k] + w[k]``, step by step."""
     count, _, _, n = noise.shape
     x = [start[:, None]]
     for w in np.moveaxis(noise.reshape(count, -1, 1, n), 1, 0):
@@ -49,12 +46,7 @@ def _states_by_steps(start: FloatArray, noise: FloatArray, powers: FloatArray) -
 
 
 def _states_by_sums(start: FloatArray, noise: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return the states (B, K L + 1, n) of B paths of ``x[k+1] = F x[k] + w[k]`` by prefix sums
-    within blocks: from ``start`` (B, n) on with the w in ``noise`` (B, K, L, n), K blocks of L
-    steps; ``powers`` (L, n, n) are F^1 .. F^L.
-
-    A few products of large matrices replace one small product a step.
-    """
+    """Return B paths (B, K L + 1, n) of ``x[k+1] = F x[k] + w[k]`` by prefix sums."""
     count, blocks, length, n = noise.shape
     x = np.empty((count, blocks * length + 1, n))
     x[:, 0] = start

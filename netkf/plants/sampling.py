@@ -112,9 +112,7 @@ class RecordedSampling(Clock):
 
 
 def _sampling(value: object) -> Clock | None:
-    """Return the clock of a sensor, None for "continuous": the conversion of ``Rule`` for the field
-    ``sampling``, which reports the TypeError for other values as a ScenarioError.
-    """
+    """Return the clock of a sensor, None for "continuous", or raise ScenarioError."""
     if isinstance(value, str) and value == "continuous":
         return None
     if not isinstance(value, Clock):

@@ -72,26 +72,19 @@ class Transitions:
         return np.asarray(Phi[index])
 
     def _doublings(self, gaps: FloatArray) -> np.ndarray:
-        """Return the number of halvings (K,) after which the power series applies to each of K
-        ``gaps`` (K,), in seconds.
-        """
+        """Return the halvings (K,) after which the power series applies to ``gaps`` (K,)."""
         # The least d with |A| g / 2^d <= UNIT_SIZE.
         sizes = np.maximum(gaps * (self._norm / UNIT_SIZE), 1.0)
         return np.ceil(np.log2(sizes)).astype(np.int64)
 
     def _unit_transition(self, gaps: FloatArray) -> FloatArray:
-        """Return exp(A g) (K, n, n) by its power series, for K ``gaps`` g (K,) in seconds so short
-        that |A| g <= UNIT_SIZE.
-        """
+        """Return exp(A g) (K, n, n) by its power series, for K short ``gaps``."""
         n, terms = self.n, len(self._series)
         powers = _powers(gaps, terms)
         return product(powers, self._series.reshape(terms, n * n)).reshape(-1, n, n)
 
     def _unit_noise(self, gaps: FloatArray) -> FloatArray:
-        """Return a factor S (K, n, 10 m) of the noise covariance S S' over K ``gaps`` g (K,) in
-        seconds so short that |A| g <= UNIT_SIZE: columns ``e^{A s} B sqrt(weight)`` at the 10
-        quadrature nodes s.
-        """
+        """Return a factor (K, n, 10 m) of the noise covariance over K short ``gaps``."""
         terms, n, m = self._response.shape
         powers = _powers(gaps[:, None] * _NODES, terms)
         response = product(powers, self._response.reshape(terms, n * m))
@@ -129,9 +122,7 @@ def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _powers(gaps: FloatArray, terms: int) -> FloatArray:
-    """Return the powers g^0 .. g^(terms - 1), (K, c, terms), of ``gaps`` g (K, c), or (K,) for c =
-    1.
-    """
+    """Return the powers g^0 .. g^(terms - 1), (K, c, terms), of ``gaps`` g."""
     # By multiplication: the last bit of numpy's power depends on the CPU.
     gaps = gaps if gaps.ndim > 1 else gaps[:, None]
     factors = np.ones((*gaps.shape, terms))

@@ -291,9 +291,7 @@ def _transposed(matrices: FloatArray) -> FloatArray:
 
 
 def _completed(D: FloatArray) -> FloatArray:
-    """Return orthogonal matrices (C, 2 n, 2 n) whose first n rows are those of ``D`` (C, n, 2 n),
-    where these are not zero.
-    """
+    """Return orthogonal matrices (C, 2 n, 2 n) whose first rows are ``D`` (C, n, 2 n)."""
     count, n, columns = D.shape
     rows = np.concatenate([D, np.zeros((count, columns - n, columns))], axis=1)
     for k in range(columns):

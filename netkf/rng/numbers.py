@@ -76,9 +76,7 @@ def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
 
 @kernel
 def _tail(states: np.ndarray, k: int, negative: bool) -> float:
-    """Return a normal number x with |x| > TAIL_START, ``negative`` or positive, by rejection
-    (Marsaglia 1964), from stream ``k`` of the ``states`` (K, WIDTH).
-    """
+    """Return a normal number beyond TAIL_START by rejection (Marsaglia 1964)."""
     # TAIL_START + x, with x exponential of mean 1 / TAIL_START, is accepted with probability
     # exp(-x^2 / 2), by an exponential y of mean 1.
     while True:
