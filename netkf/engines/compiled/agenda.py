@@ -12,8 +12,8 @@ from functools import cache
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.engines.compiled.batch_loop import BatchArrays, begin, finish, no_batch, reset_filters
-from netkf.engines.compiled.event_loop import (
+from netkf.engines.compiled.batch_arrays import BatchArrays, begin, finish, no_batch, reset_filters
+from netkf.engines.compiled.events import (
     ABSORB,
     DELIVER,
     DONE,

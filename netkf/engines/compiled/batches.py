@@ -17,7 +17,7 @@ import numpy as np
 from netkf.core.memory import keep_freed_memory
 from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
-from netkf.engines.compiled.batch_loop import BatchArrays
+from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_samples
 from netkf.engines.compiled.per_scenario import once_per_scenario

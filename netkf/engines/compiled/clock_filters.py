@@ -16,7 +16,7 @@ from netkf.algorithms.kernels.run import (
     size_of,
 )
 from netkf.algorithms.records import Kernels, double_past, make_records, resized
-from netkf.engines.compiled.batch_loop import BatchArrays
+from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
 from netkf.engines.compiled.state import Filters, Instants, Simulation, add_messages
 from netkf.linalg.arrays import FloatArray

@@ -2,7 +2,7 @@
 
 ``clock_loop`` makes it for a filter's kernels. It finds the next event, predicts the nodes that
 take part in it, and calls its handler; events are ordered by (time, rank, entity) as in
-``engines.base``. It returns a request when Python has something to do (``event_loop``).
+``engines.base``. It returns a request when Python has something to do (``events``).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from netkf.algorithms.kernels.run import ClockRun, interval_end
 from netkf.algorithms.records import Kernels
 from netkf.core.instants import snapped
 from netkf.engines.base import LONGER, MIN_GAP_SHARE
-from netkf.engines.compiled.batch_loop import BatchArrays, begin, finish, reset_messages
-from netkf.engines.compiled.event_loop import (
+from netkf.engines.compiled.batch_arrays import BatchArrays, begin, finish, reset_messages
+from netkf.engines.compiled.events import (
     ABSORB,
     DONE,
     GO_ON,
@@ -64,7 +64,7 @@ OWN = 0
 @cache
 def clock_loop(kernels: Kernels) -> Any:
     """Return the event loop for a filter's kernels, ``loop(state, record, run)``, which returns a
-    request (``event_loop``).
+    request (``events``).
     """
     predict_node = prediction_of(kernels)
     on_tick = ticking_of(kernels)

@@ -19,7 +19,7 @@ from netkf.engines.base import Progress
 from netkf.engines.compiled.agenda import advance_alone, is_immediate
 from netkf.engines.compiled.clock_filters import ClockFilters
 from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path
-from netkf.engines.compiled.event_loop import (
+from netkf.engines.compiled.events import (
     DONE,
     WANT_MESSAGES,
     WANT_PAST,

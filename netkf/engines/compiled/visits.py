@@ -31,7 +31,7 @@ from netkf.algorithms.kernels.root_flow import (
     width_of,
 )
 from netkf.algorithms.kernels.square_root import reflect_row
-from netkf.engines.compiled.event_loop import store_sample
+from netkf.engines.compiled.events import store_sample
 from netkf.engines.compiled.increments import advance_over_interval, next_interval, noise_index
 from netkf.engines.compiled.lane_readings import (
     LaneReadings,
