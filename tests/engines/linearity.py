@@ -87,11 +87,8 @@ def run(scenario, streams):
     return np.concatenate([error for *_, error in memory.samples])
 
 
-def engine_covariance(scenario, engine="auto"):
-    """(T, N, n, n): Cov(x - xhat_i) of what SimPy computes, for plants starting at mean 0; and the
-    run of an engine.
-    """
-    total = 0.0
+def error_forms(scenario):
+    """For each draw the errors (T, N, n) of what SimPy computes where it is 1 and all others 0."""
     # What is drawn ahead in blocks would be as many runs more, all of them without errors.
     with (
         mock.patch.object(linear, "BLOCK", 1),
@@ -103,6 +100,17 @@ def engine_covariance(scenario, engine="auto"):
         assert not run(scenario, silent).any()
         for name, unit in silent.made.items():
             for place in range(unit.count):
-                e = run(scenario, OneDraw(scenario.seed, name, place))
-                total = total + np.einsum("tia,tib->tiab", e, e)
+                yield run(scenario, OneDraw(scenario.seed, name, place))
+
+
+def engine_covariance(scenario, engine="auto"):
+    """(T, N, n, n): Cov(x - xhat_i) of what SimPy computes, for plants starting at mean 0; and the
+    run of an engine.
+    """
+    total = sum(np.einsum("tia,tib->tiab", e, e) for e in error_forms(scenario))
     return total, simulate(scenario, engine=engine)
+
+
+def engine_joint(scenario):
+    """The joint covariance (T, N, n, T, N, n) of all these errors."""
+    return sum(np.multiply.outer(e, e) for e in error_forms(scenario))

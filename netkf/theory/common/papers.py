@@ -9,7 +9,6 @@ import importlib.util
 import re
 import textwrap
 from collections.abc import Iterable
-from types import ModuleType
 from typing import Any
 
 from netkf.scenario.scenario import Scenario
@@ -42,11 +41,6 @@ def paper_legend(sources: Iterable[str]) -> list[str]:
     ]
 
 
-def paper_module(scenario: Scenario, name: str) -> ModuleType:
-    """Import module ``name`` of the paper of the scenario's filter, which must name one."""
-    return importlib.import_module(f"netkf.theory.{scenario.node_filter.paper}.{name}")
-
-
 def paper_function(scenario: Scenario, module: str, name: str) -> Any:
     """Return the function ``name`` of a ``module`` of the paper of the scenario's filter, or None
     if paper, module or function is missing.
@@ -54,4 +48,4 @@ def paper_function(scenario: Scenario, module: str, name: str) -> Any:
     paper = scenario.node_filter.paper
     if not paper or importlib.util.find_spec(f"netkf.theory.{paper}.{module}") is None:
         return None
-    return getattr(paper_module(scenario, module), name, None)
+    return getattr(importlib.import_module(f"netkf.theory.{paper}.{module}"), name, None)
