@@ -74,6 +74,7 @@ class ClockColumns(ErrorColumns):
         self._source: int | None = None
         self._sent: dict[tuple[int, int, int], Sent] = {}
         self._inboxes: dict[int, list[Sent]] = {}
+        self._whitened: dict[int, tuple[Observation, FloatArray, FloatArray]] = {}
         self._read: dict[int, tuple[float, FloatArray, IntArray]] = {}
         self._transitions = Transitions(plant.A, plant.B)
         # The state grows by less than e in between; other filters do not commute with a shift.
@@ -200,12 +201,7 @@ class ClockColumns(ErrorColumns):
         self._keep_digits([h])
         forms = self._forms_of_all
         first = forms.inputs(observation.root.shape[1])
-        root = np.linalg.cholesky(observation.R)
-        H, noise = np.split(
-            np.linalg.solve(root, np.column_stack([observation.H, observation.root])),
-            [self.n],
-            axis=1,
-        )
+        H, noise = self._whiten(observation)
         y = H @ forms.table[self._x, : forms.used]
         y[:, first:] += noise
         if self._filters.kernels.sends_readings:
@@ -215,6 +211,17 @@ class ClockColumns(ErrorColumns):
             forms.table[rows, : forms.used] = y
             self._read[h] = time, H, rows
         self._filters.update(h, self._gap(h, time), H, y)
+
+    def _whiten(self, observation: Observation) -> tuple[FloatArray, FloatArray]:
+        """Return H (p, n) and the root (p, p) of the noise as multiples of the assumed root of R;
+        many observations are one object.
+        """
+        key = id(observation)
+        if key not in self._whitened:
+            root = np.linalg.cholesky(observation.R)
+            H, noise = (np.linalg.solve(root, part) for part in (observation.H, observation.root))
+            self._whitened[key] = observation, H, noise
+        return self._whitened[key][1:]
 
     def _send(self, key: tuple[int, int, int], time: float) -> None:
         """Send one message, if it will arrive."""

@@ -131,11 +131,15 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
     root of the true R, by which errors are replayed: by time (seconds) and index of the estimator
     that uses them (the filter of a node, or one pooled filter). The values read are not needed.
 
-    Samples that one filter gets at one instant are one observation.
+    Samples that one filter gets at one instant are one observation. Equal ones are one object.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     by_node, noises = scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)
+    fixed = [
+        Observation(sensor.H, *noise)
+        for sensor, noise in zip(scenario.sensors, noises, strict=True)
+    ]
     observations: dict[float, dict[int, list[Observation]]] = {}
     for estimator, nodes in enumerate(nodes_by_estimator(scenario)):
         for node in nodes:
@@ -147,11 +151,12 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
                     sample_path(scenario, streams, node, placed_sensor) if sensor.varying else None
                 )
                 for k, time in enumerate(times[node, placed_sensor.ordinal].tolist()):
-                    H = path.reading(k, np.zeros(n))[1] if path is not None else sensor.H
+                    reading = fixed[placed_sensor.entry]
+                    if path is not None:
+                        H = path.reading(k, np.zeros(n))[1]
+                        reading = Observation(H, *_noise(path, k, noises[placed_sensor.entry]))
                     at_time = observations.setdefault(time, {})
-                    at_time.setdefault(estimator, []).append(
-                        Observation(H, *_noise(path, k, noises[placed_sensor.entry]))
-                    )
+                    at_time.setdefault(estimator, []).append(reading)
     return {
         time: {
             estimator: stack_observations(readings, n) for estimator, readings in at_time.items()
