@@ -2,19 +2,26 @@
 themselves in other company.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy.linalg
 
 import netkf
+from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.gossip import swap
 from netkf.algorithms.kernels.root_flow import cell_of
 from netkf.engines.compiled import agenda, batches, flow, visits
 from netkf.engines.compiled.flow import Workspace
 from netkf.engines.compiled.lane_series import NEAR
 from netkf.engines.compiled.visits import fill_row
+from netkf.kernels import Kernels
 from netkf.linalg.compiling import kernel
 from netkf.linalg.series import polynomial
+from netkf.parts import Filter, Hybrid
 from tests.benchmarks.cases import planar
+from tests.engines.agreement import assert_agree
 
 TWO_ROWS = {"nodes": [3, 5], "H": np.eye(2).tolist(), "R": [[0.5, 0.1], [0.1, 0.3]]}
 ONE_ROW = {"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}
@@ -153,3 +160,29 @@ def test_tables_of_lanes_hold_transitions_and_gains(ring, case):
                     polynomial(model.gains.series, gap),
                 )
                 np.testing.assert_allclose(gains, expected, rtol=0.0, atol=1e-13 * expected.max())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Swaps(Hybrid):
+    """A hybrid filter by name that swaps estimates."""
+
+    kernels = Kernels(absorb=swap)
+    shift = Filter.shift
+
+
+class Early(Hybrid):
+    """A rule in Python about late messages, which kernels do not know."""
+
+    def accepts(self, payload, age):
+        return age < 0.1
+
+
+def test_verbs_and_not_the_class_say_what_runs_in_lanes(ring):
+    own = [
+        dataclasses.replace(ring, filter=dataclasses.replace(ring.filter, algorithm=algorithm))
+        for algorithm in (Swaps(epsilon=0.3), Early(epsilon=0.3))
+    ]
+    assert agenda.is_immediate(ring)
+    assert not any(agenda.is_immediate(one) for one in own)
+    assert compiled_kernels(Early(epsilon=0.3), clocked=True) is None
+    assert_agree(own[0].replace({"horizon": 3.0}))
