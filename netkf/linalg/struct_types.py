@@ -30,7 +30,7 @@ from numba.extending import (
 from numba.np.numpy_support import from_dtype
 
 from netkf.linalg.array_layout import DATA, I64, array_without_owner
-from netkf.linalg.structs import WORD, Struct, StructClass, struct_at
+from netkf.linalg.structs import WORD, NumbaType, Struct, StructClass, struct_at
 
 
 class StructType(types.Type):
@@ -73,6 +73,9 @@ def struct_type(cls: type[Struct]) -> StructType:
         made = _struct_types[cls] = StructType(cls.__name__, fields)
         _classes[made.name] = cls
     return _struct_types[cls]
+
+
+NumbaType.find = staticmethod(struct_type)
 
 
 def class_of(kind: StructType) -> type[Struct]:

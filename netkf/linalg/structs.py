@@ -44,15 +44,17 @@ MAX_UNROLLED = 4
 Size = tuple[int, ...] | FloatArray
 
 
-class _NumbaType:
+class NumbaType:
     """The numba type of a class of structs until numba asks for it; from then on the type itself,
     which numba finds in a fifth of the time of asking Python.
     """
 
-    def __get__(self, _: Any, cls: Any) -> Any:
-        from netkf.linalg.struct_types import struct_type
+    find: ClassVar[Any]
+    """The function from a class to its numba type, set by ``struct_types``."""
 
-        cls._numba_type_ = struct_type(cls)
+    def __get__(self, _: Any, cls: Any) -> Any:
+        # An AttributeError, as long as nothing is compiled, says that there is none.
+        cls._numba_type_ = self.find(cls)
         return cls._numba_type_
 
 
@@ -83,7 +85,7 @@ class Struct(metaclass=StructClass):
         cls.struct_fields = tuple(cls.__annotations__)
         cls.struct_offsets, cls.struct_kinds = {}, {}
         # Each class its own, and not that of the class that it derives from.
-        cls._numba_type_ = _NumbaType()
+        cls._numba_type_ = NumbaType()
 
     @classmethod
     def of_size(cls, n: int) -> Any:
