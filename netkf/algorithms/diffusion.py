@@ -21,7 +21,7 @@ from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Needs, Weights
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -123,11 +123,9 @@ class DiffusionFilter(Filter):
             check_columns(self.weights)
 
     @property
-    def pair_weights(self) -> FloatArray | None:
-        """The matrix (N, N) of weights, entry [l, i] for messages from node l to node i; None for
-        Metropolis weights, which the method ``weight`` gives.
-        """
-        return None if isinstance(self.weights, str) else self.weights
+    def link_weights(self) -> Weights:
+        """The matrix of weights, or Metropolis weights."""
+        return Weights(matrix=None if isinstance(self.weights, str) else self.weights)
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return the own weights and inverses of roots of nodes, estimates in messages with the

@@ -16,7 +16,7 @@ from netkf.algorithms.kernels.estimates import copy_vector
 from netkf.algorithms.kernels.neighbours import use_readings_heard
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Needs, Weights
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -87,11 +87,9 @@ class DiffusionKalman(Filter):
             check_columns(self.weights)
 
     @property
-    def pair_weights(self) -> FloatArray | None:
-        """The matrix (N, N) of weights, entry [l, i] for messages from node l to node i; None for
-        Metropolis weights, which the method ``weight`` gives.
-        """
-        return None if isinstance(self.weights, str) else self.weights
+    def link_weights(self) -> Weights:
+        """The matrix of weights, or Metropolis weights."""
+        return Weights(matrix=None if isinstance(self.weights, str) else self.weights)
 
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
         """Return False if a node has nothing to send in exchange number ``phase`` of a slot: a

@@ -20,7 +20,7 @@ import numpy as np
 from netkf.algorithms import single
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.records import Kernels, Record
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Needs, Weights
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 
@@ -259,6 +259,11 @@ class Filter(Component):
         """What it needs of a scenario; by default nothing. A class may set it as a variable."""
         return Needs()
 
+    @property
+    def link_weights(self) -> Weights:
+        """The weights of messages; by default Metropolis'. A class may set it as a variable."""
+        return Weights()
+
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return the arrays of nodes, links and messages that ``kernels`` need, for nodes with
         these ``infos`` and ``models``.
@@ -433,23 +438,6 @@ class Filter(Component):
         no exchange should change; a run reports how far they have drifted.
         """
         return {}
-
-    def weight(self, degree: int, peer_degree: int) -> float:
-        """Return the weight that a node that hears ``degree`` others gives to a message of one that
-        hears ``peer_degree`` others; by default the Metropolis weight.
-        """
-        return 1.0 / (1.0 + max(degree, peer_degree))
-
-    @property
-    def pair_weights(self) -> FloatArray | None:
-        """Matrix (N, N) of weights of N nodes in the order of their ids: entry [l, i] is the weight
-        that node i gives to a message of node l. None if ``weight`` gives the weights.
-        """
-        return None
-
-    def largest_degree(self) -> float:
-        """Return the largest number of neighbours for which the weights make sense."""
-        return np.inf
 
     @property
     def wrapped(self) -> Filter | None:

@@ -12,6 +12,7 @@ from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.neighbours import combine_convex
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Weights
 from netkf.core.fields import field, number
 
 
@@ -34,15 +35,12 @@ class Hybrid(Filter):
     schedule: ClassVar[tuple[str, ...] | None] = None  # continuous time only
     kernels = Kernels(absorb=combine_convex, unrolled=True)
 
-    def weight(self, degree: int, peer_degree: int) -> float:
-        """Return ``epsilon``, the weight of every link, whatever the degrees of the nodes at its
-        ends.
+    @property
+    def link_weights(self) -> Weights:
+        """The weight ``epsilon`` for each link; with more than ``1 / epsilon`` neighbours the
+        node's own weight would be negative.
         """
-        return self.epsilon
-
-    def largest_degree(self) -> float:
-        """Return ``1 / epsilon``; with more neighbours the node's own weight would be negative."""
         # A little more, so that rounding of 1 / epsilon excludes no whole number.
-        return (1.0 + 1e-12) / self.epsilon
+        return Weights(lambda _, __: self.epsilon, largest_degree=(1.0 + 1e-12) / self.epsilon)
 
     shift = Filter.shift  # affine: the weights sum to one

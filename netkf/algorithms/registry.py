@@ -28,10 +28,8 @@ _REGISTERED: dict[str, type[Filter]] = {}  # by name, see choice_name
 WEIGHING = ("share", "max_measurement_interval", "steps", "exchange_steps", "redraws_links")
 """Methods that theorems rely on, besides STEPS, the methods that define a filter."""
 
-LINK_WEIGHTS = ("weight", "pair_weights", "largest_degree")
-"""Methods that a derived class may override without losing the theory, which asks it for its
-weights; ``largest_degree`` says how many links these weights allow.
-"""
+LINK_WEIGHTS = ("link_weights",)
+"""What a derived class may override without losing the theory, which asks it for its weights."""
 
 TRAITS = ("schedule", "clocks", "predicts", "first_slot", "pairwise", "talks", "pooled",
           "newest_only")  # fmt: skip

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
+from netkf.linalg.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -41,3 +44,26 @@ class Needs:
     one_way: bool = False
     check: Callable[[Any], None] | None = None
     notes: Callable[[Any], tuple[str, ...]] | None = None
+
+
+def metropolis(degree: int, peer_degree: int) -> float:
+    """Return the Metropolis weight of a message, ``1 / (1 + max degree)``: the node hears
+    ``degree`` others, the sender ``peer_degree``.
+    """
+    return 1.0 / (1.0 + max(degree, peer_degree))
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The weights that nodes give to messages.
+
+    of : ``of(degree, peer_degree)`` returns the weight that a node that hears ``degree`` others
+         gives to a message of one that hears ``peer_degree`` others
+    matrix : (N, N) weights of N nodes in the order of their ids instead: entry [l, i] is the weight
+             that node i gives to a message of node l
+    largest_degree : the largest number of neighbours for which the weights make sense
+    """
+
+    of: Callable[[int, int], float] = metropolis
+    matrix: FloatArray | None = None
+    largest_degree: float = math.inf

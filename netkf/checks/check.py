@@ -367,7 +367,7 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
 def _transposes(scenario: Scenario) -> bool:
     """Return True if weights are those of the base with rows and columns exchanged."""
     own, base = (
-        chosen.node_filter.pair_weights for chosen in (scenario, with_base_filter(scenario))
+        chosen.node_filter.link_weights.matrix for chosen in (scenario, with_base_filter(scenario))
     )
     if own is None or base is None or np.array_equal(own, base):
         return False

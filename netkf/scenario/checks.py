@@ -336,7 +336,7 @@ def _check_degrees(scenario: DerivedScenario) -> None:
     if not algorithm.talks or not scenario.topology.links:
         return
     node, degree = max(scenario.topology.degrees.items(), key=lambda item: item[1])
-    if degree > algorithm.largest_degree():
+    if degree > algorithm.link_weights.largest_degree:
         raise ScenarioError(
             "filter.epsilon",
             f"must be at most 1 / {degree}, because node {node} has {degree} links",

@@ -49,7 +49,7 @@ def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor
 
 def check_weights(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a matrix ``filter.weights`` (N, N) does not fit nodes and links."""
-    weights, nodes = scenario.node_filter.pair_weights, scenario.nodes
+    weights, nodes = scenario.node_filter.link_weights.matrix, scenario.nodes
     if weights is None:
         return
     require_shape("filter.weights", weights, (len(nodes),) * 2, f"there are {len(nodes)} nodes")

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,9 @@ from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval_for
 from netkf.algorithms.models import FlowModel, SlotModel
 from netkf.algorithms.modes import rate_groups
-from netkf.core.errors import TheoryError
+from netkf.algorithms.traits import Weights
+from netkf.core.contracts import ContractError
+from netkf.core.errors import TheoryError, quote
 from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
@@ -406,14 +409,21 @@ class DerivedScenario(ScenarioModel):
         """Return the weight that ``receiver`` (id) gives to the estimate of ``sender`` (id) when it
         averages estimates: pi_ij of paper H (7), a_ji of paper D (8).
 
-        The weights are those of the filter's matrix ``pair_weights``, rows senders and columns
-        receivers, or else depend on the degrees of both nodes.
+        The weights are those of the filter's matrix, rows senders and columns receivers, or else
+        depend on the degrees of both nodes.
         """
-        node_filter, topology = self.node_filter, self.topology
-        pair_weights = node_filter.pair_weights
-        if pair_weights is not None:
-            return float(pair_weights[topology.index[sender], topology.index[receiver]])
-        return node_filter.weight(topology.degrees[receiver], topology.degrees[sender])
+        weights, topology = self._link_weights, self.topology
+        if weights.matrix is not None:
+            return float(weights.matrix[topology.index[sender], topology.index[receiver]])
+        weight: Any = weights.of(topology.degrees[receiver], topology.degrees[sender])
+        if not isinstance(weight, Real):
+            where = f"{type(self.node_filter).__name__}.link_weights.of"
+            raise ContractError(f"{where} must return a number, not {quote(weight)}")
+        return float(weight)
+
+    @cached_property
+    def _link_weights(self) -> Weights:
+        return self.node_filter.link_weights
 
     @cached_property
     def own_weights(self) -> dict[int, float]:

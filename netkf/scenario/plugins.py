@@ -9,7 +9,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType, FunctionType
+from types import CodeType, FrameType, FunctionType
 from typing import Any
 
 from netkf.core.contracts import ContractError, is_netkf_class, last_call, place_of, place_of_error
@@ -114,14 +114,12 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
         return None
     text = describe_error(error)
     methods = {
-        function.__code__: (type(component), name)
+        code: (type(component), name)
         for component in components
         for cls in reversed(type(component).__mro__)
         if not is_netkf_class(cls)
         for name, member in vars(cls).items()
-        for one in [getattr(member, "fget", member)]  # of a property
-        for function in [inspect.unwrap(one) if callable(one) else one]
-        if isinstance(function, FunctionType)
+        for code in _codes_of(member)
     }
     found: tuple[type, str, FrameType, int] | None = None
     for frame, line in _frames_of(error):
@@ -139,6 +137,18 @@ def explain_user_error(scenario: Any, error: Exception) -> str | None:
         return f"{_name_of(type(components[0]))} failed: {text}"
     where = f"{call.function.__name__} ({place_of(call.function.__code__)})"
     return f"{_name_of(call.cls)} failed after {where} returned {quote(call.result)}: {text}"
+
+
+def _codes_of(member: Any) -> list[CodeType]:
+    """Return the code of a method, a property or the functions in a value, and what they define."""
+    if dataclasses.is_dataclass(member) and not isinstance(member, type):
+        return [code for one in vars(member).values() for code in _codes_of(one)]
+    function = getattr(member, "fget", member)
+    function = inspect.unwrap(function) if callable(function) else function
+    if not isinstance(function, FunctionType):
+        return []
+    code = function.__code__
+    return [code, *(inner for inner in code.co_consts if isinstance(inner, CodeType))]
 
 
 def _frames_of(error: BaseException) -> Iterator[tuple[FrameType, int]]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import CLOCKS, Filter, commutes
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Needs, Weights
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.parents import check_parent
 from netkf.testing.shifts import check_shift, make_trials
@@ -125,16 +125,17 @@ def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
 
 def _check_weights(watched: WatchedPart) -> None:
     """Check the weights of messages."""
-    part, where = watched.part, f"{watched.name}.weight"
-    largest_degree = watched.call("largest_degree")
-    got = largest_degree
-    demand(largest_degree >= 1.0, f"{watched.name}.largest_degree", "must be at least 1", got)
-    if part.pair_weights is not None:
-        _check_pair_weights(watched, np.asarray(part.pair_weights))
+    name = f"{watched.name}.link_weights"
+    given, where = watched.part.link_weights, f"{name}.of"
+    _check_flags(given, Weights, name)
+    largest = given.largest_degree
+    demand(largest >= 1.0, f"{name}.largest_degree", "must be at least 1", largest)
+    if given.matrix is not None:
+        _check_matrix(f"{name}.matrix", np.asarray(given.matrix))
         return
-    degrees = range(1, int(min(largest_degree, MAX_DEGREE)) + 1)
+    degrees = range(1, int(min(largest, MAX_DEGREE)) + 1)
     for degree in degrees:
-        weights = [watched.call("weight", degree, peer_degree) for peer_degree in degrees]
+        weights = [watched.call("link_weights.of", degree, peer_degree) for peer_degree in degrees]
         for peer_degree, weight in zip(degrees, weights, strict=True):
             is_weight = isinstance(weight, (int, float, np.floating)) and 0.0 <= weight <= 1.0
             rule = f"must be a number from 0 to 1 for {degree} and {peer_degree} links"
@@ -145,9 +146,8 @@ def _check_weights(watched: WatchedPart) -> None:
         demand(degree * max(weights) <= 1.0 + 1e-9, where, rule, got, remedy)
 
 
-def _check_pair_weights(watched: WatchedPart, weights: FloatArray) -> None:
+def _check_matrix(where: str, weights: FloatArray) -> None:
     """Check that ``weights`` (N, N) are not negative, and that columns sum to at most 1."""
-    where = f"{watched.name}.pair_weights"
     is_square = weights.ndim == 2 and weights.shape[0] == weights.shape[1]
     demand(is_square, where, "must be a square matrix", str(weights.shape))
     demand((weights >= 0.0).all(), where, "must not be negative", float(weights.min()))

@@ -187,8 +187,9 @@ class Trial(ABC):
 
 def _make_network(part: Any) -> tuple[range, FloatArray]:
     """Return the nodes and weights (N, N) of a complete graph for a filter."""
-    weights = part.pair_weights
+    given = part.link_weights
+    weights = given.matrix
     if weights is None:
-        count = 3 if part.largest_degree() >= 2.0 else 2
-        weights = np.full((count, count), part.weight(count - 1, count - 1))
+        count = 3 if given.largest_degree >= 2.0 else 2
+        weights = np.full((count, count), given.of(count - 1, count - 1))
     return range(len(weights)), np.asarray(weights) * (1.0 - np.eye(len(weights)))

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, cached_property
+from operator import attrgetter
 from typing import Any, NoReturn, cast
 
 import numpy as np
@@ -216,7 +217,8 @@ class WatchedPart:
         self._results: list[tuple[str, Any, Leaves]] = []
 
     def call(self, method: str, *arguments: Any, repeatable: bool = True) -> Any:
-        """Call a method, check for side effects and return the result.
+        """Call a method, or a function of a value as "link_weights.of", check for side effects and
+        return the result.
 
         A ``repeatable`` method, one that draws no random numbers, is called twice and must return
         equal results. Raises AssertionError if a check or the method fails.
@@ -264,7 +266,7 @@ class WatchedPart:
         """Call a method with these ``arguments`` and return the result."""
         before = global_generator_states()
         try:
-            result = getattr(self.part, method)(*arguments)
+            result = attrgetter(method)(self.part)(*arguments)
         except NetkfError as error:
             fail(where, f"failed: {error}")
         except Exception as error:
@@ -279,7 +281,7 @@ class WatchedPart:
 
     def _parameter_names(self, method: str, count: int) -> list[str]:
         """Return the names of the first ``count`` parameters of a method."""
-        names = list(inspect.signature(getattr(self.part, method)).parameters)
+        names = list(inspect.signature(attrgetter(method)(self.part)).parameters)
         return [*names, *["an argument"] * count][:count]
 
     def finish(self) -> None:

@@ -11,6 +11,7 @@ from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import AVERAGE, PushSum
+from netkf.algorithms.traits import Weights
 from netkf.core.fields import positive, setting
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
@@ -26,8 +27,9 @@ class OwnReset(Filter):
         P = state.P + sum(message.weight * message.payload.P for message in messages)
         return state._replace(root=np.linalg.cholesky(P))
 
-    def weight(self, degree, peer_degree):
-        return self.epsilon
+    @property
+    def link_weights(self):
+        return Weights(lambda degree, peer_degree: self.epsilon)
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,16 +334,18 @@ class SwapsTooMuch(Gossip):
 class HeavierLinks(Hybrid):
     """Gives its neighbours another weight, which is its own choice."""
 
-    def weight(self, degree, peer_degree):
-        return 0.5 * self.epsilon
+    @property
+    def link_weights(self):
+        return Weights(lambda degree, peer_degree: 0.5 * self.epsilon)
 
 
 @dataclass(frozen=True, eq=False)
 class SameWeights(Hybrid):
     """Writes down the weight that it has anyway."""
 
-    def weight(self, degree, peer_degree):
-        return self.epsilon
+    @property
+    def link_weights(self):
+        return Weights(lambda degree, peer_degree: self.epsilon)
 
 
 @dataclass(frozen=True, eq=False)

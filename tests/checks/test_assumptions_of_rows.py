@@ -26,7 +26,7 @@ from netkf.checks.report import verdict_text
 from netkf.laws.intervals import Interval
 from netkf.laws.losses import mean_correlation
 from netkf.laws.ticks import largest_correlation
-from netkf.parts import Bernoulli, Hybrid
+from netkf.parts import Bernoulli, Hybrid, Weights
 from netkf.scenario.reading import from_table
 from netkf.theory.common.random_links import all_messages_arrive, delivery_of
 from tests.checks.test_check import DIFFUSION, INTERMITTENT, RING, scenario_of
@@ -200,11 +200,10 @@ def test_silence_is_about_the_senders_prediction(start, tmp_path):
 class Weaker(Hybrid):
     """Gives smaller weights, and so may have more neighbours."""
 
-    def weight(self, own_degree, sender_degree):
-        return 0.5 * super().weight(own_degree, sender_degree)
-
-    def largest_degree(self):
-        return 2.0 * super().largest_degree()
+    @property
+    def link_weights(self):
+        given = super().link_weights
+        return Weights(lambda *degrees: 0.5 * given.of(*degrees), None, 2.0 * given.largest_degree)
 
 
 def test_a_class_with_weights_of_its_own_may_say_how_many_links_they_allow(tmp_path):

@@ -25,7 +25,7 @@ def beside(table, name, folder):
     [
         (Gossip(), []),
         (Hybrid(epsilon=0.3), []),
-        (HeavierLinks(epsilon=0.3), ["weight"]),
+        (HeavierLinks(epsilon=0.3), ["link_weights"]),
         (LateSwaps(), ["first_slot"]),
         (SwapsOnlyX(), ["absorb"]),
         (object(), []),
@@ -39,7 +39,7 @@ def test_own_attributes_are_those_that_a_class_defines_anew(part, own):
 def test_own_weights_are_a_design_and_the_row_says_so(tmp_path):
     verdict, row = beside(RING, "HeavierLinks", tmp_path)
     assert row.verdict == NOT_PROMISED
-    assert "weight is its own" in row.assumptions
+    assert "link_weights is its own" in row.assumptions
     # Its promises are those of the filter with these weights.
     assert bool(verdict)
 
@@ -47,9 +47,9 @@ def test_own_weights_are_a_design_and_the_row_says_so(tmp_path):
 def test_weights_that_change_nothing_hold(tmp_path):
     verdict, row = beside(RING, "SameWeights", tmp_path)
     assert row.verdict == HOLDS
-    assert "its own: weight" in row.evidence
+    assert "its own: link_weights" in row.evidence
     assert bool(verdict)
-    assert own_attributes(SameWeights(epsilon=0.3)) == ["weight"]
+    assert own_attributes(SameWeights(epsilon=0.3)) == ["link_weights"]
 
 
 @pytest.mark.parametrize(("name", "own"), [("LateSwaps", "first_slot"), ("SwapsOnlyX", "absorb")])

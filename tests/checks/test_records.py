@@ -8,6 +8,7 @@ import pytest
 
 import netkf
 from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.traits import Weights
 from netkf.checks import check as checking
 from netkf.checks.check import check, with_check_times
 from netkf.checks.evidence import BROKEN, NOT_PROMISED
@@ -198,8 +199,8 @@ def test_starts_and_weights_are_those_of_the_file(tmp_path, monkeypatch):
         wrong = getattr(run, name).copy()
         wrong[0, 1] = factor * wrong[0, 1] + 0.01
         assert "node 1 at time 0" in start_fault(begun, dataclasses.replace(run, **{name: wrong}))
-    transposed = property(lambda self: self.weights.T)
-    monkeypatch.setattr(DiffusionFilter, "pair_weights", transposed)
+    transposed = property(lambda self: Weights(matrix=self.weights.T))
+    monkeypatch.setattr(DiffusionFilter, "link_weights", transposed)
     assert weight_fault(scenario) == "node 1 gives node 0 the weight 0.2, not 0.3"
 
 

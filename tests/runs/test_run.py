@@ -132,6 +132,7 @@ def test_fine_nodes_of_a_diverged_run_are_not_judged_by_rounding(build, tmp_path
 
 FAILING = """
 from netkf.algorithms.hybrid import Hybrid
+from netkf.algorithms.traits import Weights
 
 
 class Bad(Hybrid):
@@ -145,13 +146,15 @@ class Nan(Hybrid):
 
 
 class Weightless(Hybrid):
-    def weight(self, degree, peer_degree):
-        return 1 / (degree - 2)
+    @property
+    def link_weights(self):
+        return Weights(lambda degree, peer_degree: 1 / (degree - 2))
 
 
 class Limitless(Hybrid):
-    def largest_degree(self):
-        return self.nothing
+    @property
+    def link_weights(self):
+        return Weights(largest_degree=self.nothing)
 
 
 class Picky(Hybrid):
@@ -254,7 +257,7 @@ def test_an_error_in_a_class_of_netkf_is_not_covered_up(ring, tmp_path, monkeypa
 def test_a_class_that_cannot_be_made_is_refused(plugged):
     with pytest.raises(netkf.ScenarioError, match=r"filter: Picky could not .*not today"):
         netkf.load(plugged("Picky"))
-    words = r"toml: failing_filters:Limitless failed in largest_degree: AttributeError.*; correct"
+    words = r"toml: failing_filters:Limitless failed in link_weights: AttributeError.*; correct"
     with pytest.raises(netkf.ScenarioError, match=words):
         netkf.load(plugged("Limitless"))
 
@@ -265,7 +268,9 @@ def test_a_class_that_fails_at_the_start_is_named_in_one_line(plugged, command, 
     assert main([command, "--trust", str(plugged("Weightless")), *out]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert printed.err.startswith("netkf: failing_filters:Weightless failed in weight: ZeroDiv")
+    assert printed.err.startswith(
+        "netkf: failing_filters:Weightless failed in link_weights: ZeroDiv"
+    )
     assert len(printed.err.splitlines()) == 1
 
 

@@ -90,6 +90,7 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
             from dataclasses import dataclass
 
             from netkf.algorithms.hybrid import Hybrid
+            from netkf.algorithms.traits import Weights
             from netkf.core.fields import number, setting
             from netkf.network.clocks import LinkClock
 
@@ -98,8 +99,9 @@ def test_a_class_of_the_user_needs_no_registration(tmp_path, monkeypatch, ring):
             class Timid(Hybrid):
                 share: float = setting(number(above=0.0, high=1.0), default=0.5)
 
-                def weight(self, degree, peer_degree):
-                    return self.share * self.epsilon
+                @property
+                def link_weights(self):
+                    return Weights(lambda degree, peer_degree: self.share * self.epsilon)
 
 
             class Loud(Timid):

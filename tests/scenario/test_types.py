@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 import netkf
 from netkf.parts import (
     Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, Increments,
-    LinearSensor, LinkClock, Loss, Message, Needs, NodeInfo, Poisson, Reading, State,
+    LinearSensor, LinkClock, Loss, Message, Needs, NodeInfo, Poisson, Reading, State, Weights,
     positive, probability, setting,
 )
 
@@ -127,11 +127,8 @@ class Everything(Filter):
         return 1.0 / (1 + degree)
 
     @property
-    def pair_weights(self) -> Array | None:
-        return None
-
-    def largest_degree(self) -> float:
-        return 5.0
+    def link_weights(self) -> Weights:
+        return Weights(of=self.weight, largest_degree=5.0)
 
     def check(self, scenario: netkf.Scenario) -> None:
         assert scenario.nodes
@@ -251,7 +248,7 @@ def test_a_class_with_every_method_has_every_method():
     own = OWN[OWN.index("class Everything") : OWN.index("class Regular")]
     methods = [name for name in vars(netkf.parts.Filter) if not name.startswith("_")]
     for name in set(methods) - OF_KERNELS:
-        if callable(getattr(netkf.parts.Filter, name)) or name in ("pair_weights", "needs"):
+        if callable(getattr(netkf.parts.Filter, name)) or name in ("link_weights", "needs"):
             assert f"def {name}(" in own
 
 

@@ -50,6 +50,7 @@ PARTS = {
     "CHANNEL": "",
 }
 SAME = "def absorb(self, state, messages, exchange): return state"
+WEIGHTS = f"link_weights = property(lambda self: Weights(of=self.weight))\n{SAME}"
 NEEDED = {
     "FILTER": ('kind = "{}"', "Filter"),
     "SENSOR": ('{{ nodes = [0], R = [[0.5]], kind = "{}" }}', "NonlinearSensor"),
@@ -84,10 +85,10 @@ MISTAKES = {
                                     r"F\.emit \(FILE, line 6\) must return a tuple of 2, not State"),
     "estimate returns nothing": ("FILTER", f"def estimate(self, state): pass\n{SAME}",
                                  rf"F\.estimate \(FILE, line 6\) {NO_RESULT}"),
-    "weight fails": ("FILTER", f"def weight(self, degree, peer_degree): return 1 / 0\n{SAME}",
+    "weight fails": ("FILTER", f"def weight(self, *degrees): return 1 / 0\n{WEIGHTS}",
                      r"F failed in weight: ZeroDivisionError.*; FILE, line 6"),
-    "weight is a text": ("FILTER", f"def weight(self, degree, peer_degree): return 'x'\n{SAME}",
-                         r"F failed after weight \(FILE, line 6\) returned 'x': TypeError"),
+    "weight is a text": ("FILTER", f"def weight(self, *degrees): return 'x'\n{WEIGHTS}",
+                         r"F.link_weights.of must return a number, not 'x'"),
     "absorb exits": ("FILTER", "def absorb(self, state, messages, exchange): raise SystemExit(3)",
                      r"F\.absorb \(FILE, line 6\) called exit"),
     "it cannot be made": ("FILTER", f"def __post_init__(self): raise RuntimeError('no')\n{SAME}",

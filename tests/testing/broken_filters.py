@@ -11,6 +11,7 @@ from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
+from netkf.algorithms.traits import Weights
 
 BROKEN = {}
 
@@ -88,19 +89,21 @@ class WrongShape(Hybrid):
         return state.xhat[:, None], state.P
 
 
-@says("Greedy.weight: the weights of all messages that may arrive together must sum to at most 1")
+@says("Greedy.link_weights.of: the weights of all messages that may arrive together must sum")
 class Greedy(Filter):
-    def weight(self, degree, peer_degree):
-        return 0.5
+    @property
+    def link_weights(self):
+        return Weights(lambda degree, peer_degree: 0.5)
 
     def absorb(self, state, messages, exchange):
         return state
 
 
-@says("Negative.weight: must be a number from 0 to 1")
+@says("Negative.link_weights.of: must be a number from 0 to 1")
 class Negative(Filter):
-    def weight(self, degree, peer_degree):
-        return -0.1
+    @property
+    def link_weights(self):
+        return Weights(lambda degree, peer_degree: -0.1)
 
     def absorb(self, state, messages, exchange):
         return state
@@ -322,11 +325,11 @@ class ChangesReading(Gossip):
         return super().update(state, reading)
 
 
-@says("Lopsided.pair_weights: columns, the weights that a node gives, must sum to at most 1")
+@says("Lopsided.link_weights.matrix: columns, the weights that a node gives, must sum to at most 1")
 class Lopsided(Filter):
     @property
-    def pair_weights(self):
-        return np.full((3, 3), 0.5)
+    def link_weights(self):
+        return Weights(matrix=np.full((3, 3), 0.5))
 
     def absorb(self, state, messages, exchange):
         return state

@@ -126,9 +126,9 @@ class Transposed(parts.DiffusionFilter):
     """Takes columns for rows in the matrix of its weights."""
 
     @property
-    def pair_weights(self):
-        weights = super().pair_weights
-        return None if weights is None else weights.T
+    def link_weights(self):
+        weights = super().link_weights.matrix
+        return parts.Weights(matrix=None if weights is None else weights.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +136,9 @@ class TransposedKalman(parts.DiffusionKalman):
     """The same, where a class also writes down a step that changes nothing."""
 
     @property
-    def pair_weights(self):
-        weights = super().pair_weights
-        return None if weights is None else weights.T
+    def link_weights(self):
+        weights = super().link_weights.matrix
+        return parts.Weights(matrix=None if weights is None else weights.T)
 
     def absorb(self, state, messages, exchange):
         return super().absorb(state, messages, exchange)

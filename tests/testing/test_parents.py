@@ -32,10 +32,12 @@ def keep(table, words="", **settings):
     return add
 
 
-@keep(ADJUSTED, "Heavier.weight: must have the numbers of Hybrid", epsilon=0.3)
+@keep(ADJUSTED, "Heavier.link_weights: must have the numbers of Hybrid", epsilon=0.3)
 class Heavier(parts.Hybrid):
-    def weight(self, degree, peer_degree):
-        return 1.02 * super().weight(degree, peer_degree)
+    @property
+    def link_weights(self):
+        given = super().link_weights
+        return parts.Weights(lambda *degrees: 1.02 * given.of(*degrees))
 
 
 @keep(ADJUSTED, "Averse.begin: must have the numbers of Hybrid", epsilon=0.3)
@@ -129,8 +131,9 @@ class Rewritten(parts.Hybrid):
 class OtherWeights(parts.Gossip):
     """Weights mean nothing to gossip."""
 
-    def weight(self, degree, peer_degree):
-        return 0.01
+    @property
+    def link_weights(self):
+        return parts.Weights(lambda degree, peer_degree: 0.01)
 
 
 def compare(cls, settings, same_as_parent=None):
