@@ -8,6 +8,7 @@ from typing import ClassVar
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Analysis
 
 
 @built_in("local")
@@ -17,7 +18,7 @@ class Local(Filter):
     are filtered.
     """
 
-    combination: ClassVar[str] = "none"
+    analysis = Analysis(combination="none")
     schedule: ClassVar[tuple[str, ...]] = ("predict", "sense")
     clocks: ClassVar[tuple[str, ...]] = ()
     talks: ClassVar[bool] = False

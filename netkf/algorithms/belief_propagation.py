@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +40,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of
 from netkf.linalg.arrays import FloatArray
@@ -391,8 +391,7 @@ class BeliefPropagation(Filter):
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
     memory: str = field(one_of(SLOT, ALL), default=SLOT)
 
-    paper: ClassVar[str] = "belief_propagation"
-    combination: ClassVar[str] = "beliefs"
+    analysis = Analysis(paper="belief_propagation", combination="beliefs")
     kernels = Kernels(
         predict=predict,
         update=update,

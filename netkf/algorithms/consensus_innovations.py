@@ -35,7 +35,7 @@ from netkf.algorithms.kernels.run import shift_vector
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, select, spread, store
@@ -434,8 +434,11 @@ class ConsensusInnovations(Filter):
     out, and P is then too small.
     """
 
-    paper: ClassVar[str] = "consensus_innovations"
-    combination: ClassVar[str] = "pseudo-states"
+    analysis = Analysis(
+        paper="consensus_innovations",
+        combination="pseudo-states",
+        payload_numbers=lambda n, *_: n,
+    )
     clocks: ClassVar[tuple[str, ...]] = ()
     kernels = Kernels(
         predict=predict,
@@ -507,11 +510,5 @@ class ConsensusInnovations(Filter):
             "consensus-innovations: gains and P count all messages; P is too small where some do "
             "not arrive",
         )
-
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return n, the size of a message in numbers of 64 bits: an estimate of the
-        pseudo-state.
-        """
-        return n
 
     shift = Filter.shift  # affine: gains multiply differences

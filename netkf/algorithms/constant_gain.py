@@ -32,7 +32,7 @@ from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import FlowModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, either, field, has_depth, list_of, matrix
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -140,9 +140,9 @@ class ConstantGain(Filter):
         either(matrix, list_of(matrix, "matrices"), has_depth(3))
     )
 
-    paper: ClassVar[str] = "constant_gain"
-    combination: ClassVar[str] = "constant gain"
-    P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
+    analysis = Analysis(
+        paper="constant_gain", combination="constant gain", P_by_design=("larger", "larger")
+    )
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     kernels = Kernels(
         update=use_sample,

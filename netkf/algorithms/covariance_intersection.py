@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 from netkf.algorithms.diffusion import DiffusionFilter
 from netkf.algorithms.filter import Filter, NodeInfo
@@ -27,7 +27,7 @@ class CovarianceIntersection(Hybrid):
     the error, paper H (10).
     """
 
-    combination: ClassVar[str] = "intersection"
+    analysis = replace(Hybrid.analysis, combination="intersection")
     needs = Needs(inverts=True)
     kernels = DiffusionFilter.kernels
 

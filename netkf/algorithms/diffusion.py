@@ -21,7 +21,7 @@ from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs, Weights
+from netkf.algorithms.traits import Analysis, Needs, Weights
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -107,9 +107,7 @@ class DiffusionFilter(Filter):
     )
     on_loss: str = field(one_of("renormalise", "keep-own"), default="renormalise")
 
-    paper: ClassVar[str] = "diffusion"
-    combination: ClassVar[str] = "shares"
-    P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
+    analysis = Analysis(paper="diffusion", combination="shares", P_by_design=("larger", "larger"))
     schedule: ClassVar[tuple[str, ...]] = ("sense", "predict", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
     predicts: ClassVar[bool] = True

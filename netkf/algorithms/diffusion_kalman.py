@@ -16,7 +16,7 @@ from netkf.algorithms.kernels.estimates import copy_vector
 from netkf.algorithms.kernels.neighbours import use_readings_heard
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs, Weights
+from netkf.algorithms.traits import Analysis, Needs, Weights
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -52,6 +52,13 @@ def absorb(record: Any, h: int, run: Any) -> None:
         store(lanes, x, h, i, own + total)
 
 
+def message_size(n: int, rows: int, phase: int) -> int:
+    """Return the numbers in a message: in the exchange of readings y, H and R of ``rows`` rows, in
+    that of estimates psi with n states.
+    """
+    return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
+
+
 @built_in("diffusion-kalman")
 @dataclass(frozen=True, eq=False)
 class DiffusionKalman(Filter):
@@ -69,8 +76,11 @@ class DiffusionKalman(Filter):
         either(one_of(METROPOLIS), square, has_depth(1)), default=METROPOLIS
     )
 
-    paper: ClassVar[str] = "diffusion_kalman"
-    combination: ClassVar[str] = "readings, then estimates"
+    analysis = Analysis(
+        paper="diffusion_kalman",
+        combination="readings, then estimates",
+        payload_numbers=message_size,
+    )
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
     needs = Needs(one_way=True)
@@ -96,11 +106,5 @@ class DiffusionKalman(Filter):
         reading in the first one, unless it ``has_sensor``. All send estimates in the second.
         """
         return has_sensor or phase == ESTIMATES
-
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message in numbers of 64 bits: in the exchange (``phase``) of
-        readings y, H and R of ``rows`` rows, in that of estimates psi with n states.
-        """
-        return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
 
     shift = Filter.shift  # affine: the weights sum to one

@@ -28,7 +28,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.fields import Rule, field, number, tuple_of
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store_flags
@@ -153,8 +153,7 @@ class EventTriggeredCi(Filter):
     inner: Filter = field(INNER, default=Hcmci(consensus=INFORMATION))
     thresholds: tuple[float, float] = field(THRESHOLDS, default=(1.0, 1.0))
 
-    paper: ClassVar[str] = "event_triggered"
-    P_by_design: ClassVar[tuple[str, str]] = ("larger", "")
+    analysis = Analysis(paper="event_triggered", P_by_design=("larger", ""))
     clocks: ClassVar[tuple[str, ...]] = ()
     kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, decides=True)
 

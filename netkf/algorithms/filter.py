@@ -20,7 +20,7 @@ import numpy as np
 from netkf.algorithms import single
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.records import Kernels, Record
-from netkf.algorithms.traits import Needs, Weights
+from netkf.algorithms.traits import Analysis, Needs, Weights
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
 
@@ -231,12 +231,6 @@ class Filter(Component):
     max_age        seconds beyond which a message that arrives is too late to use, under clocks
     randomised     in slots ``emit`` is given a number ``Exchange.uniform``, from the stream
                    "trigger" of the node, which nothing else draws from
-    paper        name of its packages in netkf.theory and netkf.checks, "" if there are none
-    combination  how it combines messages, for the compiled engine and the theory: "convex",
-                 "intersection", "swap", "shares", "readings", "sums", "none", ...; "" if only its
-                 methods define it
-    P_by_design  how P compares with the covariance of its error in slots and under clocks:
-                 "larger", "smaller", or "" if they are equal or nothing is proved
     """
 
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
@@ -249,9 +243,6 @@ class Filter(Component):
     newest_only: ClassVar[bool] = True
     max_age: ClassVar[float] = math.inf
     randomised: ClassVar[bool] = False
-    paper: ClassVar[str] = ""
-    combination: ClassVar[str] = ""
-    P_by_design: ClassVar[tuple[str, str]] = ("", "")
     kernels: ClassVar[Kernels | None] = None
 
     @property
@@ -263,6 +254,11 @@ class Filter(Component):
     def link_weights(self) -> Weights:
         """The weights of messages; by default Metropolis'. A class may set it as a variable."""
         return Weights()
+
+    @property
+    def analysis(self) -> Analysis:
+        """What theory, checks and comparisons know of it; by default nothing."""
+        return Analysis()
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return the arrays of nodes, links and messages that ``kernels`` need, for nodes with
@@ -408,15 +404,6 @@ class Filter(Component):
         """
         return True
 
-    def payload_numbers(self, n: int, rows: int, phase: int) -> float:
-        """Return the size, in numbers of 64 bits, of a message that a node with ``rows`` rows of
-        readings sends about ``n`` states in exchange number ``phase`` of a slot (-1 under clocks).
-
-        Comparisons of filters report the traffic that it gives. Of a symmetric matrix one triangle
-        counts; by default a message is an estimate with its covariance.
-        """
-        return n + n * (n + 1) // 2
-
     def slot_stopping(self) -> int:
         """Return the number of the exchange of a slot after which a node may freeze its network
         estimate for good (``stopped``), -1 if there is none; for compiled filters.
@@ -427,23 +414,6 @@ class Filter(Component):
         """Return True if a node may decide to send nothing."""
         return self.kernels is not None and self.kernels.decides
 
-    def stopped(self, state: Any) -> bool:
-        """Return True once the node has permanently frozen its network estimate: what it computes
-        of all nodes by exchanges, such as their number and information in push-sum.
-        """
-        return False
-
-    def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """Return quantities by name, each a number or the terms of a sum, whose sums over all nodes
-        no exchange should change; a run reports how far they have drifted.
-        """
-        return {}
-
-    @property
-    def wrapped(self) -> Filter | None:
-        """The filter that this one runs on its nodes, if it runs another, else None."""
-        return None
-
 
 def commutes(algorithm: Filter) -> bool:
     """Return True if the class of the filter ``algorithm`` declares that it commutes with a shift
@@ -452,7 +422,8 @@ def commutes(algorithm: Filter) -> bool:
     It declares so if ``shift`` is defined by the class that defines the last of its STEPS, or by
     one derived from that; a filter that it runs has to declare so, too.
     """
-    if algorithm.wrapped is not None and not commutes(algorithm.wrapped):
+    wrapped = algorithm.analysis.wrapped
+    if wrapped is not None and not commutes(wrapped):
         return False
     order = type(algorithm).__mro__
 

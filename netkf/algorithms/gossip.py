@@ -9,6 +9,7 @@ from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Analysis
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load_flags
 
@@ -34,8 +35,7 @@ class Gossip(Filter):
     and the other is gone. Of several pairs that arrive at one instant the last sender's counts.
     """
 
-    paper: ClassVar[str] = "gossip"
-    combination: ClassVar[str] = "swap"
+    analysis = Analysis(paper="gossip", combination="swap")
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "sense", "predict")
     clocks: ClassVar[tuple[str, ...]] = ("links",)
     predicts: ClassVar[bool] = True

@@ -12,7 +12,7 @@ from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.neighbours import combine_convex
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Weights
+from netkf.algorithms.traits import Analysis, Weights
 from netkf.core.fields import field, number
 
 
@@ -29,9 +29,7 @@ class Hybrid(Filter):
 
     epsilon: float = field(number(above=0.0, high=1.0))
 
-    paper: ClassVar[str] = "hybrid"
-    combination: ClassVar[str] = "convex"
-    P_by_design: ClassVar[tuple[str, str]] = ("", "larger")
+    analysis = Analysis(paper="hybrid", combination="convex", P_by_design=("", "larger"))
     schedule: ClassVar[tuple[str, ...] | None] = None  # continuous time only
     kernels = Kernels(absorb=combine_convex, unrolled=True)
 

@@ -42,7 +42,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of, positive
 from netkf.linalg.arrays import FloatArray
@@ -135,8 +135,6 @@ class InformationConsensus(Filter):
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
 
-    paper: ClassVar[str] = "information_consensus"
-    combination: ClassVar[str] = "intersection"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
     kernels = Kernels(
@@ -188,7 +186,16 @@ class InformationConsensus(Filter):
             settings={"shares": shares, "counts": counts, "steps": self.steps},
         )
 
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+    @property
+    def analysis(self) -> Analysis:
+        """Its paper, and the size of a message."""
+        return Analysis(
+            paper="information_consensus",
+            combination="intersection",
+            payload_numbers=self._message_size,
+        )
+
+    def _message_size(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message in numbers of 64 bits: K pairs (Omega, q) of n states in
         slots, one pair under clocks (``phase`` -1).
         """
@@ -234,11 +241,10 @@ class Hcmci(InformationConsensus):
         return recipe([[1.0, 0.0], [0.0, 1.0]], [1.0, omega, 0.0])
 
     @property
-    def P_by_design(self) -> tuple[str, str]:  # type: ignore[override]
-        """How P compares with the covariance of its error in slots and under clocks: "larger" for
-        consensus on information, else "", nothing proved.
-        """
-        return ("larger", "larger") if self.consensus == INFORMATION else ("", "")
+    def analysis(self) -> Analysis:
+        """That of its base; consensus on information has a P that is never too small."""
+        by_design = ("larger", "larger") if self.consensus == INFORMATION else ("", "")
+        return replace(super().analysis, P_by_design=by_design)
 
     @property
     def needs(self) -> Needs:

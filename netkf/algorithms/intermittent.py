@@ -32,7 +32,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.fields import field, of_time, one_of, positive
 from netkf.linalg.compiling import kernel
 
@@ -256,6 +256,11 @@ UNDER_CLOCKS = Kernels(
 )
 
 
+def reading_size(n: int, rows: int, _: int) -> int:
+    """Return the numbers in a message: y, H and R of ``rows`` rows and n states."""
+    return rows * (1 + n) + rows * (rows + 1) // 2
+
+
 @built_in("intermittent")
 @dataclass(frozen=True, eq=False)
 class Intermittent(Filter):
@@ -271,8 +276,7 @@ class Intermittent(Filter):
     late: str = field(one_of("exact", "drop"), default="exact")
     window: float | None = field(of_time(positive), default=None)
 
-    paper: ClassVar[str] = "intermittent"
-    combination: ClassVar[str] = "readings"
+    analysis = Analysis(paper="intermittent", combination="readings", payload_numbers=reading_size)
     schedule: ClassVar[tuple[str, ...]] = ("sense", "exchange", "predict")
     clocks: ClassVar[tuple[str, ...]] = ("readings",)
     predicts: ClassVar[bool] = True
@@ -312,12 +316,6 @@ class Intermittent(Filter):
     def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
         """Return True for nodes with a sensor: they send their readings."""
         return has_sensor
-
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message in numbers of 64 bits: y, H and R of ``rows`` rows and n
-        states.
-        """
-        return rows * (1 + n) + rows * (rows + 1) // 2
 
     @property
     def max_age(self) -> float:  # type: ignore[override]

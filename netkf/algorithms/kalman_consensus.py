@@ -24,7 +24,7 @@ from netkf.algorithms.kernels.run import (
 )
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.fields import boolean, field, number
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
@@ -120,8 +120,6 @@ class Kcf(Filter):
     epsilon: float = field(number(low=0.0), default=0.1)
     share_readings: bool = field(boolean, default=True)
 
-    paper: ClassVar[str] = "kalman_consensus"
-    combination: ClassVar[str] = "predictions"
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
     needs = Needs(one_way=True, samples=True)
@@ -140,7 +138,14 @@ class Kcf(Filter):
         """Take the first estimate for a prediction."""
         node["prior"][:], node["prior_root"][:] = node["xhat"], node["root"]
 
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
+    @property
+    def analysis(self) -> Analysis:
+        """Its paper, and the size of a message."""
+        return Analysis(
+            paper="kalman_consensus", combination="predictions", payload_numbers=self._message_size
+        )
+
+    def _message_size(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message about n states in numbers of 64 bits: (u, U, xbar) with
         u = H' R^-1 y and U = H' R^-1 H, or xbar alone from a node without ``rows`` of readings or
         if readings are not shared.

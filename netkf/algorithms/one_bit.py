@@ -20,7 +20,7 @@ from netkf.algorithms.kernels.estimates import rotate
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
 
@@ -120,7 +120,7 @@ class OneBit(Filter):
     node's own.
     """
 
-    paper: ClassVar[str] = "one_bit"
+    analysis = Analysis(paper="one_bit", payload_numbers=lambda _, rows, __: rows / 64.0)
     schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ()
     needs = Needs(one_way=True, reads_what_it_sends=True)
@@ -145,11 +145,5 @@ class OneBit(Filter):
     def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
         """Set the node's turn: slots k with ``k % nodes == turn``."""
         node["turn"][...] = info.place
-
-    def payload_numbers(self, n: int, rows: int, phase: int) -> float:
-        """Return the size of a message in numbers of 64 bits: one bit for each of the ``rows`` of a
-        reading.
-        """
-        return rows / 64.0
 
     shift = Filter.shift  # signs of innovations do not depend on the origin

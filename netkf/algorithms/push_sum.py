@@ -41,7 +41,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, field, integer, node_id, number, one_of, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
@@ -385,6 +385,41 @@ SLOTS = Kernels(
 DECIDING = replace(SLOTS, decides=True, depends_on_data=False)
 
 
+def message_size(n: int, _rows: int, phase: int) -> int:
+    """Return the numbers in a message about n states: mass w, n~, C~, or an estimate z; under
+    clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat, which for a plant with modes
+    of different rates of decay is in n more numbers for each further rate.
+    """
+    if phase == AVERAGE:
+        return n
+    return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
+
+
+def has_frozen(state: Any) -> bool:
+    """Return True if the node's estimate of the network, G^(i) and N^(i), is frozen."""
+    return hasattr(state, "stopped") and bool(state.stopped < NEVER_STOPPED)
+
+
+def masses(state: Any) -> Mapping[str, float | Sequence[float]]:
+    """Return the weight w and the number n~ of a node by name, whose sums over all nodes are 1 and
+    N; with running sums each as a list of terms, which adds to the node's mass the totals that it
+    offered to its neighbours and subtracts those it heard: mass under way counts.
+    """
+    if not hasattr(state, "mass"):
+        return running_sums.weights(state)
+    if not len(state.offered):
+        return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
+    degree = int(state.degree)
+    return {
+        name: [
+            float(state.mass[k]),
+            float(state.offered[k]) * degree,
+            *(-state.heard[:, k]).tolist(),
+        ]
+        for k, name in enumerate(("weight", "number"))
+    }
+
+
 @built_in("push-sum")
 @dataclass(frozen=True, eq=False)
 class PushSum(Filter):
@@ -416,10 +451,15 @@ class PushSum(Filter):
     tolerance: float = field(number(low=0.0), default=1e-6)
     running_sums: bool = field(boolean, default=False)
 
-    paper: ClassVar[str] = "push_sum"
-    combination: ClassVar[str] = "sums"
+    analysis = Analysis(
+        paper="push_sum",
+        combination="sums",
+        P_by_design=("", "smaller"),
+        payload_numbers=message_size,
+        conserved=masses,
+        stopped=has_frozen,
+    )
     # Until others hear of its samples, a node counts them as if all nodes had taken them.
-    P_by_design: ClassVar[tuple[str, str]] = ("", "smaller")
     schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
     clocks: ClassVar[tuple[str, ...]] = ("nodes",)
 
@@ -492,16 +532,6 @@ class PushSum(Filter):
         """
         return phase == AVERAGE or not self.asymptotic
 
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message about n states in numbers of 64 bits: mass w, n~, C~, or an
-        estimate z; under clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat, which
-        for a plant with modes of different rates of decay is in n more numbers for each further
-        rate.
-        """
-        if phase == AVERAGE:
-            return n
-        return n * (n + 1) // 2 + (2 if phase == MASS else 1 + n)
-
     def slot_stopping(self) -> int:
         """Return the number of the exchange of a slot after which nodes may freeze their network
         estimates: that of mass, or -1 if none ever does.
@@ -527,29 +557,6 @@ class PushSum(Filter):
         ``phase`` of a slot: always, unless links that are "held" keep the outcome of the first one.
         """
         return self.links == "fresh" or step == 0
-
-    def stopped(self, state: Any) -> bool:
-        """Return True if the node's estimate of the network, G^(i) and N^(i), is frozen."""
-        return hasattr(state, "stopped") and bool(state.stopped < NEVER_STOPPED)
-
-    def conserved(self, state: Any) -> Mapping[str, float | Sequence[float]]:
-        """Return the weight w and the number n~ of a node by name, whose sums over all nodes are 1
-        and N; with running sums each as a list of terms, which adds to the node's mass the totals
-        that it offered to its neighbours and subtracts those it heard: mass under way counts.
-        """
-        if not hasattr(state, "mass"):
-            return running_sums.weights(state)
-        if not len(state.offered):
-            return {"weight": float(state.mass[0]), "number": float(state.mass[1])}
-        degree = int(state.degree)
-        return {
-            name: [
-                float(state.mass[k]),
-                float(state.offered[k]) * degree,
-                *(-state.heard[:, k]).tolist(),
-            ]
-            for k, name in enumerate(("weight", "number"))
-        }
 
     shift = Filter.shift  # averaging weights sum to one
 

@@ -35,7 +35,7 @@ from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_rea
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -219,8 +219,11 @@ class ScheduledReadings(Filter):
 
     Y: float | FloatArray
 
-    paper: ClassVar[str] = "stochastic_trigger"
-    combination: ClassVar[str] = "scheduled readings"
+    analysis = Analysis(
+        paper="stochastic_trigger",
+        combination="scheduled readings",
+        payload_numbers=lambda _, rows, __: rows,
+    )
     clocks: ClassVar[tuple[str, ...]] = ()
     randomised: ClassVar[bool] = True
     kernels = Kernels(
@@ -277,12 +280,6 @@ class ScheduledReadings(Filter):
             "event-triggered: messages may be lost, and a node takes that for silence; P may then "
             "be too small",
         )
-
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message in numbers of 64 bits: the ``rows`` of a reading; sensors do
-        not change and are not counted.
-        """
-        return rows
 
     shift = Filter.shift  # innovations do not depend on the origin
 
@@ -388,15 +385,23 @@ class TriggeredMessages(Filter):
 
     clocks: ClassVar[tuple[str, ...]] = ()
     randomised: ClassVar[bool] = True
-    paper: ClassVar[str] = ""
-    combination: ClassVar[str] = ""
-    # Which messages are sent depends on data, so that no comparison is proved.
-    P_by_design: ClassVar[tuple[str, str]] = ("", "")
 
     @property
     def wrapped(self) -> Filter:
         """The filter that the trigger belongs to."""
         return self.inner
+
+    @property
+    def analysis(self) -> Analysis:
+        """No paper, and what the filter conserves."""
+        given = self.inner.analysis
+        # Which messages are sent depends on data, so that no comparison of P is proved.
+        return Analysis(
+            payload_numbers=given.payload_numbers,
+            conserved=lambda state: given.conserved(state.inner),
+            stopped=lambda state: given.stopped(state.inner),
+            wrapped=self.inner,
+        )
 
     @cached_property
     def kernels(self) -> Kernels | None:  # type: ignore[override]
@@ -477,16 +482,6 @@ class TriggeredMessages(Filter):
         """
         return state._replace(inner=self.inner.shift(state.inner, offset))
 
-    def stopped(self, state: WrappedState) -> bool:
-        """Return True once the wrapped filter has frozen its network estimate."""
-        return self.inner.stopped(state.inner)
-
-    def conserved(self, state: WrappedState) -> Any:
-        """Return by name the quantities of the wrapped filter whose sums over all nodes exchanges
-        conserve.
-        """
-        return self.inner.conserved(state.inner)
-
 
 @built_in("event-triggered", trigger="stochastic")
 @forwarding
@@ -525,13 +520,18 @@ class StochasticTrigger(Filter):
         """What it needs of a scenario."""
         return replace(self.wrapped.needs, check=self._check_scenario)
 
+    @property
+    def analysis(self) -> Analysis:
+        """That of the filter that runs."""
+        return replace(self.wrapped.analysis, wrapped=self.wrapped)
+
     def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if the filter that sends does not run in slots, sends nothing or has
         a trigger itself, or if Y is a matrix that does not fit the readings of each node of a
         ``netkf.Scenario``.
         """
         inner = self.inner
-        if inner.wrapped is not None or inner.schedule is None or not inner.talks:
+        if inner.analysis.wrapped is not None or inner.schedule is None or not inner.talks:
             raise ScenarioError(
                 "filter.inner",
                 "must be a filter in slots whose nodes send messages, without a trigger",

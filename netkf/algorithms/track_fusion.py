@@ -16,7 +16,7 @@ errors of all pairs of tracks.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -38,7 +38,7 @@ from netkf.algorithms.kernels.tracks import (
 )
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Needs
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.fields import field, one_of
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
@@ -99,7 +99,7 @@ class PairFusion(Filter):
 
     minimise: str = field(one_of(TRACE, DETERMINANT), default=TRACE)
 
-    paper: ClassVar[str] = "track_fusion"
+    analysis = Analysis(paper="track_fusion")
     clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")
     needs = Needs(one_way=True, inverts=True)
     inverse: ClassVar[bool] = False
@@ -129,8 +129,9 @@ class OptimisedIntersection(PairFusion):
     and Uhlmann 1997: P is never below the covariance of the error, however tracks are correlated.
     """
 
-    combination: ClassVar[str] = "best intersection"
-    P_by_design: ClassVar[tuple[str, str]] = ("larger", "larger")
+    analysis = replace(
+        PairFusion.analysis, combination="best intersection", P_by_design=("larger", "larger")
+    )
 
 
 @built_in("track-fusion", rule="ici")
@@ -143,7 +144,7 @@ class InverseIntersection(PairFusion):
     independent besides. For a network that fuses over and over no bound is proved.
     """
 
-    combination: ClassVar[str] = "inverse intersection"
+    analysis = replace(PairFusion.analysis, combination="inverse intersection")
     inverse: ClassVar[bool] = True
 
 
@@ -260,8 +261,7 @@ class BarShalomCampo(Filter):
     not enter the tracks. Of more than two tracks it is the combination with the least covariance.
     """
 
-    paper: ClassVar[str] = "track_fusion"
-    combination: ClassVar[str] = "tracks"
+    analysis = Analysis(paper="track_fusion", combination="tracks", payload_numbers=lambda n, *_: n)
     clocks: ClassVar[tuple[str, ...]] = ()
     needs = Needs(
         one_way=True, fixed_sensors=True, every_reading=True, common_start=True, network=True
@@ -338,12 +338,6 @@ class BarShalomCampo(Filter):
             update_joint(joint, record.pairs, record.sensors, record.rows, record.closed, work)
             slot[0] += 1
         record.key[:] = -1
-
-    def payload_numbers(self, n: int, rows: int, phase: int) -> int:
-        """Return the size of a message in numbers of 64 bits: n, a track; sensors do not change and
-        are not counted.
-        """
-        return n
 
     shift = Filter.shift  # affine: tracks enter by their differences
 

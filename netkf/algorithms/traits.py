@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,3 +67,49 @@ class Weights:
     of: Callable[[int, int], float] = metropolis
     matrix: FloatArray | None = None
     largest_degree: float = math.inf
+
+
+def estimate_numbers(n: int, _rows: int, _phase: int) -> float:
+    """Return the size of an estimate of n states with its covariance, of which one triangle
+    counts.
+    """
+    return n + n * (n + 1) // 2
+
+
+def nothing_conserved(_: Any) -> Mapping[str, float | Sequence[float]]:
+    """Return no quantities: exchanges conserve nothing that is known."""
+    return {}
+
+
+def never(_: Any) -> bool:
+    """Return False: a node goes on learning about the network."""
+    return False
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What theory, checks and comparisons know of a filter; nothing that a run depends on.
+
+    paper : name of its packages in netkf.theory and netkf.checks, "" if there are none
+    combination : how it combines messages: "convex", "intersection", "swap", "shares", "readings",
+                  "sums", "none", ...; "" if only its methods define it
+    P_by_design : how P compares with the covariance of its error in slots and under clocks:
+                  "larger", "smaller", or "" if they are equal or nothing is proved
+    payload_numbers : ``payload_numbers(n, rows, phase)``, the size, in numbers of 64 bits, of a
+                      message that a node with ``rows`` rows of readings sends about n states in
+                      exchange number ``phase`` of a slot (-1 under clocks), which comparisons of
+                      filters report; by default that of an estimate with its covariance
+    conserved : ``conserved(state)`` returns quantities by name, each a number or the terms of a
+                sum, whose sums over all nodes no exchange should change; a run reports their drift
+    stopped : ``stopped(state)``, True once the node has permanently frozen its network estimate:
+              what it computes of all nodes by exchanges, as number and information in push-sum
+    wrapped : the filter that this one runs on its nodes, if it runs another, else None
+    """
+
+    paper: str = ""
+    combination: str = ""
+    P_by_design: tuple[str, str] = ("", "")
+    payload_numbers: Callable[[int, int, int], float] = estimate_numbers
+    conserved: Callable[[Any], Mapping[str, float | Sequence[float]]] = nothing_conserved
+    stopped: Callable[[Any], bool] = never
+    wrapped: Any = None

@@ -143,7 +143,7 @@ OF_PAPERS: dict[str, PaperChecks] = {
         track_fusion,
     )
 }
-"""The checks of each paper, by the name that filters give it (``Filter.paper``)."""
+"""The checks of each paper, by the name that filters give it (``Analysis.paper``)."""
 
 
 def find_checks(scenario: Scenario) -> PaperChecks:
@@ -152,12 +152,12 @@ def find_checks(scenario: Scenario) -> PaperChecks:
         return WITHOUT_PAPER
     promised = promised_filter(scenario.filter.algorithm)
     # Without messages the equations of a Kalman filter are all that is promised.
-    if promised.combination == "none":
+    if promised.analysis.combination == "none":
         return UNDER_CLOCKS
-    if promised.paper not in OF_PAPERS:
+    if promised.analysis.paper not in OF_PAPERS:
         name = kind_name(promised)
         raise TheoryError(f"nothing is promised of the {name} filter that could be checked")
-    checks = OF_PAPERS[promised.paper]
+    checks = OF_PAPERS[promised.analysis.paper]
     return UNDER_CLOCKS if checks.slots_only and not scenario.slotted else checks
 
 

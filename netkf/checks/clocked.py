@@ -104,7 +104,7 @@ class ClockedChecks(PaperChecks):
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the statements about a scenario's filter that are tested."""
-        if with_promised_filter(scenario).node_filter.combination == "sums":
+        if with_promised_filter(scenario).node_filter.analysis.combination == "sums":
             return (MASS_CONSERVED, *PROMISES)
         return (*PROMISES[:1], UPPER_BOUND, *PROMISES[1:])
 

@@ -9,11 +9,13 @@ covariance of the integral of the prediction error e: de = A e ds + dw with cov(
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.filter import Filter, Increments, NodeInfo, Reading
+from netkf.algorithms.traits import Analysis
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.theory.numerics.prediction import LinearSDE
 
@@ -150,13 +152,15 @@ class _IncrementRecorder(_Filter):
         """Return the longest interval of increments that one update may use, in seconds."""
         return super().max_measurement_interval(state.inner)
 
-    def stopped(self, state: TimedState) -> bool:
-        """Return True once the filter has frozen its network estimate."""
-        return super().stopped(state.inner)
-
-    def conserved(self, state: TimedState) -> Any:
-        """Return the conserved quantities of the filter."""
-        return super().conserved(state.inner)
+    @property
+    def analysis(self) -> Analysis:
+        """That of the filter, whose states are inside."""
+        given = super().analysis
+        return replace(
+            given,
+            conserved=lambda state: given.conserved(state.inner),
+            stopped=lambda state: given.stopped(state.inner),
+        )
 
 
 def record_increments(algorithm: Filter, intervals: list[WhitenedInnovation]) -> Filter:

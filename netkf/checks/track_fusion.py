@@ -94,7 +94,7 @@ class FusionChecks(EquationChecks):
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario: those about the filter's equations."""
         about_errors = BY_COMBINATION.get(
-            with_promised_filter(scenario).node_filter.combination, ()
+            with_promised_filter(scenario).node_filter.analysis.combination, ()
         )
         # This is the order of rows in the report.
         return (*PROMISES[:1], *about_errors, *PROMISES[1:])

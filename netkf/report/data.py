@@ -205,7 +205,11 @@ def _flow_kind(source: ReportSource) -> str:
     node_filter = source.scenario.node_filter
     if node_filter.pooled:
         return "pooled"
-    return node_filter.combination if node_filter.combination in ("swap", "readings") else "combine"
+    return (
+        node_filter.analysis.combination
+        if node_filter.analysis.combination in ("swap", "readings")
+        else "combine"
+    )
 
 
 def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None) -> list[int]:

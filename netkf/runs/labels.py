@@ -11,7 +11,7 @@ def covariance_bias(scenario: Scenario) -> str:
     the design of the filter; empty if neither is known.
     """
     algorithm = scenario.filter.algorithm
-    in_slots, in_continuous_time = scenario.node_filter.P_by_design
+    in_slots, in_continuous_time = scenario.node_filter.analysis.P_by_design
     design = in_slots if scenario.slotted else in_continuous_time
     # P_by_design is about the steps of the built-in class, with links and linear readings.
     if overridden(algorithm) or not scenario.topology.links or not scenario.is_linear:

@@ -221,7 +221,7 @@ def find_flow(
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
-    combination = scenario.node_filter.combination
+    combination = scenario.node_filter.analysis.combination
     if combination == "swap":
         return _swap_flow(nodes, len(log), messages, np.asarray(used))
     # One segment for each node, the whole run; its index is that of the node.

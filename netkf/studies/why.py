@@ -213,7 +213,10 @@ class _Evidence:
         self.scenario = replayer.scenario
         talks, links = self.scenario.node_filter.talks, self.scenario.topology.directions
         self._links = frozenset(links if talks else ())
-        swaps, slotted = self.scenario.node_filter.combination == "swap", self.scenario.slotted
+        swaps, slotted = (
+            self.scenario.node_filter.analysis.combination == "swap",
+            self.scenario.slotted,
+        )
         self.messages = match_messages(replayer.log, swaps, slotted)
         full = match_messages(replayer.full_log, swaps, slotted)
         # What some filters send depends on the messages that they have received.

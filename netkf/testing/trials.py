@@ -133,9 +133,9 @@ class Trial(ABC):
     def absorb(self, node: int, messages: Sequence[Message], exchange: Exchange) -> None:
         """Call ``absorb`` for a node with all messages of one instant, and check ``stopped``."""
         self.step(node, "absorb", messages, exchange)
-        stopped = self.watched.call("stopped", self.states[node])
+        stopped = self.watched.call("analysis.stopped", self.states[node])
         is_flag = stopped is True or stopped is False
-        demand(is_flag, f"{self.watched.name}.stopped", "must be True or False", stopped)
+        demand(is_flag, f"{self.watched.name}.analysis.stopped", "must be True or False", stopped)
 
     def sample(self, node: int, time: float) -> Reading:
         """Return a reading of the sensors of a node at ``time`` (seconds): unit noise plus H times
@@ -159,8 +159,8 @@ class Trial(ABC):
 
     def conserved_sums(self) -> dict[str, float]:
         """Return the sums over all nodes of the quantities that ``conserved`` returns, by name."""
-        where = f"{self.watched.name}.conserved"
-        by_node = [self.watched.call("conserved", state) for state in self.states]
+        where = f"{self.watched.name}.analysis.conserved"
+        by_node = [self.watched.call("analysis.conserved", state) for state in self.states]
         names = by_node[0].keys() if isinstance(by_node[0], dict) else None
         same_names = all(isinstance(terms, dict) and terms.keys() == names for terms in by_node)
         demand(same_names, where, "must name the same quantities at every node", by_node[0])
@@ -178,7 +178,7 @@ class Trial(ABC):
         for name, total in before.items():
             demand(
                 abs(after[name] - total) <= CONSERVATION_TOLERANCE * max(abs(total), 1.0),
-                f"{self.watched.name}.conserved",
+                f"{self.watched.name}.analysis.conserved",
                 f"the sum of {name} over all nodes must survive an exchange with {lost} lost",
                 f"{total:.6g} before and {after[name]:.6g} after",
                 "let absorb give to one node what it takes from another",

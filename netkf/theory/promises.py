@@ -77,7 +77,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
         # The modules of a paper on filters in slots have functions of these names, if any.
         slot_promises = paper_function(scenario, "promises", "slot_promises")
         if slot_promises is not None:
-            promises[scenario.node_filter.paper] = slot_promises(scenario)
+            promises[scenario.node_filter.analysis.paper] = slot_promises(scenario)
         else:
             promises["slot_central_covariance"] = _value_or_reason(
                 lambda: _slot_central_covariance(scenario)
@@ -175,7 +175,7 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
     lines += paper_legend(row["source"] for row in promises["assumptions"])
-    paper = scenario.node_filter.paper
+    paper = scenario.node_filter.analysis.paper
     if paper and paper in promises:
         slot_lines = paper_function(scenario, "promises", "slot_lines")
         return "\n".join([*lines, "", *slot_lines(promises[paper], format_number)])

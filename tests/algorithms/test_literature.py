@@ -77,7 +77,9 @@ def heard_by_slot(scenario, run, steps):
         if kind == CODES["send"]:
             slot = int(t)
             place = sent.setdefault((node, peer), {})
-            silent = steps == 2 and scenario.filter.algorithm.combination.startswith("readings")
+            silent = steps == 2 and scenario.filter.algorithm.analysis.combination.startswith(
+                "readings"
+            )
             place[slot] = (
                 place.get(slot, int(silent and node not in scenario.placed_sensors) - 1) + 1
             )

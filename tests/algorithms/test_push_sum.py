@@ -225,7 +225,7 @@ def test_the_stop_rule_of_the_paper_breaks_and_the_safe_one_does_not(delivery, w
     assert np.mean(np.abs(paper - 10.0) > 0.1) > wrong
     for seed in range(5):
         found, states = numbers("safe", delivery, 300, seed)
-        assert all(PushSum(gamma=1, delta=4.01).stopped(state) for state in states)
+        assert all(PushSum(gamma=1, delta=4.01).analysis.stopped(state) for state in states)
         np.testing.assert_allclose(found, 10.0, rtol=1e-4)
 
 
@@ -277,5 +277,5 @@ def test_the_safe_rule_waits_for_mass():
     state = filter_.init(model, np.zeros(1), np.eye(1), NodeInfo(3, 1, 1, 10, 1.0, np.eye(1)))
     same = filter_.emit(state, EXCHANGE)[1]
     after = filter_.absorb(state, [Message(2, 0.0, same, 0.0)], EXCHANGE)
-    assert not filter_.stopped(after)
+    assert not filter_.analysis.stopped(after)
     assert after.number == 1.0

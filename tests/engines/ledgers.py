@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.core.fields import boolean, setting
-from netkf.parts import Filter
+from netkf.parts import Analysis, Filter
 
 NODE, DEGREE, EMITTED, MASS, HEARD, DISORDER = range(6)
 
@@ -59,8 +59,7 @@ class Ledger(Filter):
     def estimate(self, state):
         return state.ledger, None
 
-    def conserved(self, state):
-        return {"mass": float(state.ledger[MASS])}
+    analysis = Analysis(conserved=lambda state: {"mass": float(state.ledger[MASS])})
 
 
 @dataclass(frozen=True, eq=False)

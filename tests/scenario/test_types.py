@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import netkf
 from netkf.parts import (
-    Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, Increments,
+    Analysis, Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, Increments,
     LinearSensor, LinkClock, Loss, Message, Needs, NodeInfo, Poisson, Reading, State, Weights,
     positive, probability, setting,
 )
@@ -116,6 +116,12 @@ class Everything(Filter):
 
     def redraws_links(self, phase: int, step: int) -> bool:
         return step == 0
+
+    @property
+    def analysis(self) -> Analysis:
+        return Analysis(
+            payload_numbers=self.payload_numbers, conserved=self.conserved, stopped=self.stopped
+        )
 
     def stopped(self, state: Own) -> bool:
         return state.mass > 0.5
@@ -248,7 +254,11 @@ def test_a_class_with_every_method_has_every_method():
     own = OWN[OWN.index("class Everything") : OWN.index("class Regular")]
     methods = [name for name in vars(netkf.parts.Filter) if not name.startswith("_")]
     for name in set(methods) - OF_KERNELS:
-        if callable(getattr(netkf.parts.Filter, name)) or name in ("link_weights", "needs"):
+        if callable(getattr(netkf.parts.Filter, name)) or name in (
+            "link_weights",
+            "needs",
+            "analysis",
+        ):
             assert f"def {name}(" in own
 
 

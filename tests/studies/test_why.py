@@ -101,7 +101,7 @@ class EventGraph:
 
     def __init__(self, scenario, events, used):
         self.graph = nx.DiGraph()
-        self.scenario, self.kind = scenario, scenario.node_filter.combination
+        self.scenario, self.kind = scenario, scenario.node_filter.analysis.combination
         self.now = {node: (node, -1) for node in scenario.nodes}
         self.graph.add_nodes_from(self.now.values())
         self.cargo, self.waiting, self.reading = {}, {node: [] for node in scenario.nodes}, {}
@@ -173,7 +173,9 @@ def used_messages(scenario, events):
             waiting[row.node].append((row.peer, row.node, row.message))
         elif row.kind in ("absorb", "swap"):
             came, waiting[row.node] = waiting[row.node], []
-            used |= {max(came)} if scenario.node_filter.combination == "swap" else set(came)
+            used |= (
+                {max(came)} if scenario.node_filter.analysis.combination == "swap" else set(came)
+            )
     return used
 
 
@@ -196,7 +198,9 @@ def test_the_newest_readings_are_those_of_a_search_in_a_graph_of_events(runs, na
         count = rows_before(scenario, run.events, at)
         log = rows_until(scenario, run.log, at)
         assert len(log) == count
-        messages = match_messages(log, scenario.node_filter.combination == "swap", scenario.slotted)
+        messages = match_messages(
+            log, scenario.node_filter.analysis.combination == "swap", scenario.slotted
+        )
         reach = search_back(find_flow(scenario, log, messages), node)
         found = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         ours = {n: f.reading for n, f in found.items() if not math.isnan(f.reading)}

@@ -11,7 +11,7 @@ from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
-from netkf.algorithms.traits import Weights
+from netkf.algorithms.traits import Analysis, Weights
 
 BROKEN = {}
 
@@ -216,7 +216,9 @@ class Impatient(Hybrid):
         return 0.0
 
 
-@says("Hoarder.conserved: the sum of weight over all nodes must survive", gamma=2, delta=3.0)
+@says(
+    "Hoarder.analysis.conserved: the sum of weight over all nodes must survive", gamma=2, delta=3.0
+)
 class Hoarder(PushSum):
     def absorb(self, state, messages, exchange):
         new = super().absorb(state, messages, exchange)
@@ -230,7 +232,7 @@ class Purse(NamedTuple):
     mass: float
 
 
-@says("Spendthrift.conserved: the sum of weight over all nodes must survive")
+@says("Spendthrift.analysis.conserved: the sum of weight over all nodes must survive")
 class Spendthrift(Filter):
     """Under clocks it sends mass and keeps it too."""
 
@@ -246,8 +248,7 @@ class Spendthrift(Filter):
     def absorb(self, state, messages, exchange):
         return state._replace(mass=state.mass + sum(message.payload for message in messages))
 
-    def conserved(self, state):
-        return {"weight": state.mass}
+    analysis = Analysis(conserved=lambda state: {"weight": state.mass})
 
 
 @says("Empty.absorb: failed with IndexError")

@@ -125,7 +125,7 @@ def enumerated(scenario):
     whole, right = np.zeros((S, M * M, S, M * M)), np.zeros((S, M * M))
     stationary = [math.prod((0.6, 0.4)[bad] for bad in state) for state in states]
     for after, chance, heard in found:
-        A, G, K = slot_matrices(scenario.filter.algorithm.paper, frozenset(heard))
+        A, G, K = slot_matrices(scenario.filter.algorithm.analysis.paper, frozenset(heard))
         double, added = np.kron(A, A), (G @ Q @ G.T + K @ R @ K.T).ravel()
         for s, before in enumerate(states):
             p = chance * transition(before, after)

@@ -54,7 +54,7 @@ class ClockFilters:
             if "conserved" in self.records.arrays
             else []
         )
-        values = [scenario.node_filter.conserved(state) for state in states]
+        values = [scenario.node_filter.analysis.conserved(state) for state in states]
         self._at_start = {
             name: math.fsum(np.concatenate([np.atleast_1d(sums[name]) for sums in values]))
             for name in (values[0] if values else ())

@@ -260,7 +260,7 @@ class SlotSetup:
     @cached_property
     def conserved_at_start(self) -> dict[str, float]:
         """The sums over all nodes that exchanges conserve, in slot 0, by name."""
-        values = [self.algorithm.conserved(state) for state in self.states]
+        values = [self.algorithm.analysis.conserved(state) for state in self.states]
         return {
             name: math.fsum(np.concatenate([np.atleast_1d(sums[name]) for sums in values]))
             for name in values[0]

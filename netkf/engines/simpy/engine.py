@@ -290,5 +290,5 @@ class _Sums:
 
 def _conserved_terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
     """Return the terms that a node contributes to the conserved sums, as lists by name."""
-    quantities = algorithm.conserved(state)
+    quantities = algorithm.analysis.conserved(state)
     return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in quantities.items()}

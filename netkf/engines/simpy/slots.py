@@ -156,7 +156,7 @@ class SlotNode(Node):
         self._recorder, self._schedule, self._period = recorder, schedule, period
         # -1: no exchange is open, and every message is late.
         self._open = -1
-        self._stopped = False
+        self._stopped, self._has_stopped = False, self.algorithm.analysis.stopped
         self._samples: list[tuple[FloatArray, Any, FloatArray]] = []
 
     def run_process(self, timeline: Timeline) -> Process:
@@ -241,7 +241,7 @@ class SlotNode(Node):
             oldest = max(message.age for message in messages)
             append((now, ABSORB, self.node, -1, -1, phase, oldest))
         # Recorded once, when it becomes true.
-        if not self._stopped and self.algorithm.stopped(self.state):
+        if not self._stopped and self._has_stopped(self.state):
             self._stopped = True
             append((now, STOP, self.node, -1, -1, phase, NAN))
 

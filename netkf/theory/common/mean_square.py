@@ -173,7 +173,7 @@ def _choose_solver(
     """Return the special solver of the filter's paper (``steady_errors``), or None."""
     if not scenario.slotted:
         return None
-    combination = scenario.node_filter.combination.replace(" ", "_")
+    combination = scenario.node_filter.analysis.combination.replace(" ", "_")
     solver: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
         scenario, "steady_errors", f"{combination}_in_slots"
     )
@@ -182,7 +182,7 @@ def _choose_solver(
 
 def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
     """Return the function that makes the linear system of a scenario, if there is one."""
-    if scenario.node_filter.combination == "none":
+    if scenario.node_filter.analysis.combination == "none":
         return silent_jumps if scenario.slotted else None
     name = "slot_jumps" if scenario.slotted else "clock_jumps"
     maker: Callable[[Scenario], LinearErrors] | None = paper_function(

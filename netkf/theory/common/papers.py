@@ -45,7 +45,7 @@ def paper_function(scenario: Scenario, module: str, name: str) -> Any:
     """Return the function ``name`` of a ``module`` of the paper of the scenario's filter, or None
     if paper, module or function is missing.
     """
-    paper = scenario.node_filter.paper
+    paper = scenario.node_filter.analysis.paper
     if not paper or importlib.util.find_spec(f"netkf.theory.{paper}.{module}") is None:
         return None
     return getattr(importlib.import_module(f"netkf.theory.{paper}.{module}"), name, None)

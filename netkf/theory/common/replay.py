@@ -88,7 +88,7 @@ def require_known_filter(scenario: Scenario) -> None:
     name = type(algorithm).__name__
     if not scenario.is_linear:
         raise TheoryError(NONLINEAR)
-    if not scenario.node_filter.combination:
+    if not scenario.node_filter.analysis.combination:
         raise TheoryError(f"no exact error covariance for {name}")
     overridden_names = overridden(algorithm)
     if overridden_names:

@@ -96,7 +96,7 @@ def concerns_hybrid_paper(scenario: Scenario) -> bool:
     """
     if not scenario.slotted and not scenario.filter.algorithm.talks:
         return True
-    return scenario.node_filter.paper == "hybrid"
+    return scenario.node_filter.analysis.paper == "hybrid"
 
 
 def reason_without_bound(scenario: Scenario) -> str | None:

@@ -58,7 +58,7 @@ def _require_limit(scenario: Scenario) -> None:
     algorithm = scenario.filter.algorithm
     if not algorithm.talks:
         return
-    if scenario.node_filter.combination != "convex":
+    if scenario.node_filter.analysis.combination != "convex":
         raise TheoryError(
             f"Tanwani's H(13) is about the hybrid filter, not about {kind_name(algorithm)}"
         )

@@ -16,9 +16,9 @@ SOURCES = {
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the assumptions, as rows of the table, about the model and the first covariances."""
-    source = SOURCES[scenario.node_filter.combination]
+    source = SOURCES[scenario.node_filter.analysis.combination]
     rows = model_and_start_rows(scenario, source)
-    if scenario.node_filter.combination != "tracks":
+    if scenario.node_filter.analysis.combination != "tracks":
         return rows
     lossless = all_messages_arrive(scenario)
     evidence = "every message arrives in its slot" if lossless else "P depends on who is heard"
