@@ -295,7 +295,7 @@ class Maybe(Gossip):
     pairwise = "yes"
 
 
-@says("Picky.accepts (tests/testing/broken_filters.py, line 296) returned nothing", epsilon=0.3)
+@says("Picky.accepts (tests/testing/broken_filters.py, line 300) returned nothing", epsilon=0.3)
 class Picky(Hybrid):
     def accepts(self, payload, age):
         return None
@@ -353,7 +353,7 @@ class Unmade(Hybrid):
     pass
 
 
-@says("Singular matrix (tests/testing/broken_filters.py, line 355); set inverts", epsilon=0.3)
+@says("Singular matrix (tests/testing/broken_filters.py, line 359); set inverts", epsilon=0.3)
 class Inverts(Hybrid):
     def init(self, model, mean, cov, node):
         _ = np.linalg.inv(cov)
