@@ -36,7 +36,7 @@ from netkf.algorithms.one_bit import OneBit
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.stochastic_trigger import StochasticTrigger
 from netkf.algorithms.track_fusion import BarShalomCampo, InverseIntersection, OptimisedIntersection
-from netkf.algorithms.traits import Analysis, Needs, Weights
+from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.clock import Clock
 from netkf.core.fields import (
     boolean,
@@ -218,6 +218,7 @@ __all__ = [
     "State",
     "StochasticTrigger",
     "Time",
+    "Timing",
     "Topology",
     "UniformDelay",
     "UnknownDiffusion",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
 
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis
+from netkf.algorithms.traits import Analysis, Timing
 
 
 @built_in("local")
@@ -19,9 +18,7 @@ class Local(Filter):
     """
 
     analysis = Analysis(combination="none")
-    schedule: ClassVar[tuple[str, ...]] = ("predict", "sense")
-    clocks: ClassVar[tuple[str, ...]] = ()
-    talks: ClassVar[bool] = False
+    timing = Timing(schedule=("predict", "sense"), clocks=(), talks=False)
     kernels = Kernels()
 
     shift = Filter.shift  # affine in the readings
@@ -34,4 +31,4 @@ class Central(Local):
     for every node.
     """
 
-    pooled: ClassVar[bool] = True
+    timing = replace(Local.timing, pooled=True)

@@ -40,7 +40,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.modes import ModeFrame, flow_frame, slot_frame, still_frame
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of
 from netkf.linalg.arrays import FloatArray
@@ -388,7 +388,7 @@ class BeliefPropagation(Filter):
     would no longer be independent, and must not be kept.
     """
 
-    steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
+    steps: int = field(integer(low=1, high=MAX_STEPS), default=1)
     memory: str = field(one_of(SLOT, ALL), default=SLOT)
 
     analysis = Analysis(paper="belief_propagation", combination="beliefs")
@@ -456,6 +456,11 @@ class BeliefPropagation(Filter):
         node["frame"][:] = frame.basis
 
     @property
+    def timing(self) -> Timing:
+        """The only exchange of a slot has ``steps`` steps."""
+        return Timing(steps=lambda _: self.steps)
+
+    @property
     def needs(self) -> Needs:
         """What it needs of a scenario."""
         return Needs(
@@ -506,10 +511,6 @@ class BeliefPropagation(Filter):
             "belief-propagation: the graph has loops, on which readings return and count again; P "
             "is too small",
         )
-
-    def exchange_steps(self, phase: int) -> int:
-        """Return ``steps``, the number of steps of the only exchange of a slot."""
-        return self.steps
 
     shift = Filter.shift  # evidence is relative to the belief
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from netkf.algorithms.kernels.run import shift_vector
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, select, spread, store
@@ -439,7 +439,7 @@ class ConsensusInnovations(Filter):
         combination="pseudo-states",
         payload_numbers=lambda n, *_: n,
     )
-    clocks: ClassVar[tuple[str, ...]] = ()
+    timing = Timing(clocks=())
     kernels = Kernels(
         predict=predict,
         update=nothing,  # a reading is used in the exchange of its slot

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -143,7 +143,6 @@ class ConstantGain(Filter):
     analysis = Analysis(
         paper="constant_gain", combination="constant gain", P_by_design=("larger", "larger")
     )
-    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
     kernels = Kernels(
         update=use_sample,
         absorb=combine_convex,

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs, Weights
+from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -108,9 +108,11 @@ class DiffusionFilter(Filter):
     on_loss: str = field(one_of("renormalise", "keep-own"), default="renormalise")
 
     analysis = Analysis(paper="diffusion", combination="shares", P_by_design=("larger", "larger"))
-    schedule: ClassVar[tuple[str, ...]] = ("sense", "predict", "exchange")
-    clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
-    predicts: ClassVar[bool] = True
+    timing = Timing(
+        schedule=("sense", "predict", "exchange"),
+        clocks=("directions", "nodes", "readings"),
+        predicts=True,
+    )
     needs = Needs(one_way=True, inverts=True)
     kernels = Kernels(emit=emit, absorb=absorb)
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.estimates import copy_vector
 from netkf.algorithms.kernels.neighbours import use_readings_heard
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs, Weights
+from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.algorithms.weights import METROPOLIS, check_columns
 from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
@@ -81,8 +81,11 @@ class DiffusionKalman(Filter):
         combination="readings, then estimates",
         payload_numbers=message_size,
     )
-    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange", "exchange")
-    clocks: ClassVar[tuple[str, ...]] = ()
+    timing = Timing(
+        schedule=("predict", "sense", "exchange", "exchange"),
+        clocks=(),
+        sends=lambda phase, has_sensor: has_sensor or phase == ESTIMATES,
+    )
     needs = Needs(one_way=True)
     kernels = Kernels(emit=emit, absorb=absorb, sends_readings=True)
 
@@ -100,11 +103,5 @@ class DiffusionKalman(Filter):
     def link_weights(self) -> Weights:
         """The matrix of weights, or Metropolis weights."""
         return Weights(matrix=None if isinstance(self.weights, str) else self.weights)
-
-    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return False if a node has nothing to send in exchange number ``phase`` of a slot: a
-        reading in the first one, unless it ``has_sensor``. All send estimates in the second.
-        """
-        return has_sensor or phase == ESTIMATES
 
     shift = Filter.shift  # affine: the weights sum to one

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import Rule, field, number, tuple_of
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store_flags
@@ -154,7 +154,7 @@ class EventTriggeredCi(Filter):
     thresholds: tuple[float, float] = field(THRESHOLDS, default=(1.0, 1.0))
 
     analysis = Analysis(paper="event_triggered", P_by_design=("larger", ""))
-    clocks: ClassVar[tuple[str, ...]] = ()
+    timing = Timing(clocks=())
     kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, decides=True)
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:

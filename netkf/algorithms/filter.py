@@ -20,12 +20,9 @@ import numpy as np
 from netkf.algorithms import single
 from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.records import Kernels, Record
-from netkf.algorithms.traits import Analysis, Needs, Weights
+from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
-
-CLOCKS = ("links", "directions", "nodes", "readings")
-"""What may make a node transmit in continuous time, see network.clocks."""
 
 
 class Model(Protocol):
@@ -194,56 +191,22 @@ STEPS = ("init", "predict", "update", "emit", "absorb", "estimate")
 """The methods that define a filter."""
 
 
-class FirstSlot:
-    """The first slot with an exchange, where a class does not say it: that of built-in filters."""
-
-    def __get__(self, filtering: Any, cls: Any) -> int:
-        """Return 0 for filters that predict and broadcast, else 1: slot 0 has no reading."""
-        traits: Any = cls if filtering is None else filtering
-        return 0 if traits.predicts and not traits.pairwise else 1
-
-
 @dataclass(frozen=True, eq=False)
 class Filter(Component):
     """The contract of node algorithms: how readings and messages change a node's state.
 
     The base class is a Kalman filter on the node's own readings; a filter that talks defines at
-    least ``absorb``. Class variables say where it runs and what it needs:
-
-    schedule  phases of a slot in their order, of "predict", "sense" and "exchange"; None: not in
-              slots. "predict" comes first if samples show filtered estimates, after "sense" if they
-              show predictions
-    clocks    what may make its nodes transmit in continuous time, of CLOCKS; (): nothing
-    predicts  a sample in slots is the prediction with which the slot begins, else the estimate
-              after the slot's exchanges
-    first_slot  the first slot in which nodes exchange. Messages are numbered from it, and losses
-                belong to numbers: filters meet the same losses if their first slots and exchanges
-                are the same. By default it is that of built-in filters: 0 for filters that predict
-                and broadcast, else 1
-    pairwise  in slots nodes exchange in pairs (a matching), else all with all neighbours
-    talks     nodes exchange messages
-    pooled    one filter reads the sensors of all nodes at once, and its estimate is every node's
-    slot_kernel    the compiled form of the filter in slots (algorithms.kernels.slots), not used for
-                   derived classes; None: it runs in the SimPy engine
-    unrolled       ``slot_kernel`` is compiled for each n up to 4, with unrolled loops: only where
-                   that makes runs a tenth faster
-    newest_only    of several messages of one sender at one instant the newest counts
-    max_age        seconds beyond which a message that arrives is too late to use, under clocks
-    randomised     in slots ``emit`` is given a number ``Exchange.uniform``, from the stream
-                   "trigger" of the node, which nothing else draws from
+    least ``absorb``. What it says of itself beside its methods stands in values
+    (``algorithms.traits``), each a class variable, or a property where it depends on settings:
+    ``timing``, ``needs``, ``link_weights`` and ``analysis``; ``kernels`` are its compiled form.
     """
 
-    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
-    clocks: ClassVar[tuple[str, ...]] = CLOCKS
-    predicts: ClassVar[bool] = False
-    first_slot: ClassVar[int] = FirstSlot()  # type: ignore[assignment]
-    pairwise: ClassVar[bool] = False
-    talks: ClassVar[bool] = True
-    pooled: ClassVar[bool] = False
-    newest_only: ClassVar[bool] = True
-    max_age: ClassVar[float] = math.inf
-    randomised: ClassVar[bool] = False
     kernels: ClassVar[Kernels | None] = None
+
+    @property
+    def timing(self) -> Timing:
+        """When it reads, predicts and exchanges."""
+        return Timing()
 
     @property
     def needs(self) -> Needs:
@@ -358,12 +321,6 @@ class Filter(Component):
             return single.shift_payload(payload, offset)
         return payload._replace(xhat=payload.xhat + offset)
 
-    def accepts(self, payload: Any, age: float) -> bool:
-        """Return False if a message with this ``payload``, ``age`` seconds old under clocks, is too
-        late to use: by default if it is older than ``max_age``.
-        """
-        return age <= self.max_age
-
     def max_measurement_interval(self, state: Any) -> float:
         """Return the seconds of increments that ``update`` may use at once from this state on.
 
@@ -375,44 +332,11 @@ class Filter(Component):
             return single.interval(state)
         return float(state.model.max_interval(state.root))
 
-    def steps(self, phase: int) -> int:
-        """Return how often exchange number ``phase`` of a slot, from 0, is repeated, at equal
-        intervals. A hook of derived classes; engines call ``exchange_steps``.
-        """
-        return 1
 
-    def exchange_steps(self, phase: int) -> int:
-        """Return how often exchange number ``phase`` of a slot is repeated: ``steps(phase)``,
-        except for a filter that has a setting called ``steps``, which defines this method instead.
-        """
-        return self.steps(phase)
-
-    def redraws_links(self, phase: int, step: int) -> bool:
-        """Return True if links draw anew whether messages arrive in repetition ``step``, from 0, of
-        exchange number ``phase`` of a slot; else each keeps its last outcome. The very first step
-        always draws.
-        """
-        return True
-
-    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return False if a node with a sensor (``has_sensor`` True), or without one (False), sends
-        nothing in exchange number ``phase`` of a slot, from 0. By default all nodes send.
-
-        The compiled engine asks, to deliver and count the messages of senders only. In a slot
-        in which recorded sensors of a node have no row it counts as one without. In the SimPy
-        engine ``emit`` decides instead, by returning None as the payload.
-        """
-        return True
-
-    def slot_stopping(self) -> int:
-        """Return the number of the exchange of a slot after which a node may freeze its network
-        estimate for good (``stopped``), -1 if there is none; for compiled filters.
-        """
-        return -1
-
-    def decides_in_slots(self) -> bool:
-        """Return True if a node may decide to send nothing."""
-        return self.kernels is not None and self.kernels.decides
+def may_be_silent(algorithm: Filter) -> bool:
+    """Return True if nodes may decide in slots to send nothing."""
+    kernels = algorithm.kernels
+    return algorithm.timing.decides or (kernels is not None and kernels.decides)
 
 
 def commutes(algorithm: Filter) -> bool:
@@ -437,13 +361,13 @@ def commutes(algorithm: Filter) -> bool:
 
 def compiled_kernels(algorithm: Filter, clocked: bool) -> Kernels | None:
     """Return the kernels of a filter under clocks or in slots; None if it has none, or if its class
-    defines one of STEPS or ``accepts`` in Python after them, so that they do not say what it does.
+    defines one of STEPS in Python after them, so that they do not say what it does.
     """
     kernels = algorithm.kernels
     if kernels is None:
         return None
     order = type(algorithm).__mro__
     first = next((k for k, cls in enumerate(order) if "kernels" in vars(cls)), len(order))
-    if any(name in vars(cls) for cls in order[:first] for name in (*STEPS, "accepts")):
+    if any(name in vars(cls) for cls in order[:first] for name in STEPS):
         return None
     return kernels.of(clocked)

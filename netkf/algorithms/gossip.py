@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis
+from netkf.algorithms.traits import Analysis, Timing
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load_flags
 
@@ -36,10 +36,9 @@ class Gossip(Filter):
     """
 
     analysis = Analysis(paper="gossip", combination="swap")
-    schedule: ClassVar[tuple[str, ...]] = ("exchange", "sense", "predict")
-    clocks: ClassVar[tuple[str, ...]] = ("links",)
-    predicts: ClassVar[bool] = True
-    pairwise: ClassVar[bool] = True
+    timing = Timing(
+        schedule=("exchange", "sense", "predict"), clocks=("links",), predicts=True, pairwise=True
+    )
     kernels = Kernels(absorb=swap)
 
     shift = Filter.shift  # affine in readings and messages

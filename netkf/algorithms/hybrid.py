@@ -6,13 +6,12 @@ Between messages a node runs the Kalman-Bucy filter (4); messages reset estimate
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.neighbours import combine_convex
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Weights
+from netkf.algorithms.traits import Analysis, Timing, Weights
 from netkf.core.fields import field, number
 
 
@@ -30,7 +29,7 @@ class Hybrid(Filter):
     epsilon: float = field(number(above=0.0, high=1.0))
 
     analysis = Analysis(paper="hybrid", combination="convex", P_by_design=("", "larger"))
-    schedule: ClassVar[tuple[str, ...] | None] = None  # continuous time only
+    timing = Timing(schedule=None)
     kernels = Kernels(absorb=combine_convex, unrolled=True)
 
     @property

@@ -23,7 +23,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import CLOCKS, Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer, one_of, positive
 from netkf.linalg.arrays import FloatArray
@@ -133,10 +133,8 @@ class InformationConsensus(Filter):
     that does not come stays with the node itself, so that weights always sum to one.
     """
 
-    steps: int = field(integer(low=1, high=MAX_STEPS), default=1)  # type: ignore[assignment]
+    steps: int = field(integer(low=1, high=MAX_STEPS), default=1)
 
-    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
-    clocks: ClassVar[tuple[str, ...]] = ()
     kernels = Kernels(
         update=begin_pairs,
         emit=emit_pairs,
@@ -144,6 +142,11 @@ class InformationConsensus(Filter):
         unrolled=False,
         under_clocks=DiffusionFilter.kernels,
     )
+
+    @property
+    def timing(self) -> Timing:
+        """In slots only, with ``steps`` steps of the only exchange."""
+        return Timing(clocks=(), steps=lambda _: self.steps)
 
     @property
     def needs(self) -> Needs:
@@ -166,10 +169,6 @@ class InformationConsensus(Filter):
         """Return the recipe for a network of N ``nodes``: from which information pairs begin, and
         how often each counts.
         """
-
-    def exchange_steps(self, phase: int) -> int:
-        """Return the setting ``steps``, the number of steps of the only exchange of a slot."""
-        return self.steps
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return in slots the pairs of nodes, the inverse roots of their predictions, and the
@@ -224,8 +223,6 @@ class Hcmci(InformationConsensus):
     consensus: str = field(one_of(HYBRID, INFORMATION, MEASUREMENTS), default=HYBRID)
     novelty_weight: float | None = field(positive, default=None)
 
-    clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")
-
     def recipe(self, nodes: int) -> Recipe:
         """Return the recipe for a network of N ``nodes`` and the variant that was chosen: from
         which shares of prediction and reading the pairs begin, and how often each counts in the
@@ -239,6 +236,11 @@ class Hcmci(InformationConsensus):
         if self.consensus == MEASUREMENTS:
             return recipe([[0.0, 1.0]], [omega, 1.0])
         return recipe([[1.0, 0.0], [0.0, 1.0]], [1.0, omega, 0.0])
+
+    @property
+    def timing(self) -> Timing:
+        """That of its base, and under all clocks."""
+        return replace(super().timing, clocks=CLOCKS)
 
     @property
     def analysis(self) -> Analysis:

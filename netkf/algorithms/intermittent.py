@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import field, of_time, one_of, positive
 from netkf.linalg.compiling import kernel
 
@@ -277,11 +277,7 @@ class Intermittent(Filter):
     window: float | None = field(of_time(positive), default=None)
 
     analysis = Analysis(paper="intermittent", combination="readings", payload_numbers=reading_size)
-    schedule: ClassVar[tuple[str, ...]] = ("sense", "exchange", "predict")
-    clocks: ClassVar[tuple[str, ...]] = ("readings",)
-    predicts: ClassVar[bool] = True
     needs = Needs(one_way=True, samples=True)
-    newest_only: ClassVar[bool] = False
     kernels = Kernels(
         emit=send_reading,
         absorb=use_readings_heard,
@@ -313,23 +309,23 @@ class Intermittent(Filter):
             node["past_x"][0], node["past_root"][0] = node["xhat"], node["root"]
             node["kept"][...] = 1
 
-    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return True for nodes with a sensor: they send their readings."""
-        return has_sensor
-
     @property
-    def max_age(self) -> float:  # type: ignore[override]
-        """Seconds beyond which a reading that arrives is too old to use: 0 if late ones are
-        dropped, infinity without a window.
-        """
-        if self.late == "drop":
-            return 0.0
-        return math.inf if self.window is None else self.window
+    def timing(self) -> Timing:
+        """Nodes with sensors send; late readings are used as far as ``late`` and ``window`` say."""
+        window = math.inf if self.window is None else self.window
+        return Timing(
+            schedule=("sense", "exchange", "predict"),
+            clocks=("readings",),
+            predicts=True,
+            newest_only=False,
+            max_age=0.0 if self.late == "drop" else window,
+            sends=lambda _, has_sensor: has_sensor,
+        )
 
     def history_span(self, max_delay: float) -> float:
         """Return the seconds of its past that a node must keep for late readings, if no message
         takes longer than ``max_delay`` seconds.
         """
-        return SLACK * min(self.max_age, max_delay)
+        return SLACK * min(self.timing.max_age, max_delay)
 
     shift = Filter.shift  # affine in the readings

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from netkf.algorithms.kernels.run import (
 )
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import boolean, field, number
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
@@ -120,8 +120,7 @@ class Kcf(Filter):
     epsilon: float = field(number(low=0.0), default=0.1)
     share_readings: bool = field(boolean, default=True)
 
-    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
-    clocks: ClassVar[tuple[str, ...]] = ("directions", "nodes", "readings")
+    timing = Timing(clocks=("directions", "nodes", "readings"))
     needs = Needs(one_way=True, samples=True)
     kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, sends_readings=True)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from netkf.algorithms.kernels.estimates import rotate
 from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
 
@@ -121,8 +121,7 @@ class OneBit(Filter):
     """
 
     analysis = Analysis(paper="one_bit", payload_numbers=lambda _, rows, __: rows / 64.0)
-    schedule: ClassVar[tuple[str, ...] | None] = ("predict", "sense", "exchange")
-    clocks: ClassVar[tuple[str, ...]] = ()
+    timing = Timing(clocks=())
     needs = Needs(one_way=True, reads_what_it_sends=True)
     kernels = Kernels(
         update=nothing,  # a reading is used as bits, in the turn of its node

@@ -27,7 +27,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.starts import check_information, information_notes
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import boolean, field, integer, node_id, number, one_of, positive
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
@@ -460,13 +460,27 @@ class PushSum(Filter):
         stopped=has_frozen,
     )
     # Until others hear of its samples, a node counts them as if all nodes had taken them.
-    schedule: ClassVar[tuple[str, ...]] = ("exchange", "predict", "sense", "exchange")
-    clocks: ClassVar[tuple[str, ...]] = ("nodes",)
 
     @property
     def kernels(self) -> Kernels:  # type: ignore[override]
         """The verbs; by the paper's stop rule a node decides whether to send mass."""
-        return DECIDING if self.decides_in_slots() else SLOTS
+        return DECIDING if not self.asymptotic and self.stop == "paper" else SLOTS
+
+    @property
+    def timing(self) -> Timing:
+        """Mass once a slot, unless gains are asymptotic, and estimates ``gamma`` times, on links
+        that are "fresh" or "held"; nodes may freeze their network estimate after that of mass.
+        """
+        # gamma is None under clocks, which have no steps.
+        steps, held, asymptotic = self.gamma or 1, self.links != "fresh", self.asymptotic
+        return Timing(
+            schedule=("exchange", "predict", "sense", "exchange"),
+            clocks=("nodes",),
+            steps=lambda phase: steps if phase == AVERAGE else 1,
+            redraws=lambda _, step: step == 0 or not held,
+            sends=lambda phase, _: phase == AVERAGE or not asymptotic,
+            stopping=MASS if not asymptotic and self.stop != "never" else -1,
+        )
 
     def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         """Return masses, network estimates and settings in slots, running sums under clocks."""
@@ -525,38 +539,6 @@ class PushSum(Filter):
         node["information"][:] = info.information if self.asymptotic else model.information
         node["number"][...] = info.nodes if self.asymptotic else 1.0
         node["stopped"][...], node["degree"][...] = NEVER_STOPPED, info.degree
-
-    def sends_in_slots(self, phase: int, has_sensor: bool) -> bool:
-        """Return True if nodes send messages in the exchange with number ``phase``, with a sensor
-        or without: not in that of mass if the gains are asymptotic.
-        """
-        return phase == AVERAGE or not self.asymptotic
-
-    def slot_stopping(self) -> int:
-        """Return the number of the exchange of a slot after which nodes may freeze their network
-        estimates: that of mass, or -1 if none ever does.
-        """
-        # Without exchanges of mass there is nothing to stop.
-        return MASS if not self.asymptotic and self.stop != "never" else -1
-
-    def decides_in_slots(self) -> bool:
-        """Return True under the paper's stop rule, by which a node that has stopped sends no
-        mass.
-        """
-        return not self.asymptotic and self.stop == "paper"
-
-    def steps(self, phase: int) -> int:
-        """Return the steps of exchange number ``phase`` of a slot: 1 for the mass, ``gamma`` for
-        the estimates.
-        """
-        # gamma is None under clocks, which have no steps.
-        return self.gamma or 1 if phase == AVERAGE else 1
-
-    def redraws_links(self, phase: int, step: int) -> bool:
-        """Return True if links draw new outcomes in repetition ``step`` of exchange number
-        ``phase`` of a slot: always, unless links that are "held" keep the outcome of the first one.
-        """
-        return self.links == "fresh" or step == 0
 
     shift = Filter.shift  # averaging weights sum to one
 

@@ -15,25 +15,25 @@ import importlib
 import pkgutil
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import netkf.algorithms
 from netkf.algorithms.filter import STEPS, Filter
+from netkf.algorithms.traits import Timing
 from netkf.core.fields import as_class
 
 F = TypeVar("F", bound=type[Filter])
 
 _REGISTERED: dict[str, type[Filter]] = {}  # by name, see choice_name
 
-WEIGHING = ("share", "max_measurement_interval", "steps", "exchange_steps", "redraws_links")
+WEIGHING = ("share", "max_measurement_interval")
 """Methods that theorems rely on, besides STEPS, the methods that define a filter."""
 
 LINK_WEIGHTS = ("link_weights",)
 """What a derived class may override without losing the theory, which asks it for its weights."""
 
-TRAITS = ("schedule", "clocks", "predicts", "first_slot", "pairwise", "talks", "pooled",
-          "newest_only")  # fmt: skip
-"""Class variables that theorems rely on."""
+TRAITS = ("timing",)
+"""Values that theorems rely on."""
 
 
 def built_in(kind: str, **choice: str) -> Callable[[F], F]:
@@ -73,6 +73,17 @@ def built_in_filters() -> dict[str, type[Filter]]:
         if not module.ispkg:
             importlib.import_module(module.name)
     return dict(sorted(_REGISTERED.items()))
+
+
+def default_timing(cls: Any) -> Timing | None:
+    """Return the timing of a filter class with its default settings; None if it depends on settings
+    without a default.
+    """
+    try:
+        timing: Timing = cls.timing if isinstance(cls.timing, Timing) else cls().timing
+    except TypeError:
+        return None
+    return timing
 
 
 def built_in_class(algorithm: object) -> type[Filter] | None:

@@ -146,6 +146,7 @@ class Surroundings:
         past: tuple[str, ...],
     ) -> None:
         self.filtering, self.past = filtering, past
+        self.sends = filtering.timing.sends
         n, self.info, self.node_fields = len(model.information), info, node_fields
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
@@ -319,9 +320,7 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     record.payload = payload
     state.kernels.emit(record, 0, 0, run)
     has_reading = new.reading is not None
-    silent = exchange.slot >= 0 and not surroundings.filtering.sends_in_slots(
-        exchange.phase, has_reading
-    )
+    silent = exchange.slot >= 0 and not surroundings.sends(exchange.phase, has_reading)
     if silent or not run.sends[0]:
         return new, None
     fields = {name: getattr(payload, name) for name in type(payload).struct_fields}

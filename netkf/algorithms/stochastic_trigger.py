@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_rea
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -224,8 +224,7 @@ class ScheduledReadings(Filter):
         combination="scheduled readings",
         payload_numbers=lambda _, rows, __: rows,
     )
-    clocks: ClassVar[tuple[str, ...]] = ()
-    randomised: ClassVar[bool] = True
+    timing = Timing(clocks=(), randomised=True)
     kernels = Kernels(
         predict=predict_prior,
         update=nothing,  # a reading is used in the exchange of its slot, if it is sent
@@ -383,13 +382,15 @@ class TriggeredMessages(Filter):
     Y: float | FloatArray
     inner: Filter
 
-    clocks: ClassVar[tuple[str, ...]] = ()
-    randomised: ClassVar[bool] = True
-
     @property
     def wrapped(self) -> Filter:
         """The filter that the trigger belongs to."""
         return self.inner
+
+    @property
+    def timing(self) -> Timing:
+        """That of the wrapped filter in slots, whose nodes draw whether they send."""
+        return replace(self.inner.timing, clocks=(), randomised=True, decides=True)
 
     @property
     def analysis(self) -> Analysis:
@@ -426,10 +427,6 @@ class TriggeredMessages(Filter):
         """Begin as the wrapped filter does, without a reading."""
         self.inner.begin(node, info, model)
         node["trigger_news"][...], node["trigger_undecided"][...] = NO_READING, 1
-
-    def decides_in_slots(self) -> bool:
-        """Return True: a node may send nothing after a reading."""
-        return True
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
         """Return the state of the wrapped filter at time 0 from ``mean`` (n,) and ``cov`` (n, n),
@@ -500,9 +497,6 @@ class StochasticTrigger(Filter):
     a node always uses its reading, and is silent until the next one.
     """
 
-    clocks: ClassVar[tuple[str, ...]] = ()
-    talks: ClassVar[bool] = True
-
     inner: Filter = field(instance_of(Filter))
     Y: float | FloatArray = field(either(positive, definite_covariance, has_depth(1)))
 
@@ -514,6 +508,11 @@ class StochasticTrigger(Filter):
         if type(self.inner) is Intermittent:
             return ScheduledReadings(self.Y)
         return TriggeredMessages(self.Y, self.inner)
+
+    @property
+    def timing(self) -> Timing:
+        """That of the filter that runs, in slots."""
+        return replace(self.wrapped.timing, clocks=(), talks=True)
 
     @property
     def needs(self) -> Needs:
@@ -531,7 +530,11 @@ class StochasticTrigger(Filter):
         ``netkf.Scenario``.
         """
         inner = self.inner
-        if inner.analysis.wrapped is not None or inner.schedule is None or not inner.talks:
+        if (
+            inner.analysis.wrapped is not None
+            or inner.timing.schedule is None
+            or not inner.timing.talks
+        ):
             raise ScenarioError(
                 "filter.inner",
                 "must be a filter in slots whose nodes send messages, without a trigger",

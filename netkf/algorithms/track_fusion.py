@@ -38,7 +38,7 @@ from netkf.algorithms.kernels.tracks import (
 )
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs
+from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import field, one_of
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.compiling import kernel
@@ -100,7 +100,6 @@ class PairFusion(Filter):
     minimise: str = field(one_of(TRACE, DETERMINANT), default=TRACE)
 
     analysis = Analysis(paper="track_fusion")
-    clocks: ClassVar[tuple[str, ...]] = ("links", "directions", "nodes", "readings")
     needs = Needs(one_way=True, inverts=True)
     inverse: ClassVar[bool] = False
     kernels = Kernels(absorb=fuse_heard, unrolled=False)
@@ -262,7 +261,7 @@ class BarShalomCampo(Filter):
     """
 
     analysis = Analysis(paper="track_fusion", combination="tracks", payload_numbers=lambda n, *_: n)
-    clocks: ClassVar[tuple[str, ...]] = ()
+    timing = Timing(clocks=())
     needs = Needs(
         one_way=True, fixed_sensors=True, every_reading=True, common_start=True, network=True
     )

@@ -113,3 +113,76 @@ class Analysis:
     conserved: Callable[[Any], Mapping[str, float | Sequence[float]]] = nothing_conserved
     stopped: Callable[[Any], bool] = never
     wrapped: Any = None
+
+
+CLOCKS = ("links", "directions", "nodes", "readings")
+"""What may make a node transmit in continuous time, see network.clocks."""
+
+
+def once(_: int) -> int:
+    """Return 1: an exchange is not repeated."""
+    return 1
+
+
+def always(*_: object) -> bool:
+    """Return True."""
+    return True
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When a filter reads, predicts and exchanges, in slots and under clocks.
+
+    schedule : phases of a slot in their order, of "predict", "sense" and "exchange"; None: not in
+               slots. "predict" comes first if samples show filtered estimates, after "sense" if
+               they show predictions
+    clocks : what may make its nodes transmit in continuous time, of CLOCKS; (): nothing
+    predicts : a sample in slots is the prediction with which the slot begins, else the estimate
+               after the slot's exchanges
+    first_slot : the first slot in which nodes exchange. Messages are numbered from it, and losses
+                 belong to numbers: filters meet the same losses if their first slots and exchanges
+                 are the same. None: that of built-in filters, see ``first_exchange``
+    pairwise : in slots nodes exchange in pairs (a matching), else all with all neighbours
+    talks : nodes exchange messages
+    pooled : one filter reads the sensors of all nodes at once, and its estimate is every node's
+    newest_only : of several messages of one sender at one instant the newest counts
+    max_age : seconds beyond which a message that arrives is too late to use, under clocks
+    randomised : in slots ``emit`` is given a number ``Exchange.uniform``, from the stream "trigger"
+                 of the node, which nothing else draws from
+    decides : in slots ``emit`` may decide by what it knows to send nothing
+    steps : ``steps(phase)``, how often exchange number ``phase`` of a slot, from 0, is repeated, at
+            equal intervals
+    redraws : ``redraws(phase, step)``, whether links draw anew if messages arrive in repetition
+              ``step``, from 0, of an exchange; else each keeps its last outcome. The very first
+              step always draws
+    sends : ``sends(phase, has_sensor)``, False if a node with a sensor, or without one, sends
+            nothing in an exchange. In a slot in which recorded sensors of a node have no row it
+            counts as one without
+    stopping : number of the exchange of a slot after which a node may freeze its network estimate
+               for good (``Analysis.stopped``), -1 if there is none
+    """
+
+    schedule: tuple[str, ...] | None = ("predict", "sense", "exchange")
+    clocks: tuple[str, ...] = CLOCKS
+    predicts: bool = False
+    first_slot: int | None = None
+    pairwise: bool = False
+    talks: bool = True
+    pooled: bool = False
+    newest_only: bool = True
+    max_age: float = math.inf
+    randomised: bool = False
+    decides: bool = False
+    steps: Callable[[int], int] = once
+    redraws: Callable[[int, int], bool] = always
+    sends: Callable[[int, bool], bool] = always
+    stopping: int = -1
+
+    @property
+    def first_exchange(self) -> int:
+        """The first slot with an exchange: ``first_slot``, by default 0 for filters that predict
+        and broadcast, else 1, because slot 0 has no reading.
+        """
+        if self.first_slot is not None:
+            return self.first_slot
+        return 0 if self.predicts and not self.pairwise else 1

@@ -304,7 +304,7 @@ def promised_filter(algorithm: Any) -> Any:
             f"nothing is promised of {name}: derive it from a filter of netkf.parts to say which "
             "one it should be"
         )
-    if built_in.talks and not algorithm.talks:
+    if base_filter(algorithm).timing.talks and not algorithm.timing.talks:
         raise TheoryError(
             f"nothing is promised of {name}: it declares talks = False, and what is promised of "
             f"{built_in.__name__} is about exchanges; derive it from netkf.parts.Local"

@@ -362,7 +362,7 @@ def _settling_rows(scenario: Scenario) -> list[Assumption]:
 
 def _require_constant_gains(scenario: Scenario) -> None:
     """Raise TheoryError if there is no bound with constant gains beside H (12)."""
-    if not scenario.filter.algorithm.talks:
+    if not scenario.filter.algorithm.timing.talks:
         raise TheoryError("without messages the gains are those of Kalman-Bucy filters")
     if has_steady_state(scenario):
         constant_gain_bound(scenario)

@@ -112,7 +112,7 @@ class _IncrementRecorder(_Filter):
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
         """Return the state at time 0 with the estimate ``mean`` (n,), ``cov`` (n, n)."""
         inner = super().init(model, mean, cov, node)
-        return TimedState(inner, -1 if self.pooled else node.node, 0.0, (mean, None))
+        return TimedState(inner, -1 if self.timing.pooled else node.node, 0.0, (mean, None))
 
     def predict(self, state: TimedState, gap: float) -> TimedState:
         """Return the state predicted over ``gap`` seconds, with the estimate before it."""

@@ -33,7 +33,7 @@ def check_slots(scenario: Scenario) -> tuple[int, ...]:
     period = scenario.slot_plant.period
     # 1e-9: a horizon of a whole number of periods keeps its last slot despite rounding.
     last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
-    if scenario.slotted and not scenario.node_filter.predicts:
+    if scenario.slotted and not scenario.node_filter.timing.predicts:
         last = max(1, int(np.ceil(scenario.horizon / period - 1e-9)) - 1)
     return tuple(sorted({min(2, last), min(5, last), max(1, last // 2), last}))
 
@@ -49,7 +49,7 @@ def check_times(scenario: Scenario) -> list[float]:
 
 def errors_at_once(scenario: Scenario) -> int:
     """Return the number of scalar errors of all filters at one time."""
-    filters = 1 if scenario.filter.algorithm.pooled else len(scenario.nodes)
+    filters = 1 if scenario.filter.algorithm.timing.pooled else len(scenario.nodes)
     return filters * scenario.plant.n
 
 

@@ -105,7 +105,7 @@ def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
     ``replicas`` of a scenario in one RunBatch.
     """
     # A pooled filter is sampled once, not once for each node.
-    filters = 1 if scenario.node_filter.pooled else len(scenario.nodes)
+    filters = 1 if scenario.node_filter.timing.pooled else len(scenario.nodes)
     return BatchSink(replicas, scenario.times, (filters, scenario.plant.n))
 
 

@@ -203,7 +203,7 @@ def _make_layout(source: ReportSource, run: StoredRun) -> dict[int, Any]:
 def _flow_kind(source: ReportSource) -> str:
     """Return how messages change their receivers: "combine", "swap", "readings" or "pooled"."""
     node_filter = source.scenario.node_filter
-    if node_filter.pooled:
+    if node_filter.timing.pooled:
         return "pooled"
     return (
         node_filter.analysis.combination

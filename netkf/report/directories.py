@@ -110,7 +110,7 @@ class ReportSource:
         """
         if not self.scenario.slotted:
             return "until"
-        return "before" if self.scenario.node_filter.predicts else "slot"
+        return "before" if self.scenario.node_filter.timing.predicts else "slot"
 
     @property
     def period(self) -> float:

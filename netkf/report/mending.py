@@ -90,7 +90,7 @@ def central_sample(source: ReportSource) -> CentralSample | None:
     send messages, or if the scenario does not allow that filter.
     """
     run = source.run
-    if source.worst is None or run is None or not run.scenario.filter.algorithm.talks:
+    if source.worst is None or run is None or not run.scenario.filter.algorithm.timing.talks:
         return None
     filtering = dataclasses.replace(run.scenario.filter, algorithm=Central())
     try:

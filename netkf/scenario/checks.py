@@ -208,7 +208,7 @@ def _check_network(scenario: DerivedScenario) -> None:
                 part.check(topology)
             except ScenarioError as error:
                 raise error.under(key) from None
-    if not node_filter.talks:
+    if not node_filter.timing.talks:
         return
     name = filter_name(scenario)
     if network.activation is None:
@@ -273,7 +273,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
                     f"{len(value)} entries",
                     "add or remove some",
                 )
-            if filtering.algorithm.pooled:
+            if filtering.algorithm.timing.pooled:
                 raise ScenarioError(
                     key,
                     "must be one for the filter that all nodes share",
@@ -333,7 +333,7 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
 def _check_degrees(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a node has more links than the filter allows."""
     algorithm = scenario.filter.algorithm
-    if not algorithm.talks or not scenario.topology.links:
+    if not algorithm.timing.talks or not scenario.topology.links:
         return
     node, degree = max(scenario.topology.degrees.items(), key=lambda item: item[1])
     if degree > algorithm.link_weights.largest_degree:
@@ -363,7 +363,7 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
             period,
             f"give at most {scenario.diffusion.longest_period:.3g}, or leave it out",
         )
-    pooled = scenario.filter.algorithm.pooled
+    pooled = scenario.filter.algorithm.timing.pooled
     models = [scenario.pooled_model] if pooled else scenario.models
     distinct_models = {id(model): model for model in models if len(model.H)}.values()
     A, Q = scenario.belief
@@ -403,21 +403,21 @@ def _check_slots(scenario: DerivedScenario) -> None:
             "sample at slots only, with all digits of the period",
         )
     activation = scenario.network.activation
-    if not node_filter.talks:
+    if not node_filter.timing.talks:
         return
     is_matching = isinstance(activation, Matching) or (
         isinstance(activation, RecordedSlots) and activation.matching
     )
-    if is_matching != node_filter.pairwise:
+    if is_matching != node_filter.timing.pairwise:
         assert activation is not None
-        form = "matching" if node_filter.pairwise else "broadcast"
+        form = "matching" if node_filter.timing.pairwise else "broadcast"
         raise ScenarioError(
             "network.activation.kind",
             f"must be a {form} for the {filter_name(scenario)}",
             _describe_activation(activation),
             "choose another activation or another filter",
         )
-    exchanges = (node_filter.schedule or ()).count("exchange")
+    exchanges = (node_filter.timing.schedule or ()).count("exchange")
     if exchanges * scenario.phase_length >= plant.period * (1.0 - 1e-9):
         raise ScenarioError(
             "network.activation.phase",

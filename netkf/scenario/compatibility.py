@@ -29,9 +29,9 @@ def check_time(scenario: DerivedScenario) -> None:
     # A filter runs in slots if it has a ``schedule`` of their phases, and in continuous time if it
     # names ``clocks`` that may make it send, or never sends.
     if slotted:
-        fits = algorithm.schedule is not None
+        fits = algorithm.timing.schedule is not None
     else:
-        fits = bool(algorithm.clocks) or not algorithm.talks
+        fits = bool(algorithm.timing.clocks) or not algorithm.timing.talks
     if not fits:
         rule = explain_time_mismatch(slotted)
         raise ScenarioError("filter.kind", rule, kind_name(algorithm), remedy)
@@ -48,19 +48,21 @@ def check_activation(scenario: DerivedScenario) -> None:
     """
     clock, topology = scenario.network.activation, scenario.topology
     node_filter = scenario.node_filter
-    if not isinstance(clock, LinkClock) or not node_filter.talks:
+    if not isinstance(clock, LinkClock) or not node_filter.timing.talks:
         return
     name = filter_name(scenario)
-    if topology.directed and (clock.at == "links" or node_filter.clocks == ("links",)):
-        remedies = [f'at = "{at}"' for at in ("directions", "nodes") if at in node_filter.clocks]
+    if topology.directed and (clock.at == "links" or node_filter.timing.clocks == ("links",)):
+        remedies = [
+            f'at = "{at}"' for at in ("directions", "nodes") if at in node_filter.timing.clocks
+        ]
         raise ScenarioError(
             "network.graph.directed",
             f"must be false for the {name} at links, which work both ways",
             True,
             " or ".join(["give an undirected graph", *remedies]),
         )
-    if clock.at not in node_filter.clocks:
-        _reject_clock(clock.at, node_filter.clocks, name)
+    if clock.at not in node_filter.timing.clocks:
+        _reject_clock(clock.at, node_filter.timing.clocks, name)
     # A filter that needs samples says so itself, of the sensors that there are.
     says_so = bool(scenario.sensors) and node_filter.needs.samples
     if clock.at == "readings" and not says_so and not any(map(takes_samples, scenario.sensors)):

@@ -449,7 +449,7 @@ class DerivedScenario(ScenarioModel):
     def _effective_rates(self) -> dict[Link, float]:
         """Cache of ``effective_rates``: rate of sending times probability of delivery."""
         clock, loss = self.network.activation, self.network.channel.loss
-        if not isinstance(clock, LinkClock) or not self.filter.algorithm.talks:
+        if not isinstance(clock, LinkClock) or not self.filter.algorithm.timing.talks:
             return {}
         return {
             link: self._send_rate(clock, link)

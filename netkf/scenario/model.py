@@ -259,7 +259,7 @@ class ScenarioModel(Component):
         It is the horizon, or in slots one period later if states are sampled after the exchanges of
         their slot.
         """
-        if not self.slotted or self.node_filter.predicts:
+        if not self.slotted or self.node_filter.timing.predicts:
             return self.horizon
         return self.horizon + self.slot_plant.period
 
@@ -273,7 +273,7 @@ class ScenarioModel(Component):
         assert isinstance(activation, SlotActivation)
         if activation.phase is not None:
             return activation.phase
-        exchanges = (self.node_filter.schedule or ()).count("exchange")
+        exchanges = (self.node_filter.timing.schedule or ()).count("exchange")
         return 0.5 * self.slot_plant.period / max(1, exchanges)
 
     @cached_property

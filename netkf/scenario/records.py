@@ -35,7 +35,7 @@ def check_records(scenario: DerivedScenario) -> None:
     plant = scenario.plant
     if isinstance(plant, RecordedPlant):
         _check_under("plant", lambda: plant.require_slots(sorted(_state_slots(scenario))))
-    if scenario.slotted and scenario.filter.algorithm.talks:
+    if scenario.slotted and scenario.filter.algorithm.timing.talks:
         _check_exchanges(scenario)
 
 
@@ -80,7 +80,7 @@ def sensed_slots(scenario: DerivedScenario) -> range:
     end = max(int(scenario.horizon / plant.period) - 1, 0)
     while not plant.over(end, scenario.horizon):
         end += 1
-    if scenario.node_filter.predicts:
+    if scenario.node_filter.timing.predicts:
         return range(end)
     return range(1, end + (end in scenario.sampled_slots))
 
@@ -91,12 +91,12 @@ def _check_exchanges(scenario: DerivedScenario) -> None:
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return
     # The schedule lists the phases of a slot; ``recorded`` counts only the exchanges among them.
-    phases = (node_filter.schedule or ()).count("exchange")
+    phases = (node_filter.timing.schedule or ()).count("exchange")
     for slot, phase, step in activation.recorded:
-        steps = node_filter.exchange_steps(phase) if phase < phases else 0
+        steps = node_filter.timing.steps(phase) if phase < phases else 0
         if step >= steps:
             limits = " and ".join(
-                f"{node_filter.exchange_steps(k)} in phase {k}" for k in range(phases)
+                f"{node_filter.timing.steps(k)} in phase {k}" for k in range(phases)
             )
             raise ScenarioError(
                 "network.activation.path",
@@ -110,7 +110,7 @@ def exchange_slots(scenario: DerivedScenario) -> range:
     """Return the slots in which nodes exchange messages: from the filter's first to the last in
     which it is given readings.
     """
-    return range(scenario.node_filter.first_slot, sensed_slots(scenario).stop)
+    return range(scenario.node_filter.timing.first_exchange, sensed_slots(scenario).stop)
 
 
 def count_state_rows(scenario: DerivedScenario) -> RowUse | None:

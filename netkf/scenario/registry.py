@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from netkf.algorithms.filter import Filter
-from netkf.algorithms.registry import built_in_filters, split_choice
+from netkf.algorithms.registry import built_in_filters, default_timing, split_choice
 from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
@@ -111,7 +111,10 @@ KINDS: dict[str, dict[str, type[Component]]] = {
     },
 }
 KINDS["slot filter"] = {
-    name: cls for name, cls in KINDS["filter"].items() if getattr(cls, "schedule", None)
+    name: cls
+    for name, cls in KINDS["filter"].items()
+    for timing in [default_timing(cls)]
+    if timing is None or timing.schedule is not None
 }
 """The classes by family and name.
 

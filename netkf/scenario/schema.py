@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from netkf.algorithms.filter import Filter
-from netkf.algorithms.registry import split_choice
+from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
@@ -206,7 +206,8 @@ def _time_model_rules() -> list[Schema]:
     clocked_filters = dict.fromkeys(
         split_choice(name)[0]
         for name, cls in KINDS["filter"].items()
-        if getattr(cls, "clocks", ()) or not getattr(cls, "talks", True)
+        for timing in [default_timing(cls)]
+        if timing is not None and (timing.clocks or not timing.talks)
     )
     slot_limits = limit_kinds(list_kinds("slot activation"), list_kinds("slot filter"))
     clock_limits = limit_kinds(list_kinds("activation"), [*clocked_filters])

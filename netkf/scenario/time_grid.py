@@ -112,12 +112,14 @@ def _times_of(key: str, part: Any) -> Iterator[TimeConstant]:
 def _step_lengths(scenario: Any) -> Iterator[TimeConstant]:
     """Yield the length of a step of each exchange of a slot."""
     activation, node_filter = scenario.network.activation, scenario.node_filter
-    if not (scenario.slotted and isinstance(activation, SlotActivation) and node_filter.talks):
+    if not (
+        scenario.slotted and isinstance(activation, SlotActivation) and node_filter.timing.talks
+    ):
         return
     length = scenario.phase_length
     exact = as_fraction(length)
-    for phase in range((node_filter.schedule or ()).count("exchange")):
-        steps = node_filter.exchange_steps(phase)
+    for phase in range((node_filter.timing.schedule or ()).count("exchange")):
+        steps = node_filter.timing.steps(phase)
         if steps:
             share = None if exact is None else exact / steps
             yield TimeConstant("network.activation.phase", length / steps, share)

@@ -145,7 +145,7 @@ def _make_use(use: RowUse) -> Use:
 
 def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
     """Return the use of the table of a recorded activation, None for other activations."""
-    activation, talks = scenario.network.activation, scenario.filter.algorithm.talks
+    activation, talks = scenario.network.activation, scenario.filter.algorithm.timing.talks
     if isinstance(activation, RecordedClock):
         end = scenario.horizon if talks else 0.0
         return count_rows(activation.path.name, activation.row_keys, lambda key: 0.0 < key[1] < end)

@@ -205,7 +205,8 @@ def compare_filters(
         rows.append(
             dataclasses.replace(
                 row,
-                predicts=scenario_of_filter.slotted and scenario_of_filter.node_filter.predicts,
+                predicts=scenario_of_filter.slotted
+                and scenario_of_filter.node_filter.timing.predicts,
                 same_losses=_meet_same_losses(scenario_of_filter, scenarios[first]),
             )
         )
@@ -217,13 +218,13 @@ def compare_filters(
 def _meet_same_losses(scenario: Scenario, other: Scenario) -> bool:
     """Return True unless messages of two filters in one slot meet different losses or delays."""
     filters = scenario.node_filter, other.node_filter
-    is_ideal = scenario.delivers_all or not all(one.talks for one in filters)
+    is_ideal = scenario.delivers_all or not all(one.timing.talks for one in filters)
     if is_ideal or not scenario.slotted:
         return True
     first, second = (
-        (one.first_slot, [one.exchange_steps(k) for k in range(phases)])
+        (one.timing.first_exchange, [one.timing.steps(k) for k in range(phases)])
         for one in filters
-        for phases in [(one.schedule or ()).count("exchange")]
+        for phases in [(one.timing.schedule or ()).count("exchange")]
     )
     return first == second
 

@@ -155,7 +155,7 @@ class _Innovations:
         self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
         self._streams = Streams(run.seed, run.replica)
         # Samples of a predicting filter are predictions; others are predicted by one slot.
-        self._steps = 0 if scenario.node_filter.predicts else 1
+        self._steps = 0 if scenario.node_filter.timing.predicts else 1
         # Innovations exist where the sample that the prediction comes from was taken.
         slots = np.round(run.times / scenario.slot_plant.period).astype(int).tolist()
         self._samples = [
@@ -312,7 +312,7 @@ def consistency(
 def _without_horizon(scenario: Scenario) -> Scenario:
     """Return the scenario without a filtered sample at the horizon, whose exchanges are missing."""
     node_filter = scenario.node_filter
-    if not scenario.slotted or not node_filter.talks or node_filter.predicts:
+    if not scenario.slotted or not node_filter.timing.talks or node_filter.timing.predicts:
         return scenario
     over_end = [scenario.slot_plant.over(slot, scenario.horizon) for slot in scenario.sampled_slots]
     times = scenario.times[~np.array(over_end)]

@@ -179,7 +179,7 @@ def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> in
     plant = scenario.slot_plant
     slot = round(at / plant.period)
     # A sample of a predicting filter is before the events of its slot, a filtered one after them.
-    end = plant.slot_time(slot if scenario.node_filter.predicts else slot + 1)
+    end = plant.slot_time(slot if scenario.node_filter.timing.predicts else slot + 1)
     return int(np.searchsorted(times, end, side="left"))
 
 
@@ -248,7 +248,7 @@ def find_flow(
         target=np.searchsorted(nodes, messages.receiver),
         cost=1 - used,
         last={n: k for k, n in enumerate(scenario.nodes)},  # segment k is that of the k-th node
-        pooled=scenario.node_filter.pooled,
+        pooled=scenario.node_filter.timing.pooled,
     )
 
 

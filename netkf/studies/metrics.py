@@ -162,11 +162,11 @@ def bound_traces(scenario: Scenario) -> FloatArray:
     if not scenario.slotted:
         bound = covariance_bound(scenario, scenario.times)
         return time_average(scenario, np.trace(bound, axis1=2, axis2=3))
-    if scenario.filter.algorithm.talks:
+    if scenario.filter.algorithm.timing.talks:
         raise TheoryError("Tanwani's H(12) is about filters in continuous time")
     _require_fixed_H(scenario)
     # A pooled filter has the readings of all nodes.
-    pooled = scenario.filter.algorithm.pooled
+    pooled = scenario.filter.algorithm.timing.pooled
     models = [scenario.pooled_slot_model] * len(scenario.nodes) if pooled else scenario.slot_models
     starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
     columns = [_slot_traces(scenario, m, P) for m, P in zip(models, starts, strict=True)]
@@ -198,7 +198,7 @@ def _require_fixed_H(scenario: Scenario) -> None:
 
 def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
     """Return the traces (T,) of P of a Kalman filter in slots from P(0) = ``start``."""
-    predicts = scenario.filter.algorithm.predicts
+    predicts = scenario.filter.algorithm.timing.predicts
     # At most n rows with the same information: a central filter may read hundreds.
     F, Q, H = model.F, model.Q, whiten_observation(model.H, model.R)
     R = np.eye(len(H))

@@ -77,7 +77,7 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
     traces, algorithm = bound_traces(scenario), scenario.filter.algorithm
     # Without exchange the bound of bound_traces() is the covariance itself.
     message = "exact: the covariance of filters that do not talk"
-    if algorithm.talks:
+    if algorithm.timing.talks:
         message = "an upper bound: the trace of Tanwani's H(12), which E[P_i] stays below"
     if target.of_errors:
         message += _explain_errors(scenario)
@@ -89,7 +89,7 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
 
 def theory_is_exact(scenario: Scenario, target: Target) -> bool:
     """Return True if ``quantity_by_theory`` is the quantity itself, False if it is a bound."""
-    if scenario.filter.algorithm.talks:
+    if scenario.filter.algorithm.timing.talks:
         return False
     return not target.of_errors or _starts_with_the_truth(scenario)
 
@@ -111,7 +111,7 @@ def _explain_errors(scenario: Scenario) -> str:
     start = rows[rows["assumption"].str.startswith("P_i(0) >= ")]
     if not start["holds"].all():
         raise TheoryError("P_i(0) is below the covariance of the first error: P need not bound it")
-    exact = _starts_with_the_truth(scenario) and not scenario.filter.algorithm.talks
+    exact = _starts_with_the_truth(scenario) and not scenario.filter.algorithm.timing.talks
     return "" if exact else "; P_i in turn bounds the covariance of the error, Tanwani's H (10)"
 
 

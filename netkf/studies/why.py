@@ -211,7 +211,7 @@ class _Evidence:
         """Search the paths on which information reached, or could have reached, ``node``."""
         self._replayer, self._node, self._max_missing = replayer, node, max_missing
         self.scenario = replayer.scenario
-        talks, links = self.scenario.node_filter.talks, self.scenario.topology.directions
+        talks, links = self.scenario.node_filter.timing.talks, self.scenario.topology.directions
         self._links = frozenset(links if talks else ())
         swaps, slotted = (
             self.scenario.node_filter.analysis.combination == "swap",

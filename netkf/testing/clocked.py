@@ -92,12 +92,12 @@ class ClockTrial(Trial):
         """Run all rounds: time passes, sensors read, and nodes exchange messages; before that check
         that predictions over two gaps compose, in the trial of one clock only.
         """
-        if self._clock in (None, *self.part.clocks[:1]):
+        if self._clock in (None, *self.part.timing.clocks[:1]):
             for node in self.nodes:
                 self._check_composition(node)
         for k in range(ROUNDS):
             self._pass_time(shift=k == SHIFT_ROUND)
-            if self.part.talks:
+            if self.part.timing.talks:
                 self._exchange(k, reliable=k % 2 == 0)
             self.record_end()
 
@@ -214,7 +214,7 @@ class ClockTrial(Trial):
         for node in self.nodes:
             accepted = [self._accept(message) for message in arrivals if message.receiver == node]
             messages = sorted((m for m in accepted if m is not None), key=lambda m: m.sender)
-            if self.part.newest_only:
+            if self.part.timing.newest_only:
                 # The last entry of a sender stays: its message with the smallest age.
                 newest = {m.sender: m for m in sorted(messages, key=lambda m: -m.age)}
                 messages = [newest[sender] for sender in sorted(newest)]
@@ -224,8 +224,6 @@ class ClockTrial(Trial):
     def _accept(self, arrival: MessageInFlight) -> Message | None:
         """Return the message as its receiver gets it, or None if the filter refuses its age."""
         age = self._time - arrival.sent
-        accepts = self.watched.call("accepts", arrival.payload, age)
-        is_flag = accepts is True or accepts is False
-        demand(is_flag, f"{self.watched.name}.accepts", "must be True or False", accepts)
+        accepts = age <= self.part.timing.max_age
         weight = float(self.weights[arrival.sender, arrival.receiver])
         return Message(arrival.sender, weight, arrival.payload, age) if accepts else None

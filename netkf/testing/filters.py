@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.filter import CLOCKS, Filter, commutes
-from netkf.algorithms.traits import Needs, Weights
+from netkf.algorithms.filter import Filter, commutes
+from netkf.algorithms.traits import CLOCKS, Needs, Timing, Weights
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.parents import check_parent
 from netkf.testing.shifts import check_shift, make_trials
@@ -16,7 +16,6 @@ from netkf.testing.watching import WatchedPart, demand, make_part
 
 MAX_DEGREE = 8  # weights are checked for all pairs of degrees up to it
 PHASES = ("predict", "sense", "exchange")
-FLAGS = ("predicts", "pairwise", "talks", "pooled", "newest_only")
 
 
 def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings: Any) -> None:
@@ -47,10 +46,10 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
     part = make_part(filter, (Filter,), settings)
     watched = WatchedPart(part)
     watched.pickle_copy()
-    _check_class_variables(watched)
-    if part.talks:
+    _check_values(watched)
+    if part.timing.talks:
         _check_weights(watched)
-    if part.schedule is not None:
+    if part.timing.schedule is not None:
         _check_schedule(watched)
     trials = list(make_trials(watched))
     for trial in trials:
@@ -61,21 +60,19 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
     check_parent(watched, same_as_parent)
 
 
-def _check_class_variables(watched: WatchedPart) -> None:
-    """Check types and values of the class variables that state what a filter does."""
-    part, name = watched.part, watched.name
-    for flag in FLAGS:
-        value = getattr(part, flag)
-        demand(isinstance(value, bool), f"{name}.{flag}", "must be True or False", value)
-    _check_flags(part.needs, Needs, f"{name}.needs")
-    clocks = part.clocks
+def _check_values(watched: WatchedPart) -> None:
+    """Check types and values of what a filter says of its needs and its timing."""
+    part, name = watched.part, f"{watched.name}.timing"
+    _check_flags(part.needs, Needs, f"{watched.name}.needs")
+    _check_flags(part.timing, Timing, name)
+    clocks = part.timing.clocks
     are_clocks = isinstance(clocks, tuple) and set(clocks) <= set(CLOCKS)
     text = ", ".join(f'"{clock}"' for clock in CLOCKS)
     demand(are_clocks, f"{name}.clocks", f"must be a tuple of {text}", clocks)
-    can_run = bool(clocks) or part.schedule is not None or not part.talks
+    can_run = bool(clocks) or part.timing.schedule is not None or not part.timing.talks
     rule = "must name a clock where schedule is None: the filter could not run at all"
     demand(can_run, f"{name}.clocks", rule, clocks)
-    slot = part.first_slot
+    slot = part.timing.first_exchange
     is_count = isinstance(slot, int) and slot >= 0
     demand(is_count, f"{name}.first_slot", "must be a whole number of at least 0", slot)
 
@@ -96,7 +93,8 @@ def _check_flags(value: Any, kind: type[Any], where: str) -> None:
 
 def _check_schedule(watched: WatchedPart) -> None:
     """Check the schedule of a user's filter in slots."""
-    schedule, where = watched.part.schedule, f"{watched.name}.schedule"
+    name = f"{watched.name}.timing"
+    schedule, where = watched.part.timing.schedule, f"{name}.schedule"
     are_phases = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
     text = ", ".join(f'"{phase}"' for phase in PHASES)
     demand(are_phases, where, f"must be None or a tuple of {text}", schedule)
@@ -104,12 +102,12 @@ def _check_schedule(watched: WatchedPart) -> None:
     demand(no_repeats, where, 'must have one "predict" and one "sense" at most', schedule)
     _check_predicts(watched, schedule)
     for phase in range(schedule.count("exchange")):
-        steps = watched.call("exchange_steps", phase)
+        steps = watched.call("timing.steps", phase)
         is_count = isinstance(steps, int) and steps >= 1
-        demand(is_count, f"{watched.name}.steps", "must be a whole number of at least 1", steps)
-        redraws = watched.call("redraws_links", phase, 0)
+        demand(is_count, f"{name}.steps", "must be a whole number of at least 1", steps)
+        redraws = watched.call("timing.redraws", phase, 0)
         rule, remedy = "must be True in step 0", "links have no outcome yet"
-        demand(redraws is True, f"{watched.name}.redraws_links", rule, redraws, remedy)
+        demand(redraws is True, f"{name}.redraws", rule, redraws, remedy)
 
 
 def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
@@ -118,9 +116,9 @@ def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
         return
     predicts = schedule.index("sense") < schedule.index("predict")
     rule = 'must be True where the schedule has "predict" after "sense", and False where before'
-    got = watched.part.predicts
+    got = watched.part.timing.predicts
     remedy = "else estimates are compared with the state of another slot"
-    demand(watched.part.predicts is predicts, f"{watched.name}.predicts", rule, got, remedy)
+    demand(got is predicts, f"{watched.name}.timing.predicts", rule, got, remedy)
 
 
 def _check_weights(watched: WatchedPart) -> None:

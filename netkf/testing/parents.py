@@ -121,11 +121,11 @@ def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Tria
     """Yield pairs of equal trials of a filter and of its parent, with the unit of their time."""
     parts = child.part, parent.part
     slots = None
-    if all(part.schedule is not None for part in parts):
+    if all(part.timing.schedule is not None for part in parts):
         slots = max(map(trial_slots, parts))
     clocks: list[str | None] = [None]
-    if any(part.talks for part in parts):
-        clocks = [clock for clock in child.part.clocks if clock in parent.part.clocks]
+    if any(part.timing.talks for part in parts):
+        clocks = [clock for clock in child.part.timing.clocks if clock in parent.part.timing.clocks]
     systems = make_systems(any(part.needs.inverts for part in parts))
     if isinstance(getattr(child.part, "weights", None), np.ndarray):
         systems = [system._replace(spread=1.0) for system in systems]

@@ -27,10 +27,10 @@ def make_trials(watched: WatchedPart, shift: FloatArray | None = None) -> Iterat
     """
     part = watched.part
     systems = make_systems(part.needs.inverts)
-    clocks: list[str | None] = list(part.clocks) if part.talks else [None]
+    clocks: list[str | None] = list(part.timing.clocks) if part.timing.talks else [None]
     for system in systems:
         system_shift = None if shift is None else shift[: len(system.M)]
-        if part.schedule is not None:
+        if part.timing.schedule is not None:
             yield SlotTrial(watched, system, system_shift)
         for clock in clocks:
             # All clocks on one system only: a fault that depends on it shows under any clock.

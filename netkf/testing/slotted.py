@@ -17,7 +17,7 @@ PERIOD = 1.0  # seconds of a slot
 
 def trial_slots(part: Any) -> int:
     """Return the number of slots of a trial: SLOTS from the first one with exchanges on."""
-    return min(int(part.first_slot), MAX_FIRST_SLOT) + SLOTS
+    return min(int(part.timing.first_exchange), MAX_FIRST_SLOT) + SLOTS
 
 
 class SlotTrial(Trial):
@@ -41,37 +41,39 @@ class SlotTrial(Trial):
         """
         part, slots = self.part, self.slots or trial_slots(self.part)
         for slot in range(slots):
-            if part.predicts and slot == slots - SLOTS_AFTER_SHIFT:
+            if part.timing.predicts and slot == slots - SLOTS_AFTER_SHIFT:
                 self.shift_truth()
             self._run_slot(slot, lost=slot == slots - 1)
-            if not part.predicts and slot == slots - SLOTS_AFTER_SHIFT:
+            if not part.timing.predicts and slot == slots - SLOTS_AFTER_SHIFT:
                 self.shift_truth()
             self.record_end()
 
     def _run_slot(self, slot: int, lost: bool) -> None:
         """Run the phases of a slot, with all messages delivered or all ``lost``."""
         part, phase = self.part, 0
-        for kind in part.schedule:
+        for kind in part.timing.schedule:
             if kind == "exchange":
-                if part.talks and slot >= part.first_slot:
-                    for step in range(min(part.exchange_steps(phase), MAX_STEPS)):
+                if part.timing.talks and slot >= part.timing.first_exchange:
+                    for step in range(min(part.timing.steps(phase), MAX_STEPS)):
                         self._exchange(Exchange(PERIOD * slot, phase, step, slot), lost)
                 phase += 1
-            elif slot > 0 or part.predicts:  # else the first estimate is that before any reading
+            elif (
+                slot > 0 or part.timing.predicts
+            ):  # else the first estimate is that before any reading
                 self._advance(kind, slot)
 
     def _advance(self, kind: str, slot: int) -> None:
         """Run the phase ``kind`` of a slot, and move the shift of the truth with it."""
         part = self.part
-        update_predicts = kind == "sense" and "predict" not in part.schedule
-        if kind == "predict" or (update_predicts and not part.predicts):
+        update_predicts = kind == "sense" and "predict" not in part.timing.schedule
+        if kind == "predict" or (update_predicts and not part.timing.predicts):
             self.offset = self.system.M @ self.offset
         if kind == "predict":
             for node in self.nodes:
                 self.step(node, "predict", PERIOD)
             return
         readings = [self.sample(node, PERIOD * slot) for node in self.nodes]
-        if update_predicts and part.predicts:
+        if update_predicts and part.timing.predicts:
             self.offset = self.system.M @ self.offset
         for node, reading in zip(self.nodes, readings, strict=True):
             self.step(node, "update", reading)
@@ -92,7 +94,7 @@ class SlotTrial(Trial):
 
     def _choose_senders(self, slot: int) -> list[list[int]]:
         """Return the senders whose messages each node receives."""
-        if not self.part.pairwise:
+        if not self.part.timing.pairwise:
             return [[k for k in self.nodes if k != node] for node in self.nodes]
         pair = self._talking_nodes(slot)
         return [[k for k in pair if k != node] if node in pair else [] for node in self.nodes]
@@ -100,6 +102,6 @@ class SlotTrial(Trial):
     def _talking_nodes(self, slot: int) -> list[int]:
         """Return the nodes that send: all, or the pair of this slot."""
         count = len(self.nodes)
-        if not self.part.pairwise:
+        if not self.part.timing.pairwise:
             return list(self.nodes)
         return sorted({slot % count, (slot + 1) % count})

@@ -72,14 +72,14 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     if not concerns_hybrid_paper(scenario):
         # Of what H assumes, this decides about errors of every filter.
         rows = [*_plant_rows(scenario), *start_rows(scenario, ANY)]
-        if scenario.filter.algorithm.talks:
+        if scenario.filter.algorithm.timing.talks:
             rows = [_reach_row(scenario), *_weight_rows(scenario), *rows]
         return [
             (name, ANY if source.startswith("H ") else source, holds, evidence)
             for name, source, holds, evidence in rows
         ]
     rows = [*_plant_rows(scenario), *_sampling_rows(scenario)]
-    if scenario.filter.algorithm.talks:
+    if scenario.filter.algorithm.timing.talks:
         network = [*_link_clock_rows(scenario), *_channel_rows(scenario)]
         rows = [*_graph_rows(scenario), *rows, *network]
     return [*rows, *start_rows(scenario, "H (9), (10)")]

@@ -82,7 +82,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
             promises["slot_central_covariance"] = _value_or_reason(
                 lambda: _slot_central_covariance(scenario)
             )
-    if has_linear_errors(scenario) and scenario.node_filter.talks:
+    if has_linear_errors(scenario) and scenario.node_filter.timing.talks:
         promises["steady_error"] = _steady_error(scenario)
     if not scenario.slotted:
         ends = np.array([scenario.horizon])
@@ -152,7 +152,7 @@ def _steady_bound(scenario: Scenario) -> dict[str, Any]:
         )
         return {"value": None, "trace": None, "reason": reason}
     result = _value_or_reason(lambda: steady_covariance_bound(scenario))
-    if result["reason"] and not scenario.filter.algorithm.talks:
+    if result["reason"] and not scenario.filter.algorithm.timing.talks:
         by_node = _value_or_reason(lambda: steady_by_node(scenario))
         return {**by_node, "reason": result["reason"]}
     return result

@@ -85,7 +85,7 @@ def _steady_note(scenario: Scenario) -> str:
             return ""
     except TheoryError as error:
         return f"steady state of the bound: {error}"
-    if not scenario.filter.algorithm.talks:
+    if not scenario.filter.algorithm.timing.talks:
         return "at some nodes P has no steady state, it grows without end; see netkf theory"
     return "the bound has no steady state, it grows without end; see netkf theory"
 
@@ -113,5 +113,5 @@ def delay_suffix(scenario: Scenario) -> str:
     """Return text to append to the name of a limit that assumes no delays: empty unless messages
     are delayed.
     """
-    delayed = scenario.filter.algorithm.talks and scenario.network.channel.delay.fixed != 0.0
+    delayed = scenario.filter.algorithm.timing.talks and scenario.network.channel.delay.fixed != 0.0
     return ", if messages took no time" if delayed else ""

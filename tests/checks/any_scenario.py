@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.registry import built_in_filters, split_choice
+from netkf.algorithms.registry import built_in_filters, default_timing, split_choice
 from netkf.core.errors import NetkfError
 from netkf.scenario.reading import from_table
 from netkf.scenario.scenario import Scenario
@@ -36,8 +36,11 @@ def draw_any(number: int, folder: Path) -> Scenario:
 
 def _draw_table(random: np.random.Generator, name: str, folder: Path) -> Table:
     cls, (kind, choice) = built_in_filters()[name], split_choice(name)
+    timing = default_timing(cls)
     flows = kind in ("hybrid", "covariance-intersection")
-    clocks = flows or ((bool(cls.clocks) or kind in ("central", "local")) and _is(random, 0.35))
+    clocks = flows or (
+        (bool(timing and timing.clocks) or kind in ("central", "local")) and _is(random, 0.35)
+    )
     n = int(random.integers(1, 3))
     nodes = 1 if _is(random, 0.05) else int(random.integers(2, 6))
     horizon = float(random.choice([1, 2, 5] if clocks else [3, 5, 12, 24, 40]))

@@ -1,6 +1,6 @@
 """Filters, matchings and channels with one thing wrong each."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import AVERAGE, PushSum
-from netkf.algorithms.traits import Weights
+from netkf.algorithms.traits import Timing, Weights
 from netkf.core.fields import positive, setting
 from netkf.network.channels import Bernoulli
 from netkf.network.matchings import Matching
@@ -36,9 +36,7 @@ class OwnReset(Filter):
 class OwnSwap(Filter):
     """A gossip filter from scratch that takes twice the partner's covariance."""
 
-    schedule = ("exchange", "sense", "predict")
-    predicts = True
-    pairwise = True
+    timing = Timing(schedule=("exchange", "sense", "predict"), predicts=True, pairwise=True)
 
     def absorb(self, state, messages, exchange):
         for message in messages:
@@ -50,8 +48,7 @@ class OwnSwap(Filter):
 class UpdateThenSwap(Gossip):
     """Updates first, then swaps what came of it, from slot 0 on."""
 
-    schedule = ("sense", "predict", "exchange")
-    first_slot = 0
+    timing = replace(Gossip.timing, schedule=("sense", "predict", "exchange"), first_slot=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,4 +349,4 @@ class SameWeights(Hybrid):
 class LateSwaps(Gossip):
     """Swaps from slot 3 on."""
 
-    first_slot = 3
+    timing = replace(Gossip.timing, first_slot=3)

@@ -1,12 +1,13 @@
 """Healthy scenarios that look suspicious: none of them may be accused, whatever the level."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 import netkf
+from netkf.algorithms.traits import Timing
 from netkf.checks import exact, statistics
 from netkf.checks.check import check
 from netkf.checks.evidence import BROKEN, HOLDS, UNDECIDED
@@ -55,7 +56,6 @@ class Kcf(Filter):
     """A Kalman consensus filter in slots, derived from the contract alone."""
 
     epsilon: float = setting(number(above=0.0, high=1.0))
-    schedule = ("predict", "sense", "exchange")
 
     def absorb(self, state, messages, exchange):
         pull = sum((m.payload.xhat - state.xhat for m in messages), np.zeros_like(state.xhat))
@@ -67,7 +67,7 @@ class Intersection(Filter):
     """Covariance intersection under link clocks, written from scratch."""
 
     epsilon: float = setting(number(above=0.0, high=1.0))
-    schedule = None
+    timing = Timing(schedule=None)
 
     def absorb(self, state, messages, exchange):
         moved = [state.model.extrapolate(*m.payload, m.age) for m in messages]
@@ -84,7 +84,7 @@ class Renamed(Filter):
     """The same with another name for its setting."""
 
     eps: float = setting(number(above=0.0, high=1.0))
-    schedule = None
+    timing = Timing(schedule=None)
 
     def absorb(self, state, messages, exchange):
         return Intersection(epsilon=self.eps).absorb(state, messages, exchange)
@@ -94,7 +94,7 @@ class Renamed(Filter):
 class Silent(Hybrid):
     """Declares that its nodes do not talk."""
 
-    talks = False
+    timing = replace(Hybrid.timing, talks=False)
 
 
 @dataclass(frozen=True, eq=False)

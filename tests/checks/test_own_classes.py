@@ -26,7 +26,7 @@ def beside(table, name, folder):
         (Gossip(), []),
         (Hybrid(epsilon=0.3), []),
         (HeavierLinks(epsilon=0.3), ["link_weights"]),
-        (LateSwaps(), ["first_slot"]),
+        (LateSwaps(), ["timing"]),
         (SwapsOnlyX(), ["absorb"]),
         (object(), []),
     ],
@@ -52,7 +52,7 @@ def test_weights_that_change_nothing_hold(tmp_path):
     assert own_attributes(SameWeights(epsilon=0.3)) == ["link_weights"]
 
 
-@pytest.mark.parametrize(("name", "own"), [("LateSwaps", "first_slot"), ("SwapsOnlyX", "absorb")])
+@pytest.mark.parametrize(("name", "own"), [("LateSwaps", "timing"), ("SwapsOnlyX", "absorb")])
 def test_what_should_be_the_same_and_is_not_is_broken(name, own, tmp_path):
     verdict, row = beside(GOSSIP, name, tmp_path)
     if name == "SwapsOnlyX":  # its P departs too, which says more

@@ -8,6 +8,7 @@ import pytest
 
 import netkf
 from netkf.algorithms.filter import Filter
+from netkf.algorithms.traits import Timing
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.pools import PoolOptions
 from netkf.runs.run import run_to_directory
@@ -72,7 +73,7 @@ def test_samples_after_digits_are_lost_are_found(growing):
 class NoFrames(Filter):
     """A local filter that does not say how it commutes with a shift."""
 
-    talks = False
+    timing = Timing(talks=False)
 
     def absorb(self, state, messages, exchange):
         return state

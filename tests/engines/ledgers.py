@@ -1,10 +1,11 @@
 """Small filters whose estimate is a ledger of what their node knew and did."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.traits import Timing
 from netkf.core.fields import boolean, setting
 from netkf.parts import Analysis, Filter
 
@@ -39,7 +40,7 @@ class Ledger(Filter):
     def emit(self, state, exchange):
         if self.silent and state.ledger[NODE] % 2:
             return state, None
-        hearers = len(exchange.receivers) or (1 if self.pairwise else state.receivers)
+        hearers = len(exchange.receivers) or (1 if self.timing.pairwise else state.receivers)
         ledger = state.ledger.copy()
         share = ledger[MASS] / (hearers + 1)
         ledger[MASS] -= hearers * share
@@ -66,7 +67,7 @@ class Ledger(Filter):
 class PairLedger(Ledger):
     """The same, in pairs."""
 
-    pairwise = True
+    timing = replace(Ledger.timing, pairwise=True)
 
 
 class StepsState(NamedTuple):
@@ -78,12 +79,12 @@ class StepsState(NamedTuple):
 class Steps(Filter):
     """Two exchanges a slot, of one step and of three; keeps when it sent and absorbed."""
 
-    schedule = ("exchange", "predict", "sense", "exchange")
-    clocks = ()
-    first_slot = 1
-
-    def steps(self, phase):
-        return 1 + 2 * phase
+    timing = Timing(
+        schedule=("exchange", "predict", "sense", "exchange"),
+        clocks=(),
+        first_slot=1,
+        steps=lambda phase: 1 + 2 * phase,
+    )
 
     def init(self, model, mean, cov, node):
         return StepsState()

@@ -83,7 +83,7 @@ def clocks(scenario):
     """Links, directions or nodes that have a clock."""
     at = getattr(scenario.network.activation, "at", None)
     topology = scenario.topology
-    if not scenario.filter.algorithm.talks:
+    if not scenario.filter.algorithm.timing.talks:
         return 0
     return {
         "links": len(topology.links),
@@ -97,7 +97,7 @@ def in_continuous_time(scenario, run):
     """Processes and events of a run, counted by hand."""
     samples = scenario.sample_times(Streams(scenario.seed))
     sampled = {(node, t) for (node, _), times in samples.items() for t in times.tolist()}
-    pooled = scenario.node_filter.pooled  # all nodes share one filter
+    pooled = scenario.node_filter.timing.pooled  # all nodes share one filter
     updates = len({t for _, t in sampled}) if pooled else len(sampled)
     frames = len(scenario.continuous_truth(Streams(scenario.seed)).frame_times)
     delayed = rows(run, "deliver", "late")
@@ -158,10 +158,10 @@ def test_simpy_counts_what_happens_in_slots(name, stepped):
     stages, exchanges = SLOTTED[name]
     slots, nodes, sensing = 20, len(scenario.nodes), len(scenario.placed_sensors)
     processes = 1 + nodes + sensing + 1
-    if scenario.filter.algorithm.predicts:
+    if scenario.filter.algorithm.timing.predicts:
         events = slots * (1 + nodes * stages + sensing + exchanges)
         events -= (
-            scenario.node_filter.first_slot * (nodes + 1) * exchanges
+            scenario.node_filter.timing.first_exchange * (nodes + 1) * exchanges
         )  # gossip begins in slot 1
     else:  # nothing happens in slot 0, whose sample is taken at its end as all are
         events = 2 * slots + (slots - 1) * (nodes * stages + sensing + exchanges)

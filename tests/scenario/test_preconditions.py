@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import netkf
+from netkf.algorithms.registry import default_timing
 from netkf.parts import kinds
 from netkf.scenario.reading import from_table
 
@@ -265,9 +266,11 @@ def test_every_filter_under_clocks_is_refused_in_one_line_or_runs(case, tmp_path
              "cov": [[1.0, 0.0], [0.0, 1.0]], **change.get("plant", {})}  # fmt: skip
     ran = 0
     for (name, table), (at, clock) in itertools.product(FILTERS.items(), CLOCKS.items()):
-        algorithm = kinds()["filter"][name]
+        timing = default_timing(kinds()["filter"][name])
         memory = name == "belief-propagation"  # needs a plant without noise
-        if memory or at not in (algorithm.clocks if algorithm.talks else ("links",)):
+        if memory or at not in (
+            timing.clocks if timing is not None and timing.talks else ("links",)
+        ):
             continue
         if at == "readings" and case == "no sensor":
             continue

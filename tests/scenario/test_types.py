@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 import netkf
 from netkf.parts import (
     Analysis, Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, Increments,
-    LinearSensor, LinkClock, Loss, Message, Needs, NodeInfo, Poisson, Reading, State, Weights,
-    positive, probability, setting,
+    LinearSensor, LinkClock, Loss, Message, Needs, NodeInfo, Poisson, Reading, State, Timing,
+    Weights, positive, probability, setting,
 )
 
 Array = NDArray[np.float64]
@@ -35,9 +35,8 @@ Array = NDArray[np.float64]
 class Listen(Filter):
     """Takes the last estimate that arrives; the rest as in the base class."""
 
-    clocks = ("nodes", "links")
+    timing = Timing(clocks=("nodes", "links"))
     needs = Needs(one_way=True)
-    schedule = ("predict", "sense", "exchange")
 
     def absorb(self, state: State, messages: Sequence[Message], exchange: Exchange) -> State:
         for message in messages:
@@ -60,8 +59,11 @@ class Everything(Filter):
 
     gain: float = setting(positive, default=0.1)
 
-    schedule = None
-    first_slot = 1
+    @property
+    def timing(self) -> Timing:
+        return Timing(
+            schedule=None, first_slot=1, max_age=1.0, steps=self.steps, redraws=self.redraws
+        )
 
     @property
     def needs(self) -> Needs:
@@ -99,14 +101,8 @@ class Everything(Filter):
     def shift_payload(self, payload: tuple[float, Array], offset: Array) -> tuple[float, Array]:
         return payload[0], payload[1] + offset
 
-    def accepts(self, payload: tuple[float, Array], age: float) -> bool:
-        return age < 1.0
-
     def max_measurement_interval(self, state: Own) -> float:
         return 0.1
-
-    def exchange_steps(self, phase: int) -> int:
-        return super().exchange_steps(phase)
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:
         return 2.0 * n
@@ -114,7 +110,7 @@ class Everything(Filter):
     def steps(self, phase: int) -> int:
         return 1 + phase
 
-    def redraws_links(self, phase: int, step: int) -> bool:
+    def redraws(self, phase: int, step: int) -> bool:
         return step == 0
 
     @property
@@ -245,7 +241,7 @@ def test_mypy_accepts_classes_of_ones_own_and_finds_mistakes(tmp_path):
 
 
 OF_KERNELS = {
-    *("sends_in_slots", "slot_stopping", "decides_in_slots", "record", "begin", "prepare"),
+    *("record", "begin", "prepare"),
 }
 
 

@@ -183,7 +183,7 @@ def rows_before(scenario, events, at):
     """The number of rows that a state shown at a time contains."""
     if not scenario.slotted:
         return int((events.t <= at).sum())
-    return int((events.t < (at if scenario.node_filter.predicts else at + 0.5) - 1e-9).sum())
+    return int((events.t < (at if scenario.node_filter.timing.predicts else at + 0.5) - 1e-9).sum())
 
 
 @pytest.mark.parametrize("name", CASES)

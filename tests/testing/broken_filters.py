@@ -1,7 +1,7 @@
 """Filters with one breach of the contract each, and what their checker must say."""
 
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import MASS, PushSum
-from netkf.algorithms.traits import Analysis, Weights
+from netkf.algorithms.traits import Analysis, Timing, Weights
 
 BROKEN = {}
 
@@ -236,8 +236,7 @@ class Purse(NamedTuple):
 class Spendthrift(Filter):
     """Under clocks it sends mass and keeps it too."""
 
-    schedule = None
-    clocks = ("nodes", "links")
+    timing = Timing(schedule=None, clocks=("nodes", "links"))
 
     def init(self, model, mean, cov, node):
         return Purse(*super().init(model, mean, cov, node), 1.0)
@@ -258,52 +257,46 @@ class Empty(Intermittent):
         return super().absorb(state, messages, exchange)
 
 
-@says('Listens.schedule: must be None or a tuple of "predict", "sense", "exchange"')
+@says('Listens.timing.schedule: must be None or a tuple of "predict", "sense", "exchange"')
 class Listens(Gossip):
-    schedule = ("exchange", "listen")
+    timing = replace(Gossip.timing, schedule=("exchange", "listen"))
 
 
-@says('Twice.schedule: must have one "predict" and one "sense" at most')
+@says('Twice.timing.schedule: must have one "predict" and one "sense" at most')
 class Twice(Gossip):
-    schedule = ("exchange", "predict", "sense", "predict")
+    timing = replace(Gossip.timing, schedule=("exchange", "predict", "sense", "predict"))
 
 
-@says('Ahead.predicts: must be True where the schedule has "predict" after "sense"')
+@says('Ahead.timing.predicts: must be True where the schedule has "predict" after "sense"')
 class Ahead(Gossip):
     """Its samples would be taken for the state of the slot before."""
 
-    predicts = False
+    timing = replace(Gossip.timing, predicts=False)
 
 
-@says("NoClock.clocks: must be a tuple of", epsilon=0.3)
+@says("NoClock.timing.clocks: must be a tuple of", epsilon=0.3)
 class NoClock(Hybrid):
-    clocks = "nodes"
+    timing = replace(Hybrid.timing, clocks="nodes")
 
 
-@says("NoSuchClock.clocks: must be a tuple of", epsilon=0.3)
+@says("NoSuchClock.timing.clocks: must be a tuple of", epsilon=0.3)
 class NoSuchClock(Hybrid):
-    clocks = ("node",)
+    timing = replace(Hybrid.timing, clocks=("node",))
 
 
-@says("Nowhere.clocks: must name a clock where schedule is None", epsilon=0.3)
+@says("Nowhere.timing.clocks: must name a clock where schedule is None", epsilon=0.3)
 class Nowhere(Hybrid):
-    clocks = ()
+    timing = replace(Hybrid.timing, clocks=())
 
 
-@says("Maybe.pairwise: must be True or False")
+@says("Maybe.timing.pairwise: must be True or False")
 class Maybe(Gossip):
-    pairwise = "yes"
-
-
-@says("Picky.accepts (tests/testing/broken_filters.py, line 300) returned nothing", epsilon=0.3)
-class Picky(Hybrid):
-    def accepts(self, payload, age):
-        return None
+    timing = replace(Gossip.timing, pairwise="yes")
 
 
 @says("SlotInPlace.update: must not change its arguments, but changed state.root")
 class SlotInPlace(Gossip):
-    clocks = ()
+    timing = replace(Gossip.timing, clocks=())
 
     def update(self, state, reading):
         new = super().update(state, reading)
@@ -311,15 +304,14 @@ class SlotInPlace(Gossip):
         return new
 
 
-@says("NeverFresh.redraws_links: must be True in step 0")
+@says("NeverFresh.timing.redraws: must be True in step 0")
 class NeverFresh(Gossip):
-    def redraws_links(self, phase, step):
-        return False
+    timing = replace(Gossip.timing, redraws=lambda _, __: False)
 
 
 @says("ChangesReading.update: must not change its arguments, but changed reading.y")
 class ChangesReading(Gossip):
-    clocks = ()
+    timing = replace(Gossip.timing, clocks=())
 
     def update(self, state, reading):
         reading.y[:] = 0.0

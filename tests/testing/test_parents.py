@@ -48,14 +48,14 @@ class Averse(parts.Hybrid):
         node["root"][:] *= 1.1
 
 
-@keep(ADJUSTED, "LateStart.first_slot: must have the numbers of Gossip")
+@keep(ADJUSTED, "LateStart.timing: must have the numbers of Gossip")
 class LateStart(parts.Gossip):
-    first_slot = 3
+    timing = replace(parts.Gossip.timing, first_slot=3)
 
 
-@keep(ADJUSTED, "Everyone.pairwise: must have the numbers of Gossip")
+@keep(ADJUSTED, "Everyone.timing: must have the numbers of Gossip")
 class Everyone(parts.Gossip):
-    pairwise = False
+    timing = replace(parts.Gossip.timing, pairwise=False)
 
 
 @keep(ADJUSTED, "Unfair.begin: must have the numbers of DiffusionFilter")
@@ -71,10 +71,9 @@ class Certain(parts.PushSum):
     kernels = replace(SLOTS, predict=predict_mean)
 
 
-@keep(ADJUSTED, "Deaf.accepts: must have the numbers of CovarianceIntersection", epsilon=0.25)
+@keep(ADJUSTED, "Deaf.timing: must have the numbers of CovarianceIntersection", epsilon=0.25)
 class Deaf(parts.CovarianceIntersection):
-    def accepts(self, payload, age):
-        return age == 0.0
+    timing = replace(parts.CovarianceIntersection.timing, max_age=0.0)
 
 
 @keep(DEFINED, "its own: absorb", epsilon=0.3)
@@ -102,7 +101,7 @@ class Renamed(parts.Hybrid):
 
 @keep(SAME, epsilon=0.3)
 class OneClock(parts.Hybrid):
-    clocks = ("nodes",)
+    timing = replace(parts.Hybrid.timing, clocks=("nodes",))
 
     @property
     def needs(self):
@@ -171,12 +170,12 @@ def test_equal_numbers_pass_silently(name):
 
 
 def test_check_filter_compares_with_the_parent():
-    with pytest.raises(AssertionError, match=r"LateStart.first_slot: must have the numbers of Gos"):
+    with pytest.raises(AssertionError, match=r"LateStart.timing: must have the numbers of Gos"):
         check_filter(LateStart)
     assert check_filter(LateStart, same_as_parent=False) is None
 
 
 def test_attributes_of_its_own_are_listed_without_fields_and_new_names():
-    assert own_attributes(OneClock(epsilon=0.3)) == ["clocks", "needs"]
+    assert own_attributes(OneClock(epsilon=0.3)) == ["needs", "timing"]
     assert own_attributes(Averse(epsilon=0.3)) == ["begin"]
     assert own_attributes(Renamed(epsilon=0.3)) == []

@@ -66,8 +66,7 @@ def shift_payload(record, m, run):
 
 
 class Remembering(Filter):
-    schedule = None
-    clocks = ("nodes", "directions", "readings")
+    timing = Timing(schedule=None, clocks=("nodes", "directions", "readings"))
     needs_samples = True
     kernels = Kernels(
         predict=predict, update=update, emit=emit, absorb=absorb, shift=shift,

@@ -33,7 +33,7 @@ def network_clocks(scenario: Scenario) -> ClockGroup:
     or link; empty if no messages are sent or no clock decides when.
     """
     clock = scenario.network.activation
-    if not scenario.filter.algorithm.talks or not isinstance(clock, LinkClock):
+    if not scenario.filter.algorithm.timing.talks or not isinstance(clock, LinkClock):
         return NO_CLOCKS
     entities = tuple(clock.entities(scenario.topology))
     stated, law, share = stated_part(clock, "activation"), stated_law(clock, "activation"), {}
@@ -193,9 +193,9 @@ def _redraws_links(scenario: Scenario) -> bool:
     filter_ = scenario.node_filter
     if not scenario.slotted:
         return True
-    phases = range((filter_.schedule or ()).count("exchange"))
-    steps = [(phase, k) for phase in phases for k in range(filter_.exchange_steps(phase))]
-    return all(filter_.redraws_links(*step) for step in steps)
+    phases = range((filter_.timing.schedule or ()).count("exchange"))
+    steps = [(phase, k) for phase in phases for k in range(filter_.timing.steps(phase))]
+    return all(filter_.timing.redraws(*step) for step in steps)
 
 
 def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
@@ -247,7 +247,7 @@ def pairs_of(scenario: Scenario, run: Run) -> PairCounts | None:
     # One integer for each link and slot: the same link one slot before has that less len(links).
     keys = slots * len(links) + link_of_row
     repeated = np.isin(keys - len(links), keys)
-    first = scenario.node_filter.first_slot  # filters may exchange nothing in slot 0
+    first = scenario.node_filter.timing.first_exchange  # filters may exchange nothing in slot 0
     total = int(np.ceil(scenario.horizon / scenario.slot_plant.period - 1e-9)) - first
     return PairCounts(
         count, np.bincount(link_of_row[repeated], minlength=len(links)), np.array(float(total))

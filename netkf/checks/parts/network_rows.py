@@ -318,7 +318,7 @@ def network_promises(samples: PartSamples) -> list[Promise]:
     """
     scenario = samples.scenario
     promises = [*_clock_promises(NETWORK, samples), *_clock_promises(SENSORS, samples)]
-    drawn = samples.pairs is not None and scenario.node_filter.talks
+    drawn = samples.pairs is not None and scenario.node_filter.timing.talks
     if drawn and pair_probabilities(scenario) is not None:
         promises.append(MATCHING_ROW)
     if samples.fates is None or not samples.fates.sent.any():

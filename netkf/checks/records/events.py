@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.filter import may_be_silent
 from netkf.checks.parts.events import draw_ticks
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock, OnReadings
@@ -194,7 +195,7 @@ def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     if scenario.slotted and isinstance(scenario.network.activation, Matching):
         swaps, arrivals = (np.flatnonzero(kinds == kind) for kind in (SWAP, DELIVER))
         fields = ["node", "peer", "message", "phase"]
-        if not scenario.node_filter.pairwise:
+        if not scenario.node_filter.timing.pairwise:
             return
         one, other = (np.sort(log[rows][fields]) for rows in (swaps, arrivals))
         # Messages of the last exchange may arrive in a slot that is not recorded to its end.
@@ -252,7 +253,7 @@ def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     """Yield a fault unless clocks tick at the times drawn again, in order of clocks."""
     clock = scenario.network.activation
-    silent = not scenario.node_filter.talks or run.status != "complete"
+    silent = not scenario.node_filter.timing.talks or run.status != "complete"
     if silent or not isinstance(clock, LinkClock) or isinstance(clock, OnReadings):
         return
     entities = list(clock.entities(scenario.topology))
@@ -317,9 +318,9 @@ def _slots(scenario: Scenario) -> int:
 
 def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     """Yield a fault unless each node with sensors senses once in every slot."""
-    if run.status != "complete" or "sense" not in (scenario.node_filter.schedule or ()):
+    if run.status != "complete" or "sense" not in (scenario.node_filter.timing.schedule or ()):
         return
-    first = 0 if scenario.node_filter.predicts else 1
+    first = 0 if scenario.node_filter.timing.predicts else 1
     expected = np.arange(first, _slots(scenario))
     senses = log[log["kind"] == SENSE]
     slots = scenario.slot_plant.slots_of(senses["t"])
@@ -332,10 +333,10 @@ def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     """Yield a fault unless all nodes, or drawn pairs, send in every step."""
     algorithm, activation = scenario.node_filter, scenario.network.activation
-    if run.status != "complete" or not algorithm.talks or algorithm.decides_in_slots():
+    if run.status != "complete" or not algorithm.timing.talks or may_be_silent(algorithm):
         return
     kinds = log["kind"]
-    if algorithm.pairwise:
+    if algorithm.timing.pairwise:
         ticks, messages = (int((kinds == kind).sum()) for kind in (TICK, SEND))
         if messages != 2 * ticks:
             yield f"{messages:,} messages of {ticks:,} pairs"
@@ -344,10 +345,10 @@ def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
         isinstance(sensor, RecordedSensor) for sensor in scenario.sensors
     ):
         return
-    phases = range((algorithm.schedule or ()).count("exchange"))
-    steps = [algorithm.exchange_steps(phase) for phase in phases]
+    phases = range((algorithm.timing.schedule or ()).count("exchange"))
+    steps = [algorithm.timing.steps(phase) for phase in phases]
     rounds = log["phase"][kinds == ROUND]
-    slots = _slots(scenario) - algorithm.first_slot
+    slots = _slots(scenario) - algorithm.timing.first_exchange
     expected = np.tile(np.repeat(np.array(phases, dtype=int), steps), max(slots, 0))
     if not np.array_equal(rounds, expected):
         yield f"{len(rounds):,} rounds of exchanges, not {len(expected):,} in order"
@@ -358,7 +359,7 @@ def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
         [
             direction
             for direction in scenario.topology.directions
-            if algorithm.sends_in_slots(phase, direction[0] in scenario.placed_sensors)
+            if algorithm.timing.sends(phase, direction[0] in scenario.placed_sensors)
         ]
         for phase in phases
     ]

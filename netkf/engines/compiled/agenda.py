@@ -91,12 +91,12 @@ def is_immediate(scenario: Scenario) -> bool:
     return (
         kernels is not None
         and kernels.is_convex
-        and node_filter.talks
+        and node_filter.timing.talks
         and not scenario.sampled_sensors
         and type(network.activation) is Poisson
         and delay_is_zero(network.channel)
         # A negative max_age makes even messages of age 0 too old.
-        and node_filter.max_age >= 0.0
+        and node_filter.timing.max_age >= 0.0
         # Each message of a tick has a bit of one integer.
         and int(np.diff(senders_of(scenario).first).max(initial=0)) <= MAX_LINKS_OF_CLOCK
     )

@@ -179,7 +179,7 @@ def batch_size(scenario: Scenario) -> int:
         return 1
     # An estimate of the floats that one run draws and stores as samples.
     n, period = scenario.plant.n, scenario.diffusion.sensing_period
-    filters = 1 if scenario.node_filter.pooled else len(scenario.nodes)
+    filters = 1 if scenario.node_filter.timing.pooled else len(scenario.nodes)
     # One piece for each step, and one more for each sample that cuts a step.
     steps = BLOCK + len(scenario.times) + (scenario.horizon / period if period else 0.0)
     sensors = sum(len(placed) for placed in scenario.placed_sensors.values())
@@ -210,7 +210,7 @@ def quick_runs(scenario: Scenario) -> int:
 def _expected_ticks(scenario: Scenario) -> float:
     """Return the expected number of ticks of a run, large if a clock has no finite rate."""
     clock = scenario.network.activation
-    if not (scenario.node_filter.talks and isinstance(clock, LinkClock)):
+    if not (scenario.node_filter.timing.talks and isinstance(clock, LinkClock)):
         return 0.0
     entities = clock.entities(scenario.topology)
     ticks = sum(clock.mean_rate(entity) for entity in entities) * scenario.horizon

@@ -37,7 +37,7 @@ class ClockFilters:
     ) -> None:
         self.kernels, self._loop = kernels, clock_loop(kernels)
         self._p = 1
-        pooled = scenario.node_filter.pooled
+        pooled = scenario.node_filter.timing.pooled
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
         models = (scenario.pooled_model,) if pooled else scenario.models
         links = _links_by_receiver(scenario)
@@ -182,7 +182,7 @@ class ClockFilters:
 def _links_by_receiver(scenario: Scenario) -> dict[str, Any]:
     """Return the directed links sorted by receiver and sender, as fields of a run."""
     index = scenario.topology.index
-    directions = scenario.topology.directions if scenario.node_filter.talks else ()
+    directions = scenario.topology.directions if scenario.node_filter.timing.talks else ()
     ends = sorted((index[receiver], index[sender]) for sender, receiver in directions)
     receivers = np.array([receiver for receiver, _ in ends], dtype=np.int64)
     nodes, senders = scenario.nodes, np.array([sender for _, sender in ends], dtype=np.int64)

@@ -180,7 +180,7 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
             scenario.sensors[placed_sensor.entry].H,
             roots[placed_sensor.entry],
         )
-    index, pooled = scenario.topology.index, scenario.node_filter.pooled
+    index, pooled = scenario.topology.index, scenario.node_filter.timing.pooled
     indices = [0 if pooled else index[node] for node in scenario.increment_sensors]
     shared = {
         "rows": rows,

@@ -291,7 +291,7 @@ class Workspace:
         max_messages = int(np.diff(self._senders.first).max(initial=0))
         return {
             "clock_kind": CLOCKS.index(self._senders.at),
-            "newest_only": algorithm.newest_only,
+            "newest_only": algorithm.timing.newest_only,
             "most_messages": max_messages,
             "free_count": len(self._pool[0]),
             # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
@@ -300,7 +300,7 @@ class Workspace:
             "most_rows": 2 + 3 * max_messages + int(np.diff(instants.first).max(initial=0)),
             "horizon": self._scenario.horizon,
             "per_second": self._scenario.time_grid.per_second,
-            "age_limit": algorithm.max_age,
+            "age_limit": algorithm.timing.max_age,
             "inbox_time": 0.0,
         }
 

@@ -121,7 +121,7 @@ def _make_instants(
 ) -> Instants:
     """Return the instants: times at which a node uses one or several samples at once."""
     index = scenario.topology.index if placed else {}
-    pooled, n = scenario.node_filter.pooled, scenario.plant.n
+    pooled, n = scenario.node_filter.timing.pooled, scenario.plant.n
     node = np.array([node for node, _ in placed], dtype=np.int64)
     filters = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
     parts = [

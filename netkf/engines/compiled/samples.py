@@ -39,7 +39,7 @@ def record_samples(
     sound_filters = sound_mask(xhat, P, error=error if scenario.plant.truth_known else None)
     sound = sound_filters.all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.
-    if scenario.node_filter.pooled:
+    if scenario.node_filter.timing.pooled:
         nodes = len(scenario.nodes)
         xhat, P, error = (np.repeat(values, nodes, axis=1) for values in (xhat, P, error))
         sound_filters = np.repeat(sound_filters, nodes, axis=1)

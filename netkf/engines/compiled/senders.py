@@ -47,7 +47,7 @@ def senders_of(scenario: Scenario) -> Senders:
     """
     topology, clock = scenario.topology, scenario.network.activation
     # In slots there is no link clock.
-    if not scenario.node_filter.talks or not isinstance(clock, LinkClock):
+    if not scenario.node_filter.timing.talks or not isinstance(clock, LinkClock):
         no_links = np.zeros(0, dtype=np.int64)
         return Senders("links", (), (), np.zeros(1, dtype=np.int64), no_links, (), no_links)
     if clock.at == "links":

@@ -98,7 +98,7 @@ class SlotEvents:
         """Make the streams of matchings (which pairs of nodes exchange) and of all directed links
         of one run; no slot has been made yet.
         """
-        self._scenario, self._setup, self._algorithm = scenario, setup, scenario.node_filter
+        self._scenario, self._setup, self._timing = scenario, setup, scenario.node_filter.timing
         self._instant = scenario.time_grid.instant
         self._random = streams.generator("matching")
         self._directions = [
@@ -141,7 +141,7 @@ class SlotEvents:
         for step in self._iterate_steps(self._slot):
             self._chosen_pairs.append(self._choose_pairs(step))
             # Links of the matching just drawn; broadcasts use all links.
-            links = self._chosen_pairs[-1][0] if self._algorithm.pairwise else self._by_link
+            links = self._chosen_pairs[-1][0] if self._timing.pairwise else self._by_link
             asked[step.step, [index[node] for link in links for node in link]] = 1
         return asked
 
@@ -170,7 +170,7 @@ class SlotEvents:
 
     def _one_slot(self) -> np.ndarray:
         """Make all events of the present slot."""
-        setup, algorithm, slot = self._setup, self._algorithm, self._slot
+        setup, timing, slot = self._setup, self._timing, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
         if setup.may_miss:
             self._unread = setup.unread(slot, 1)[0]
@@ -180,14 +180,14 @@ class SlotEvents:
         self._deliver(start)
         # Filters that predict are sampled at the beginning of the slot, the others at its end.
         # None among the rows marks the sample.
-        if sampled and algorithm.predicts:
+        if sampled and timing.predicts:
             self._rows.append(None)
         # At the horizon only the sample matters: no events.
         self._recording = slot < setup.last
-        if self._recording or not algorithm.predicts:
+        if self._recording or not timing.predicts:
             self._make_stage_events(slot, up)
         self._recording = True
-        if sampled and not algorithm.predicts:
+        if sampled and not timing.predicts:
             self._rows.append(None)
         return up
 
@@ -198,7 +198,7 @@ class SlotEvents:
             if step < 0:
                 # Slot 0 of a filter that does not predict has no reading: its sample is the initial
                 # state.
-                if slot > 0 or self._algorithm.predicts:
+                if slot > 0 or self._timing.predicts:
                     for node in self._scenario.sensing_nodes:
                         self._append_row((now, SENSE, node, -1, -1, -1, NAN))
                 continue
@@ -215,10 +215,10 @@ class SlotEvents:
 
     def _iterate_steps(self, slot: int) -> Iterator[Step]:
         """Yield the exchange steps of ``slot`` with their phase and times in seconds."""
-        setup, algorithm, repeats = self._setup, self._algorithm, [0, 0]
+        setup, timing, repeats = self._setup, self._timing, [0, 0]
         # At the horizon filters that predict are only sampled.
-        acts = slot < setup.last or not algorithm.predicts
-        if not (acts and algorithm.talks and slot >= algorithm.first_slot):
+        acts = slot < setup.last or not timing.predicts
+        if not (acts and timing.talks and slot >= timing.first_exchange):
             return
         start = now = self._scenario.slot_plant.slot_time(slot)
         for step, phase, end in zip(*(c.tolist() for c in setup.stages[:3]), strict=True):
@@ -267,7 +267,7 @@ class SlotEvents:
 
     def _send_all(self, step: Step) -> None:
         """Send all messages of an exchange step, with a draw of the channel for each."""
-        broadcast, now, phase = not self._algorithm.pairwise, step.begin, step.phase
+        broadcast, now, phase = not self._timing.pairwise, step.begin, step.phase
         pairs, up = self._chosen_pairs.pop(0) if self._chosen_pairs else self._choose_pairs(step)
         if broadcast:
             self._append_row((now, ROUND, -1, -1, -1, phase, NAN))
@@ -298,7 +298,7 @@ class SlotEvents:
         if not isinstance(activation, RecordedSlots):
             return links, None
         listed = activation.pairs(step.slot, step.phase, step.repeat)
-        if self._algorithm.pairwise:
+        if self._timing.pairwise:
             return listed, None
         # A recorded list names links once: in an undirected graph both directions are up.
         up = set(listed)
@@ -369,9 +369,9 @@ class SlotEvents:
             for peer in sorted(arrived):
                 number, age = arrived[peer]
                 up[self._setup.index_of_direction[peer, node]] = 1
-                if self._algorithm.pairwise:
+                if self._timing.pairwise:
                     self._append_row((step.end, SWAP, node, peer, number, step.phase, age))
-            if not self._algorithm.pairwise:
+            if not self._timing.pairwise:
                 oldest = max(age for _, age in arrived.values())
                 self._append_row((step.end, ABSORB, node, -1, -1, step.phase, oldest))
         # Mark the place for stop rows, which ``rows`` inserts once the kernel has decided on them.

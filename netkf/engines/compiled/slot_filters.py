@@ -94,16 +94,15 @@ class SlotFilters:
         )
         algorithm = setup.algorithm
         stages = [
-            kind for kind in algorithm.schedule or () if algorithm.talks or kind != "exchange"
+            kind
+            for kind in algorithm.timing.schedule or ()
+            if algorithm.timing.talks or kind != "exchange"
         ]
         self._stages = np.array([_KINDS[kind] for kind in stages], dtype=np.int64)
         exchange = np.cumsum(self._stages == EXCHANGE) - 1
         self._phases = np.where(self._stages == EXCHANGE, exchange, -1)
         self._steps = np.array(
-            [
-                algorithm.exchange_steps(phase) if phase >= 0 else 0
-                for phase in self._phases.tolist()
-            ],
+            [algorithm.timing.steps(phase) if phase >= 0 else 0 for phase in self._phases.tolist()],
             dtype=np.int64,
         )
 
@@ -117,7 +116,7 @@ class SlotFilters:
             stages=self._stages,
             phases=self._phases,
             steps=self._steps,
-            predicts=self._setup.algorithm.predicts,
+            predicts=self._setup.algorithm.timing.predicts,
             direction=self._setup.links.direction,
             varies=H.shape[0] * H.shape[1] > 1,
             start=0,

@@ -197,7 +197,7 @@ class SlotRuns:
             streams_per_link=setup.streams_per_link,
         )
         protocol, probability, first, members = setup.matching
-        if setup.algorithm.randomised:
+        if setup.algorithm.timing.randomised:
             self._triggers = self._in_lanes("trigger", [(node,) for node in setup.nodes.tolist()])
         states = streams.states("matching", [()])
         order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
@@ -316,10 +316,10 @@ class SlotRuns:
         slots = np.arange(self._slot, self._slot + count)
         recorded = slots < setup.last
         # At the horizon a filter that predicts is only sampled: its prediction is the result.
-        active = recorded | (not algorithm.predicts)
+        active = recorded | (not algorithm.timing.predicts)
         # Filters that do not predict use no reading in slot 0: its sample is their initial state.
-        sensed = active & ((slots > 0) | algorithm.predicts)
-        exchanged = active & (slots >= algorithm.first_slot) & algorithm.talks
+        sensed = active & ((slots > 0) | algorithm.timing.predicts)
+        exchanged = active & (slots >= algorithm.timing.first_exchange) & algorithm.timing.talks
         sample = np.full(count, -1, dtype=np.int64)
         first, last = np.searchsorted(setup.samples, (self._slot, self._slot + count))
         # Indices count from the first sample of the run, or of these slots.
@@ -336,7 +336,7 @@ class SlotRuns:
             sensed=sensed,
             exchanged=exchanged,
             sample=sample,
-            predicts=algorithm.predicts,
+            predicts=algorithm.timing.predicts,
         )
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
@@ -411,7 +411,7 @@ class SlotRuns:
 
     def _draw_uniforms(self, sent: np.ndarray) -> FloatArray:
         """Return uniform numbers (B, S, E, N, L) for decisions; empty if none is needed."""
-        if not self.setup.algorithm.randomised or not self.setup.decides:
+        if not self.setup.algorithm.timing.randomised or not self.setup.decides:
             # Five dimensions, as kernels are compiled for.
             return np.zeros((0,) * 5)
         uniform = np.zeros(sent.shape)
@@ -457,7 +457,7 @@ class SlotRuns:
             H = unset((*shape, setup.n, LANES))
             H[:] = setup.H
         x = local
-        if rebased.any() and setup.algorithm.predicts:
+        if rebased.any() and setup.algorithm.timing.predicts:
             # The origin moves before the reading: the state in the new frame is 0.
             x = local.copy()
             x[:, rebased] = 0.0
@@ -515,7 +515,7 @@ class SlotRuns:
         columns: Any = [table[name] for name in ROW_COLUMNS]
         count = make_rows(
             setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
-            setup.algorithm.pairwise, first, stop, Rows._make([*columns, before_sample]),
+            setup.algorithm.timing.pairwise, first, stop, Rows._make([*columns, before_sample]),
         )  # fmt: skip
         return table[:count]
 
@@ -526,7 +526,7 @@ class SlotRuns:
         setup = self.setup
         count_events(
             MANY, setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
-            setup.algorithm.pairwise, aligned((len(KINDS), LANES)), self.counts,
+            setup.algorithm.timing.pairwise, aligned((len(KINDS), LANES)), self.counts,
         )  # fmt: skip
 
     def _traced_nodes(self) -> TracedNodes:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel
 from netkf.engines.compiled.slot_messages import (
@@ -92,7 +92,7 @@ class SlotSetup:
         self._set_stages(scenario)
         self._set_sensors(scenario)
         self._set_states(scenario)
-        links = topology.links if algorithm.talks else ()
+        links = topology.links if algorithm.timing.talks else ()
         ends = [[topology.index[i], topology.index[j]] for i, j in links]
         self.ends = np.array(ends, dtype=np.int64).reshape(-1, 2)
         # Directions 2 l and 2 l + 1 belong to link l, as in the SimPy engine.
@@ -123,30 +123,30 @@ class SlotSetup:
     def _set_stages(self, scenario: Scenario) -> None:
         """Set the ``stages`` of a slot, the ``phases`` of exchange steps, and ``fresh`` ones."""
         algorithm, phase, step = self.algorithm, 0, 0
-        length = scenario.phase_length if algorithm.talks else 0.0
+        length = scenario.phase_length if algorithm.timing.talks else 0.0
         stages: list[tuple[int, int, float]] = []
         fresh: list[bool] = []
-        for kind in algorithm.schedule or ():
+        for kind in algorithm.timing.schedule or ():
             if kind == "sense":
                 # -1: a reading, which is no step of an exchange.
                 stages.append((-1, -1, 0.0))
             elif kind == "exchange":
-                steps = algorithm.exchange_steps(phase) if algorithm.talks else 0
+                steps = algorithm.timing.steps(phase) if algorithm.timing.talks else 0
                 for k in range(steps):
                     # Steps share the phase equally; ends are seconds after the slot begins.
                     stages.append((step, phase, (phase + (k + 1) / steps) * length))
-                    fresh.append(algorithm.redraws_links(phase, k))
+                    fresh.append(algorithm.timing.redraws(phase, k))
                     step += 1
                 phase += 1
         numbers, phases, ends = zip(*stages, strict=True)
         # The last step of each exchange; -1 for readings, whose phase is -1.
         last_step = {phase: step for step, phase, _ in stages}
-        self.decides = algorithm.decides_in_slots()
+        self.decides = may_be_silent(algorithm)
         self.stages = Stages(
             np.array(numbers, dtype=np.int64),
             np.array(phases, dtype=np.int64),
             np.array(ends, dtype=np.float64),
-            last_step.get(algorithm.slot_stopping(), -1),
+            last_step.get(algorithm.timing.stopping, -1),
             scenario.time_grid.per_second,
         )
         self.fresh = np.array(fresh, dtype=bool)
@@ -154,7 +154,7 @@ class SlotSetup:
 
     def _set_sensors(self, scenario: Scenario) -> None:
         """Assign each sensor to a filter and to its rows there, and to what reads it."""
-        pooled = self.algorithm.pooled
+        pooled = self.algorithm.timing.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.estimators, dtype=np.int64)
         self.sensing = np.array(scenario.sensing_nodes, dtype=np.int64)
@@ -236,7 +236,7 @@ class SlotSetup:
         """Set the H filters at slot 0, and the F and root of Q that all of them believe."""
         infos: Sequence[NodeInfo] = scenario.node_infos
         models: Sequence[Any] = scenario.slot_models
-        if self.algorithm.pooled:
+        if self.algorithm.timing.pooled:
             infos, models = infos[:1], [scenario.pooled_slot_model]
         models = [
             _widened(model, rows) for model, rows in zip(models, self.rows.tolist(), strict=True)
@@ -313,7 +313,7 @@ class SlotSetup:
         ]
         # Some filters send nothing in some phases, the exchanges of a slot (push-sum with
         # asymptotic gains: no mass), or only from nodes that have sensors.
-        sends = self.algorithm.sends_in_slots
+        sends = self.algorithm.timing.sends
         talks = [
             [sends(phase, direction[0] in scenario.placed_sensors) for direction in self.directions]
             for phase in self.phases
@@ -359,7 +359,9 @@ class SlotSetup:
         if self.deliveries is not None and (self.decides or self.may_miss):
             return False
         # Kernels know broadcasts and matchings without delay, with the built-in losses.
-        exchanges = type(network.activation) in (Matching, Broadcast) or not self.algorithm.talks
+        exchanges = (
+            type(network.activation) in (Matching, Broadcast) or not self.algorithm.timing.talks
+        )
         return self.has_known_probabilities and network.channel.delay.fixed == 0.0 and exchanges
 
     @property
@@ -386,7 +388,7 @@ class SlotSetup:
         floats = self.estimators * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.max_pairs + 8)
         mask = self.decides or self.may_miss
-        asked = len(self.nodes) * (mask + 8 * self.algorithm.randomised)
+        asked = len(self.nodes) * (mask + 8 * self.algorithm.timing.randomised)
         return 8 * floats + messages + len(self.fresh) * asked
 
     def block_slots(self, runs: int, max_events: int) -> int:

@@ -330,7 +330,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
     nodes), the one that reads all sensors (N = 1).
     """
     # A pooled filter is one node with the id -1, which belongs to no node of the network.
-    ids, pooled = scenario.nodes, scenario.node_filter.pooled
+    ids, pooled = scenario.nodes, scenario.node_filter.timing.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
     # Nodes that share a model share its table.
     distinct = list({id(model): model for model in models}.values())

@@ -311,7 +311,7 @@ def is_kernel_clock(clock: object) -> bool:
 
 def is_drawn_in_kernels(scenario: Scenario) -> bool:
     """Return True if kernels can draw the ticks and the outcomes of a scenario."""
-    network, talks = scenario.network, scenario.node_filter.talks
+    network, talks = scenario.network, scenario.node_filter.timing.talks
     return (
         talks
         and bool(scenario.topology.links)

@@ -41,7 +41,7 @@ def clock_processes(
     There are none with activation by readings: nodes then transmit after their samples.
     """
     activation = scenario.network.activation
-    if not scenario.node_filter.talks or not isinstance(activation, LinkClock):
+    if not scenario.node_filter.timing.talks or not isinstance(activation, LinkClock):
         return []
     shared = (scenario, recorder, transmitter, nodes)
     if activation.at == "readings":

@@ -175,7 +175,7 @@ class _Simulation:
             entity = scenario.topology.index[node]
             reader = Reader(recorder, schedule, node, entity, nodes[node])
             processes.append(reader.run_process(self.timeline, truth, sensors))
-        if scenario.node_filter.talks:
+        if scenario.node_filter.timing.talks:
             shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)
             processes.append(SlotClock(*shared).run_process(self.timeline))
         sums = _Sums(distinct(nodes))
@@ -185,7 +185,7 @@ class _Simulation:
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
         """Record plant and ``nodes`` in slots, predictions first or filtered states last."""
-        predicts, recorder, slot = self._scenario.node_filter.predicts, self._recorder, 0
+        predicts, recorder, slot = self._scenario.node_filter.timing.predicts, self._recorder, 0
 
         def sample() -> None:
             """Record a sample if the slot has one, and move the origin if a frame begins."""
@@ -248,7 +248,7 @@ class _Simulation:
 def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any]) -> dict[int, Any]:
     """Return the node process of every node by id; the nodes of a pooled filter share one."""
     nodes = scenario.nodes
-    if scenario.node_filter.pooled:
+    if scenario.node_filter.timing.pooled:
         return dict.fromkeys(nodes, make(-1, 0, scenario.sensing_nodes))
     return {node: make(node, entity, (node,)) for entity, node in enumerate(nodes)}
 

@@ -56,7 +56,7 @@ class Node:
         at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index.
         """
         self.node, self.entity, self.info, self.model = node, entity, info, model
-        self.algorithm = algorithm
+        self.algorithm, self._timing = algorithm, algorithm.timing
         self.state = algorithm.init(model, *start, info)
         # By sender: absorption is in the order of senders, whatever the order of arrival.
         self.inbox: dict[int, list[Envelope]] = {}
@@ -66,7 +66,7 @@ class Node:
         filter has ``newest_only``, the newest of each sender replaces the others.
         """
         envelopes = self.inbox.setdefault(envelope.sender, [])
-        if self.algorithm.newest_only and envelopes:
+        if self._timing.newest_only and envelopes:
             # Delays may differ: a message that arrives later may have been sent earlier.
             if envelope.sent >= envelopes[0].sent:
                 envelopes[0] = envelope
@@ -197,7 +197,7 @@ class ClockedNode(Node):
 
     def in_time(self, envelope: Envelope) -> bool:
         """Return True if the filter accepts a message that arrives now."""
-        return self.algorithm.accepts(envelope.payload, envelope.age)
+        return envelope.age <= self._timing.max_age
 
     def receive(self, envelope: Envelope) -> None:
         """Put a message into the inbox, to be absorbed with all others of this instant."""

@@ -58,12 +58,12 @@ class SlotSchedule:
         """Take the filter's schedule, the order of predictions, readings and exchanges in a slot,
         and the number of steps of each of its exchanges.
         """
-        self._algorithm, self._plant = scenario.node_filter, scenario.slot_plant
+        self._timing, self._plant = scenario.node_filter.timing, scenario.slot_plant
         self.horizon, self._instant = scenario.horizon, scenario.time_grid.instant
-        phases = self._algorithm.schedule or ()
+        phases = self._timing.schedule or ()
         # Steps of each exchange; none if the filter does not talk.
         self._exchanges = [
-            self._algorithm.exchange_steps(k) if self._algorithm.talks else 0
+            self._timing.steps(k) if self._timing.talks else 0
             for k in range(phases.count("exchange"))
         ]
         # Exchanges without steps take no time.
@@ -81,7 +81,7 @@ class SlotSchedule:
 
     def runs(self, slot: int) -> bool:
         """Return True if a slot has stages; at the horizon only if its sample needs them."""
-        return not self.over(slot) or (self.sampled(slot) and not self._algorithm.predicts)
+        return not self.over(slot) or (self.sampled(slot) and not self._timing.predicts)
 
     def start(self, slot: int) -> float:
         """Return the time in seconds at which a slot begins."""
@@ -106,14 +106,14 @@ class SlotSchedule:
 
     def _stages_of(self, slot: int) -> Generator[Stage, None, None]:
         """Yield the stages of a slot in order, by the filter's schedule."""
-        algorithm, start = self._algorithm, self.start(slot)
+        timing, start = self._timing, self.start(slot)
         now, rank, phase = start, FIRST_RANK + 1, 0
         # In slot 0 a filter that does not predict uses no reading: its sample is the initial state.
-        is_initial = slot == 0 and not algorithm.predicts
-        talks = algorithm.talks and slot >= algorithm.first_slot
+        is_initial = slot == 0 and not timing.predicts
+        talks = timing.talks and slot >= timing.first_exchange
         # Exchanges begin at the filter's first slot, and their numbers at 0 there.
-        number = (slot - algorithm.first_slot) * sum(self._exchanges)
-        for kind in algorithm.schedule or ():
+        number = (slot - timing.first_exchange) * sum(self._exchanges)
+        for kind in timing.schedule or ():
             if kind == "exchange":
                 # Steps share the phase equally; their ends are counted from the start of the slot.
                 steps = self._exchanges[phase]
@@ -151,7 +151,7 @@ class SlotNode(Node):
         """
         super().__init__(*arguments)
         # Only randomised filters draw from this stream.
-        randomised = self.algorithm.randomised
+        randomised = self._timing.randomised
         self._uniforms = streams.generator("trigger", self.node) if randomised else None
         self._recorder, self._schedule, self._period = recorder, schedule, period
         # -1: no exchange is open, and every message is late.
@@ -233,7 +233,7 @@ class SlotNode(Node):
         exchange = Exchange(now, phase, stage.step, slot)
         self.state = self.algorithm.absorb(self.state, messages, exchange)
         # A swap records each message; other filters absorb all of them in one event.
-        if self.algorithm.pairwise:
+        if self._timing.pairwise:
             for envelope in envelopes:
                 peer, number, age = envelope.sender, envelope.number, envelope.age
                 append((now, SWAP, self.node, peer, number, phase, age))
@@ -301,11 +301,11 @@ class SlotClock:
         matchings.
         """
         self._scenario, self._recorder, self._schedule = scenario, recorder, schedule
-        self._nodes, self._algorithm = nodes, scenario.node_filter
+        self._nodes, self._timing = nodes, scenario.node_filter.timing
         # A pooled filter appears once.
         self._distinct = distinct(nodes)
         self._matching_random = streams.generator("matching")
-        links = scenario.topology.links if scenario.node_filter.talks else ()
+        links = scenario.topology.links if scenario.node_filter.timing.talks else ()
         # Nodes without links are never asked for a message.
         self._talking = sorted({node for link in links for node in link})
         self._links = {
@@ -325,7 +325,7 @@ class SlotClock:
 
     def _exchange(self, stage: Stage, slot: int) -> None:
         """Let all nodes send in one step of an exchange, and record ticks or the round."""
-        now, phase, broadcast = stage.time, stage.phase, not self._algorithm.pairwise
+        now, phase, broadcast = stage.time, stage.phase, not self._timing.pairwise
         # All inboxes open before any node sends: a message without delay arrives at once.
         for node in self._distinct:
             node.open(stage.number)
@@ -339,7 +339,7 @@ class SlotClock:
         # All payloads are computed before any message arrives: the order of nodes does not matter.
         payloads = {node: self._nodes[node].emit(exchange) for node in senders}
         # Held links keep their outcome for all steps of an exchange.
-        fresh = self._algorithm.redraws_links(phase, stage.step)
+        fresh = self._timing.redraws(phase, stage.step)
         for i, j in pairs:
             if not broadcast:
                 self._recorder.append((now, TICK, i, j, -1, phase, NAN))

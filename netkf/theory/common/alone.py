@@ -32,7 +32,7 @@ def silent_jumps(scenario: Scenario) -> SlotJumps:
     Gains follow from the R that filters assume, the noise of the readings from the true one.
     """
     F, Q = scenario.slot_belief
-    if scenario.node_filter.pooled:
+    if scenario.node_filter.timing.pooled:
         model = scenario.pooled_slot_model
         sensors = [(model.H, model.R)]
         true = [block_diagonal([scenario.observation_matrices(node)[1] for node in scenario.nodes])]

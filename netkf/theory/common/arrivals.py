@@ -20,7 +20,7 @@ def with_last_exchanges(scenario: Scenario, run: Run) -> Run:
     algorithm, plant, horizon = scenario.node_filter, scenario.slot_plant, scenario.horizon
     slots = plant.slots_of(run.times).tolist()
     last = slots[-1] if slots else 0
-    if algorithm.predicts or not algorithm.talks or not plant.over(last, horizon):
+    if algorithm.timing.predicts or not algorithm.timing.talks or not plant.over(last, horizon):
         return run
     try:
         longer = scenario.replace({"horizon": plant.slot_time(last + 1), "probe": [horizon]})

@@ -122,7 +122,7 @@ class ClockColumns(ErrorColumns):
     def _apply(self, time: float, kind: int, node: int, peer: int, message: int) -> None:
         """Repeat one row of the log."""
         if kind == SENSE:
-            self._sense(0 if self._scenario.node_filter.pooled else self._index[node], time)
+            self._sense(0 if self._scenario.node_filter.timing.pooled else self._index[node], time)
         elif kind == TRANSMIT and self._shared:
             h = self._index[node]
             gap = self._gap(h, time)
@@ -273,7 +273,7 @@ class ClockColumns(ErrorColumns):
         gap = self._gap(h, time)
         all_heard = sorted(self._inboxes.pop(node), key=lambda m: (m.sender, m.time, m.number))
         inbox = all_heard
-        if scenario.node_filter.newest_only:
+        if scenario.node_filter.timing.newest_only:
             inbox = list({message.sender: message for message in inbox}.values())
         readings = []
         for k, message in enumerate(inbox):

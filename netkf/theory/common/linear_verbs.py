@@ -217,7 +217,7 @@ class LinearVerbs:
         with_means = ClockFilters(scenario, kernels, start, messages)
         self.run, self._p = with_means.run, max(1, rows)
         self.messages = len(self.run.message)
-        pooled = scenario.node_filter.pooled
+        pooled = scenario.node_filter.timing.pooled
         records = make_records(
             scenario.node_filter,
             [(np.zeros(self.n), root) for root in start.root],

@@ -28,7 +28,7 @@ EstimatorObservations = dict[int, Observation]
 
 def nodes_by_estimator(scenario: Scenario) -> list[tuple[int, ...]]:
     """Return the nodes whose readings each filter uses: one filter uses all if they are pooled."""
-    if scenario.filter.algorithm.pooled:
+    if scenario.filter.algorithm.timing.pooled:
         return [scenario.nodes]
     return [(node,) for node in scenario.nodes]
 

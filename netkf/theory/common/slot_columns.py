@@ -85,7 +85,7 @@ class SlotColumns(ErrorColumns):
         """Replay the events of the run; yield at each of ``run.times``."""
         scenario, run, setup = self._scenario, self._run, self._setup
         observe, arrivals = slot_observations(scenario, run), _arrivals(scenario, run, setup)
-        predicts, processed = scenario.node_filter.predicts, 0
+        predicts, processed = scenario.node_filter.timing.predicts, 0
         for until in scenario.slot_plant.slots_of(run.times).tolist():
             while processed < until:
                 slot = processed if predicts else processed + 1
@@ -136,7 +136,7 @@ class SlotColumns(ErrorColumns):
         framed = self._scenario.filters_know_the_truth
         state = padded(self._x, width - columns).reshape(n, 1, blocks, LANES)
         local = np.ascontiguousarray(np.moveaxis(state, 2, 0).swapaxes(1, 2))
-        if framed and setup.algorithm.predicts:
+        if framed and setup.algorithm.timing.predicts:
             self._x[:] = 0.0
         y = np.zeros((setup.estimators, setup.p, width))
         H = np.zeros((1, 1, setup.estimators, setup.p, n, LANES))
@@ -158,7 +158,9 @@ class SlotColumns(ErrorColumns):
             _no_samples(local, blocks, self._filters),
             first=slot,
             sensed=~nothing,
-            exchanged=np.array([algorithm.talks and slot >= algorithm.first_slot]),
+            exchanged=np.array(
+                [algorithm.timing.talks and slot >= algorithm.timing.first_exchange]
+            ),
             sample=np.full(1, -1),
             rebased=~nothing if framed else nothing,
             up=np.ascontiguousarray(np.broadcast_to(up[None, None, :, :, None], shape)),

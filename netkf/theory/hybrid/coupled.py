@@ -94,7 +94,7 @@ def concerns_hybrid_paper(scenario: Scenario) -> bool:
     """Return True if results of the hybrid paper are about the scenario's filter: the hybrid filter
     and covariance intersection, and in continuous time any filter that does not talk.
     """
-    if not scenario.slotted and not scenario.filter.algorithm.talks:
+    if not scenario.slotted and not scenario.filter.algorithm.timing.talks:
         return True
     return scenario.node_filter.analysis.paper == "hybrid"
 
@@ -104,7 +104,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     Riccati equations H(12) bounds the mean of P, does not apply to a scenario; None if it applies.
     """
     algorithm, network = scenario.filter.algorithm, scenario.network
-    if not scenario.slotted and not algorithm.talks:
+    if not scenario.slotted and not algorithm.timing.talks:
         return _reason_of_samples(scenario)
     name = type(algorithm).__name__
     if not concerns_hybrid_paper(scenario):
@@ -166,7 +166,7 @@ def increment_informations(scenario: Scenario) -> FloatArray:
         for key, observation in distinct.items()
     }
     informations = [information[id(observation)] for observation in observations]
-    if scenario.filter.algorithm.pooled:
+    if scenario.filter.algorithm.timing.pooled:
         informations = informations * len(scenario.nodes)
     return np.stack(informations)
 
@@ -201,7 +201,7 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
     A, Q = scenario.belief
     n = scenario.plant.n
     delay = scenario.network.channel.delay.fixed or 0.0
-    if not scenario.filter.algorithm.talks:
+    if not scenario.filter.algorithm.timing.talks:
         delay = 0.0
     T, q = np.eye(n), np.zeros((n, n))
     if delay > 0.0:
@@ -254,7 +254,7 @@ def left_weights(scenario: Scenario) -> FloatArray:
     algorithm = scenario.filter.algorithm
     if len(scenario.nodes) == 1:
         return np.ones(1)
-    if not algorithm.talks:
+    if not algorithm.timing.talks:
         raise TheoryError(
             f"the {kind_name(algorithm)} filter does not talk, links mean nothing to it"
         )

@@ -56,7 +56,7 @@ def limit_covariance(scenario: Scenario) -> FloatArray:
 def _require_limit(scenario: Scenario) -> None:
     """Raise TheoryError for filters and clocks that H(13) is not about."""
     algorithm = scenario.filter.algorithm
-    if not algorithm.talks:
+    if not algorithm.timing.talks:
         return
     if scenario.node_filter.analysis.combination != "convex":
         raise TheoryError(
@@ -146,7 +146,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
 def _central_slot_covariance(scenario: Scenario) -> FloatArray:
     """Return the steady covariance (n, n) of the central filter in slots, after the reading."""
     plant = scenario.slot_plant
-    if scenario.node_filter.predicts:
+    if scenario.node_filter.timing.predicts:
         raise TheoryError("the filter's samples are predictions, the central filter's are not")
     if any(sensor.varying for sensor in scenario.sensors):
         raise TheoryError("H differs from slot to slot: there is no steady covariance")

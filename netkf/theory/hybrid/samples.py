@@ -116,7 +116,7 @@ def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
 
     Keys are the indices (receiver, sender); empty if the nodes do not transmit at samples.
     """
-    if not scenario.filter.algorithm.talks or not transmits_at_samples(scenario):
+    if not scenario.filter.algorithm.timing.talks or not transmits_at_samples(scenario):
         return {}
     index, loss = scenario.topology.index, scenario.network.channel.loss
     return {
@@ -131,7 +131,7 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
     (S, p, n), R (S, p, p) and rates (S,) of its S sensors.
     """
     index, size = scenario.topology.index, len(scenario.nodes)
-    pooled = scenario.filter.algorithm.pooled
+    pooled = scenario.filter.algorithm.timing.pooled
     entries_by_rows: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
     for node, placed_sensor in randomly_sampled_sensors(scenario):
         sensor = scenario.sensors[placed_sensor.entry]
@@ -199,7 +199,7 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
             node: stack_observations(readings, n) for node, readings in by_time[time].items()
         }
         weights = _sent_weights(scenario, list(observations))
-        if scenario.filter.algorithm.pooled:
+        if scenario.filter.algorithm.timing.pooled:
             joint = stack_observations(list(itertools.chain(*by_time[time].values())), n)
             observations = dict.fromkeys(everyone, joint)
         jumps.append(SampleJump(time, observations, weights))

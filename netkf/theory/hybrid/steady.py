@@ -196,7 +196,7 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
         listed = ", ".join(unsteady_nodes[:MAX_LISTED]) + (
             ", ..." if len(unsteady_nodes) > MAX_LISTED else ""
         )
-        talks = scenario.filter.algorithm.talks
+        talks = scenario.filter.algorithm.timing.talks
         reason = "no message ever arrives" if talks else "the filter does not talk"
         plural = "s" if len(unsteady_nodes) > 1 else ""
         return f"{reason}, and the covariance of node{plural} {listed} alone has no steady state"
