@@ -1,6 +1,6 @@
 """Small filters whose estimate is a ledger of what their node knew and did."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,7 +67,7 @@ class Ledger(Filter):
 class PairLedger(Ledger):
     """The same, in pairs."""
 
-    timing = replace(Ledger.timing, pairwise=True)
+    timing = Timing(pairwise=True)
 
 
 class StepsState(NamedTuple):

@@ -1,7 +1,7 @@
 """A user's own filter meets the losses that the built-in filter of its kind meets."""
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ class Average(Filter):
 class Predicted(Average):
     """Predictions of all neighbours, as diffusion has them."""
 
-    timing = replace(Average.timing, schedule=("sense", "predict", "exchange"), predicts=True)
+    timing = Timing(schedule=("sense", "predict", "exchange"), predicts=True)
 
 
 OWN = {"gossip": Swap(), "kcf": Average(), "diffusion": Predicted()}

@@ -14,7 +14,7 @@ REMEMBERING = """
 from netkf.kernels import (
     Kernels, Record, carry_mean, copy_vector, kernel, predict_estimate, shift_vector
 )
-from netkf.parts import Filter
+from netkf.parts import Filter, Needs, Timing
 
 
 @kernel
@@ -67,7 +67,7 @@ def shift_payload(record, m, run):
 
 class Remembering(Filter):
     timing = Timing(schedule=None, clocks=("nodes", "directions", "readings"))
-    needs_samples = True
+    needs = Needs(samples=True)
     kernels = Kernels(
         predict=predict, update=update, emit=emit, absorb=absorb, shift=shift,
         shift_payload=shift_payload,
