@@ -372,6 +372,55 @@ def shift(record: Any, h: int, run: Any) -> None:
     set_growing(record, run.lanes, record.centre[h], record.base[h])
 
 
+def belief_propagation_record(
+    filtering: BeliefPropagation, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return what a node knows: evidence ``prior``, ``own`` and ``received`` by link, relative
+    to the state ``base``, as an e ``centre``. Where messages are kept, ``frame`` is W, ``step``
+    the way from the centre to the belief, as an e, ``heard_at`` the time ``elapsed`` at which
+    the evidence of a link was sent.
+    """
+    n, model, keeps = len(models[0].information), models[0], filtering._keeps(models[0])
+    frame, clocked = filtering._frame(model), not isinstance(model, SlotModel)
+    # Exponentials are computed of generators with a minus.
+    sign = -1.0 if clocked else 1.0
+    part, kept = (n, n + 1), n if keeps else 0
+    node = {"prior": part, "own": part, "base": (n,), "centre": (n,)}
+    return Record(
+        node={**node, "frame": (kept, kept), "step": (kept,), "elapsed": ()},
+        link={"received": part, "heard_at": ()},
+        payload={"evidence": part, "xhat": (n,), "centre": (n,)},
+        scratch={"suffix": (1 + max(info.degree for info in infos), *part)},
+        settings={
+            "steps": filtering.steps,
+            "keeps": int(keeps),
+            "clocked": int(clocked),
+            "growing": frame.growing,
+            "inverse": np.ascontiguousarray(frame.inverse),
+            "forward": np.ascontiguousarray(sign * frame.forward),
+            "back": np.ascontiguousarray(sign * frame.back),
+            "W": np.eye(n),
+            "zeros": np.zeros((n, n)),
+            "maps": np.zeros((3, n, n)),
+        },
+    )
+
+
+def begin_belief_propagation(
+    filtering: BeliefPropagation, node: Mapping[str, np.ndarray], _info: NodeInfo, model: Any
+) -> None:
+    """Begin with a prior only: nothing was read or heard."""
+    frame = filtering._frame(model)
+    node["base"][:], node["centre"][:] = node["xhat"], frame.inverse @ node["xhat"]
+    if not filtering._keeps(model):
+        # The first prediction writes the prior; before it P may be singular.
+        return
+    # [Z, 0] with Z' Z = W' P^-1 W, both triangles turned round for a lower Z.
+    weighted = np.linalg.solve(node["root"], frame.basis)
+    node["prior"][:, :-1] = lower_root(weighted.T[::-1]).T[::-1, ::-1]
+    node["frame"][:] = frame.basis
+
+
 @built_in("belief-propagation")
 @dataclass(frozen=True, eq=False)
 class BeliefPropagation(Filter):
@@ -400,6 +449,8 @@ class BeliefPropagation(Filter):
         shift=shift,
         addressed=True,
         unrolled=False,
+        record=belief_propagation_record,
+        begin=begin_belief_propagation,
     )
 
     def _keeps(self, model: Any) -> bool:
@@ -411,49 +462,6 @@ class BeliefPropagation(Filter):
         if not isinstance(model, SlotModel):
             return flow_frame(model.A)
         return slot_frame(model.F) if self.memory == ALL else still_frame(len(model.F))
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return what a node knows: evidence ``prior``, ``own`` and ``received`` by link, relative
-        to the state ``base``, as an e ``centre``. Where messages are kept, ``frame`` is W, ``step``
-        the way from the centre to the belief, as an e, ``heard_at`` the time ``elapsed`` at which
-        the evidence of a link was sent.
-        """
-        n, model, keeps = len(models[0].information), models[0], self._keeps(models[0])
-        frame, clocked = self._frame(model), not isinstance(model, SlotModel)
-        # Exponentials are computed of generators with a minus.
-        sign = -1.0 if clocked else 1.0
-        part, kept = (n, n + 1), n if keeps else 0
-        node = {"prior": part, "own": part, "base": (n,), "centre": (n,)}
-        return Record(
-            node={**node, "frame": (kept, kept), "step": (kept,), "elapsed": ()},
-            link={"received": part, "heard_at": ()},
-            payload={"evidence": part, "xhat": (n,), "centre": (n,)},
-            scratch={"suffix": (1 + max(info.degree for info in infos), *part)},
-            settings={
-                "steps": self.steps,
-                "keeps": int(keeps),
-                "clocked": int(clocked),
-                "growing": frame.growing,
-                "inverse": np.ascontiguousarray(frame.inverse),
-                "forward": np.ascontiguousarray(sign * frame.forward),
-                "back": np.ascontiguousarray(sign * frame.back),
-                "W": np.eye(n),
-                "zeros": np.zeros((n, n)),
-                "maps": np.zeros((3, n, n)),
-            },
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Begin with a prior only: nothing was read or heard."""
-        frame = self._frame(model)
-        node["base"][:], node["centre"][:] = node["xhat"], frame.inverse @ node["xhat"]
-        if not self._keeps(model):
-            # The first prediction writes the prior; before it P may be singular.
-            return
-        # [Z, 0] with Z' Z = W' P^-1 W, both triangles turned round for a lower Z.
-        weighted = np.linalg.solve(node["root"], frame.basis)
-        node["prior"][:, :-1] = lower_root(weighted.T[::-1]).T[::-1, ::-1]
-        node["frame"][:] = frame.basis
 
     @property
     def timing(self) -> Timing:

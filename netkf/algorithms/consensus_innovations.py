@@ -423,6 +423,51 @@ def shift_payload(record: Any, m: int, run: Any) -> None:
     shift_pseudo(record, run, record.payload.pseudo, m)
 
 
+def consensus_innovations_record(
+    _: Any, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return pseudo-states of nodes and messages, their matrices, and room for gains."""
+    network = infos[0].network
+    assert network is not None
+    n, H = len(models[0].information), len(infos)
+    pseudo = pseudo_states(models[0].F, network.information.sum(axis=0))
+    return Record(
+        node={"pseudo": (n,), "start": (n, n)},
+        payload={"pseudo": (n,)},
+        settings={
+            **{name: np.array(part, order="C") for name, part in pseudo._asdict().items()},
+            "B": np.zeros((1, 1, n, n)),
+            **{name: np.zeros((1, H, n, n)) for name in ("M", "K", "roots")},
+            "table_row": np.zeros(1, dtype=np.int64),
+            "first_slot": -1,
+        },
+    )
+
+
+def begin_consensus_innovations(
+    _: Any, node: Mapping[str, np.ndarray], info: NodeInfo, _model: Any
+) -> None:
+    """Set the first pseudo-state, and keep the covariance from which gains follow."""
+    assert info.network is not None
+    node["pseudo"][:] = info.network.information.sum(axis=0) @ node["xhat"]
+    node["start"][:] = node["root"] @ node["root"].T
+
+
+def prepare_consensus_innovations(
+    _: Any, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
+) -> None:
+    """Set the gains of the slots, which follow from the network and its start."""
+    network = infos[0].network
+    assert network is not None
+    if record.first_slot == first and len(record.table_row) == count:
+        return
+    start = np.ascontiguousarray(record.start[0, ..., 0])
+    sequence = gain_sequence(design_of(models[0], network, start))
+    record.table_row, gains = sequence.table(first, count, [info.place for info in infos])
+    record.B, record.M, record.K, record.roots = map(np.ascontiguousarray, gains)
+    record.first_slot = first
+
+
 @built_in("consensus-innovations")
 @dataclass(frozen=True, eq=False)
 class ConsensusInnovations(Filter):
@@ -448,45 +493,10 @@ class ConsensusInnovations(Filter):
         shift=shift,
         shift_payload=shift_payload,
         unrolled=False,
+        record=consensus_innovations_record,
+        begin=begin_consensus_innovations,
+        prepare=prepare_consensus_innovations,
     )
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return pseudo-states of nodes and messages, their matrices, and room for gains."""
-        network = infos[0].network
-        assert network is not None
-        n, H = len(models[0].information), len(infos)
-        pseudo = pseudo_states(models[0].F, network.information.sum(axis=0))
-        return Record(
-            node={"pseudo": (n,), "start": (n, n)},
-            payload={"pseudo": (n,)},
-            settings={
-                **{name: np.array(part, order="C") for name, part in pseudo._asdict().items()},
-                "B": np.zeros((1, 1, n, n)),
-                **{name: np.zeros((1, H, n, n)) for name in ("M", "K", "roots")},
-                "table_row": np.zeros(1, dtype=np.int64),
-                "first_slot": -1,
-            },
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Set the first pseudo-state, and keep the covariance from which gains follow."""
-        assert info.network is not None
-        node["pseudo"][:] = info.network.information.sum(axis=0) @ node["xhat"]
-        node["start"][:] = node["root"] @ node["root"].T
-
-    def prepare(
-        self, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
-    ) -> None:
-        """Set the gains of the slots, which follow from the network and its start."""
-        network = infos[0].network
-        assert network is not None
-        if record.first_slot == first and len(record.table_row) == count:
-            return
-        start = np.ascontiguousarray(record.start[0, ..., 0])
-        sequence = gain_sequence(design_of(models[0], network, start))
-        record.table_row, gains = sequence.table(first, count, [info.place for info in infos])
-        record.B, record.M, record.K, record.roots = map(np.ascontiguousarray, gains)
-        record.first_slot = first
 
     @property
     def needs(self) -> Needs:

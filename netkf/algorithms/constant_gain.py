@@ -123,6 +123,32 @@ def closed_loop_interval(record: Any, h: int, _run: Any) -> float:
     return usable(record.loops.rate[h])
 
 
+def constant_gain_record(
+    filtering: ConstantGain, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the constant matrices of all nodes: for readings, and under clocks the closed
+    loops of those with increments.
+    """
+    N, n = len(infos), len(models[0].information)
+    gains = [filtering.gain_of(info.place) for info in infos]
+    settings: dict[str, Any] = {
+        "gain": np.zeros((N, n, max(1, *(gain.shape[1] for gain in gains)))),
+        "remaining": np.zeros((N, n, n)),
+        "noise": np.zeros((N, n, n)),
+    }
+    for k, (info, L) in enumerate(zip(infos, gains, strict=True)):
+        H, R = info.sampled
+        if len(H):
+            settings["remaining"][k], settings["noise"][k] = sample_maps(L, H, R)
+            # Readings come whitened, with the inverse of the root of R.
+            settings["gain"][k, :, : len(H)] = L @ np.linalg.cholesky(R)
+    if isinstance(models[0], FlowModel):
+        settings["loops"] = _closed_loops(models, gains)
+    return Record(
+        payload={"xhat": (n,), "root": (n, n)}, scratch={"mean": (1, n)}, settings=settings
+    )
+
+
 @built_in("constant-gain")
 @dataclass(frozen=True, eq=False)
 class ConstantGain(Filter):
@@ -154,30 +180,8 @@ class ConstantGain(Filter):
             interval=closed_loop_interval,
             unrolled=False,
         ),
+        record=constant_gain_record,
     )
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the constant matrices of all nodes: for readings, and under clocks the closed
-        loops of those with increments.
-        """
-        N, n = len(infos), len(models[0].information)
-        gains = [self.gain_of(info.place) for info in infos]
-        settings: dict[str, Any] = {
-            "gain": np.zeros((N, n, max(1, *(gain.shape[1] for gain in gains)))),
-            "remaining": np.zeros((N, n, n)),
-            "noise": np.zeros((N, n, n)),
-        }
-        for k, (info, L) in enumerate(zip(infos, gains, strict=True)):
-            H, R = info.sampled
-            if len(H):
-                settings["remaining"][k], settings["noise"][k] = sample_maps(L, H, R)
-                # Readings come whitened, with the inverse of the root of R.
-                settings["gain"][k, :, : len(H)] = L @ np.linalg.cholesky(R)
-        if isinstance(models[0], FlowModel):
-            settings["loops"] = _closed_loops(models, gains)
-        return Record(
-            payload={"xhat": (n,), "root": (n, n)}, scratch={"mean": (1, n)}, settings=settings
-        )
 
     def gain_of(self, index: int) -> FloatArray:
         """Return the gain (n, p) of the node with this ``index`` in the order of ids, from 0."""

@@ -8,12 +8,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.diffusion import DiffusionFilter, diffusion_filter_record
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.hybrid import Hybrid
-from netkf.algorithms.records import Record
+from netkf.algorithms.records import Record, begin_estimate
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Needs
+
+
+def covariance_intersection_record(
+    _: Any, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the record of the diffusion filter with ``on_loss = "keep-own"``."""
+    return diffusion_filter_record(DiffusionFilter(on_loss="keep-own"), infos, models)
 
 
 @built_in("covariance-intersection")
@@ -29,10 +36,8 @@ class CovarianceIntersection(Hybrid):
 
     analysis = replace(Hybrid.analysis, combination="intersection")
     needs = Needs(inverts=True)
-    kernels = DiffusionFilter.kernels
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the record of the diffusion filter with ``on_loss = "keep-own"``."""
-        return DiffusionFilter(on_loss="keep-own").record(infos, models)
+    kernels = replace(
+        DiffusionFilter.kernels, record=covariance_intersection_record, begin=begin_estimate
+    )
 
     shift = Filter.shift  # affine: the weights sum to one

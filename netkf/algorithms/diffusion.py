@@ -82,6 +82,27 @@ def applied_weights(lanes: Lanes, own: Any, received: Any, keep_own: int) -> tup
     return select(keeps, remainder, own / divisor), divisor
 
 
+def diffusion_filter_record(
+    filtering: DiffusionFilter, _infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the own weights and inverses of roots of nodes, estimates in messages with the
+    inverses of their roots, and the rule for lost messages.
+    """
+    n = len(models[0].information)
+    return Record(
+        node={"own": (), "inverse": (n, n)},
+        payload={"xhat": (n,), "root": (n, n), "inverse": (n, n)},
+        settings={"keep_own": filtering.on_loss == "keep-own"},
+    )
+
+
+def begin_diffusion_filter(
+    _: Any, node: Mapping[str, np.ndarray], info: NodeInfo, _model: Any
+) -> None:
+    """Set the weight of the node's own estimate when all messages arrive."""
+    node["own"][...] = info.own_weight
+
+
 @built_in("diffusion")
 @dataclass(frozen=True, eq=False)
 class DiffusionFilter(Filter):
@@ -114,7 +135,9 @@ class DiffusionFilter(Filter):
         predicts=True,
     )
     needs = Needs(one_way=True, inverts=True)
-    kernels = Kernels(emit=emit, absorb=absorb)
+    kernels = Kernels(
+        emit=emit, absorb=absorb, record=diffusion_filter_record, begin=begin_diffusion_filter
+    )
 
     def __post_init__(self) -> None:
         """Raise ScenarioError if a weight is negative or a column does not sum to 1."""
@@ -126,20 +149,5 @@ class DiffusionFilter(Filter):
     def link_weights(self) -> Weights:
         """The matrix of weights, or Metropolis weights."""
         return Weights(matrix=None if isinstance(self.weights, str) else self.weights)
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the own weights and inverses of roots of nodes, estimates in messages with the
-        inverses of their roots, and the rule for lost messages.
-        """
-        n = len(models[0].information)
-        return Record(
-            node={"own": (), "inverse": (n, n)},
-            payload={"xhat": (n,), "root": (n, n), "inverse": (n, n)},
-            settings={"keep_own": self.on_loss == "keep-own"},
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Set the weight of the node's own estimate when all messages arrive."""
-        node["own"][...] = info.own_weight
 
     shift = Filter.shift  # affine: the weights sum to one

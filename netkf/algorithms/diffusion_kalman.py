@@ -59,6 +59,11 @@ def message_size(n: int, rows: int, phase: int) -> int:
     return n if phase == ESTIMATES else rows * (1 + n) + rows * (rows + 1) // 2
 
 
+def diffusion_kalman_record(_: Any, _infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+    """Return the estimate that messages carry."""
+    return Record(payload={"xhat": (len(models[0].information),)})
+
+
 @built_in("diffusion-kalman")
 @dataclass(frozen=True, eq=False)
 class DiffusionKalman(Filter):
@@ -87,11 +92,7 @@ class DiffusionKalman(Filter):
         sends=lambda phase, has_sensor: has_sensor or phase == ESTIMATES,
     )
     needs = Needs(one_way=True)
-    kernels = Kernels(emit=emit, absorb=absorb, sends_readings=True)
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the estimate that messages carry."""
-        return Record(payload={"xhat": (len(models[0].information),)})
+    kernels = Kernels(emit=emit, absorb=absorb, sends_readings=True, record=diffusion_kalman_record)
 
     def __post_init__(self) -> None:
         """Raise ScenarioError if a weight is negative or a column does not sum to 1."""

@@ -130,6 +130,28 @@ THRESHOLDS = tuple_of(
 )
 
 
+def event_triggered_ci_record(
+    filtering: EventTriggeredCi, _infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return what nodes sent last, the copies of what they heard last on each link, and the
+    thresholds.
+    """
+    n, flag = len(models[0].information), ((), np.uint8)
+    return Record(
+        node={"sent_x": (n,), "sent_root": (n, n), "has_sent": flag, "inverse": (n, n)},
+        link={
+            **{"copy_x": (n,), "copy_root": (n, n), "copy_inverse": (n, n)},
+            **{"has_copy": flag, "fresh": flag, "weight": ()},
+        },
+        payload={"xhat": (n,), "root": (n, n)},
+        settings={
+            "alpha": float(filtering.thresholds[0]),
+            "ratio": 1.0 + filtering.thresholds[1],
+            "share": 1.0 / filtering.widening**2,
+        },
+    )
+
+
 @built_in("event-triggered", trigger="consensus")
 @dataclass(frozen=True, eq=False)
 class EventTriggeredCi(Filter):
@@ -155,26 +177,14 @@ class EventTriggeredCi(Filter):
 
     analysis = Analysis(paper="event_triggered", P_by_design=("larger", ""))
     timing = Timing(clocks=())
-    kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, decides=True)
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return what nodes sent last, the copies of what they heard last on each link, and the
-        thresholds.
-        """
-        n, flag = len(models[0].information), ((), np.uint8)
-        return Record(
-            node={"sent_x": (n,), "sent_root": (n, n), "has_sent": flag, "inverse": (n, n)},
-            link={
-                **{"copy_x": (n,), "copy_root": (n, n), "copy_inverse": (n, n)},
-                **{"has_copy": flag, "fresh": flag, "weight": ()},
-            },
-            payload={"xhat": (n,), "root": (n, n)},
-            settings={
-                "alpha": float(self.thresholds[0]),
-                "ratio": 1.0 + self.thresholds[1],
-                "share": 1.0 / self.widening**2,
-            },
-        )
+    kernels = Kernels(
+        predict=predict,
+        emit=emit,
+        absorb=absorb,
+        shift=shift,
+        decides=True,
+        record=event_triggered_ci_record,
+    )
 
     @property
     def widening(self) -> float:

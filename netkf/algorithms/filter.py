@@ -11,7 +11,7 @@ carried as roots, ``P = root root'``, so that wide and narrow directions keep th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from netkf.algorithms import single
 from netkf.algorithms.models import first_root, sample_update
-from netkf.algorithms.records import Kernels, Record
+from netkf.algorithms.records import Kernels
 from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
@@ -222,25 +222,6 @@ class Filter(Component):
     def analysis(self) -> Analysis:
         """What theory, checks and comparisons know of it; by default nothing."""
         return Analysis()
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the arrays of nodes, links and messages that ``kernels`` need, for nodes with
-        these ``infos`` and ``models``.
-        """
-        n = len(models[0].information)
-        return Record(payload={"xhat": (n,), "root": (n, n)})
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Set the entries of one node in the arrays of its ``record`` at time 0: ``node`` has
-        views by name, with xhat (n,) and root (n, n) set.
-        """
-
-    def prepare(
-        self, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
-    ) -> None:
-        """Set the fields of a ``record`` of nodes with these ``infos`` and ``models`` that are
-        known before the run for ``count`` slots from number ``first`` on, such as gains.
-        """
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
         """Return the state at time 0 from ``mean`` (n,) and ``cov`` (n, n), with the ``model`` of

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.diffusion import DiffusionFilter
+from netkf.algorithms.diffusion import DiffusionFilter, diffusion_filter_record
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.information import (
     add_reading_pair,
@@ -124,6 +124,24 @@ def mix_pairs(record: Any, h: int, run: Any) -> None:
         finish_lanes(lanes, record.root, x, h, x, total, work, False)
 
 
+def information_consensus_record(
+    filtering: InformationConsensus, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return in slots the pairs of nodes, the inverse roots of their predictions, and the
+    recipe; under clocks that of covariance intersection, one step of consensus on information.
+    """
+    if not isinstance(models[0], SlotModel):
+        return diffusion_filter_record(DiffusionFilter(on_loss="keep-own"), infos, models)
+    n = len(models[0].information)
+    shares, counts = filtering.recipe(infos[0].nodes)
+    pairs = {"parts": (len(shares), n, n + 1)}
+    return Record(
+        node={**pairs, "inverse": (n, n)},
+        payload={"xhat": (n,), **pairs},
+        settings={"shares": shares, "counts": counts, "steps": filtering.steps},
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class InformationConsensus(Filter):
     """Consensus on information pairs, ``steps`` times a slot; ``recipe`` of a derived class says
@@ -141,6 +159,7 @@ class InformationConsensus(Filter):
         absorb=mix_pairs,
         unrolled=False,
         under_clocks=DiffusionFilter.kernels,
+        record=information_consensus_record,
     )
 
     @property
@@ -169,21 +188,6 @@ class InformationConsensus(Filter):
         """Return the recipe for a network of N ``nodes``: from which information pairs begin, and
         how often each counts.
         """
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return in slots the pairs of nodes, the inverse roots of their predictions, and the
-        recipe; under clocks that of covariance intersection, one step of consensus on information.
-        """
-        if not isinstance(models[0], SlotModel):
-            return DiffusionFilter(on_loss="keep-own").record(infos, models)
-        n = len(models[0].information)
-        shares, counts = self.recipe(infos[0].nodes)
-        pairs = {"parts": (len(shares), n, n + 1)}
-        return Record(
-            node={**pairs, "inverse": (n, n)},
-            payload={"xhat": (n,), **pairs},
-            settings={"shares": shares, "counts": counts, "steps": self.steps},
-        )
 
     @property
     def analysis(self) -> Analysis:

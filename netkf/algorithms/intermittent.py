@@ -261,6 +261,35 @@ def reading_size(n: int, rows: int, _: int) -> int:
     return rows * (1 + n) + rows * (rows + 1) // 2
 
 
+def intermittent_record(
+    filtering: Intermittent, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return what nodes keep under clocks: their time, the number of moves of the origin, the
+    time when they last forgot events, and events of the past with the state after each.
+    """
+    if isinstance(models[0], SlotModel):
+        return Record()
+    n = len(models[0].information)
+    return Record(
+        node={"time": (), "moves": (), "swept": ()},
+        past={
+            **{"past_time": (), "past_moves": (), "past_rows": ((), np.int64)},
+            **{"past_y": (n,), "past_H": (n, n), "past_x": (n,), "past_root": (n, n)},
+        },
+        payload={"moves": ()},
+        settings={"lag": filtering.history_span(max(info.max_delay for info in infos))},
+    )
+
+
+def begin_intermittent(
+    _: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any
+) -> None:
+    """Make the start the first event of the past: every late reading has a state before it."""
+    if "kept" in node:
+        node["past_x"][0], node["past_root"][0] = node["xhat"], node["root"]
+        node["kept"][...] = 1
+
+
 @built_in("intermittent")
 @dataclass(frozen=True, eq=False)
 class Intermittent(Filter):
@@ -284,30 +313,9 @@ class Intermittent(Filter):
         shift_payload=keep_payload,
         sends_readings=True,
         under_clocks=UNDER_CLOCKS,
+        record=intermittent_record,
+        begin=begin_intermittent,
     )
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return what nodes keep under clocks: their time, the number of moves of the origin, the
-        time when they last forgot events, and events of the past with the state after each.
-        """
-        if isinstance(models[0], SlotModel):
-            return Record()
-        n = len(models[0].information)
-        return Record(
-            node={"time": (), "moves": (), "swept": ()},
-            past={
-                **{"past_time": (), "past_moves": (), "past_rows": ((), np.int64)},
-                **{"past_y": (n,), "past_H": (n, n), "past_x": (n,), "past_root": (n, n)},
-            },
-            payload={"moves": ()},
-            settings={"lag": self.history_span(max(info.max_delay for info in infos))},
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Make the start the first event of the past: every late reading has a state before it."""
-        if "kept" in node:
-            node["past_x"][0], node["past_root"][0] = node["xhat"], node["root"]
-            node["kept"][...] = 1
 
     @property
     def timing(self) -> Timing:

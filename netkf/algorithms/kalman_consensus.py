@@ -103,6 +103,21 @@ def shift(record: Any, h: int, run: Any) -> None:
     shift_vector(run, record.prior, h)
 
 
+def kcf_record(filtering: Kcf, _infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+    """Return predictions of nodes, (xbar, root) in messages, and the settings."""
+    estimate = {"xhat": (n := len(models[0].information),), "root": (n, n)}
+    return Record(
+        node={"prior": (n,), "prior_root": (n, n)},
+        payload=estimate,
+        settings={"epsilon": filtering.epsilon, "share": filtering.share_readings},
+    )
+
+
+def begin_kcf(_: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any) -> None:
+    """Take the first estimate for a prediction."""
+    node["prior"][:], node["prior_root"][:] = node["xhat"], node["root"]
+
+
 @built_in("kcf")
 @dataclass(frozen=True, eq=False)
 class Kcf(Filter):
@@ -122,20 +137,15 @@ class Kcf(Filter):
 
     timing = Timing(clocks=("directions", "nodes", "readings"))
     needs = Needs(one_way=True, samples=True)
-    kernels = Kernels(predict=predict, emit=emit, absorb=absorb, shift=shift, sends_readings=True)
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return predictions of nodes, (xbar, root) in messages, and the settings."""
-        estimate = {"xhat": (n := len(models[0].information),), "root": (n, n)}
-        return Record(
-            node={"prior": (n,), "prior_root": (n, n)},
-            payload=estimate,
-            settings={"epsilon": self.epsilon, "share": self.share_readings},
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Take the first estimate for a prediction."""
-        node["prior"][:], node["prior_root"][:] = node["xhat"], node["root"]
+    kernels = Kernels(
+        predict=predict,
+        emit=emit,
+        absorb=absorb,
+        shift=shift,
+        sends_readings=True,
+        record=kcf_record,
+        begin=begin_kcf,
+    )
 
     @property
     def analysis(self) -> Analysis:

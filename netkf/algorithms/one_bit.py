@@ -107,6 +107,20 @@ def use_bit(record: Any, h: int, run: Any, sign: Any, r: int, k: int, arrived: A
         store(lanes, record.xhat, h, i, x + load(lanes, gains, i) * step)
 
 
+def one_bit_record(_: Any, infos: Sequence[NodeInfo], _models: Sequence[Any]) -> Record:
+    """Return the turns of nodes, and signs in messages."""
+    return Record(
+        node={"turn": ()},
+        payload={"signs": (infos[0].rows,)},
+        settings={"nodes": infos[0].nodes},
+    )
+
+
+def begin_one_bit(_: Any, node: Mapping[str, np.ndarray], info: NodeInfo, _model: Any) -> None:
+    """Set the node's turn: slots k with ``k % nodes == turn``."""
+    node["turn"][...] = info.place
+
+
 @built_in("one-bit")
 @dataclass(frozen=True, eq=False)
 class OneBit(Filter):
@@ -131,18 +145,8 @@ class OneBit(Filter):
         decides=True,
         sends_readings=True,
         unrolled=False,
+        record=one_bit_record,
+        begin=begin_one_bit,
     )
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the turns of nodes, and signs in messages."""
-        return Record(
-            node={"turn": ()},
-            payload={"signs": (infos[0].rows,)},
-            settings={"nodes": infos[0].nodes},
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Set the node's turn: slots k with ``k % nodes == turn``."""
-        node["turn"][...] = info.place
 
     shift = Filter.shift  # signs of innovations do not depend on the origin

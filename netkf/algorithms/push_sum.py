@@ -373,18 +373,6 @@ def shift_payload(record: Any, m: int, run: Any) -> None:
     shift_vector(run, record.payload.xhat, m)
 
 
-SLOTS = Kernels(
-    predict=predict,
-    update=update,
-    emit=emit,
-    absorb=absorb,
-    shift_payload=shift_payload,
-    observe=observe,
-    under_clocks=running_sums.KERNELS,
-)
-DECIDING = replace(SLOTS, decides=True, depends_on_data=False)
-
-
 def message_size(n: int, _rows: int, phase: int) -> int:
     """Return the numbers in a message about n states: mass w, n~, C~, or an estimate z; under
     clocks (``phase`` -1) a weight, an information P^-1 and P^-1 xhat, which for a plant with modes
@@ -418,6 +406,82 @@ def masses(state: Any) -> Mapping[str, float | Sequence[float]]:
         ]
         for k, name in enumerate(("weight", "number"))
     }
+
+
+def push_sum_record(filtering: PushSum, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+    """Return masses, network estimates and settings in slots, running sums under clocks."""
+    if not isinstance(models[0], SlotModel):
+        return running_sums.record(infos, models)
+    n = len(models[0].information)
+    m, running = 2 + n * n, filtering.running_sums and not filtering.asymptotic
+    limit = np.zeros((n, n))
+    if filtering.asymptotic:
+        # Every node knows G, of all sensors. _check_scenario() refuses where there is no P_inf.
+        found = asymptotic_root(models[0].F, models[0].Q, infos[0].information)
+        limit = limit if found is None else found
+    shapes: dict[str, tuple[int, ...]] = {"mass": (m,), "before": (m,), "work": (n, n)}
+    shapes |= dict.fromkeys(("information", "former"), (n, n))
+    shapes |= dict.fromkeys(("number", "former_number"), (1,))
+    return Record(
+        node={
+            "mass": (m,),
+            "information": (n, n),
+            "number": (),
+            "stopped": ((), np.int64),
+            "degree": ((), np.int64),
+            "offered": (m if running else 0,),
+            "conserved": (2,),
+        },
+        link={"heard": (m if running else 0,)},
+        payload={"mass": (m,), "xhat": (n,)},
+        scratch={
+            "before": (m,),
+            "new_information": (n, n),
+            "new_number": (1,),
+            "silent": ((), np.uint8),
+        },
+        settings={
+            "step": MassStep(**{name: np.zeros(shape) for name, shape in shapes.items()}),
+            "alone": np.stack([model.information for model in models]),
+            "limit": np.ascontiguousarray(limit),
+            "rule": RULES.index(filtering.stop),
+            "tolerance": float(filtering.tolerance),
+            # In slots _check_scenario() demands a delta.
+            "factor": 1.0 / (filtering.delta or math.inf),
+            "asymptotic": int(filtering.asymptotic),
+            "running": int(running),
+        },
+    )
+
+
+def begin_push_sum(
+    filtering: PushSum, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any
+) -> None:
+    """Set one node to P step 1: w is 1 at the leader and 0 elsewhere, n~ = 1, C~ is its own
+    information; with asymptotic gains it knows the limits.
+    """
+    if not isinstance(model, SlotModel):
+        node["weight"][...] = 1.0
+        return
+    node["mass"][:2] = 1.0 if info.node == filtering.leader else 0.0, 1.0
+    node["mass"][2:] = model.information.reshape(-1)
+    node["information"][:] = info.information if filtering.asymptotic else model.information
+    node["number"][...] = info.nodes if filtering.asymptotic else 1.0
+    node["stopped"][...], node["degree"][...] = NEVER_STOPPED, info.degree
+
+
+SLOTS = Kernels(
+    record=push_sum_record,
+    begin=begin_push_sum,
+    predict=predict,
+    update=update,
+    emit=emit,
+    absorb=absorb,
+    shift_payload=shift_payload,
+    observe=observe,
+    under_clocks=running_sums.KERNELS,
+)
+DECIDING = replace(SLOTS, decides=True, depends_on_data=False)
 
 
 @built_in("push-sum")
@@ -481,64 +545,6 @@ class PushSum(Filter):
             sends=lambda phase, _: phase == AVERAGE or not asymptotic,
             stopping=MASS if not asymptotic and self.stop != "never" else -1,
         )
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return masses, network estimates and settings in slots, running sums under clocks."""
-        if not isinstance(models[0], SlotModel):
-            return running_sums.record(infos, models)
-        n = len(models[0].information)
-        m, running = 2 + n * n, self.running_sums and not self.asymptotic
-        limit = np.zeros((n, n))
-        if self.asymptotic:
-            # Every node knows G, of all sensors. _check_scenario() refuses where there is no P_inf.
-            found = asymptotic_root(models[0].F, models[0].Q, infos[0].information)
-            limit = limit if found is None else found
-        shapes: dict[str, tuple[int, ...]] = {"mass": (m,), "before": (m,), "work": (n, n)}
-        shapes |= dict.fromkeys(("information", "former"), (n, n))
-        shapes |= dict.fromkeys(("number", "former_number"), (1,))
-        return Record(
-            node={
-                "mass": (m,),
-                "information": (n, n),
-                "number": (),
-                "stopped": ((), np.int64),
-                "degree": ((), np.int64),
-                "offered": (m if running else 0,),
-                "conserved": (2,),
-            },
-            link={"heard": (m if running else 0,)},
-            payload={"mass": (m,), "xhat": (n,)},
-            scratch={
-                "before": (m,),
-                "new_information": (n, n),
-                "new_number": (1,),
-                "silent": ((), np.uint8),
-            },
-            settings={
-                "step": MassStep(**{name: np.zeros(shape) for name, shape in shapes.items()}),
-                "alone": np.stack([model.information for model in models]),
-                "limit": np.ascontiguousarray(limit),
-                "rule": RULES.index(self.stop),
-                "tolerance": float(self.tolerance),
-                # In slots _check_scenario() demands a delta.
-                "factor": 1.0 / (self.delta or math.inf),
-                "asymptotic": int(self.asymptotic),
-                "running": int(running),
-            },
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Set one node to P step 1: w is 1 at the leader and 0 elsewhere, n~ = 1, C~ is its own
-        information; with asymptotic gains it knows the limits.
-        """
-        if not isinstance(model, SlotModel):
-            node["weight"][...] = 1.0
-            return
-        node["mass"][:2] = 1.0 if info.node == self.leader else 0.0, 1.0
-        node["mass"][2:] = model.information.reshape(-1)
-        node["information"][:] = info.information if self.asymptotic else model.information
-        node["number"][...] = info.nodes if self.asymptotic else 1.0
-        node["stopped"][...], node["degree"][...] = NEVER_STOPPED, info.degree
 
     shift = Filter.shift  # averaging weights sum to one
 

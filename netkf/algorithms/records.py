@@ -1,14 +1,15 @@
 """Filters as kernels: the verbs, and the record of a node that they change.
 
 A filter whose verbs are kernels (``Filter.kernels``) says what a node knows, in arrays with names:
-``Filter.record`` returns their shapes. Engines make one *record* of H nodes, a struct with an axis
+``Kernels.record`` returns their shapes. Engines make one *record* of H nodes, a struct with an axis
 of nodes before each shape and an axis of L runs side by side after it, and call the verbs for one
 node at a time, see ``algorithms.kernels.run``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -47,10 +48,36 @@ class Record:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
+def estimate_shapes(n: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of an estimate and the root of its covariance."""
+    return {"xhat": (n,), "root": (n, n)}
+
+
+def estimate_record(_filtering: Any, _infos: Sequence[Any], models: Sequence[Any]) -> Record:
+    """Return the record of a filter whose messages are estimates with their roots."""
+    return Record(payload=estimate_shapes(len(models[0].information)))
+
+
+def begin_estimate(_filtering: Any, _node: Any, _info: Any, _model: Any) -> None:
+    """Leave a node as it is at time 0."""
+
+
+def prepare_nothing(_filtering: Any, _record: Any, *_: Any) -> None:
+    """Set nothing: the record does not depend on the slots."""
+
+
 @dataclass(frozen=True)
 class Kernels:
-    """The verbs of a filter as kernels, by default those of a Kalman filter on own readings.
+    """The verbs of a filter as kernels, by default those of a Kalman filter on own readings, and
+    plain functions that make its record; their first argument is the filter.
 
+    record : ``record(filtering, infos, models)`` returns the ``Record`` of nodes with these infos
+             and models
+    begin : ``begin(filtering, node, info, model)`` sets the entries of one node in the arrays of
+            its record at time 0: ``node`` has views by name, with xhat (n,) and root (n, n) set
+    prepare : ``prepare(filtering, record, infos, models, first, count)`` sets the fields of a
+              record that are known before the run for ``count`` slots from number ``first`` on,
+              such as gains
     predict, update, absorb, shift : ``verb(record, h, run)`` for node h
     emit : ``emit(record, h, m, run)`` writes payload number m of node h
     shift_payload : ``shift_payload(record, m, run)``, of payload m
@@ -68,10 +95,13 @@ class Kernels:
                 link, or where it is -1 for a node that it does not hear
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
-    under_clocks : the verbs under clocks, where they are others than in slots
+    under_clocks : the verbs under clocks, where they are others than in slots; the record is one
     depends_on_data : whether who sends depends on readings or estimates; by default ``decides``
     """
 
+    record: Callable[..., Record] = estimate_record
+    begin: Callable[..., None] = begin_estimate
+    prepare: Callable[..., None] = prepare_nothing
     predict: Any = standard.predict
     update: Any = standard.update
     emit: Any = standard.emit
@@ -120,11 +150,6 @@ def make_arrays(shapes: Shapes, leading: tuple[int, ...], lanes: int) -> dict[st
         shape, kind = given if has_type else (given, np.float64)
         made[name] = aligned((*leading, *shape, lanes), kind)
     return made
-
-
-def estimate_shapes(n: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of an estimate and the root of its covariance."""
-    return {"xhat": (n,), "root": (n, n)}
 
 
 def record_class(name: str, values: Mapping[str, Any]) -> Any:
@@ -200,7 +225,8 @@ def make_records(
     room for so many ``messages``; ``starts`` are estimates (n,) and roots (n, n) of the nodes.
     """
     n, count = len(starts[0][0]), len(starts)
-    record: Record = filtering.record(infos, models)
+    kernels = filtering.kernels
+    record: Record = kernels.record(filtering, infos, models)
     known = {**estimate_shapes(n), **record.node}
     if record.past:
         known["kept"] = ((), np.int64)
@@ -210,23 +236,24 @@ def make_records(
     for h, ((mean, root), info, model) in enumerate(zip(starts, infos, models, strict=True)):
         views = {name: array[0, h, ..., 0] for name, array in nodes.items()}
         views["xhat"][...], views["root"][...] = mean, root
-        filtering.begin(views, info, model)
+        kernels.begin(filtering, views, info, model)
     for array in nodes.values():
         # All runs start alike.
         array[:] = array[:1, ..., :1].copy()
     payload = make_arrays({**record.payload}, (messages,), lanes)
     arrays = {**nodes, **per_link}
     values: dict[str, Any] = {name: array[0] for name, array in arrays.items()}
-    name = record_owner(type(filtering)).__name__
+    # Filters of one record share its compiled code.
+    name = re.sub(r"\W", "_", kernels.record.__name__)
     # A struct has at least one field.
     payload = payload or {"empty": np.zeros((1, 1))}
-    values["payload"] = record_class(f"{name}Payload", payload)(**payload)
+    values["payload"] = record_class(f"{name}_payload", payload)(**payload)
     values |= make_arrays(record.scratch, (), lanes)
     values |= record.settings
     if record.past:
         values["room"] = FIRST_PAST
     return Records(
-        record_class(f"{name}Record", values)(**values), arrays, tuple(per_link), tuple(record.past)
+        record_class(name, values)(**values), arrays, tuple(per_link), tuple(record.past)
     )
 
 
@@ -246,8 +273,3 @@ def resized(payload: Any, messages: int) -> Any:
         fields[name] = np.zeros((messages, *old.shape[1:]), dtype=old.dtype)
         fields[name][: len(old)] = old
     return type(payload)(**fields)
-
-
-def record_owner(cls: type) -> type:
-    """Return the class, ``cls`` or one it derives from, that defines the record."""
-    return next(base for base in cls.__mro__ if "record" in vars(base))

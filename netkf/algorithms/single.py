@@ -146,7 +146,7 @@ class Surroundings:
         past: tuple[str, ...],
     ) -> None:
         self.filtering, self.past = filtering, past
-        self.sends = filtering.timing.sends
+        self.sends, self._prepare = filtering.timing.sends, filtering.kernels.prepare
         n, self.info, self.node_fields = len(model.information), info, node_fields
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
@@ -229,7 +229,7 @@ class Surroundings:
     def prepare(self, record: Any, slot: int) -> None:
         """Let the filter set what it knows of a slot before the run."""
         if slot >= 0:
-            self.filtering.prepare(record, [self.info], [self.model], slot, 1)
+            self._prepare(self.filtering, record, [self.info], [self.model], slot, 1)
 
     def set_exchange(self, exchange: Any) -> None:
         """Set the circumstances of ``emit`` or ``absorb``."""

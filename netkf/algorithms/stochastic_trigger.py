@@ -208,6 +208,34 @@ def shift_prior(record: Any, h: int, run: Any) -> None:
     shift_vector(run, record.prior, h)
 
 
+def scheduled_readings_record(
+    filtering: ScheduledReadings, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return predictions, what was sent, and the sensors that nodes know: their own, and those
+    of the senders of each link.
+    """
+    n, p = len(models[0].information), infos[0].rows
+    trigger = whitened_triggers(models, p, filtering.Y)
+    flag = ((), np.uint8)
+    return Record(
+        node={"prior": (n,), "own": (p, n), "sent": flag, "known": flag},
+        link={"rows": (p, n), "heard": flag, "silent": flag},
+        payload={"rows": (p, n)},
+        scratch={"innovation": (1, p), "news": (1,)},
+        settings={
+            "trigger": trigger,
+            "whitening": np.stack([silence_whitening(one) for one in trigger]),
+        },
+    )
+
+
+def begin_scheduled_readings(
+    _: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any
+) -> None:
+    """Take the first estimate for a prediction."""
+    node["prior"][:] = node["xhat"]
+
+
 @dataclass(frozen=True, eq=False)
 class ScheduledReadings(Filter):
     """Every node broadcasts its reading y or is silent, and its receivers use the silence, too.
@@ -234,29 +262,9 @@ class ScheduledReadings(Filter):
         shift_payload=nothing,
         sends_readings=True,
         decides=True,
+        record=scheduled_readings_record,
+        begin=begin_scheduled_readings,
     )
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return predictions, what was sent, and the sensors that nodes know: their own, and those
-        of the senders of each link.
-        """
-        n, p = len(models[0].information), infos[0].rows
-        trigger = whitened_triggers(models, p, self.Y)
-        flag = ((), np.uint8)
-        return Record(
-            node={"prior": (n,), "own": (p, n), "sent": flag, "known": flag},
-            link={"rows": (p, n), "heard": flag, "silent": flag},
-            payload={"rows": (p, n)},
-            scratch={"innovation": (1, p), "news": (1,)},
-            settings={
-                "trigger": trigger,
-                "whitening": np.stack([silence_whitening(one) for one in trigger]),
-            },
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Take the first estimate for a prediction."""
-        node["prior"][:] = node["xhat"]
 
     @property
     def needs(self) -> Needs:
@@ -366,7 +374,44 @@ def with_trigger(inner: Kernels) -> Kernels:
             if record.trigger_silent[h, q] == 1:
                 run.sends[q] = 0
 
-    return replace(inner, update=update, emit=emit, decides=True, under_clocks=None)
+    def triggered_messages_record(
+        filtering: Any, infos: Sequence[NodeInfo], models: Sequence[Any]
+    ) -> Record:
+        """Return the record of the wrapped filter with news and decisions."""
+        wrapped, p, flag = (
+            inner.record(filtering.inner, infos, models),
+            infos[0].rows,
+            ((), np.uint8),
+        )
+        flags = dict.fromkeys(("trigger_undecided", "trigger_silent", "trigger_has_sent"), flag)
+        return replace(
+            wrapped,
+            node={**wrapped.node, "trigger_news": (), **flags},
+            scratch={**wrapped.scratch, "trigger_z": (1, p)},
+            settings={**wrapped.settings, "trigger_Y": whitened_triggers(models, p, filtering.Y)},
+        )
+
+    def begin_triggered_messages(
+        filtering: Any, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any
+    ) -> None:
+        """Begin as the wrapped filter does, without a reading."""
+        inner.begin(filtering.inner, node, info, model)
+        node["trigger_news"][...], node["trigger_undecided"][...] = NO_READING, 1
+
+    def prepare(filtering: Any, record: Any, *slots: Any) -> None:
+        """Prepare the slots as the wrapped filter does."""
+        inner.prepare(filtering.inner, record, *slots)
+
+    return replace(
+        inner,
+        record=triggered_messages_record,
+        begin=begin_triggered_messages,
+        prepare=prepare,
+        update=update,
+        emit=emit,
+        decides=True,
+        under_clocks=None,
+    )
 
 
 @forwarding
@@ -411,22 +456,6 @@ class TriggeredMessages(Filter):
         """
         inner = compiled_kernels(self.inner, clocked=False)
         return None if inner is None else with_trigger(inner)
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the record of the wrapped filter with news and decisions."""
-        inner, p, flag = self.inner.record(infos, models), infos[0].rows, ((), np.uint8)
-        flags = dict.fromkeys(("trigger_undecided", "trigger_silent", "trigger_has_sent"), flag)
-        return replace(
-            inner,
-            node={**inner.node, "trigger_news": (), **flags},
-            scratch={**inner.scratch, "trigger_z": (1, p)},
-            settings={**inner.settings, "trigger_Y": whitened_triggers(models, p, self.Y)},
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Begin as the wrapped filter does, without a reading."""
-        self.inner.begin(node, info, model)
-        node["trigger_news"][...], node["trigger_undecided"][...] = NO_READING, 1
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> WrappedState:
         """Return the state of the wrapped filter at time 0 from ``mean`` (n,) and ``cov`` (n, n),

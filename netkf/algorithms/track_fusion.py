@@ -89,6 +89,23 @@ def copy_track(
             root[i, j] = roots[h, i, j, q]
 
 
+def pair_fusion_record(
+    filtering: PairFusion, _infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the rule, and scratch for one fusion at a time."""
+    n = len(models[0].information)
+    scratch = {"work": (2 * n + 2, n), "x": (n,), "S": (n, n), "other_x": (n,)}
+    scratch |= {"other_S": (n, n)}
+    return Record(
+        payload={"xhat": (n,), "root": (n, n)},
+        settings={
+            "inverse": filtering.inverse,
+            "trace": filtering.minimise == TRACE,
+            **{name: np.zeros(shape) for name, shape in scratch.items()},
+        },
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class PairFusion(Filter):
     """A node fuses its estimate with each one that it hears, one after the other in the order of
@@ -102,21 +119,7 @@ class PairFusion(Filter):
     analysis = Analysis(paper="track_fusion")
     needs = Needs(one_way=True, inverts=True)
     inverse: ClassVar[bool] = False
-    kernels = Kernels(absorb=fuse_heard, unrolled=False)
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return the rule, and scratch for one fusion at a time."""
-        n = len(models[0].information)
-        scratch = {"work": (2 * n + 2, n), "x": (n,), "S": (n, n), "other_x": (n,)}
-        scratch |= {"other_S": (n, n)}
-        return Record(
-            payload={"xhat": (n,), "root": (n, n)},
-            settings={
-                "inverse": self.inverse,
-                "trace": self.minimise == TRACE,
-                **{name: np.zeros(shape) for name, shape in scratch.items()},
-            },
-        )
+    kernels = Kernels(absorb=fuse_heard, unrolled=False, record=pair_fusion_record)
 
     shift = Filter.shift  # affine: the gains of both estimates sum to I, and only P decides them
 
@@ -249,6 +252,73 @@ def shift_tracks(record: Any, h: int, run: Any) -> None:
     shift_vector(run, record.track_x, h)
 
 
+def bar_shalom_campo_record(_: Any, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
+    """Return tracks of nodes and messages, the pairs of tracks that some node may combine, room
+    for their covariances, which are the same in all runs, and for combinations.
+    """
+    network, n, H = infos[0].network, len(models[0].information), len(infos)
+    assert network is not None
+    places = [info.place for info in infos]
+    others = {j for place in places for j in network.heard[place]}.difference(places)
+    index = {place: k for k, place in enumerate([*places, *sorted(others)])}
+    heard = [[index[j] for j in network.heard[place]] for place in places]
+    pairs = combined_pairs(len(index), heard)
+    degree = max(1, *map(len, heard))
+    information = network.information[list(index)]
+    return Record(
+        node={"track_x": (n,), "track_root": (n, n), "start": (n, n)},
+        payload={"xhat": (n,)},
+        settings={
+            "own": np.arange(H),
+            "heard": np.array([j for some in heard for j in some] + [0]),
+            "pairs": pairs,
+            "pairs_of": np.searchsorted(pairs[:, 0], np.arange(len(index) + 1)),
+            "joint": np.zeros((len(pairs), n, n)),
+            # Number of the slot that they belong to.
+            "joint_slot": np.full(1, -1),
+            # Rows of unit noise with the information of the sensors.
+            "sensors": np.ascontiguousarray(np.stack([square_root(one).T for one in information])),
+            "rows": np.where(information.any(axis=(1, 2)), n, 0),
+            "closed": np.zeros((len(index), n, n)),
+            **{name: np.zeros(degree + 1, dtype=np.int64) for name in ("tracks", "messages")},
+            "block": np.zeros((degree + 1, degree + 1, n, n)),
+            "scratch": track_scratch(degree, n),
+            # -1: a free entry.
+            "key": np.full((H, COMBINATIONS), -1),
+            "rank": np.zeros((H, COMBINATIONS), dtype=np.int64),
+            "gain": np.zeros((H, COMBINATIONS, n, degree * n)),
+            "combined": np.zeros((H, COMBINATIONS, n, n)),
+        },
+    )
+
+
+def begin_bar_shalom_campo(
+    _: Any, node: Mapping[str, np.ndarray], _info: NodeInfo, _model: Any
+) -> None:
+    """Begin the track with the first estimate, and keep its covariance."""
+    node["track_x"][:], node["track_root"][:] = node["xhat"], node["root"]
+    node["start"][:] = node["root"] @ node["root"].T
+
+
+def prepare_bar_shalom_campo(
+    _: Any, record: Any, _infos: Sequence[NodeInfo], models: Sequence[Any], first: int, _count: int
+) -> None:
+    """Compute the covariances of tracks in slot ``first``."""
+    joint, slot = record.joint, record.joint_slot
+    if slot[0] == first:
+        return
+    # All tracks start with one common error.
+    if slot[0] < 0 or slot[0] > first:
+        joint[:], slot[0] = record.start[0, ..., 0], 0
+    F, Q = (np.array(part, order="C") for part in (models[0].F, models[0].Q))
+    work = np.empty(F.shape)
+    while slot[0] < first:
+        predict_joint(joint, F, Q, work)
+        update_joint(joint, record.pairs, record.sensors, record.rows, record.closed, work)
+        slot[0] += 1
+    record.key[:] = -1
+
+
 @built_in("track-fusion", rule="cross-covariance")
 @dataclass(frozen=True, eq=False)
 class BarShalomCampo(Filter):
@@ -272,71 +342,10 @@ class BarShalomCampo(Filter):
         absorb=combine_heard,
         shift=shift_tracks,
         slotwise=True,
+        record=bar_shalom_campo_record,
+        begin=begin_bar_shalom_campo,
+        prepare=prepare_bar_shalom_campo,
     )
-
-    def record(self, infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
-        """Return tracks of nodes and messages, the pairs of tracks that some node may combine, room
-        for their covariances, which are the same in all runs, and for combinations.
-        """
-        network, n, H = infos[0].network, len(models[0].information), len(infos)
-        assert network is not None
-        places = [info.place for info in infos]
-        others = {j for place in places for j in network.heard[place]}.difference(places)
-        index = {place: k for k, place in enumerate([*places, *sorted(others)])}
-        heard = [[index[j] for j in network.heard[place]] for place in places]
-        pairs = combined_pairs(len(index), heard)
-        degree = max(1, *map(len, heard))
-        information = network.information[list(index)]
-        return Record(
-            node={"track_x": (n,), "track_root": (n, n), "start": (n, n)},
-            payload={"xhat": (n,)},
-            settings={
-                "own": np.arange(H),
-                "heard": np.array([j for some in heard for j in some] + [0]),
-                "pairs": pairs,
-                "pairs_of": np.searchsorted(pairs[:, 0], np.arange(len(index) + 1)),
-                "joint": np.zeros((len(pairs), n, n)),
-                # Number of the slot that they belong to.
-                "joint_slot": np.full(1, -1),
-                # Rows of unit noise with the information of the sensors.
-                "sensors": np.ascontiguousarray(
-                    np.stack([square_root(one).T for one in information])
-                ),
-                "rows": np.where(information.any(axis=(1, 2)), n, 0),
-                "closed": np.zeros((len(index), n, n)),
-                **{name: np.zeros(degree + 1, dtype=np.int64) for name in ("tracks", "messages")},
-                "block": np.zeros((degree + 1, degree + 1, n, n)),
-                "scratch": track_scratch(degree, n),
-                # -1: a free entry.
-                "key": np.full((H, COMBINATIONS), -1),
-                "rank": np.zeros((H, COMBINATIONS), dtype=np.int64),
-                "gain": np.zeros((H, COMBINATIONS, n, degree * n)),
-                "combined": np.zeros((H, COMBINATIONS, n, n)),
-            },
-        )
-
-    def begin(self, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any) -> None:
-        """Begin the track with the first estimate, and keep its covariance."""
-        node["track_x"][:], node["track_root"][:] = node["xhat"], node["root"]
-        node["start"][:] = node["root"] @ node["root"].T
-
-    def prepare(
-        self, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
-    ) -> None:
-        """Compute the covariances of tracks in slot ``first``."""
-        joint, slot = record.joint, record.joint_slot
-        if slot[0] == first:
-            return
-        # All tracks start with one common error.
-        if slot[0] < 0 or slot[0] > first:
-            joint[:], slot[0] = record.start[0, ..., 0], 0
-        F, Q = (np.array(part, order="C") for part in (models[0].F, models[0].Q))
-        work = np.empty(F.shape)
-        while slot[0] < first:
-            predict_joint(joint, F, Q, work)
-            update_joint(joint, record.pairs, record.sensors, record.rows, record.closed, work)
-            slot[0] += 1
-        record.key[:] = -1
 
     shift = Filter.shift  # affine: tracks enter by their differences
 

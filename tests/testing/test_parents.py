@@ -40,12 +40,19 @@ class Heavier(parts.Hybrid):
         return parts.Weights(lambda *degrees: 1.02 * given.of(*degrees))
 
 
-@keep(ADJUSTED, "Averse.begin: must have the numbers of Hybrid", epsilon=0.3)
+def widen(filtering, node, info, model):
+    node["root"][:] *= 1.1
+
+
+def grow_own_weight(filtering, node, info, model):
+    node["own"][...] = 1.2 * info.own_weight
+
+
+@keep(ADJUSTED, "Averse.kernels: must have the numbers of Hybrid", epsilon=0.3)
 class Averse(parts.Hybrid):
     """A first covariance that is too large."""
 
-    def begin(self, node, info, model):
-        node["root"][:] *= 1.1
+    kernels = replace(parts.Hybrid.kernels, begin=widen)
 
 
 @keep(ADJUSTED, "LateStart.timing: must have the numbers of Gossip")
@@ -58,10 +65,9 @@ class Everyone(parts.Gossip):
     timing = replace(parts.Gossip.timing, pairwise=False)
 
 
-@keep(ADJUSTED, "Unfair.begin: must have the numbers of DiffusionFilter")
+@keep(ADJUSTED, "Unfair.kernels: must have the numbers of DiffusionFilter")
 class Unfair(parts.DiffusionFilter):
-    def begin(self, node, info, model):
-        node["own"][...] = 1.2 * info.own_weight
+    kernels = replace(parts.DiffusionFilter.kernels, begin=grow_own_weight)
 
 
 @keep(ADJUSTED, "Certain.kernels: must have the numbers of PushSum", gamma=3, delta=4.0)
@@ -177,5 +183,5 @@ def test_check_filter_compares_with_the_parent():
 
 def test_attributes_of_its_own_are_listed_without_fields_and_new_names():
     assert own_attributes(OneClock(epsilon=0.3)) == ["needs", "timing"]
-    assert own_attributes(Averse(epsilon=0.3)) == ["begin"]
+    assert own_attributes(Averse(epsilon=0.3)) == ["kernels"]
     assert own_attributes(Renamed(epsilon=0.3)) == []

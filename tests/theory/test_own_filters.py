@@ -65,20 +65,21 @@ def shift_payload(record, m, run):
     shift_vector(run, record.payload.x, m)
 
 
+def remembering_record(filtering, infos, models):
+    n = len(models[0].information)
+    return Record(
+        link={"heard": (n,), "told": ()}, payload={"x": (n,)}, settings={"gain": 0.15}
+    )
+
+
 class Remembering(Filter):
     timing = Timing(schedule=None, clocks=("nodes", "directions", "readings"))
     needs = Needs(samples=True)
     kernels = Kernels(
-        predict=predict, update=update, emit=emit, absorb=absorb, shift=shift,
-        shift_payload=shift_payload,
+        record=remembering_record, predict=predict, update=update, emit=emit, absorb=absorb,
+        shift=shift, shift_payload=shift_payload,
     )
     shift = Filter.shift
-
-    def record(self, infos, models):
-        n = len(models[0].information)
-        return Record(
-            link={"heard": (n,), "told": ()}, payload={"x": (n,)}, settings={"gain": 0.15}
-        )
 """
 A, B = np.array([[0.1, 0.5], [-0.6, 0.2]]), np.array([[0.8, 0.0], [0.1, 0.5]])
 H, R, GAIN, N = np.array([[1.0, 0.3]]), 0.4, 0.15, 4

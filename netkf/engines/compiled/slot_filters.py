@@ -125,8 +125,10 @@ class SlotFilters:
         )
         setup, record, count = self._setup, self.records.struct, len(plan.sensed)
         loop, step = slot_loop(self._kernels), 1 if self._kernels.slotwise else max(1, count)
+        assert setup.algorithm.kernels is not None
+        prepare = setup.algorithm.kernels.prepare
         for start in range(0, count, step):
             first = plan.first + start
-            setup.algorithm.prepare(record, setup.infos, setup.models, first, step)
+            prepare(setup.algorithm, record, setup.infos, setup.models, first, step)
             part = plan._replace(start=start, end=start + step)
             loop(record, self.records.memories, self._run, part, samples)
