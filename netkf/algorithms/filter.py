@@ -11,7 +11,7 @@ carried as roots, ``P = root root'``, so that wide and narrow directions keep th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -282,36 +282,34 @@ class Filter(Component):
         return state.xhat, state.root @ state.root.T
 
     def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return the state with ``offset`` (n,) added to the estimate and to everything like one.
+        """Return a state, or a payload under way, with ``offset`` (n,) added to the estimate and to
+        everything like one.
 
         Engines call it when they move the origin of coordinates near to the true state, so that
-        errors on unstable plants keep their digits. That needs a filter that commutes with such a
-        shift (``commutes``), as those that are affine in readings and payloads do. A class that
-        defines one of STEPS itself says so by defining ``shift`` too.
+        errors on unstable plants keep their digits; of a payload ``offset`` is the move at the time
+        of sending. That needs a filter that commutes with such a shift (``commutes``), as those
+        that are affine in readings and payloads do. A class that defines one of STEPS itself says
+        so by defining ``shift`` too.
         """
         if self.kernels is not None:
             return single.shift(state, offset)
         return state._replace(xhat=state.xhat + offset)
 
-    def shift_payload(self, payload: Any, offset: FloatArray) -> Any:
-        """Return a payload under way with ``offset`` (n,) added to the estimate in it. Engines
-        call it when they move the origin, with ``shift`` for all states; ``offset`` is the move at
-        the time of sending.
-        """
-        if self.kernels is not None:
-            return single.shift_payload(payload, offset)
-        return payload._replace(xhat=payload.xhat + offset)
 
-    def max_measurement_interval(self, state: Any) -> float:
-        """Return the seconds of increments that ``update`` may use at once from this state on.
+def interval_rule(algorithm: Filter) -> Callable[[Any], float]:
+    """Return a function of a state: the seconds of increments that ``update`` may use at once from
+    it on, by ``Timing.interval``, or else by the kernels or the model.
+    """
+    given = algorithm.timing.interval
+    if given is not None:
+        return given
+    if algorithm.kernels is not None:
+        return single.interval
+    return _interval_of_model
 
-        A large covariance shrinks fast, and the weights of readings change as fast: on the time
-        scale 1 / trace(P G), G = H' R^-1 H, after a first guess or after a reset by a neighbour
-        that knew less.
-        """
-        if self.kernels is not None:
-            return single.interval(state)
-        return float(state.model.max_interval(state.root))
+
+def _interval_of_model(state: Any) -> float:
+    return float(state.model.max_interval(state.root))
 
 
 def may_be_silent(algorithm: Filter) -> bool:
@@ -342,7 +340,7 @@ def commutes(algorithm: Filter) -> bool:
 
 def compiled_kernels(algorithm: Filter, clocked: bool) -> Kernels | None:
     """Return the kernels of a filter under clocks or in slots; None if it has none, or if its class
-    defines one of STEPS in Python after them, so that they do not say what it does.
+    defines one of STEPS in Python after them, or an interval, so that they do not say what it does.
     """
     kernels = algorithm.kernels
     if kernels is None:
@@ -350,5 +348,7 @@ def compiled_kernels(algorithm: Filter, clocked: bool) -> Kernels | None:
     order = type(algorithm).__mro__
     first = next((k for k, cls in enumerate(order) if "kernels" in vars(cls)), len(order))
     if any(name in vars(cls) for cls in order[:first] for name in STEPS):
+        return None
+    if clocked and algorithm.timing.interval is not None:
         return None
     return kernels.of(clocked)

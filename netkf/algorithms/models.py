@@ -126,7 +126,7 @@ class FlowModel:
 
     def max_interval(self, root: FloatArray) -> float:
         """Return the longest measurement interval, in seconds, for a covariance with this root
-        (n, n), see ``Filter.max_measurement_interval``.
+        (n, n), see ``Timing.interval``.
         """
         # trace(P G) = |R^-1/2 H S|^2, without forming P = S S' and G = H' R^-1 H.
         HS = self.flow.whitened_H[0] @ root
@@ -185,7 +185,7 @@ class SlotModel:
     def max_interval(self, root: FloatArray) -> float:
         """Return the longest measurement interval in seconds: infinity, whatever the ``root``
         (n, n), since slots have no increments that an interval would limit; see
-        ``Filter.max_measurement_interval``.
+        ``Timing.interval``.
         """
         return math.inf
 

@@ -26,9 +26,6 @@ F = TypeVar("F", bound=type[Filter])
 
 _REGISTERED: dict[str, type[Filter]] = {}  # by name, see choice_name
 
-WEIGHING = ("share", "max_measurement_interval")
-"""Methods that theorems rely on, besides STEPS, the methods that define a filter."""
-
 LINK_WEIGHTS = ("link_weights",)
 """What a derived class may override without losing the theory, which asks it for its weights."""
 
@@ -141,6 +138,6 @@ def overridden(algorithm: object, base: type | None = None) -> list[str]:
     cls = type(algorithm)
     return [
         name
-        for name in (*STEPS, *WEIGHING, *TRAITS)
+        for name in (*STEPS, *TRAITS)
         if hasattr(base, name) and getattr(cls, name, None) is not getattr(base, name)
     ]

@@ -354,16 +354,19 @@ def interval(state: NodeState) -> float:
     return float(state.kernels.interval(state.record, 0, state.run.struct))
 
 
-def shift(state: NodeState, offset: FloatArray) -> NodeState:
-    """Return the state after the origin of coordinates moved by ``-offset`` (n,)."""
+def shift(state: Any, offset: FloatArray) -> Any:
+    """Return a state, or a payload under way, after the origin of coordinates moved by ``-offset``
+    (n,), of a payload at its sending.
+    """
+    if isinstance(state, Payload):
+        return _shift_payload(state, offset)
     new, run = state.copied(events=1), state.run.struct
     run.offset[:, 0] = offset
     state.kernels.shift(new.record, 0, run)
     return new
 
 
-def shift_payload(payload: Payload, offset: FloatArray) -> Payload:
-    """Return a payload under way after the origin moved by ``-offset`` (n,) at its sending."""
+def _shift_payload(payload: Payload, offset: FloatArray) -> Payload:
     new = payload.sender.copied()
     record, run = new.record, new.run.struct
     run.offset[:, 0] = offset

@@ -502,10 +502,13 @@ class TriggeredMessages(Filter):
         """Return estimate (n,) and covariance (n, n) of the wrapped filter."""
         return self.inner.estimate(state.inner)
 
-    def shift(self, state: WrappedState, offset: FloatArray) -> WrappedState:
-        """Return the state with ``offset`` (n,) added to the wrapped filter's estimate, for a move
-        of the origin: innovations do not change, and so the trigger's news neither.
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """Return the state, or a payload, with ``offset`` (n,) added to the wrapped filter's
+        estimate, for a move of the origin: innovations do not change, and so the trigger's news
+        neither.
         """
+        if not isinstance(state, WrappedState):
+            return self.inner.shift(state, offset)
         return state._replace(inner=self.inner.shift(state.inner, offset))
 
 

@@ -158,6 +158,10 @@ class Timing:
     sends : ``sends(phase, has_sensor)``, False if a node with a sensor, or without one, sends
             nothing in an exchange. In a slot in which recorded sensors of a node have no row it
             counts as one without
+    interval : ``interval(state)`` returns the seconds of increments that ``update`` may use at once
+               from a state on; None: as kernels or the model say. A large covariance shrinks fast,
+               and the weights of readings change as fast: on the time scale 1 / trace(P G), G =
+               H' R^-1 H, after a first guess or after a reset by a neighbour that knew less
     stopping : number of the exchange of a slot after which a node may freeze its network estimate
                for good (``Analysis.stopped``), -1 if there is none
     """
@@ -176,6 +180,7 @@ class Timing:
     steps: Callable[[int], int] = once
     redraws: Callable[[int, int], bool] = always
     sends: Callable[[int, bool], bool] = always
+    interval: Callable[[Any], float] | None = None
     stopping: int = -1
 
     @property

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from netkf.algorithms.filter import Filter, Increments, NodeInfo, Reading
-from netkf.algorithms.traits import Analysis
+from netkf.algorithms.filter import Filter, Increments, NodeInfo, Reading, interval_rule
+from netkf.algorithms.traits import Analysis, Timing
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.theory.numerics.prediction import LinearSDE
 
@@ -144,13 +144,17 @@ class _IncrementRecorder(_Filter):
         """Return xhat (n,) and P (n, n) or None, as the filter does."""
         return super().estimate(state.inner)
 
-    def shift(self, state: TimedState, offset: FloatArray) -> TimedState:
-        """Return the state with the estimate moved by ``offset`` (n,)."""
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """Return a state or a payload with the estimate moved by ``offset`` (n,)."""
+        if not isinstance(state, TimedState):
+            return super().shift(state, offset)
         return state._replace(inner=super().shift(state.inner, offset))
 
-    def max_measurement_interval(self, state: TimedState) -> float:
-        """Return the longest interval of increments that one update may use, in seconds."""
-        return super().max_measurement_interval(state.inner)
+    @property
+    def timing(self) -> Timing:
+        """That of the filter, whose states are inside."""
+        rule = interval_rule(cast(Filter, super()))
+        return replace(super().timing, interval=lambda state: rule(state.inner))
 
     @property
     def analysis(self) -> Analysis:

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.filter import Exchange, Increments, Message
+from netkf.algorithms.filter import Exchange, Increments, Message, interval_rule
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel
 from netkf.linalg.arrays import FloatArray
 from netkf.testing.estimates import check_estimate
 from netkf.testing.systems import System
 from netkf.testing.trials import Trial
-from netkf.testing.watching import WatchedPart, demand
+from netkf.testing.watching import WatchedPart, call_user_function, demand
 
 HORIZON = 4.0  # seconds: longer than all rounds of a trial
 # Pairs of gaps in seconds: below, about and above the time scale of the system.
@@ -115,8 +115,8 @@ class ClockTrial(Trial):
                 if one is not None and other is not None:
                     self._compare_predictions(name, one, other, first, second)
         if self._increments and len(self.models[node].H):
-            seconds = watched.call("max_measurement_interval", state)
-            where = f"{watched.name}.max_measurement_interval"
+            where = f"{watched.name}.timing.interval"
+            seconds = call_user_function(where, interval_rule(watched.part), state)
             demand(seconds > 0.0, where, "must be above 0 seconds", seconds)
 
     def _compare_predictions(
@@ -174,7 +174,7 @@ class ClockTrial(Trial):
         super().shift_truth()
         for k, message in enumerate(self._in_flight):
             earlier = scipy.linalg.expm((message.sent - self._time) * self._A) @ self.offset
-            payload = self.watched.call("shift_payload", message.payload, earlier)
+            payload = self.watched.call("shift", message.payload, earlier)
             self._in_flight[k] = message._replace(payload=payload)
 
     def _exchange(self, k: int, reliable: bool) -> None:

@@ -62,7 +62,7 @@ def _compare_trials(watched: WatchedPart, trial: Trial, shifted: Trial) -> None:
                 "a class that defines shift must commute with a shift of the truth",
                 f"{name} of node {one.node} after {one.after} that differs by {difference:.3g} "
                 "once truth, states and payloads are shifted",
-                "correct shift or shift_payload, or define neither of them",
+                "correct shift, of states and of payloads, or do not define it",
             )
 
 

@@ -62,7 +62,8 @@ class Everything(Filter):
     @property
     def timing(self) -> Timing:
         return Timing(
-            schedule=None, first_slot=1, max_age=1.0, steps=self.steps, redraws=self.redraws
+            schedule=None, first_slot=1, max_age=1.0, steps=self.steps, redraws=self.redraws,
+            interval=self.interval,
         )
 
     @property
@@ -95,13 +96,12 @@ class Everything(Filter):
     def estimate(self, state: Own) -> tuple[Array, Array | None]:
         return state.xhat, None
 
-    def shift(self, state: Own, offset: Array) -> Own:
-        return state._replace(xhat=state.xhat + offset)
+    def shift(self, state: Own | tuple[float, Array], offset: Array) -> Own | tuple[float, Array]:
+        if isinstance(state, Own):
+            return state._replace(xhat=state.xhat + offset)
+        return state[0], state[1] + offset
 
-    def shift_payload(self, payload: tuple[float, Array], offset: Array) -> tuple[float, Array]:
-        return payload[0], payload[1] + offset
-
-    def max_measurement_interval(self, state: Own) -> float:
+    def interval(self, state: Own) -> float:
         return 0.1
 
     def payload_numbers(self, n: int, rows: int, phase: int) -> float:

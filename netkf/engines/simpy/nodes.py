@@ -7,7 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import simpy
 
-from netkf.algorithms.filter import Exchange, Filter, Increments, Message, NodeInfo, Reading
+from netkf.algorithms.filter import (
+    Exchange,
+    Filter,
+    Increments,
+    Message,
+    NodeInfo,
+    Reading,
+    interval_rule,
+)
 from netkf.algorithms.kernels.run import interval_end
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.timeline import Timeline
@@ -57,6 +65,7 @@ class Node:
         """
         self.node, self.entity, self.info, self.model = node, entity, info, model
         self.algorithm, self._timing = algorithm, algorithm.timing
+        self._interval = interval_rule(algorithm)
         self.state = algorithm.init(model, *start, info)
         # By sender: absorption is in the order of senders, whatever the order of arrival.
         self.inbox: dict[int, list[Envelope]] = {}
@@ -136,7 +145,7 @@ class ClockedNode(Node):
         min_interval = MIN_GAP_SHARE * (time - self._now)
         while self._now < time:
             end = time
-            interval = self.algorithm.max_measurement_interval(self.state)
+            interval = self._interval(self.state)
             if interval < time - self._now:
                 # P changes too much over the whole gap: use the increments of a part of it.
                 end = interval_end(self._now, time, max(interval, min_interval))

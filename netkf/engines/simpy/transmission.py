@@ -158,7 +158,7 @@ class Transmitter:
         for key, envelope in self._under_way.items():
             # A payload refers to the time of sending: predict the offset back to it.
             earlier = self._scenario.move_back(offset, now - envelope.sent)
-            payload = algorithm.shift_payload(envelope.payload, earlier)
+            payload = algorithm.shift(envelope.payload, earlier)
             self._under_way[key] = envelope._replace(payload=payload)
 
 
