@@ -88,7 +88,7 @@ def never(_: Any) -> bool:
 
 @dataclass(frozen=True)
 class Analysis:
-    """What theory, checks and comparisons know of a filter; nothing that a run depends on.
+    """What theory, checks and comparisons know of a filter; no state depends on it.
 
     paper : name of its packages in netkf.theory and netkf.checks, "" if there are none
     combination : how it combines messages: "convex", "intersection", "swap", "shares", "readings",
