@@ -351,6 +351,39 @@ def decide(record: Any, h: int, run: Any) -> None:
                 record.trigger_has_sent[h, q] = 1
 
 
+def triggered_record(
+    filtering: TriggeredMessages, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the record of the wrapped filter with news and decisions."""
+    inner: Record = _kernels_inside(filtering).record(filtering.inner, infos, models)
+    p, flag = infos[0].rows, ((), np.uint8)
+    flags = dict.fromkeys(("trigger_undecided", "trigger_silent", "trigger_has_sent"), flag)
+    return replace(
+        inner,
+        node={**inner.node, "trigger_news": (), **flags},
+        scratch={**inner.scratch, "trigger_z": (1, p)},
+        settings={**inner.settings, "trigger_Y": whitened_triggers(models, p, filtering.Y)},
+    )
+
+
+def begin_triggered(
+    filtering: TriggeredMessages, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any
+) -> None:
+    """Begin as the wrapped filter does, without a reading."""
+    _kernels_inside(filtering).begin(filtering.inner, node, info, model)
+    node["trigger_news"][...], node["trigger_undecided"][...] = NO_READING, 1
+
+
+def prepare_triggered(filtering: TriggeredMessages, record: Any, *slots: Any) -> None:
+    """Prepare the slots as the wrapped filter does."""
+    _kernels_inside(filtering).prepare(filtering.inner, record, *slots)
+
+
+def _kernels_inside(filtering: TriggeredMessages) -> Kernels:
+    assert filtering.inner.kernels is not None
+    return filtering.inner.kernels
+
+
 @cache
 def with_trigger(inner: Kernels) -> Kernels:
     """Return the kernels of a filter with a trigger before those of the filter ``inner``."""
@@ -374,39 +407,11 @@ def with_trigger(inner: Kernels) -> Kernels:
             if record.trigger_silent[h, q] == 1:
                 run.sends[q] = 0
 
-    def triggered_messages_record(
-        filtering: Any, infos: Sequence[NodeInfo], models: Sequence[Any]
-    ) -> Record:
-        """Return the record of the wrapped filter with news and decisions."""
-        wrapped, p, flag = (
-            inner.record(filtering.inner, infos, models),
-            infos[0].rows,
-            ((), np.uint8),
-        )
-        flags = dict.fromkeys(("trigger_undecided", "trigger_silent", "trigger_has_sent"), flag)
-        return replace(
-            wrapped,
-            node={**wrapped.node, "trigger_news": (), **flags},
-            scratch={**wrapped.scratch, "trigger_z": (1, p)},
-            settings={**wrapped.settings, "trigger_Y": whitened_triggers(models, p, filtering.Y)},
-        )
-
-    def begin_triggered_messages(
-        filtering: Any, node: Mapping[str, np.ndarray], info: NodeInfo, model: Any
-    ) -> None:
-        """Begin as the wrapped filter does, without a reading."""
-        inner.begin(filtering.inner, node, info, model)
-        node["trigger_news"][...], node["trigger_undecided"][...] = NO_READING, 1
-
-    def prepare(filtering: Any, record: Any, *slots: Any) -> None:
-        """Prepare the slots as the wrapped filter does."""
-        inner.prepare(filtering.inner, record, *slots)
-
     return replace(
         inner,
-        record=triggered_messages_record,
-        begin=begin_triggered_messages,
-        prepare=prepare,
+        record=triggered_record,
+        begin=begin_triggered,
+        prepare=prepare_triggered,
         update=update,
         emit=emit,
         decides=True,
@@ -449,7 +454,7 @@ class TriggeredMessages(Filter):
             wrapped=self.inner,
         )
 
-    @cached_property
+    @property
     def kernels(self) -> Kernels | None:  # type: ignore[override]
         """The kernels of the wrapped filter with those of the trigger; None where it is one in
         plain Python.
