@@ -76,6 +76,8 @@ def default_timing(cls: Any) -> Timing | None:
     """Return the timing of a filter class with its default settings; None if it depends on settings
     without a default.
     """
+    if cls.timing is Filter.timing:
+        return Timing()
     try:
         timing: Timing = cls.timing if isinstance(cls.timing, Timing) else cls().timing
     except TypeError:

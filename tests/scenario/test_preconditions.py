@@ -267,10 +267,11 @@ def test_every_filter_under_clocks_is_refused_in_one_line_or_runs(case, tmp_path
     ran = 0
     for (name, table), (at, clock) in itertools.product(FILTERS.items(), CLOCKS.items()):
         timing = default_timing(kinds()["filter"][name])
+        if timing is None:  # that of the filter which a trigger wraps: in slots only
+            assert name == "event-triggered trigger=stochastic"
+            continue
         memory = name == "belief-propagation"  # needs a plant without noise
-        if memory or at not in (
-            timing.clocks if timing is not None and timing.talks else ("links",)
-        ):
+        if memory or at not in (timing.clocks if timing.talks else ("links",)):
             continue
         if at == "readings" and case == "no sensor":
             continue
