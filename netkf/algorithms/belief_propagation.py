@@ -448,7 +448,6 @@ class BeliefPropagation(Filter):
         absorb=absorb,
         shift=shift,
         addressed=True,
-        unrolled=False,
         record=belief_propagation_record,
         begin=begin_belief_propagation,
     )

@@ -492,7 +492,6 @@ class ConsensusInnovations(Filter):
         absorb=absorb,
         shift=shift,
         shift_payload=shift_payload,
-        unrolled=False,
         record=consensus_innovations_record,
         begin=begin_consensus_innovations,
         prepare=prepare_consensus_innovations,

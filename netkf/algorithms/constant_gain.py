@@ -172,13 +172,11 @@ class ConstantGain(Filter):
     kernels = Kernels(
         update=use_sample,
         absorb=combine_convex,
-        unrolled=False,
         under_clocks=Kernels(
             predict=predict_closed_loop,
             update=use_sample_or_increments,
             absorb=combine_convex,
             interval=closed_loop_interval,
-            unrolled=False,
         ),
         record=constant_gain_record,
     )

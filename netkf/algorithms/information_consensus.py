@@ -157,7 +157,6 @@ class InformationConsensus(Filter):
         update=begin_pairs,
         emit=emit_pairs,
         absorb=mix_pairs,
-        unrolled=False,
         under_clocks=DiffusionFilter.kernels,
         record=information_consensus_record,
     )

@@ -252,7 +252,6 @@ UNDER_CLOCKS = Kernels(
     shift_payload=keep_payload,
     sends_readings=True,
     remembers=True,
-    unrolled=False,
 )
 
 

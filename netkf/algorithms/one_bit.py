@@ -144,7 +144,6 @@ class OneBit(Filter):
         shift_payload=nothing,
         decides=True,
         sends_readings=True,
-        unrolled=False,
         record=one_bit_record,
         begin=begin_one_bit,
     )

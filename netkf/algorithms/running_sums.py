@@ -384,5 +384,4 @@ KERNELS = Kernels(
     decides=True,
     depends_on_data=False,
     counts_sends=True,
-    unrolled=False,
 )

@@ -119,7 +119,7 @@ class PairFusion(Filter):
     analysis = Analysis(paper="track_fusion")
     needs = Needs(one_way=True, inverts=True)
     inverse: ClassVar[bool] = False
-    kernels = Kernels(absorb=fuse_heard, unrolled=False, record=pair_fusion_record)
+    kernels = Kernels(absorb=fuse_heard, record=pair_fusion_record)
 
     shift = Filter.shift  # affine: the gains of both estimates sum to I, and only P decides them
 
