@@ -37,7 +37,10 @@ class CovarianceIntersection(Hybrid):
     analysis = replace(Hybrid.analysis, combination="intersection")
     needs = Needs(inverts=True)
     kernels = replace(
-        DiffusionFilter.kernels, record=covariance_intersection_record, begin=begin_estimate
+        DiffusionFilter.kernels,
+        record=covariance_intersection_record,
+        begin=begin_estimate,
+        unrolled=True,
     )
 
     shift = Filter.shift  # affine: the weights sum to one
