@@ -1,17 +1,23 @@
 """Methods of users' classes are held to the contract that they override.
 
-A class that takes other arguments than the contract is refused when it is defined. A method that
-returns nothing where a result is due says so at once, with its file and line; what any method
-returned last is kept, so that an error that a wrong result causes later can name its origin.
+A class is refused when it is defined if a method takes other arguments than the contract, or if a
+member that nothing uses looks like one of the contract misspelled. A method that returns nothing
+where a result is due says so at once, with its file and line; what any method returned last is
+kept, so that an error that a wrong result causes later can name its origin.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
+import dis
 import functools
 import inspect
 import os
 import re
+import sys
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
@@ -82,24 +88,134 @@ def describe_method(cls: type, function: FunctionType) -> str:
 
 def hold_to_contract(cls: type) -> None:
     """Wrap the methods of a user's class that override a method of netkf, so that their results are
-    looked at; raise ContractError if one takes other arguments.
+    looked at; raise ContractError if one takes other arguments, or if a member of the class can
+    never be used and looks like one of the contract.
     """
+    _require_known_members(cls)
     for name, own in list(vars(cls).items()):
-        if name.startswith("_") or not isinstance(own, FunctionType):
+        if name.startswith("_"):
             continue
-        contract = _method_of_netkf(cls, name)
-        if contract is not None:
+        contract = _member_of_netkf(cls, name)
+        _require_same_kind(cls, name, own, contract)
+        if isinstance(own, FunctionType) and isinstance(contract, FunctionType):
             _require_arguments(cls, own, contract)
             setattr(cls, name, _watched(cls, own, contract))
 
 
-def _method_of_netkf(cls: type, name: str) -> FunctionType | None:
-    """Return the method ``name`` of the first of netkf's classes from which ``cls`` derives."""
+def _member_of_netkf(cls: type, name: str) -> Any:
+    """Return the member ``name`` of the first of netkf's classes from which ``cls`` derives, a
+    dataclass field of it if it is one; None if there is none.
+    """
     for parent in cls.__mro__[1:]:
-        method = vars(parent).get(name)
-        if is_netkf_class(parent) and isinstance(method, FunctionType):
-            return method
+        if is_netkf_class(parent) and name in _own_names(parent):
+            fields = vars(parent).get("__dataclass_fields__", {})
+            return fields.get(name, vars(parent).get(name))
     return None
+
+
+def _own_names(cls: type) -> set[str]:
+    names = {*vars(cls), *vars(cls).get("__annotations__", {})}
+    return {name for name in names if not name.startswith("_")}
+
+
+def _require_same_kind(cls: type, name: str, own: Any, contract: Any) -> None:
+    """Raise ContractError if ``own`` is a method where the contract has a value, or a value where
+    it has a method: neither would ever be called.
+    """
+    if isinstance(own, FunctionType):
+        where = describe_method(cls, own)
+        if isinstance(contract, dataclasses.Field) and "ClassVar" not in str(contract.type):
+            rule = "is never called, it has the name of a setting"
+            raise ContractError(f"{where} {rule}; give it another name")
+        is_value = contract is not None and not callable(contract)
+        if is_value and not isinstance(contract, staticmethod | classmethod):
+            raise ContractError(f"{where} must be a value or a property; write @property above it")
+        return
+    is_data = not callable(own) and not hasattr(own, "__get__")
+    if isinstance(contract, FunctionType) and is_data and not isinstance(own, dataclasses.Field):
+        raise ContractError(f"{cls.__name__}.{name} must be a method, not {quote(own)}")
+
+
+SIMILAR = 0.8
+"""Similarity of two names, by difflib, from which on one is taken for the other misspelled."""
+
+
+def _require_known_members(cls: type) -> None:
+    """Raise ContractError for a member that no code of the class uses and whose name is similar to
+    one of the contract that the class does not define, or to a field of one of its values.
+    """
+    parents = cls.__mro__[1:]
+    known = set().union(*map(_own_names, parents))
+    new = _own_names(cls) - known - _used_names(cls)
+    defined = _own_names(cls).union(*(_own_names(p) for p in parents if not is_netkf_class(p)))
+    contracts = [parent for parent in parents if is_netkf_class(parent)]
+    advice: dict[str, str] = {}
+    for name, kind, fields in (stated for contract in contracts for stated in _values_of(contract)):
+        advice.update((f, f"state it in {name}, as {kind}({f}=...)") for f in fields)
+        advice[kind.lower()] = f"state it in {name}, as {kind}(...)"
+    for name in set().union(*map(_own_names, contracts)) - defined:
+        advice[name] = f"did you mean {name}?"
+    for name in sorted(new):
+        own = vars(cls).get(name)
+        similar = difflib.get_close_matches(name, sorted(advice), 1, SIMILAR)
+        if not similar or isinstance(own, type):
+            continue
+        where, verb = f"{cls.__name__}.{name}", "read"
+        if isinstance(own, FunctionType):
+            where, verb = describe_method(cls, own), "called"
+        rule = f"is never {verb}: {advice[similar[0]]}"
+        raise ContractError(f"{where} {rule}; give a member of your own another name")
+
+
+def _values_of(contract: type) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Yield the name of each value with fields that a class of netkf states, the name of the
+    value's class, and those of its fields.
+    """
+    stated = {
+        name: str(member.fget.__annotations__.get("return", ""))
+        for name, member in vars(contract).items()
+        if isinstance(member, property) and member.fget is not None
+    }
+    notes = vars(contract).get("__annotations__", {})
+    stated |= {name: note for name, note in notes.items() if str(note).startswith("ClassVar")}
+    module = vars(sys.modules[contract.__module__])
+    for name, note in stated.items():
+        for kind in (module.get(word) for word in re.findall(r"\w+", note)):
+            fields = getattr(kind, "__match_args__", ())
+            if isinstance(kind, type) and fields and not name.startswith("_"):
+                yield name, kind.__name__, fields
+
+
+def _used_names(cls: type) -> set[str]:
+    """Return the names that a class's own functions read from their first argument, and those of
+    members that other members hold.
+    """
+    members, used = dict(vars(cls)), set()
+    for owner, member in members.items():
+        parts = getattr(member, "__match_args__", ())
+        used |= {part for part in parts if getattr(member, part, None) is members.get(part, dis)}
+        functions = [getattr(member, part, None) for part in (*parts, "fget", "func", "__func__")]
+        functions = [inspect.unwrap(f) for f in (member, *functions) if callable(f)]
+        used |= {n for n, f in members.items() if n != owner and callable(f) and f in functions}
+        for code in (getattr(function, "__code__", None) for function in functions):
+            if isinstance(code, CodeType) and code.co_varnames:
+                used |= _names_read(code, {code.co_varnames[0], cls.__name__})
+    return used
+
+
+def _names_read(code: CodeType, objects: set[str]) -> set[str]:
+    """Return the names of attributes that ``code`` and functions in it read from variables."""
+    names, last = set(), None
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            source = last[-1:] if isinstance(last, tuple) else (last,)
+            names |= {str(instruction.argval)} if objects.intersection(source) else set()
+        if instruction.opname != "EXTENDED_ARG":
+            last = instruction.argval
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            names |= _names_read(constant, objects)
+    return names
 
 
 def _require_arguments(cls: type, own: FunctionType, contract: FunctionType) -> None:

@@ -123,6 +123,40 @@ MISTAKES = {
                            r"F\.draw \(FILE, line 6\) must take \(.+\), not \(\)"),
     "a plant returns no truth": ("PLANT", "def sampled_truth(self, *arguments): pass",
                                  rf"F\.sampled_truth \(FILE, line 6\) {NO_RESULT}"),
+    "a misspelled verb": ("FILTER", f"def upate(self, state, reading): return state\n{SAME}",
+                          r"F\.upate \(FILE, line 6\) is never called: did you mean update\?"),
+    "a need outside needs": ("FILTER", f"inverts = True\n{SAME}",
+                             r"F\.inverts is never read: state it in needs, as Needs\(inverts=\.\.\.\)"),
+    "a misspelled need": ("FILTER", f"invert: bool = True\n{SAME}", r"F\.invert is never read: .*Needs\(inverts"),
+    "weights outside link_weights": (
+        "FILTER", "def weight(self, degree, peer): return 0.1\n"
+        "def absorb(self, state, messages, exchange): return [state for m in messages if m.weight][0]",
+        r"F\.weight \(FILE, line 6\) is never called: state it in link_weights, as Weights\("),
+    "an age outside a timing": (
+        "FILTER", f"max_age = 3.0\ntiming = property(lambda self: Timing(max_age=2.0))\n{SAME}",
+        r"F\.max_age is never read: state it in timing, as Timing\(max_age=\.\.\.\)"),
+    "a setting that nothing reads": (
+        "FILTER", f"max_age: float = setting(positive, default=3.0)\n{SAME}",
+        r"F\.max_age is never read: state it in timing"),
+    "a timing that is a method": ("FILTER", f"def timing(self): return Timing()\n{SAME}",
+                                  r"F\.timing \(FILE, line 6\) must be a value or a property; write @property"),
+    "a verb that is no method": ("FILTER", "absorb = 3", r"F\.absorb must be a method, not 3"),
+    "a misspelled h": ("SENSOR", "def jacobain(self, x, node): return x",
+                       r"F\.jacobain \(FILE, line 6\) is never called: did you mean jacobian\?"),
+    "a misspelled build": ("GRAPH", "def biuld(self, seed): return 0",
+                           r"F\.biuld \(FILE, line 6\) is never called: did you mean build\?"),
+    "a method for a setting": ("CLOCK", "def rate(self): return 3.0",
+                               r"F\.rate \(FILE, line 6\) is never called, it has the name of a setting"),
+    "a misspelled rate": ("CLOCK", "@property\ndef mean_rates(self): return 3.0",
+                          r"F\.mean_rates is never read: did you mean mean_rate\?"),
+    "a law that is a method": ("CLOCK", "def gaps(self): return None",
+                               r"F\.gaps \(FILE, line 6\) must be a value or a property"),
+    "a misspelled property of a loss": ("LOSS", "independant = False",
+                                        r"F\.independant is never read: did you mean independent\?"),
+    "a law's number outside the law": ("DELAY", "def cdf(self, t): return t\ndef draw(self, random): return 1.0",
+                                       r"F\.cdf \(FILE, line 6\) is never called: state it in law, as WaitingLaw\(cdf"),
+    "a misspelled start": ("PLANT", "def start_meen(self): return np.zeros(1)",
+                           r"F\.start_meen \(FILE, line 6\) is never called: did you mean start_mean\?"),
 }  # fmt: skip
 
 
@@ -250,3 +284,38 @@ except netkf.EngineError as error:
     assert first == "here"
     assert re.search(r'line 15 under if __name__ == "__main__":', message), message
     assert done.stderr == ""
+
+
+HEALTHY = {
+    "helpers that other methods call": (
+        "Filter", "def weight(self, age): return 0.5\ndef updated(self, state): return state\n"
+        "def absorb(self, state, messages, exchange):\n"
+        "    return [self.weight(m.age) * self.updated(state) for m in messages]"),
+    "helpers of a property, a nested function and a static method": (
+        "Filter", "max_age: float = setting(positive, default=3.0)\nsteps = 2\n"
+        "timing = property(lambda self: Timing(max_age=self.max_age, steps=lambda phase: self.steps))\n"
+        f"@staticmethod\ndef redraw(): return True\n_first = property(lambda self: self.redraw())\n{SAME}"),
+    "members that a value holds": (
+        "Filter", "inverts = True\nneeds = Needs(inverts=inverts)\n"
+        "def weight(degree, peer): return 0.1\nlink_weights = Weights(of=weight)\n" + SAME),
+    "helpers whose names are their own": (
+        "Filter", "gain = 0.3\ndef absorb_all(self, state): return state\n"
+        "def innovation(self, y): return y\ndef evidence(self, state): return 1.0\n" + SAME),
+    "settings with names of their own": (
+        "Poisson", "bursts: int = setting(integer(1), default=2)\nspread: float = setting(positive, default=1.0)\n"
+        "def mean_rate(self, entity): return self.bursts * self.spread"),
+    "a method where the contract has a method, by assignment": (
+        "Delay", "def one(self, random): return 1.0\ndraw = one"),
+    "a property as a value, a value as a property": (
+        "Loss", "independent = False\ndef delivery_probability(self, *arguments): return 1.0\n"
+        "@property\ndef stateful(self): return self.independent"),
+    "a setting instead of a property": (
+        "Delay", "fixed: float = setting(positive, default=1.0)\ndef draw(self, random): return self.fixed"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_members_of_their_own_are_no_mistakes(name):
+    base, body = HEALTHY[name]
+    source = f"{HEAD}@dataclass(frozen=True, eq=False)\nclass F({base}):\n"
+    exec(source + textwrap.indent(body, "    "), {"__name__": __name__})  # raises no ContractError
