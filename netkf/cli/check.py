@@ -158,7 +158,6 @@ def _write_verdict(
 
 
 def _replay_command(options: argparse.Namespace) -> str:
-    """Return the command line that replays one run, whose number the caller appends."""
     command = ["netkf", "run", str(options.scenario)]
     for change in options.set:
         command += ["--set", change]

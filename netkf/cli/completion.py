@@ -35,7 +35,6 @@ class PrintCompletion(argparse.Action):
 
 
 def _iterate_actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Yield all options and arguments of a parser and of its subparsers."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):

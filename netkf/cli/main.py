@@ -78,7 +78,6 @@ def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
 
 
 def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
-    """Run a command line and return its exit status and the message about its error, if any."""
     try:
         options = make_parser().parse_args(arguments)
         status: int = options.run(options)

@@ -83,7 +83,6 @@ class Interruption:
             raise KeyboardInterrupt
 
     def _handle_unraisable(self, unraisable: Any) -> None:
-        """Send again a KeyboardInterrupt that Python dropped in a finalizer or C callback."""
         if unraisable.exc_type is None or not issubclass(unraisable.exc_type, KeyboardInterrupt):
             self._previous_hook(unraisable)
         elif self._armed and self._previous_handlers:

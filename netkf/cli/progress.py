@@ -79,7 +79,6 @@ class ProgressLine:
 
 
 def _print_direct(text: str) -> None:
-    """Replace the current line of the terminal by a text, past the escaping of SafeStream."""
     # SafeStream.write would escape the control characters that clear the line.
     write = getattr(sys.stderr, "direct", sys.stderr.write)
     write(f"{CLEAR_LINE}{text}")

@@ -140,7 +140,6 @@ def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
 
 
 def _print_note(note: str) -> None:
-    """Print a note on standard error."""
     print_notes([note])
 
 
@@ -171,7 +170,6 @@ def _print_ensemble(completed: Any, runs: int) -> None:
 
 
 def _describe_divergence(completed: CompletedRun, nodes: Sequence[int]) -> str:
-    """Return what diverged, where and when, and from when on rounding dominates errors."""
     samples = completed.samples
     problem = describe_divergence(nodes, *samples.last)
     averaging = ""

@@ -159,7 +159,6 @@ class BlockCheckpoints:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _block_paths(self) -> list[Path]:
-        """Return the files of all blocks, in order."""
         files = self._folder.glob("*.npz") if self._folder.is_dir() else ()
         return sorted(file for file in files if file.stem.isdecimal())
 
@@ -325,7 +324,6 @@ def _as_arrays(statistics: RunStatistics, identity: dict[str, Any]) -> dict[str,
 
 
 def _read_texts(arrays: Any) -> dict[str, Any]:
-    """Return the values of a block that are text or single numbers, stored as JSON."""
     texts: dict[str, Any] = json.loads(str(arrays["words"]))
     return texts
 

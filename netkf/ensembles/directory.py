@@ -244,7 +244,6 @@ class _DirectoryWriter:
         return statistics
 
     def _runs_in_block(self, number: int) -> int:
-        """Return the number of runs in a block."""
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
@@ -294,5 +293,4 @@ class _DirectoryWriter:
         self._ended = True
 
     def _identity_entries(self, **others: Any) -> dict[str, Any]:
-        """Return the entries of the manifest that identify the run."""
         return {"scenario": self.plan.scenario, "trace": self.plan.trace, **others}

@@ -85,7 +85,6 @@ class Ensemble(NotebookTable):
         return plot_by_name(self, figure)
 
     def _notebook_table(self) -> pd.DataFrame:
-        """Return the table that notebooks show for the ensemble."""
         import pandas as pd
 
         mean, error = self.average, self.se_average

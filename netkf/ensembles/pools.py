@@ -151,7 +151,6 @@ class AdaptivePool(LocalPool):
         self._begun = True
 
     def _worth_processes(self, job: Job) -> bool:
-        """Return True if worker processes would save more time in the runs that are left."""
         expected = 0.0  # seconds that the runs left take in this process
         if self._seconds > WARM:
             expected = self._seconds / self._runs * (job.stop - job.start)
@@ -239,7 +238,6 @@ class DaskPool(RemotePool):
         self.width = max(1, sum(self._client.nthreads().values()))
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
-        """Return the scenario with the versions that workers must have."""
         # Workers may join at any time, so that each checks its own versions.
         return pack_scenario(scenario)._replace(versions=tuple(versions().items()))
 

@@ -252,7 +252,6 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
 
 
 def _batch_arrays(batch: RunBatch) -> Batch:
-    """Return the arrays of a batch of R runs with F filters, as contiguous arrays for kernels."""
     runs = len(batch)
     x, P, error = (np.ascontiguousarray(part) for part in (batch.x, batch.P, batch.error))
     return Batch(

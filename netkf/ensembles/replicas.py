@@ -113,7 +113,6 @@ def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[An
 
 
 def _keep_result(number: int, result: Any) -> Any:  # noqa: ARG001
-    """Return the result of a block unchanged."""
     return result
 
 
@@ -132,7 +131,6 @@ def _gather(
     blocks: NumberedBlocks,
     progress: Progress,
 ) -> Any:
-    """Return the merged result of all blocks of replicas."""
     tree, runs_done, known = MergeTree(merge), 0, blocks.known
 
     def take(block: Job, result: Any) -> None:

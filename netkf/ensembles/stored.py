@@ -110,7 +110,6 @@ def read_ensemble(directory: Path, scenario: Scenario, manifest: dict[str, Any])
 
 
 def _of_blocks(directory: Path, scenario: Scenario, manifest: dict[str, Any]) -> Ensemble:
-    """Return the ensemble of the runs in the blocks that an interrupted ensemble has finished."""
     blocks = BlockCheckpoints(directory, scenario)
     blocks_statistics = blocks.readable(scenario_digest(scenario), int(manifest["seed"]))
     if not blocks_statistics:
@@ -138,7 +137,6 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
 
 
 def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
-    """Return the arrays of an ensemble in ensemble.parquet."""
     n, N = scenario.plant.n, len(scenario.nodes)
     i, j = np.triu_indices(n)
     names = ensemble_columns(n)

@@ -61,7 +61,6 @@ def summarise_ensemble(
 
 
 def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, float]:
-    """Return chi-square bounds on the mean NEES over the runs."""
     n, runs = scenario.plant.n, statistics.runs
     low, high = nees_bounds(n, runs)
     clear = (scenario.times > 0.0) & (scenario.times < statistics.rounding_from)
@@ -73,7 +72,6 @@ def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, floa
 
 
 def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
-    """Return averages over the samples after time 0."""
     if promised.bound is None:
         return [None] * (len(scenario.nodes) + 1)
     after_start: FloatArray = promised.bound[scenario.times > 0.0]
@@ -82,7 +80,6 @@ def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | N
 
 
 def _make_row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
-    """Return the summary of a node, or of all nodes together, by the names in summary.json."""
     rms = float(np.sqrt(mean[0]))
     return {
         "rms_error": rms,

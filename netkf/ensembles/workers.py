@@ -160,7 +160,6 @@ class WorkerProcesses:
             worker.join(0.0 if at_once or worker.task is not None else GRACE)
 
     def _hand_out(self) -> None:
-        """Send waiting tasks to idle workers, and start workers up to the allowed number."""
         while self._waiting:
             worker = next(
                 (candidate for candidate in self._workers if candidate.task is None), None
@@ -185,7 +184,6 @@ class WorkerProcesses:
                 self._discard_worker(worker)
 
     def _receive_result(self, worker: _Worker) -> None:
-        """Take the answer of a worker, and set the future of its task to the result or error."""
         assert worker.task is not None
         future = worker.task.future
         try:
@@ -206,7 +204,6 @@ class WorkerProcesses:
             future.set_result(result)
 
     def _discard_worker(self, worker: _Worker) -> None:
-        """Remove a dead worker and queue its task again."""
         self._workers.remove(worker)
         worker.end()
         worker.join(0.0)
@@ -219,7 +216,6 @@ class WorkerProcesses:
 
 
 def _serve(jobs: Connection, results: Connection) -> None:
-    """Run jobs in a worker process until the pipe with the jobs is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when workers end
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
@@ -228,7 +224,6 @@ def _serve(jobs: Connection, results: Connection) -> None:
 
 
 def _run_job(message: bytes) -> bytes:
-    """Run a pickled job in a worker."""
     try:
         answer: tuple[bytes | None, bytes | None, str]
         answer = pickle.dumps(work(pickle.loads(message)), pickle.HIGHEST_PROTOCOL), None, ""
@@ -238,7 +233,6 @@ def _run_job(message: bytes) -> bytes:
 
 
 def _pickled_error(error: Exception) -> bytes:
-    """Return the pickle of an exception that a worker sends to its parent."""
     try:
         payload = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
         pickle.loads(payload)
@@ -249,7 +243,6 @@ def _pickled_error(error: Exception) -> bytes:
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent has ended, even in the middle of a job."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -79,7 +79,6 @@ def bound_headline(data: FigureData) -> str:
 
 
 def _one_run_headline(rows: list[dict[str, Any]]) -> str:
-    """Return how many nodes of one run have trace P below the bound, which is on the mean."""
     below, count = sum(row["ratio"] <= 1.0 for row in rows), len(rows)
     if count == 1:
         return f"In this run the node claims {'no more' if below else 'more'} than the bound"
@@ -87,7 +86,6 @@ def _one_run_headline(rows: list[dict[str, Any]]) -> str:
 
 
 def _mean_headline(rows: list[dict[str, Any]]) -> str:
-    """Return how many mean traces of P are below or above the bound, by 95% intervals."""
     margins = [NORMAL_QUANTILE * _known_or_zero(row.get("ratio_se")) for row in rows]
     above = sum(row["ratio"] - m > 1.0 for row, m in zip(rows, margins, strict=True))
     below = sum(row["ratio"] + m <= 1.0 for row, m in zip(rows, margins, strict=True))

@@ -287,7 +287,6 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
 def _average_rows(
     scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces
 ) -> list[dict[str, Any]]:
-    """Return a row of averages over time for each node, by the names in summary.json."""
     after_start = ensemble.times > 0.0
     bound = None if promised.bound is None else promised.bound[after_start].mean(axis=0)
     rows = []

@@ -71,7 +71,6 @@ def _colour_quantities(data: FigureData) -> dict[str, dict[int, float]]:
 
 
 def _message_bytes(data: FigureData) -> int:
-    """Return the bytes of an estimate with the upper triangle of its covariance, as float64."""
     n = data.scenario.plant.n
     return 8 * (n + n * (n + 1) // 2)
 
@@ -88,7 +87,6 @@ def _explain_widths(data: FigureData) -> str:
 
 
 def _make_headline(data: FigureData) -> str:
-    """Return a sentence on the nodes with the largest and smallest error, or trace P."""
     key, _ = error_label(data)
     values = {n: v for n, v in node_values(data, key).items() if math.isfinite(v)}
     quantity = "RMS error" if data.shows_errors else "mean trace of P"
@@ -104,7 +102,6 @@ def _make_headline(data: FigureData) -> str:
 
 
 def _network_aspect(positions: Positions) -> float:
-    """Return the ratio of width to height of a network, clipped to 1 .. 8."""
     xy = np.array(list(positions.values()), dtype=np.float64)
     width, height = np.ptp(xy, axis=0) if len(xy) else (1.0, 1.0)
     return float(np.clip(width / height if height > 0.0 else 8.0, 1.0, 8.0))
@@ -151,7 +148,6 @@ def _dot_area(data: FigureData) -> float:
 
 
 def _draw_links(axes: Any, data: FigureData, positions: Positions) -> None:
-    """Draw at most MAX_LINKS links, evenly selected, as wide as the messages they delivered."""
     pairs = sorted({(min(i, j), max(i, j)) for i, j in data.scenario.topology.links})
     if len(pairs) > MAX_LINKS:
         pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, MAX_LINKS).astype(int).tolist()]

@@ -52,7 +52,6 @@ def overview(data: FigureData) -> Picture:
 
 
 def _caption_sentences(data: FigureData) -> list[str]:
-    """Return the sentences of the caption on intervals, widths of links and counts of messages."""
     sentences = []
     if data.runs > 1:
         sentences.append("Bands: 95% intervals of the means (1.96 standard errors).")

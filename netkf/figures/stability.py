@@ -189,7 +189,6 @@ def _draw_sweep_curves(axes: Any, table: Any, keys: list[str]) -> None:
 
 
 def _draw_sweep_map(axes: Any, table: Any, keys: list[str]) -> None:
-    """Draw a cell per point, crosses where runs diverged, circles where there is no bound."""
     x_values, y_values = (list(dict.fromkeys(table[key].tolist())) for key in keys)
     errors = np.full((len(y_values), len(x_values)), np.nan)
     diverged, unbounded = (np.zeros(errors.shape, dtype=bool) for _ in range(2))
@@ -241,7 +240,6 @@ def _axis_positions(set_scale: Callable[[str], Any], values: Any) -> tuple[Float
 
 
 def _format_value(value: Any) -> str:
-    """Return a value of a varied key as text of at most MAX_TEXT characters."""
     text = f"{value:.4g}" if isinstance(value, (int, float, np.number)) else str(value)
     return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
 

@@ -96,5 +96,4 @@ def _draw_row(axes: Any, height: int, row: Evidence) -> None:
 
 
 def _make_label(row: Evidence) -> str:
-    """Return the statement of a promise, shortened to one line of the picture."""
     return textwrap.shorten(row.promise, MAX_LABEL_LENGTH, placeholder=" ...")

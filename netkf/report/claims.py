@@ -103,7 +103,6 @@ def describe_differences(
 
 
 def _describe_first_difference(first: ReportSource, second: ReportSource) -> list[str]:
-    """Return a sentence on the first event in which two recorded runs differ."""
     if first.run is None or second.run is None:
         return []
     if max(len(first.run.log), len(second.run.log)) > MAX_COMPARED:
@@ -147,7 +146,6 @@ def _describe_interruption(source: ReportSource) -> str:
 
 
 def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndarray) -> list[str]:
-    """Return sentences on the worst node of a run, its worst sample and the reasons."""
     if source.worst is None:
         return []
     worst = source.worst.overall
@@ -177,7 +175,6 @@ def _describe_worst_node(source: ReportSource, run: StoredRun, messages: np.ndar
 def _explain_worst(
     source: ReportSource, run: StoredRun, messages: np.ndarray, samples: WorstSamples
 ) -> list[str]:
-    """Return sentences on the messages received by the worst sample, and on its error and P."""
     worst, topology = samples.explained, source.scenario.topology
     received = messages[messages["receiver"] == worst.node]
     sentences = []
@@ -323,7 +320,6 @@ def _describe_ensemble(source: ReportSource) -> list[str]:
 
 
 def _describe_bound(source: ReportSource) -> list[str]:
-    """Return a sentence on mean trace P and its bound, at the node that exceeds it most."""
     summary = source.summary
     if not summary:
         return []
@@ -402,7 +398,6 @@ def _describe_sweep(source: ReportSource) -> list[str]:
 
 
 def _describe_filters(comparison: StoredComparison) -> list[str]:
-    """Return sentences on the best filter, certain differences, consistency, and failures."""
     rows = [row for row in comparison.rows if row.ran and math.isfinite(_rms_error(row).value)]
     if not rows:
         return ["No filter has a finite RMS error"]
@@ -440,7 +435,6 @@ def _describe_difference(row: ComparedFilter, first: str) -> str:
 
 
 def _rms_error(row: ComparedFilter) -> Quantity:
-    """Return the RMS error of a compared filter, with its difference from the first filter."""
     return row.quantities["rms_error"]
 
 

@@ -213,7 +213,6 @@ def _flow_kind(source: ReportSource) -> str:
 
 
 def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None) -> list[int]:
-    """Return the indices of the two components of the state that the page shows first."""
     n = run.x.shape[1]
     observed_states: set[int] = set()
     for sensor in source.scenario.sensors:
@@ -229,14 +228,12 @@ def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None)
 
 
 def _is_broadcast(run: StoredRun) -> bool:
-    """Return True if the messages that a node sends at the same time are one transmission."""
     # Messages in slots have a phase of 0 or more.
     in_slots = bool((run.log["phase"][run.log["kind"] == CODES["send"]] >= 0).any())
     return in_slots or run.count("transmit") > 0
 
 
 def _drawing_limits(source: ReportSource) -> dict[str, Any]:
-    """Return the finite limits of trace P by theory, by their labels."""
     promised = source.promised
     if promised is None:
         return {}

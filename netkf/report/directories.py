@@ -179,7 +179,6 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
 def _choose_run(
     stored: StoredRun | StoredEnsemble, replica: int | None
 ) -> tuple[StoredRun | None, StoredEnsemble | None]:
-    """Return the run that the page animates, if any, and the ensemble that it is from, if any."""
     if isinstance(stored, StoredRun):
         if replica is not None and replica != stored.replica:
             where = shorten(stored.directory)
@@ -192,6 +191,5 @@ def _choose_run(
 
 
 def _read_scenario_text(path: Path) -> str:
-    """Return the text of a scenario file, cut after MAX_TEXT characters."""
     text = path.read_text(encoding="utf-8")
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}\n# ({len(text):,} characters)"

@@ -330,7 +330,6 @@ def _main_sections(
 
 
 def _curve_area(entries: list[_AnalysedSource]) -> str:
-    """Return the element in which the script draws the curves, and notes on innovations."""
     reasons = dict.fromkeys(entry.readings for entry in entries if isinstance(entry.readings, str))
     notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
     return '<div id="curves" class="curves"></div>' + "".join(notes)
@@ -385,7 +384,6 @@ def _scenario_text(source: ReportSource) -> str:
 
 
 def _event_counts(run: StoredRun) -> str:
-    """Return a sentence that counts the events of a run, in total and by kind."""
     counts = [f"{run.count(kind):,} {kind}" for kind in KINDS if run.count(kind)]
     by_kind = f" ({', '.join(counts)})" if counts else ""
     return f"Events of replica {run.replica}: {len(run.log):,}{by_kind}"
@@ -409,12 +407,10 @@ def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]
 
 
 def _command_box(command: str) -> str:
-    """Return a command line as HTML, in a box that scrolls by itself."""
     return f'<pre tabindex="0" role="group" aria-label="command">{text(command)}</pre>'
 
 
 def _source_command(source: ReportSource) -> str:
-    """Return the command line that computes the results of a source again."""
     subcommands = {"sweep": "sweep", "verdict": "check", "filters": "compare-filters"}
     subcommand = subcommands.get(source.kind, "run")
     command = f"netkf {subcommand} {shlex.quote(source.label + '/scenario.toml')}"
@@ -466,5 +462,4 @@ def _script() -> str:
 
 @cache
 def _style() -> str:
-    """Return the style sheets of uPlot and of the page as one."""
     return _asset("uPlot.min.css") + "\n" + _asset("page.css")

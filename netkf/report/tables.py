@@ -89,7 +89,6 @@ def summary_section(source: ReportSource) -> str:
 
 
 def _summary_cells(row: dict[str, Any], columns: Iterable[str]) -> list[str]:
-    """Return the values of a row of the summary with their standard errors as text."""
     return [format_with_error(row[key], row.get(f"{key}_se")) for key in columns]
 
 

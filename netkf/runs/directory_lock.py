@@ -74,7 +74,6 @@ def _lock_or_refuse(descriptor: int, directory: Path) -> None:
 
 
 def _print_note(directory: Path, error: OSError) -> None:
-    """Print to standard error that the directory could not be locked, and why."""
     note = f"note: {directory} cannot be locked ({error.strerror}): one command at a time on it"
     print(note, file=sys.stderr)
 
@@ -83,7 +82,6 @@ if sys.platform == "win32":
     import msvcrt
 
     def _open_lock_file(directory: Path) -> int:
-        """Open and return a temporary file named after the directory."""
         name = sha256(str(directory.resolve()).casefold().encode()).hexdigest()[:32]
         return os.open(Path(tempfile.gettempdir()) / f"netkf-{name}.lock", os.O_RDWR | os.O_CREAT)
 

@@ -132,7 +132,6 @@ def is_numeric_column(path: Path, name: str) -> bool:
 
 
 def _is_numeric(kind: Any) -> bool:
-    """Return True for Arrow types of integers and floats."""
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 
 
@@ -171,7 +170,6 @@ class ParquetSink(Sink):
                 self._flush()
 
     def _flush(self) -> None:
-        """Write the samples that have been collected as a row group of states.parquet."""
         if self._states is None or not self._samples:
             return
         columns = zip(*self._samples, strict=True)
@@ -230,7 +228,6 @@ class TraceTables:
             self._flush()
 
     def _flush(self) -> None:
-        """Write the events and samples of the runs that have been collected."""
         for pending, table in (
             (self._pending_events, self._events),
             (self._pending_states, self._states),

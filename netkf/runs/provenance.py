@@ -83,6 +83,5 @@ def installation_digest() -> str:
 
 
 def _numpy_build() -> dict[str, Any]:
-    """Return the build configuration of numpy, nested dictionaries by topic."""
     configuration: Any = np.show_config(mode="dicts")
     return dict(configuration or {})

@@ -211,7 +211,6 @@ class _Output:
 def _create_output(
     scenario: Scenario, out: Path | None, seed: int, replica: int, engine: str, tables: bool
 ) -> _Output:
-    """Create the run directory with scenario.toml and a manifest, and return it with its sinks."""
     check_sources(scenario)
     directory = create_output_directory(out, scenario.name)
     channel = scenario.network.channel

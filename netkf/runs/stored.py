@@ -191,7 +191,6 @@ def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:
 def _read_states(
     path: Path, scenario: Scenario, replica: int
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Return the table of state samples of a replica, and the arrays of a Run that it holds."""
     import pandas as pd
 
     n, N = scenario.plant.n, len(scenario.nodes)

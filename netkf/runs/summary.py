@@ -210,7 +210,6 @@ def summarise(
 def _average_rows(
     scenario: Scenario, sink: SummarySink, promised: PromisedTraces
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return a row of averages over time for each node, and one for all nodes together."""
     rounding_from = np.inf if sink.rounding_from is None else sink.rounding_from
     indices = select_averaged_samples(np.array(sink.times), rounding_from, bool(sink.diverged))
     mean_square = _mean_or_nan(sink.sq_error, indices.errors, scenario)

@@ -99,7 +99,6 @@ def columns_of(summary: dict[str, Any]) -> dict[str, str]:
 
 
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table of averages by node."""
     columns = columns_of(summary)
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     names = [str(row["node"]) for row in nodes]
@@ -133,7 +132,6 @@ def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[s
 
 
 def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
-    """Return the line on what theory gives to compare traces of P with."""
     traces = {limit: summary["limit"], "centralised filter": summary["central"]}
     limits = [
         f"{label} {format_number(value)}"
@@ -155,7 +153,6 @@ def _nees_lines(nees: dict[str, Any]) -> list[str]:
 
 
 def _message_line(messages: dict[str, Any]) -> str:
-    """Return the line on the numbers of messages sent, delivered and lost, and of transmissions."""
     transmissions = messages.get("transmissions")
     if transmissions is None or math.isnan(transmissions):  # in slots they are not counted
         transmissions = messages["sent"]
@@ -171,7 +168,6 @@ def _message_line(messages: dict[str, Any]) -> str:
 
 
 def _describe_conserved(sums: dict[str, dict[str, float]]) -> str:
-    """Return text on the sums that exchanges should conserve, with their relative drift."""
     totals = [
         f"{name} {format_number(entry['total'])} of {format_number(entry['exact'])} "
         f"({entry['drift']:+.1e})"

@@ -82,7 +82,6 @@ class Transmissions:
 
     @property
     def _clock_transmissions(self) -> Counter[int]:
-        """Number of transmissions of each node in continuous time."""
         return self._broadcasts if self._broadcasts else self._clock_messages
 
 

@@ -324,7 +324,6 @@ def _pair_runs(
 
 
 def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
-    """Return True if both ensembles have the same true states in all samples that both kept."""
     base_samples, samples = first.samples, other.samples
     # The same seed is not enough: keys of the plant may differ.
     if (

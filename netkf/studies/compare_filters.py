@@ -257,7 +257,6 @@ def _make_row(
 
 
 def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEntry, ...]:
-    """Return the filters to compare, each with a scenario or the reason why it cannot run."""
     if isinstance(filters, str) or not isinstance(filters, Sequence) or not filters:
         rule, remedy = "must be a list of filters", 'such as ["hcmci", "icf"]'
         raise ScenarioError("filters", rule, filters, remedy)
@@ -314,7 +313,6 @@ def _distinct_labels(filters: Sequence[Choice], labels: list[str]) -> list[str]:
 
 
 def _differing_settings(filters: Sequence[Any]) -> list[dict[str, str]]:
-    """Return for each of several filters of one kind the settings that are not the same in all."""
     tables = [
         {name: one_line(value) for name, value in part_as_table(algorithm).items()}
         for algorithm in filters

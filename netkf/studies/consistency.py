@@ -107,7 +107,6 @@ def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
 
 
 def _count_errors(scenario: Scenario) -> int:
-    """Return the number of errors N n of all nodes."""
     return len(scenario.nodes) * scenario.plant.n
 
 

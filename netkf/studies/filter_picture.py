@@ -46,7 +46,6 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
 
 
 def _make_title(rows: list[ComparedFilter]) -> str:
-    """Return the title of the figure, a sentence on the filter with the smallest RMS error."""
     finite_rows = [row for row in rows if math.isfinite(row.quantities["rms_error"].value)]
     if not finite_rows:
         return "No filter has a finite error"

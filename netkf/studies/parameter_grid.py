@@ -51,7 +51,6 @@ def _even_values(key: str, start: str, stop: str, count: str) -> list[Any]:
 
 
 def _are_finite(*texts: str) -> bool:
-    """Return True if all texts are finite numbers."""
     try:
         return all(math.isfinite(float(text)) for text in texts)
     except ValueError:

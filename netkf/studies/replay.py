@@ -161,7 +161,6 @@ def _shorten(scenario: Scenario, at: float, to_horizon: bool) -> Scenario:
 
 
 def _with(scenario: Scenario, **changes: Any) -> Scenario:
-    """Return the scenario with some fields changed and the same topology and grid of time."""
     changed = copy.copy(scenario)  # without derived values
     for name, value in changes.items():
         object.__setattr__(changed, name, value)

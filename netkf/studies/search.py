@@ -282,7 +282,6 @@ class Search:
         return value, misses
 
     def _probe(self, value: float) -> Probe:
-        """Try a value and keep the result."""
         self.probes.append(self._decide(value))
         return self.probes[-1]
 
@@ -372,7 +371,6 @@ def _advise_runs(probe: Probe, target: Target) -> str:
 def _describe_certainty(
     probes: tuple[Probe, ...], confidence: float, grows: bool, none_reached: bool
 ) -> str:
-    """Return a sentence on how certain the answer is and what it assumes."""
     if all(probe.runs == 0 for probe in probes):
         certainty = "computed, no simulation"
         if any(probe.target == NOT_SHOWN for probe in probes):

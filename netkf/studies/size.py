@@ -116,7 +116,6 @@ def size(
 
 
 def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
-    """Return the task of a probe, a description of its quantity, and the runs before a decision."""
     quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
     # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
     if problem.target.of_errors and expected_errors_known(problem.at(low)):

@@ -87,7 +87,6 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
 
 
 def _read_filter(row: dict[str, Any]) -> ComparedFilter:
-    """Return a filter of a comparison from its row in the stored table, by column names."""
     quantities = {
         key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in QUANTITIES
     }

@@ -126,7 +126,6 @@ def plan_sweep(
 def _simulate_points(
     plan: SweepPlan, options: PoolOptions, progress: Progress | None
 ) -> Iterator[Row]:
-    """Yield the row of each point when it is finished."""
     with shared_pool(plan.runs, options) as pool:
         for k, point in enumerate(plan.points):
             with explain_failures(point.scenario):
@@ -169,7 +168,6 @@ def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
 
 
 def _same_truth(first: Scenario, other: Scenario) -> bool:
-    """Return True if replica 0 of both has the same true states at instants that both probe."""
     times = np.intersect1d(first.times, other.times)[:SHOWN]
     if first is other or not len(times) or not (first.plant.is_random or other.plant.is_random):
         return True

@@ -175,7 +175,6 @@ def format_filters(comparison: FilterComparison) -> str:
 
 
 def _format_quantity(cells: Quantity) -> tuple[str, str]:
-    """Return the cells of a value and of its difference, starred if its interval excludes 0."""
     difference = "-"
     if math.isfinite(cells.difference):
         width = 0.5 * (cells.high - cells.low)

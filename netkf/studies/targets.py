@@ -95,7 +95,6 @@ def theory_is_exact(scenario: Scenario, target: Target) -> bool:
 
 
 def _starts_with_the_truth(scenario: Scenario) -> bool:
-    """Return True if every filter starts with the mean and the covariance of x(0)."""
     plant = scenario.plant
     return all(
         np.array_equal(P, plant.start_cov) and np.array_equal(x, plant.start_mean)

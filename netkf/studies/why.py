@@ -368,7 +368,6 @@ def _make_what_ifs(
 def _group_by_missing(
     sources: Sequence[InformationSource],
 ) -> dict[tuple[MessageKey, ...], list[InformationSource]]:
-    """Group the sources by the missing messages that would have brought newer readings."""
     groups: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
     for source in sources:
         if source.missing:

@@ -146,7 +146,6 @@ def _state_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _heard_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield sentences on the last message of each neighbour and on those not used since."""
     neighbours = [s for s in explanation.sources if s.neighbour]
     if not neighbours:
         yield f"No other node sends to node {explanation.node}."
@@ -166,7 +165,6 @@ def _heard_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _unheard_sentence(neighbours: list[InformationSource]) -> str:
-    """Return the sentence on messages sent since the last one that was used."""
     unheard = sum(s.unheard for s in neighbours)
     counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
     noun = "message" if unheard == 1 else "messages"
@@ -178,7 +176,6 @@ def _unheard_sentence(neighbours: list[InformationSource]) -> str:
 
 
 def _reading_sentences(explanation: Explanation) -> Iterator[str]:
-    """Yield sentences on the newest readings in the estimate, and on newer ones that were lost."""
     sensors = [s for s in explanation.sources if s.sensor and s.node != explanation.node]
     with_reading = sorted(
         (s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading
@@ -264,7 +261,6 @@ def _smallest_sentences(explanation: Explanation) -> Iterator[str]:
 
 
 def _format_limit(explanation: Explanation, smallest: SmallestSet) -> str:
-    """Return the limit on trace P as text, with the meaning of the default."""
     usual = (1.0 + GOOD_ENOUGH) * explanation.what_ifs[-1].trace
     where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
     is_default = math.isclose(smallest.limit, usual, rel_tol=1e-9)
@@ -330,7 +326,6 @@ def _replay_table(explanation: Explanation) -> str:
 
 
 def _count_messages(what_if: WhatIf) -> str:
-    """Return as text the number of missing messages that a replay delivers."""
     return "all" if what_if.messages is None else str(len(what_if.messages))
 
 
@@ -362,7 +357,6 @@ def _format_time_before(explanation: Explanation, seconds: float) -> str:
 
 
 def _format_route(source: InformationSource) -> str:
-    """Return the nodes of a route as text, shortened in the middle."""
     if not source.route:
         return "-"
     if len(source.route) == 1:

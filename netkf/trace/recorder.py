@@ -142,7 +142,6 @@ class Recorder:
                     thread.shutdown()
 
     def _flush_gathered(self) -> None:
-        """Pass the gathered events to all sinks, or only count them."""
         if not self._rows:
             return
         if self.counts_only:
@@ -219,7 +218,6 @@ class Recorder:
             self._run_or_submit(self._pass_sample_on, t, x, xhat, P, error)
 
     def _pass_sample_on(self, *sample: FloatArray) -> None:
-        """Pass a sample to all sinks."""
         for sink in self._sinks:
             sink.states(*sample)
 

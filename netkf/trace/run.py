@@ -115,7 +115,6 @@ class Run(NotebookTable):
         return plot_by_name(self, figure)
 
     def _notebook_table(self) -> pd.DataFrame:
-        """Return averages over the samples after time 0, a row per node."""
         import pandas as pd
 
         after = self.times > 0.0

@@ -78,6 +78,5 @@ def ensemble_columns(n: int) -> list[str]:
 
 
 def _upper_names(name: str, n: int) -> list[str]:
-    """Return the column names of the upper triangle of an n by n matrix, row by row."""
     join = "" if n <= 10 else "_"
     return [f"{name}{i}{join}{j}" for i in range(n) for j in range(i, n)]
