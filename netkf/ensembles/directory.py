@@ -12,7 +12,8 @@ from typing import Any
 from netkf.core.fields import integer, one_of
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
-from netkf.ensembles.pools import ANYWHERE, Pool, PoolOptions, block_size, make_pool
+from netkf.ensembles.pool import Pool, block_size
+from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
 from netkf.ensembles.replicas import NumberedBlocks, Progress, replicate_blocks
 from netkf.ensembles.resume import find_stored_blocks
 from netkf.ensembles.statistics import RunStatistics, block_statistics, merge
@@ -104,8 +105,7 @@ def runs_to_directory(
     one_of(*TRACES)("trace", options.trace)
     engine_used = choose_engine(options.engine, scenario, announce=False)
     check_sources(scenario)
-    pool = make_pool(runs, options.pool)
-    try:
+    with make_pool(runs, options.pool) as pool:
         writer = _open_directory(scenario, runs, out, options, engine_used.name, pool.width)
         if writer is None:
             return None
@@ -114,8 +114,8 @@ def runs_to_directory(
             engine_used.announce(scenario)
             task = partial(block_statistics, engine=engine_used, traces=writer.traces)
             statistics = writer.simulate(task, pool, progress)
-            written = _write_files(writer, statistics)
-            finished = FinishedEnsemble(*written, writer.simulated, time.perf_counter() - started)
+            pool.close(at_once=False)  # its memory is not needed any more
+            finished = _write_files(writer, statistics, started)
             if finish is not None:
                 finish(finished)
             writer.end(finished.status, statistics)
@@ -124,8 +124,6 @@ def runs_to_directory(
             if reason is error:
                 raise
             raise reason from error
-    finally:
-        pool.close(at_once=True)
     writer.blocks.remove()
     return finished
 
@@ -142,9 +140,8 @@ def _open_directory(
     size = block_size(runs, width)
     if options.trace == "full":
         size = min(size, MAX_TRACED_BLOCK)  # events of all runs of a block are in memory
-    digest = scenario_digest(scenario)
     plan = RunIdentity(
-        scenario=digest,
+        scenario=scenario_digest(scenario),
         seed=scenario.seed,
         runs=runs,
         trace=options.trace,
@@ -163,9 +160,9 @@ def _open_directory(
 
 
 def _write_files(
-    writer: _DirectoryWriter, statistics: RunStatistics
-) -> tuple[Path, str, dict[str, Any], Ensemble, PromisedTraces]:
-    """Write all files but the manifest; return the first fields of FinishedEnsemble."""
+    writer: _DirectoryWriter, statistics: RunStatistics, started: float
+) -> FinishedEnsemble:
+    """Write all files but the manifest; ``started`` is a value of the performance counter."""
     directory, scenario, plan = writer.directory, writer.scenario, writer.plan
     ensemble = ensemble_of(scenario, statistics, plan.seed, plan.engine)
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))
@@ -176,8 +173,15 @@ def _write_files(
     promised = promise_traces(scenario, scenario.times)
     summary = summarise_ensemble(scenario, statistics, promised)
     write_json(directory / "summary.json", summary)
-    status = "diverged" if ensemble.diverged else "complete"
-    return directory, status, summary, ensemble, promised
+    return FinishedEnsemble(
+        directory,
+        "diverged" if ensemble.diverged else "complete",
+        summary,
+        ensemble,
+        promised,
+        writer.simulated,
+        time.perf_counter() - started,
+    )
 
 
 class _DirectoryWriter:
@@ -192,11 +196,10 @@ class _DirectoryWriter:
         """
         self.scenario, self.directory, self.plan = scenario, directory, plan
         self.blocks = BlockCheckpoints(directory, scenario)
-        name, seed = scenario.name, scenario.seed
         self._manifest = Manifest(
             directory=directory,
-            name=name,
-            seed=seed,
+            name=scenario.name,
+            seed=scenario.seed,
             replica=0,
             engine=plan.engine,
             runs=plan.runs,

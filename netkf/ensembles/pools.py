@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass
@@ -15,13 +14,11 @@ from netkf.core.fields import integer
 from netkf.core.printable import shorten
 from netkf.ensembles.ask_scheduler import scheduler_answers
 from netkf.ensembles.blocks import Job, PackedScenario, pack_scenario, work
-from netkf.ensembles.workers import WorkerProcesses
+from netkf.ensembles.pool import AHEAD, Pool, RemotePool, block_size
+from netkf.ensembles.workers import ProcessPool
 from netkf.linalg.compiling import seconds_spent
 from netkf.runs.provenance import versions
 from netkf.scenario.scenario import Scenario
-
-AHEAD = 1024
-"""Largest number of blocks that are submitted and not yet completed."""
 
 QUICK_SECONDS, MAX_BLOCK_HERE = 0.2, 1024
 """Blocks in this process double in size while they take fewer seconds, up to so many runs."""
@@ -31,46 +28,11 @@ WARM, SAVING = 0.2, 2.0
 in seconds above which worker processes are started, about the cost of starting them.
 """
 
-MAX_BLOCK = 64  # runs in a block: a killed command repeats at most so many for each worker
-MAX_BLOCKS = 4096  # blocks in all: each is a file and a message to a worker
-ROUNDS = 16  # blocks for each worker, so that all workers end at nearly the same time
-
 PATIENCE = 8
 """Seconds to wait for a scheduler."""
 LOOK_SECONDS, CLOSE_SECONDS = 1.0, 2.0
 """Interval at which a scheduler's connection is checked, and longest wait when it is closed."""
 MAX_ADDRESS = 1024  # characters; a longer address is refused
-
-
-class Pool(ABC):
-    """Runs blocks of replicas.
-
-    width : number of blocks that run at a time, as far as known
-    ahead : number of blocks that may be submitted before the first is complete
-    """
-
-    width: int = 1
-    ahead: int = AHEAD
-
-    @abstractmethod
-    def submit(self, job: Job) -> Future[Any]:
-        """Submit a job, a block of replicas; return the future of its result.
-
-        Pools that work in this process may run the block before they return.
-        """
-
-    def next_size(self, left: int, runs: int) -> int:
-        """Return the number of runs of the next block, a power of two, when ``left`` of ``runs``
-        are not yet submitted; asked before each block is made.
-        """
-        return block_size(runs, self.width)
-
-    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
-        """Wait until one of the futures of ``submit`` is done; return all that are."""
-        return wait(futures, return_when=FIRST_COMPLETED).done
-
-    def close(self, at_once: bool) -> None:  # noqa: B027 - most have nothing of their own
-        """Release the workers; ``at_once`` without waiting for unfinished blocks."""
 
 
 class LocalPool(Pool):
@@ -170,31 +132,6 @@ class AdaptivePool(LocalPool):
             self._processes.close(at_once)
 
 
-class RemotePool(Pool):
-    """A pool outside this process, to which each scenario is sent pickled, packed once."""
-
-    def __init__(self) -> None:
-        """Make a pool that has packed no scenario yet."""
-        # The last scenario and its packed form, to be reused for its other blocks.
-        self._packed: tuple[object, PackedScenario] | None = None
-
-    def submit(self, job: Job) -> Future[Any]:
-        """Submit a block with the scenario pickled; blocks of one scenario share one pickle."""
-        if isinstance(job.scenario, Scenario):
-            if self._packed is None or self._packed[0] is not job.scenario:
-                self._packed = job.scenario, self._pack(job.scenario)
-            job = job._replace(scenario=self._packed[1])
-        return self._send(job)
-
-    def _pack(self, scenario: Scenario) -> PackedScenario:
-        """Return the scenario in the form that is sent to workers; subclasses may add to it."""
-        return pack_scenario(scenario)
-
-    @abstractmethod
-    def _send(self, job: Job) -> Future[Any]:
-        """Submit a block whose scenario is packed (pickled) to the pool's workers."""
-
-
 class ExecutorPool(RemotePool):
     """A user's concurrent.futures executor, which is not shut down."""
 
@@ -281,47 +218,10 @@ def _unreachable(address: str, reason: str) -> ScenarioError:
     return ScenarioError("scheduler", f"cannot be reached ({reason})", address, remedy)
 
 
-class ProcessPool(RemotePool):
-    """Own worker processes, each with one BLAS thread and without the user's script as __main__."""
-
-    def __init__(self, workers: int) -> None:
-        """Make a pool of at most ``workers`` processes, which are started as blocks need them."""
-        super().__init__()
-        self.width = workers
-        self._workers = WorkerProcesses(workers)
-
-    def _send(self, job: Job) -> Future[Any]:
-        """Submit a block; return its future."""
-        return self._workers.submit(job)
-
-    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
-        """Wait until one of the futures is done; return all that are."""
-        return self._workers.wait(futures)
-
-    def close(self, at_once: bool) -> None:
-        """End the processes."""
-        self._workers.close(at_once)
-
-
 def cores() -> int:
     """Return the number of processor cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-
-
-def block_size(runs: int, width: int) -> int:
-    """Return the number of runs in a block, the unit of work that one worker does at a time, for
-    ``runs`` runs on ``width`` workers: a power of two.
-
-    Every worker gets about ROUNDS blocks, so that all end at nearly the same time, within the
-    limits MAX_BLOCK and MAX_BLOCKS.
-    """
-    size = 1
-    while size < MAX_BLOCK and 2 * size * width * ROUNDS <= runs:
-        size *= 2
-    while size * MAX_BLOCKS < runs:
-        size *= 2
-    return size
 
 
 @dataclass(frozen=True)

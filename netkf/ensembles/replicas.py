@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Future
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.ensembles.blocks import BlockTask, Job, Task, each_replica
 from netkf.ensembles.merge_tree import Merge, MergeTree
-from netkf.ensembles.pools import ANYWHERE, Pool, PoolOptions, make_pool
+from netkf.ensembles.pool import Pool
+from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
 from netkf.linalg.lanes import LANES
 from netkf.scenario.scenario import Scenario
 
@@ -29,9 +32,9 @@ class NumberedBlocks(NamedTuple):
                and returns the result to merge
     """
 
-    size: int
-    known: Mapping[int, Callable[[], Any]]
-    received: Callable[[int, Any], Any]
+    size: int = 0
+    known: Mapping[int, Callable[[], Any]] = MappingProxyType({})
+    received: Callable[[int, Any], Any] = lambda _, result: result
 
 
 def replicate(
@@ -59,7 +62,7 @@ def replicate_blocks(
     progress: Progress | None = None,
     first: int = 0,
     together: int | None = None,
-    blocks: NumberedBlocks | None = None,
+    blocks: NumberedBlocks = NumberedBlocks(),  # noqa: B008 - it is immutable
 ) -> Any:
     """Return ``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first +
     runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
@@ -71,7 +74,7 @@ def replicate_blocks(
     their results must pickle.
 
     seed     : defaults to the scenario's
-    pool     : a pool of make_pool, or options for one; it is closed at the end
+    pool     : a pool of make_pool, or options for one that is closed at the end
     progress : called after each block
     together : smallest number of replicas in a block run in this process, a power of two; by
                default as many as SIMD lanes for a scenario in slots, whose runs are simulated in
@@ -86,52 +89,8 @@ def replicate_blocks(
         raise ScenarioError("", "must be a netkf.Scenario", scenario, "netkf.load(path) gives one")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     runs, first = integer(low=1)("runs", runs), integer(low=0)("first", first)
-    blocks = blocks or CHOSEN_BY_POOL
-    if isinstance(pool, PoolOptions):
-        pool = make_pool(-(-runs // (blocks.size or 1)), pool)
-    ended = False
-    try:
-        job = Job(
-            scenario=scenario,
-            task=task,
-            seed=seed,
-            first=first,
-            start=0,
-            stop=runs,
-            size=blocks.size,
-        )
-        result = _gather(pool, job, together, merge, blocks, progress or _report_nothing)
-        ended = True
-    finally:
-        pool.close(at_once=not ended)
-    return result
-
-
-def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
-    """Return the result of one replica as a list, which ``operator.add`` merges with others."""
-    return [task(scenario, seed, replica)]
-
-
-def _keep_result(number: int, result: Any) -> Any:  # noqa: ARG001
-    return result
-
-
-CHOSEN_BY_POOL = NumberedBlocks(0, {}, _keep_result)
-
-
-def _report_nothing(done: int, wanted: int) -> None:
-    """Report no progress."""
-
-
-def _gather(
-    pool: Pool,
-    job: Job,
-    together: int | None,
-    merge: Merge,
-    blocks: NumberedBlocks,
-    progress: Progress,
-) -> Any:
     tree, runs_done, known = MergeTree(merge), 0, blocks.known
+    job = Job(scenario, task, seed, first, start=0, stop=runs, size=blocks.size)
 
     def take(block: Job, result: Any) -> None:
         """Add the result of a block to the tree and report progress."""
@@ -139,13 +98,21 @@ def _gather(
         # A block of 2^level replicas, the k-th of this size, is the node (level, k) of the tree.
         tree.add(block.start // block.size, result, block.size.bit_length() - 1)
         runs_done += len(block.replicas)
-        progress(runs_done, job.stop)
+        if progress is not None:
+            progress(runs_done, runs)
 
-    for number in sorted(known):
-        take(job._replace(start=number * job.size), known[number]())
-    for block, result in _complete_blocks(pool, _make_blocks(pool, job, together, known)):
-        take(block, blocks.received(block.start // block.size, result))
+    with contextlib.ExitStack() as stack:
+        if isinstance(pool, PoolOptions):
+            pool = stack.enter_context(make_pool(-(-runs // (blocks.size or 1)), pool))
+        for number in sorted(known):
+            take(job._replace(start=number * job.size), known[number]())
+        for block, result in _complete_blocks(pool, _make_blocks(pool, job, together, known)):
+            take(block, blocks.received(block.start // block.size, result))
     return tree.result()
+
+
+def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
+    return [task(scenario, seed, replica)]
 
 
 def _make_blocks(

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError
 from netkf.ensembles.blocks import Job, PackedScenario, work
+from netkf.ensembles.pool import RemotePool
 from netkf.ensembles.process_start import (
     block_signals,
     hide_main_module,
@@ -120,18 +121,19 @@ class _RemoteError(Exception):
         return f"\n{self.args[0]}"
 
 
-class WorkerProcesses:
-    """At most ``width`` worker processes, started as they are needed, and the tasks for them."""
+class ProcessPool(RemotePool):
+    """Own worker processes, started as blocks need them, each with one BLAS thread and without the
+    user's script as __main__.
+    """
 
-    def __init__(self, width: int) -> None:
-        self._width = width
+    def __init__(self, workers: int) -> None:
+        """Make a pool of at most ``workers`` processes."""
+        super().__init__()
+        self.width = workers
         self._workers: list[_Worker] = []
         self._waiting: deque[_Task] = deque()
 
-    def submit(self, job: Job) -> Future[Any]:
-        """Submit a job (a block of replicas), which starts at once if a worker is idle; return the
-        future of its result, which is set within ``wait``.
-        """
+    def _send(self, job: Job) -> Future[Any]:
         future: Future[Any] = Future()
         self._waiting.append(_Task(job, future))
         self._hand_out()
@@ -164,7 +166,7 @@ class WorkerProcesses:
             worker = next(
                 (candidate for candidate in self._workers if candidate.task is None), None
             )
-            if worker is None and len(self._workers) >= self._width:
+            if worker is None and len(self._workers) >= self.width:
                 return
             task = self._waiting.popleft()
             # The future of a task whose worker died is running already.

@@ -16,7 +16,8 @@ from netkf.core.errors import EngineError, ScenarioError, suggest_nearest
 from netkf.core.fields import integer, number
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
-from netkf.ensembles.pools import Pool, PoolOptions
+from netkf.ensembles.pool import Pool
+from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failures
@@ -38,7 +39,6 @@ from netkf.studies.filter_values import (
     estimate_quantities,
     join_values,
 )
-from netkf.studies.pools import shared_pool
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -173,7 +173,7 @@ def compare_filters(
     candidates = _candidates(scenario, filters, engine)
     values: dict[str, FilterValues] = {}
     traffic: dict[str, Traffic] = {}
-    with shared_pool(count, PoolOptions(workers, executor, scheduler)) as pool:
+    with make_pool(count, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
         for k, candidate in enumerate(candidates):
             if candidate.scenario is not None:
                 values[candidate.label] = _simulate(candidate.scenario, count, root, engine, pool)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from netkf.core.errors import ScenarioError
 from netkf.core.notebook import NotebookTable
 from netkf.ensembles.blocks import BlockTask
-from netkf.ensembles.pools import Pool
+from netkf.ensembles.pool import Pool
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import central_trace, join_metrics

@@ -11,7 +11,7 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number, one_of
 from netkf.engines.base import Engine
 from netkf.ensembles.blocks import BlockTask, each_replica
-from netkf.ensembles.pools import PoolOptions
+from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
@@ -21,7 +21,6 @@ from netkf.studies.metrics import (
     join_metrics,
 )
 from netkf.studies.parameter_grid import is_integer_key
-from netkf.studies.pools import shared_pool
 from netkf.studies.search import (
     FIRST_BATCH,
     FIRST_EXPECTED,
@@ -106,7 +105,7 @@ def size(
     # Bonferroni over all values and all looks at each of them while its runs are doubled.
     looks = 1 + math.ceil(math.log2(max(1.0, runs / first)))
     level = (1.0 - confidence) / (MAX_PROBES["simulation"] * looks)
-    with shared_pool(runs, PoolOptions(workers, executor, scheduler)) as pool:
+    with make_pool(runs, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
         plan = SimulationPlan(
             task=task, runs=runs, level=level, pool=pool, progress=progress, first=first
         )

@@ -15,7 +15,7 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer
-from netkf.ensembles.pools import ANYWHERE, PoolOptions
+from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
@@ -43,7 +43,6 @@ from netkf.studies.metrics import (
     worst_node,
 )
 from netkf.studies.parameter_grid import GridPoint, check_grid, expand_grid, table_value
-from netkf.studies.pools import shared_pool
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -126,7 +125,7 @@ def plan_sweep(
 def _simulate_points(
     plan: SweepPlan, options: PoolOptions, progress: Progress | None
 ) -> Iterator[Row]:
-    with shared_pool(plan.runs, options) as pool:
+    with make_pool(plan.runs, options, open_ended=True) as pool:
         for k, point in enumerate(plan.points):
             with explain_failures(point.scenario):
                 task = partial(block_metrics, engine=choose_engine(plan.engine, point.scenario))
