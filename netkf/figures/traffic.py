@@ -27,6 +27,7 @@ from netkf.figures.style import (
     new_figure,
 )
 from netkf.linalg.arrays import FloatArray
+from netkf.trace.messages import DELIVERED, UNDER_WAY, by_link, join_messages
 from netkf.trace.schema import CODES
 
 AGE_BINS = 160  # of time, for means and maxima of the age
@@ -197,33 +198,14 @@ class DirectedMessages(NamedTuple):
 
 def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
     """Return the messages with an outcome of each direction, from EVENT rows ``log``."""
-    arrivals = log[log["kind"] == CODES["deliver"]]
-    losses = log[np.isin(log["kind"], (CODES["lost"], CODES["late"]))]
-    # The node of an arrival, late ones included, is the receiver; that of a loss is the sender.
-    is_late = losses["kind"] == CODES["late"]
-    sender = np.where(is_late, losses["peer"], losses["node"])
-    receiver = np.where(is_late, losses["node"], losses["peer"])
-    delivered = _times_by_direction(arrivals["peer"], arrivals["node"], arrivals["t"])
-    lost = _times_by_direction(sender, receiver, losses["t"])
-    none = np.empty(0)
-    return [
-        DirectedMessages(*direction, delivered.get(direction, none), lost.get(direction, none))
-        for direction in sorted({*delivered, *lost})
-    ]
-
-
-def _times_by_direction(
-    senders: np.ndarray, receivers: np.ndarray, times: FloatArray
-) -> dict[tuple[int, int], FloatArray]:
-    """Return the sorted times (s) of the events of each (sender, receiver)."""
-    if not len(times):
-        return {}
-    order = np.lexsort((times, receivers, senders))
-    i, j, t = senders[order], receivers[order], times[order]
-    boundaries = np.flatnonzero((i[1:] != i[:-1]) | (j[1:] != j[:-1])) + 1
-    starts = [0, *boundaries.tolist()]
-    groups = np.split(t, boundaries)
-    return {(int(i[s]), int(j[s])): group for s, group in zip(starts, groups, strict=True)}
+    directions = []
+    for link in by_link(join_messages(log)):
+        delivered = np.sort(link["ended"][link["outcome"] == DELIVERED])
+        lost = np.sort(link["ended"][~np.isin(link["outcome"], (DELIVERED, UNDER_WAY))])
+        if len(delivered) or len(lost):
+            sender, receiver = int(link["sender"][0]), int(link["receiver"][0])
+            directions.append(DirectedMessages(sender, receiver, delivered, lost))
+    return directions
 
 
 def links_figure(data: FigureData) -> Picture:

@@ -15,7 +15,7 @@ from netkf.engines.soundness import describe_divergence
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import describe_innovations
-from netkf.report.messages import DELIVERED, LATE, LOST, information_age
+from netkf.report.messages import information_age
 from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_samples
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
@@ -25,6 +25,7 @@ from netkf.studies.compare_filters import ComparedFilter
 from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
 from netkf.theory.common.papers import PAPERS
+from netkf.trace.messages import DELIVERED, LATE, LOST
 from netkf.trace.run import first_difference
 
 UNUSUAL_SHARE = 0.9

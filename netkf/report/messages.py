@@ -1,4 +1,4 @@
-"""Messages of a run for a page: each send event joined with its outcome, thinned, and counted."""
+"""Messages of a run for a page: thinned, and counted."""
 
 from __future__ import annotations
 
@@ -7,25 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.trace.schema import CODES
-
-DELIVERED, LOST, LATE, UNDER_WAY = range(4)
-MESSAGE = np.dtype(
-    [
-        ("sent", "f8"),
-        ("ended", "f8"),
-        ("age", "f8"),
-        ("sender", "i8"),
-        ("receiver", "i8"),
-        ("number", "i8"),
-        ("phase", "i4"),
-        ("outcome", "u1"),
-    ]
-)
-"""A message. sent, ended: seconds, ``ended`` is nan for a message under way; age: seconds of travel
-as recorded, nan for a lost one; sender, receiver: ids; number: counts the messages of a directed
-link; phase: that of its slot, -1 under clocks; outcome: DELIVERED, LOST, LATE or UNDER_WAY.
-"""
+from netkf.trace.messages import DELIVERED, LATE, LOST, UNDER_WAY, by_link
 
 
 class ThinnedMessages(NamedTuple):
@@ -37,58 +19,6 @@ class ThinnedMessages(NamedTuple):
     start: float
     end: float
     step: int
-
-
-def join_messages(log: np.ndarray) -> np.ndarray:
-    """Return one MESSAGE row for each of the M messages sent in a run, (M,), ordered by sender,
-    receiver and number: its send event joined with that of its delivery or loss.
-
-    ``log`` (E,) are the EVENT rows of the run. Raises ValueError if an outcome belongs to no send
-    event, or if ids or numbers are too large.
-    """
-    sends = log[log["kind"] == CODES["send"]]
-    messages = np.zeros(len(sends), dtype=MESSAGE)
-    for name, column in (("sender", "node"), ("receiver", "peer"), ("number", "message")):
-        messages[name] = sends[column]
-    messages["sent"], messages["phase"] = sends["t"], sends["phase"]
-    messages["ended"] = messages["age"] = np.nan
-    messages["outcome"] = UNDER_WAY
-    order = np.argsort(_message_keys(messages, ("sender", "receiver")), kind="stable")
-    messages = messages[order]
-    # A loss is an event of the sender, an arrival one of the receiver.
-    lost = log[log["kind"] == CODES["lost"]]
-    _set_outcomes(messages, lost, LOST, ("node", "peer"))
-    for kind, outcome in (("deliver", DELIVERED), ("late", LATE)):
-        rows = log[log["kind"] == CODES[kind]]
-        _set_outcomes(messages, rows, outcome, ("peer", "node"))
-    return messages
-
-
-def _message_keys(
-    rows: np.ndarray, node_columns: tuple[str, str], number_column: str = "number"
-) -> np.ndarray:
-    """Return integers (M,) that order messages by sender, receiver, number; raises ValueError."""
-    sender, receiver = (rows[name].astype(np.uint64) for name in node_columns)
-    number = rows[number_column].astype(np.uint64)
-    if len(rows) and (max(sender.max(), receiver.max()) >> 20 or number.max() >> 24):
-        raise ValueError("node ids or message numbers are too large for a page")
-    return np.asarray((sender << np.uint64(44)) | (receiver << np.uint64(24)) | number)
-
-
-def _set_outcomes(
-    messages: np.ndarray, rows: np.ndarray, outcome: int, node_columns: tuple[str, str]
-) -> None:
-    """Set ``outcome``, ``ended`` and ``age`` of the ``messages`` that EVENT ``rows`` are about."""
-    if not len(rows):
-        return
-    keys = _message_keys(messages, ("sender", "receiver"))
-    row_keys = _message_keys(rows, node_columns, "message")
-    indices = np.minimum(np.searchsorted(keys, row_keys), max(0, len(keys) - 1))
-    if not len(keys) or (keys[indices] != row_keys).any():
-        raise ValueError("an outcome belongs to no message")
-    messages["outcome"][indices] = outcome
-    messages["ended"][indices] = rows["t"]
-    messages["age"][indices] = rows["age"]
 
 
 def thin_messages(messages: np.ndarray, max_messages: int, instant: float) -> ThinnedMessages:
@@ -124,9 +54,7 @@ def information_age(
     """
     total = np.zeros((len(times), len(nodes)))
     links = np.zeros(len(nodes))
-    # The messages of each directed link are neighbours.
-    ends = np.flatnonzero((np.diff(messages["sender"]) != 0) | (np.diff(messages["receiver"]) != 0))
-    for link in np.split(messages, ends + 1) if len(messages) else []:
+    for link in by_link(messages):
         column = int(np.searchsorted(nodes, link["receiver"][0]))
         arrived = link[link["outcome"] == DELIVERED]
         arrived = arrived[np.argsort(arrived["ended"], kind="stable")]

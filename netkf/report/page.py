@@ -31,7 +31,6 @@ from netkf.report.mending import (
     explain_worst,
     mending_section,
 )
-from netkf.report.messages import MESSAGE, join_messages
 from netkf.report.packing import Packer
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
 from netkf.runs.files import require_own, write_text
@@ -40,6 +39,7 @@ from netkf.scenario.writing import toml_text
 from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.studies.explanation import Explanation
 from netkf.studies.stored import StoredComparison
+from netkf.trace.messages import MESSAGE, join_messages
 from netkf.trace.schema import KINDS
 
 MAX_BYTES = 4_800_000

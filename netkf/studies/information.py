@@ -21,6 +21,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.network.deliveries import MessageKey
 from netkf.scenario.derived import DerivedScenario
+from netkf.trace.messages import DELIVERED, join_messages
 from netkf.trace.schema import CODES
 
 IntArray = np.ndarray
@@ -72,62 +73,30 @@ def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     largest id. A message with a ``late`` event was too late if the run is ``slotted``, else
     refused.
     """
-    # Messages are sorted by directed link and number, so that an event about a message finds it by
-    # the first message of its link and the number.
-    kind = log["kind"]
-    rows = np.flatnonzero(kind == CODES["send"])
-    rows = rows[np.lexsort((log["message"][rows], log["peer"][rows], log["node"][rows]))]
-    sender, receiver, number = (log[name][rows] for name in ("node", "peer", "message"))
-    first = np.ones(len(rows), dtype=bool)
-    first[1:] = (sender[1:] != sender[:-1]) | (receiver[1:] != receiver[:-1])
-    links = _Links(sender[first], receiver[first], np.flatnonzero(first))
-    outcome = np.full(len(rows), UNDER_WAY)
-    arrived, used_row = np.full(len(rows), np.nan), np.full(len(rows), NEVER)
-    lost = np.flatnonzero(kind == CODES["lost"])
-    outcome[links.indices(log["node"][lost], log["peer"][lost], log["message"][lost])] = LOST
-    late = np.flatnonzero(kind == CODES["late"])
-    indices = links.indices(log["peer"][late], log["node"][late], log["message"][late])
-    outcome[indices], arrived[indices] = (LATE if slotted else REFUSED), log["t"][late]
-    deliveries = np.flatnonzero(kind == CODES["deliver"])
-    indices = links.indices(
-        log["peer"][deliveries], log["node"][deliveries], log["message"][deliveries]
-    )
-    arrived[indices], used_row[indices] = log["t"][deliveries], _next_use(log, deliveries)
-    outcome[indices] = np.where(used_row[indices] == NEVER, UNDER_WAY, USED)
+    joined = join_messages(log)
+    used_row = np.full(len(joined), NEVER)
+    arrivals = np.flatnonzero(joined["outcome"] == DELIVERED)
+    used_row[arrivals] = _next_use(log, joined["end_row"][arrivals])
+    # By outcome in the log: DELIVERED, LOST, LATE, UNDER_WAY.
+    outcome = np.array([USED, LOST, LATE if slotted else REFUSED, UNDER_WAY])[joined["outcome"]]
+    outcome[arrivals] = np.where(used_row[arrivals] == NEVER, UNDER_WAY, USED)
     if swaps:
-        arrivals = np.flatnonzero(outcome == USED)
-        counts = _last_of_instant(used_row[arrivals], sender[arrivals], rows[arrivals])
-        outcome[arrivals[~counts]] = UNUSED
-    sent, phase = log["t"][rows], log["phase"][rows]
+        used = np.flatnonzero(outcome == USED)
+        # A swap uses the last message of the sender with the largest id.
+        order = used[np.lexsort((joined["sent_row"][used], joined["sender"][used], used_row[used]))]
+        is_last = np.append(np.diff(used_row[order]) != 0, True)[: len(order)]
+        outcome[order[~is_last]] = UNUSED
     return Messages(
-        sender=sender,
-        receiver=receiver,
-        number=number,
-        sent=sent,
-        arrived=arrived,
-        phase=phase,
+        sender=joined["sender"],
+        receiver=joined["receiver"],
+        number=joined["number"],
+        sent=joined["sent"],
+        arrived=np.where(outcome == LOST, np.nan, joined["ended"]),
+        phase=joined["phase"],
         outcome=outcome,
-        sent_row=rows,
+        sent_row=joined["sent_row"],
         used_row=used_row,
     )
-
-
-class _Links(NamedTuple):
-    """Directed links by ``sender`` and ``receiver`` (L,); ``start`` (L,): first messages."""
-
-    sender: IntArray
-    receiver: IntArray
-    start: IntArray
-
-    def indices(self, sender: IntArray, receiver: IntArray, number: IntArray) -> IntArray:
-        """Return the indices (K,) of messages given by sender, receiver and ``number`` (K,)."""
-        if not len(self.start):
-            return np.empty(0, dtype=np.int64)
-        # Each pair of ids becomes one integer, which one sorted search finds for all messages.
-        ids = np.unique(np.concatenate([self.sender, self.receiver]))
-        keys = np.searchsorted(ids, self.sender) * len(ids) + np.searchsorted(ids, self.receiver)
-        message_keys = np.searchsorted(ids, sender) * len(ids) + np.searchsorted(ids, receiver)
-        return np.asarray(self.start[np.searchsorted(keys, message_keys)] + number)
 
 
 def _next_use(log: IntArray, rows: IntArray) -> IntArray:
@@ -142,16 +111,6 @@ def _next_use(log: IntArray, rows: IntArray) -> IntArray:
     position = np.searchsorted(keys[order], node * length + rows)
     next_row = np.append(uses[order], NEVER)[position]
     return np.where((next_row >= 0) & (log["node"][next_row] == log["node"][rows]), next_row, NEVER)
-
-
-def _last_of_instant(used: IntArray, sender: IntArray, sent_row: IntArray) -> IntArray:
-    """Return a mask (K,) of the messages used by a swap: the largest sender, and its last one."""
-    order = np.lexsort((sent_row, sender, used))
-    last = np.ones(len(used), dtype=bool)
-    last[:-1] = used[order][1:] != used[order][:-1]
-    is_last = np.empty(len(used), dtype=bool)
-    is_last[order] = last  # back in the order of the arguments
-    return is_last
 
 
 def at_once(messages: Messages, log: IntArray) -> Messages:

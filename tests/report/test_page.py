@@ -27,13 +27,14 @@ from netkf.report.data import Budget, sample_indices
 from netkf.report.directories import read_source
 from netkf.report.markup import script_json
 from netkf.report.mending import explain_worst
-from netkf.report.messages import MESSAGE, information_age, join_messages, thin_messages
+from netkf.report.messages import information_age, thin_messages
 from netkf.report.page import make_page
 from netkf.report.tables import difference_curves
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
 from netkf.studies.compare_filters import compare_filters, write_comparison
+from netkf.trace.messages import MESSAGE, join_messages
 from tests.conftest import SCENARIOS
 from tests.report.conftest import EVIL, write_verdict
 from tests.report.decoding import Page
