@@ -27,7 +27,7 @@ from netkf.runs.files import (
     write_json,
     write_scenario,
 )
-from netkf.runs.parquet_files import TraceTables, write_table
+from netkf.runs.parquet_files import ParquetSink, write_table
 from netkf.runs.provenance import installation_digest
 from netkf.runs.run import Manifest
 from netkf.runs.simulate import choose_engine
@@ -167,7 +167,7 @@ def _write_files(
     ensemble = ensemble_of(scenario, statistics, plan.seed, plan.engine)
     write_table(directory / "ensemble.parquet", ensemble_table(ensemble))
     if plan.trace != "none":
-        with TraceTables(directory, scenario) as tables:
+        with ParquetSink(directory, scenario) as tables:
             for replica, log, *arrays in writer.blocks.traces():
                 tables.add(replica, log, StateSamples(*arrays))
     promised = promise_traces(scenario, scenario.times)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pandas as pd
@@ -136,117 +136,80 @@ def _is_numeric(kind: Any) -> bool:
 
 
 class ParquetSink(Sink):
-    """Writes the events and states of one run to events.parquet and states.parquet as they come.
+    """Writes events.parquet and states.parquet of one run, or of several, one after the other.
 
-    Rows are written block by block, so that memory is bounded. Without ``events`` there are no
-    files.
+    Rows are written when they fill a row group, so that memory is bounded. As a context manager it
+    removes the unfinished files after an exception.
     """
 
     thread_safe: ClassVar[bool] = True
 
-    def __init__(self, directory: Path, scenario: Scenario, replica: int, events: bool) -> None:
-        """Prepare the files of run number ``replica`` in ``directory``; none without ``events``."""
+    def __init__(self, directory: Path, scenario: Scenario, replica: int = 0) -> None:
+        """Prepare both files in ``directory``; the first run has the number ``replica``."""
         self._nodes, self._replica, self._event_count = scenario.nodes, replica, 0
         self._truth_known = scenario.plant.truth_known
-        self._events = _Table(directory / "events.parquet", EVENT_ENCODING) if events else None
-        self._states = _Table(directory / "states.parquet", STATE_ENCODING) if events else None
+        self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
+        self._states = _Table(directory / "states.parquet", STATE_ENCODING)
         self._samples: list[tuple[FloatArray, ...]] = []
         self._rows = 0
 
+    def add(self, replica: int, log: np.ndarray, samples: StateSamples) -> None:
+        """Append a whole run, number ``replica``: the EVENT rows ``log`` (E,) and its samples."""
+        self._collect_samples()
+        self._replica, self._event_count = replica, 0
+        self.events(log)
+        self.states(*samples)
+
     def events(self, rows: np.ndarray) -> None:
-        """Write a block ``rows`` (E,) of EVENT rows as a row group of events.parquet."""
-        if self._events is not None:
-            self._events.write(event_columns(rows, self._replica, self._event_count))
-            self._event_count += len(rows)
+        """Take the next EVENT ``rows`` (E,) of the run."""
+        self._events.collect(event_columns(rows, self._replica, self._event_count))
+        self._event_count += len(rows)
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
-        """Collect T samples of N nodes, and write them when they fill a row group."""
-        if self._states is not None:
-            self._samples.append((t, x, xhat, P, error))
-            self._rows += len(t) * len(self._nodes)
-            if self._rows >= ROW_GROUP_ROWS:
-                self._flush()
+        """Take T samples of N nodes of the run."""
+        self._samples.append((t, x, xhat, P, error))
+        self._rows += len(t) * len(self._nodes)
+        if self._rows >= ROW_GROUP_ROWS:
+            self._collect_samples()
+
+    def _collect_samples(self) -> None:
+        """Make a table of the samples of the present run that were taken."""
+        if self._samples:
+            samples = StateSamples(*map(np.concatenate, zip(*self._samples, strict=True)))
+            self._samples.clear()
+            self._rows = 0
+            table = state_table(self._replica, self._nodes, samples, self._truth_known)
+            self._states.collect(table)
 
     def _flush(self) -> None:
-        if self._states is None or not self._samples:
-            return
-        columns = zip(*self._samples, strict=True)
-        times, x, xhat, P, error = (np.concatenate(column) for column in columns)
-        self._samples.clear()
-        self._rows = 0
-        self._states.write(
-            state_table(
-                self._replica,
-                self._nodes,
-                StateSamples(times=times, x=x, xhat=xhat, P=P, error=error),
-                self._truth_known,
-            )
-        )
+        """Write all rows that were taken."""
+        self._collect_samples()
+        self._events.flush()
+        self._states.flush()
 
     def close(self) -> None:
-        """Write what is left, finish events.parquet and states.parquet and rename them from
-        NAME.part; raises WriteError.
+        """Write what is left, finish the files and rename them from NAME.part; raises WriteError.
+
+        Without samples there is no states.parquet.
         """
-        # Callbacks run in reverse order and all of them run: if the disk is full when the last
-        # samples are written, the table of events is finished nevertheless.
+        # All callbacks run, the last one first: if the disk is full when the last samples are
+        # written, the table of events is finished nevertheless.
         with contextlib.ExitStack() as callbacks:
-            if self._states is not None:
-                # Without samples there is no states.parquet.
-                callbacks.callback(self._states.close, None)
-            if self._events is not None:
-                empty = np.empty(0, dtype=EVENT)
-                callbacks.callback(self._events.close, lambda: event_columns(empty, 0, 0))
+            callbacks.callback(self._states.close)
+            callbacks.callback(self._events.close)
             callbacks.callback(self._flush)
+            self.events(np.empty(0, dtype=EVENT))
 
-
-class TraceTables:
-    """Writes events.parquet and states.parquet of several runs, one run after the other.
-
-    Use it as a context manager: an exception in its body removes the unfinished files.
-    """
-
-    def __init__(self, directory: Path, scenario: Scenario) -> None:
-        """Prepare both files in ``directory``, for runs of the scenario."""
-        self._nodes, self._truth_known = scenario.nodes, scenario.plant.truth_known
-        self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
-        self._states = _Table(directory / "states.parquet", STATE_ENCODING)
-        self._pending_events: list[pd.DataFrame] = []
-        self._pending_states: list[pd.DataFrame] = []
-        self._rows = 0
-
-    def add(self, replica: int, log: np.ndarray, samples: StateSamples) -> None:
-        """Append run number ``replica``: the EVENT rows ``log`` (E,) and its samples; written once
-        they fill a row group.
-        """
-        states = state_table(replica, self._nodes, samples, self._truth_known)
-        self._pending_events.append(pd.DataFrame(event_columns(log, replica, 0)))
-        self._pending_states.append(pd.DataFrame(states))
-        self._rows += max(len(log), len(samples.times) * len(self._nodes))
-        if self._rows >= ROW_GROUP_ROWS:
-            self._flush()
-
-    def _flush(self) -> None:
-        for pending, table in (
-            (self._pending_events, self._events),
-            (self._pending_states, self._states),
-        ):
-            if pending:
-                table.write(pd.concat(pending, ignore_index=True))
-                pending.clear()
-        self._rows = 0
-
-    def __enter__(self) -> TraceTables:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Finish the files, or remove them after an exception."""
         try:
             if error is None:
-                self._flush()
-                self._events.close(None)
-                self._states.close(None)
+                self.close()
         finally:
             self._events.discard()
             self._states.discard()
@@ -255,8 +218,8 @@ class TraceTables:
 def write_table(path: Path, columns: dict[str, Any]) -> None:
     """Write columns {name: values (rows,)} as a Parquet file; raises WriteError."""
     table = _Table(path)
-    table.write(columns)
-    table.close(None)
+    table.collect(columns)
+    table.close()
 
 
 class _Table:
@@ -272,15 +235,26 @@ class _Table:
         """
         self._path, self._temporary = path, path.with_name(path.name + ".part")
         self._encoding = encoding or {}
+        self._pending: list[Any] = []
         self._file: Any = None
         self._writer: Any = None
         self._closed = False
 
-    def write(self, columns: dict[str, Any] | pd.DataFrame) -> None:
-        """Append rows as a row group (a part of the file that is read as a whole); the first call
-        creates the file, and its columns give the schema.
+    def collect(self, columns: dict[str, Any]) -> None:
+        """Append rows, which are written once they fill a row group (a part of the file that is
+        read as a whole).
         """
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
+        self._pending.append(table)
+        if sum(map(len, self._pending)) >= ROW_GROUP_ROWS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the collected rows as a row group; the first ones give the schema."""
+        if not self._pending:
+            return
+        table = pa.concat_tables(self._pending).unify_dictionaries()
+        self._pending.clear()
         with self._discard_on_failure():
             if self._writer is None:
                 self._file = _open_arrow_file(self._temporary, "wb")
@@ -289,15 +263,13 @@ class _Table:
                 )
             self._writer.write_table(table)
 
-    def close(self, empty_columns: Callable[[], dict[str, Any]] | None) -> None:
-        """Finish the file and rename it from NAME.part.
-
-        If no rows were written, the file gets the ``empty_columns``; with None there is no file.
+    def close(self) -> None:
+        """Write what is left, finish the file and rename it from NAME.part; without any rows,
+        not even none, there is no file.
         """
         if self._closed:
             return
-        if self._writer is None and empty_columns is not None:
-            self.write(empty_columns())
+        self.flush()
         self._closed = True
         if self._writer is not None:
             with self._discard_on_failure():

@@ -103,7 +103,7 @@ def run_to_directory(
     try:
         status, seconds = _simulate(chosen_engine, scenario, replica, recorder, progress)
         is_complete = status == "complete"
-        output.tables.close()
+        output.close_tables()
         promised = promise_traces(scenario, np.array(output.samples.times))
         summary = output.write_summary(promised, recorder.count, recorder.sums, status)
         completed = CompletedRun(
@@ -149,7 +149,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
         sink.events(run.log)
         sink.exact_errors = run.exact_errors
         sink.states(run.times, run.x, run.xhat, run.P, run.error)
-    output.tables.close()
+    output.close_tables()
     output.write_summary(promise_traces(scenario, run.times), run.count, run.sums, run.status)
     totals: dict[str, Any] = {"events": len(run.log), "fingerprint": run.fingerprint}
     totals |= {"simpy": run.stats} if run.stats else {}
@@ -169,14 +169,19 @@ class _Output:
     directory: Path
     scenario: Scenario
     samples: SummarySink
-    tables: ParquetSink
+    tables: ParquetSink | None
     links: list[SentPerLink]
     manifest: Manifest
 
     @property
     def sinks(self) -> list[Sink]:
         """All sinks, which receive the events and samples of the run."""
-        return [self.samples, self.tables, *self.links]
+        return [self.samples, *([] if self.tables is None else [self.tables]), *self.links]
+
+    def close_tables(self) -> None:
+        """Finish the Parquet tables, if the run has any; raises WriteError."""
+        if self.tables is not None:
+            self.tables.close()
 
     def write_summary(
         self,
@@ -231,7 +236,7 @@ def _create_output(
         directory=directory,
         scenario=scenario,
         samples=SummarySink(),
-        tables=ParquetSink(directory, scenario, replica, tables),
+        tables=ParquetSink(directory, scenario, replica) if tables else None,
         links=[SentPerLink()] if is_recorded else [],
         manifest=manifest,
     )
@@ -252,7 +257,7 @@ def _keep_partial_results(
 ) -> None:
     """Finish the files of a run that stopped with ``error``."""
     status = "failed" if isinstance(error, Exception) else "interrupted"
-    for finish in (recorder.flush, output.tables.close):
+    for finish in (recorder.flush, output.close_tables):
         with contextlib.suppress(Exception):  # a full disk fails again, and ``error`` says so
             finish()
     if not (output.directory / "summary.json").exists():

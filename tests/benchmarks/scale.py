@@ -45,7 +45,7 @@ def measured(case):
     started = []
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        sink = ParquetSink(Path(folder), case, 0, True)
+        sink = ParquetSink(Path(folder), case)
         recorder = Recorder([sink])
 
         def progress(now):

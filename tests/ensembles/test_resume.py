@@ -23,7 +23,7 @@ from netkf.ensembles.pools import PoolOptions
 from netkf.runs import provenance
 from netkf.runs.documents import write_sealed
 from netkf.runs.files import write_scenario
-from netkf.runs.parquet_files import TraceTables
+from netkf.runs.parquet_files import ParquetSink
 from tests.conftest import SCENARIOS
 
 RUNS, OPTIONS = 12, EnsembleOptions(pool=PoolOptions(1))
@@ -346,8 +346,8 @@ def test_tables_that_are_stopped_leave_no_part(cut, made, monkeypatch, error):
         assert list(cut.glob("*.part"))
         raise error
 
-    add = TraceTables.add
-    monkeypatch.setattr(TraceTables, "add", stop)
+    add = ParquetSink.add
+    monkeypatch.setattr(ParquetSink, "add", stop)
     with pytest.raises((KeyboardInterrupt, OSError)):
         resume(cut)
     assert not list(cut.glob("*.part"))
