@@ -234,7 +234,6 @@ def _require_arguments(cls: type, own: FunctionType, contract: FunctionType) -> 
 
 
 def _watched(cls: type, own: FunctionType, contract: FunctionType) -> Any:
-    """Return a method that calls ``own`` and looks at what it returns."""
     returned = str(contract.__annotations__.get("return", "None"))
     is_optional = returned == "None" or returned.endswith("| None")
     pair = re.match(r"tuple\[(.*)\]$", returned)

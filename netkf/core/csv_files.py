@@ -220,7 +220,6 @@ class _Entries:
         return self._limited(column, value)
 
     def _with_point(self, text: str) -> str:
-        """Return a number with a decimal point for a decimal comma."""
         if self._separator == "," or ":" in text:
             return text
         for sign in ",.":
@@ -233,20 +232,17 @@ class _Entries:
         return text.replace(",", ".") if text.count(",") == 1 else text
 
     def _limited(self, column: int, value: float) -> float:
-        """Return ``value``; raises ScenarioError if it is larger than MAX_MAGNITUDE."""
         if abs(value) > MAX_MAGNITUDE:
             rule = f"must be at most {MAX_MAGNITUDE:g} in size"
             raise self._refusal(column, rule, "correct it, or choose other units")
         return value
 
     def _refusal(self, column: int, rule: str, remedy: str) -> ScenarioError:
-        """Return the error that the entry in the column with this index breaks a ``rule``."""
         where = f"{self._source.name} line {self._line}: {self._header[column]}"
         return ScenarioError("path", f"{where} {rule}", self._row[column], remedy)
 
 
 def _require_columns(source: SourceFile, sheet: _Sheet, required: tuple[str, ...]) -> None:
-    """Raise ScenarioError if the header lacks a required column; the remedy says why it may."""
     header = sheet.header
     missing = [name for name in required if name not in header]
     if not missing:
@@ -267,14 +263,12 @@ def _require_columns(source: SourceFile, sheet: _Sheet, required: tuple[str, ...
 
 
 def _words(text: str) -> list[str]:
-    """Return the words of a line, whatever separates them."""
     for sign in "#,;|:":
         text = text.replace(sign, " ")
     return text.split()
 
 
 def _is_number(text: str) -> bool:
-    """Return True if a text is a number."""
     try:
         float(text.replace(",", "."))
     except ValueError:
@@ -346,7 +340,6 @@ def read_content(source: SourceFile) -> bytes:
 
 @contextmanager
 def _open_table(source: SourceFile) -> Iterator[_Sheet]:
-    """Open a table for a block; raises ScenarioError if it cannot be read as one."""
     start = b""
     try:
         with source.full.open("rb") as packed:

@@ -130,7 +130,6 @@ class Component:
 
 
 def _check_settings(cls: type, values: Sequence[Any], named: Mapping[str, Any]) -> None:
-    """Raise ScenarioError for too many ``values`` without names, and unknown ``named`` ones."""
     fields = [f for f in dataclasses.fields(cls) if f.init]
     unnamed = [f.name for f in fields if not f.kw_only]
     listed = ", ".join(f"{f.name}=..." for f in fields)
@@ -144,7 +143,6 @@ def _check_settings(cls: type, values: Sequence[Any], named: Mapping[str, Any]) 
 
 
 def _are_equal(a: Any, b: Any) -> bool:
-    """Return True if two values of fields are equal, arrays and tuples entry by entry."""
     # Fast path: scenarios that are made from each other share most of their components.
     if a is b:
         return True
@@ -175,7 +173,6 @@ def number(
     ]
 
     def convert(value: Any) -> float:
-        """Return the value as a finite float within the limits."""
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise TypeError
         result = float(value)
@@ -203,7 +200,6 @@ MIN_SECONDS, MAX_SECONDS = 1e-9, 1e15
 
 
 def _convert_seconds(value: Any) -> float:
-    """Return a duration in seconds from MIN_SECONDS to MAX_SECONDS."""
     result: float = positive.convert(value)
     if not MIN_SECONDS <= result <= MAX_SECONDS:
         requirement = f"must be from {MIN_SECONDS:g} to {MAX_SECONDS:g} seconds"
@@ -218,7 +214,6 @@ def of_time(rule: Rule) -> Rule:
     """
 
     def convert(value: Any) -> Any:
-        """Return the value by the rule, a number as it is meant."""
         result = rule.convert(value)
         return as_written(result) if isinstance(result, float) else result
 
@@ -238,7 +233,6 @@ def integer(low: int | None = None, high: int | None = None) -> Rule:
     """Return the rule for an integer from ``low`` to ``high``; None means no limit."""
 
     def convert(value: Any) -> int:
-        """Return the value as an int within the limits."""
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
             raise TypeError
         if (low is not None and value < low) or (high is not None and value > high):
@@ -259,7 +253,6 @@ MAX_MAGNITUDE = 1e30
 
 
 def _require_bool(value: Any) -> bool:
-    """Return the value if it is a bool."""
     if not isinstance(value, bool):
         raise TypeError
     return value
@@ -274,14 +267,12 @@ boolean = Rule(
 
 
 def _require_line(value: Any) -> str:
-    """Return the value if it is printable text without line breaks."""
     if not isinstance(value, str) or not value.isprintable():
         raise TypeError
     return value
 
 
 def _require_text(value: Any) -> str:
-    """Return the value if it is one nonempty line of printable text."""
     if not _require_line(value):
         raise TypeError
     return str(value)
@@ -305,7 +296,6 @@ def instance_of(*classes: type) -> Rule:
     """Return the rule for an object of one of the classes."""
 
     def convert(value: Any) -> Any:
-        """Return the value if it is of one of the classes, else raise TypeError (see Rule)."""
         if not isinstance(value, classes):
             raise TypeError
         return value
@@ -318,7 +308,6 @@ def one_of(*names: str) -> Rule:
     """Return the rule for a text that is one of ``names``."""
 
     def convert(value: Any) -> str:
-        """Return the value if it is one of the names, else raise ValueError (see Rule)."""
         if value not in names:
             raise ValueError
         return str(value)
@@ -338,7 +327,6 @@ def either(first: Rule, second: Rule, is_second: Callable[[Any], bool]) -> Rule:
     """
 
     def convert(value: Any) -> Any:
-        """Return the value as converted by the rule that applies to it."""
         rule = second if is_second(value) else first
         try:
             return rule.convert(value)
@@ -376,7 +364,6 @@ def array(dimensions: int, name: str) -> Rule:
     """
 
     def convert(value: Any) -> FloatArray:
-        """Return the value as a read-only array of finite float64 numbers."""
         if isinstance(value, (str, bytes)) or _has_bool_or_text(value):
             raise TypeError
         result = readonly_array(value)
@@ -402,7 +389,6 @@ def array(dimensions: int, name: str) -> Rule:
 
 
 def _has_bool_or_text(value: Any) -> bool:
-    """Return True if a bool or a text is somewhere in nested lists."""
     # numpy would convert both True and "1" to 1.0.
     if isinstance(value, (list, tuple)):
         return any(map(_has_bool_or_text, value))
@@ -414,7 +400,6 @@ matrix = array(2, "matrix")
 
 
 def _convert_square(value: Any) -> FloatArray:
-    """Return the value as a square matrix (n, n)."""
     result = matrix.convert(value)
     if result.shape[0] != result.shape[1]:
         raise _SpecificError(f"must be a square matrix, not {result.shape[0]} x {result.shape[1]}")
@@ -427,7 +412,6 @@ square = Rule(
 
 
 def _convert_symmetric(value: Any) -> FloatArray:
-    """Return the value as a matrix (n, n) that is symmetric up to rounding."""
     result = _convert_square(value)
     if not np.allclose(result, result.T, rtol=1e-9, atol=1e-12 * np.abs(result).max()):
         raise _SpecificError("must be a symmetric matrix")
@@ -435,7 +419,6 @@ def _convert_symmetric(value: Any) -> FloatArray:
 
 
 def _convert_covariance(value: Any) -> FloatArray:
-    """Return the value as a symmetric positive semidefinite matrix (n, n)."""
     result = _convert_symmetric(value)
     if not is_semidefinite(result):
         smallest = np.linalg.eigvalsh(result)[0]
@@ -444,7 +427,6 @@ def _convert_covariance(value: Any) -> FloatArray:
 
 
 def _convert_definite_covariance(value: Any) -> FloatArray:
-    """Return the value as a symmetric positive definite matrix (n, n), not close to singular."""
     result = _convert_symmetric(value)
     eigenvalues = np.linalg.eigvalsh(result)
     smallest, largest = eigenvalues[0], eigenvalues[-1]
@@ -476,7 +458,6 @@ def list_of(rule: Rule, items: str, min_length: int = 1) -> Rule:
     """
 
     def convert(value: Any) -> tuple[Any, ...]:
-        """Return the items as a tuple, each converted by the rule."""
         if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
             raise TypeError
         if len(value) < min_length:
@@ -496,7 +477,6 @@ def tuple_of(*rules: Rule, description: str) -> Rule:
     """
 
     def convert(value: Any) -> tuple[Any, ...]:
-        """Return the items as a tuple, each converted by its own rule."""
         if not isinstance(value, (list, tuple, np.ndarray)) or len(value) != len(rules):
             raise TypeError
         return tuple(rules[k](f"[{k}]", item) for k, item in enumerate(value))
@@ -518,7 +498,6 @@ def node_id(low: int | None = None, high: int | None = None) -> Rule:
     ids = integer(low, high)
 
     def convert(value: Any) -> int | str:
-        """Return the id as an int, or the name; raise TypeError or ValueError for others."""
         if not isinstance(value, str):
             node: int = ids.convert(value)
             # Ids of nodes with names are integers of a class of their own.
@@ -558,7 +537,6 @@ class SourceFile:
 
 
 def _convert_source_file(value: Any) -> SourceFile:
-    """Return the value as an existing SourceFile inside its folder."""
     if isinstance(value, SourceFile):
         source = value
     elif isinstance(value, (str, Path)) and str(value):

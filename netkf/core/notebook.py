@@ -22,7 +22,6 @@ class NotebookTable:
         return getattr(self, "table", None)
 
     def _repr_html_(self) -> str:
-        """Return the HTML that notebooks display."""
         line = f"<p><code>{html.escape(one_line(repr(self)))}</code></p>"
         table, rows = self._notebook_table(), ""
         if table is not None:

@@ -60,7 +60,6 @@ def first_rows(
 
 
 def _printable(value: object) -> object:
-    """Return a value of a row for a message: a number without decimals as an integer."""
     if isinstance(value, (tuple, list)):
         return [_printable(item) for item in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -152,7 +152,6 @@ def probability_interval(successes: int, trials: int, level: float) -> Interval:
 
 
 def _binomial_shift(p: float, trials: int, level: float) -> float:
-    """Return the error of ``p`` that a binomial test finds with probability POWER."""
     # Of the rarer outcome: q rises where p > 1/2 falls.
     up = _binomial_rise(p, trials, level), _binomial_rise(1.0 - p, trials, level)
     possible = [shift for shift in up if math.isfinite(shift)]
@@ -273,7 +272,6 @@ def poisson_interval(total: float, mean: float, level: float) -> Interval:
 
 
 def _poisson_shift(mean: float, level: float) -> float:
-    """Return the relative error of a ``mean`` that Garwood's test finds with probability POWER."""
     # The least count that has at most the probability level / 2, and the largest such one.
     many = math.ceil(scipy.special.pdtrik(1.0 - 0.5 * level, mean)) + 1
     few = math.floor(scipy.special.pdtrik(0.5 * level, mean)) - 1

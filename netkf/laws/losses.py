@@ -143,7 +143,6 @@ def direction_label(link: tuple[int, int]) -> str:
 def _loss_interval(
     law: LossLaw, sent: np.ndarray, lost: np.ndarray, directions: np.ndarray, level: float
 ) -> Interval:
-    """Return an interval for the distance between the lost and the stated share of messages."""
     q, sent, lost = law.lost[directions], sent[:, directions], lost[:, directions]
     total, losses, runs = float(sent.sum()), lost.sum(axis=1), len(sent)
     excess = (lost - sent * q).sum(axis=1)
@@ -296,7 +295,6 @@ def correlation_of_runs(
 
 
 def _links_apart(law: LossLaw, counts: LossCounts, level: float) -> list[tuple[Interval, str]]:
-    """Return intervals for the largest and the mean correlation of losses of two links."""
     # One direction of a link stands for both, which may share their draws.
     direction_of_link: dict[tuple[int, int], int] = {}
     for k, (i, j) in enumerate(law.links):

@@ -106,7 +106,6 @@ def compare_variances(
         return NO_COMPARISON
 
     def distance(square: float, kurtosis: float, count: float, level_part: float) -> Interval:
-        """Return the interval of a variance relative to 1 from the sum of ``count`` squares."""
         # The relative variance of a sum of squares is (kurtosis - 1) / count, that of chi-square
         # with f degrees of freedom 2 / f: hence f = 2 count / (kurtosis - 1). A sample kurtosis
         # below 3 counts as 3, which widens the interval.
@@ -169,7 +168,6 @@ def compare_means(
 def _with_states(
     states: FloatArray, labels: Sequence[str], level: float
 ) -> list[tuple[Interval, str]]:
-    """Return labelled intervals for the correlations of noises with states."""
     counts, products = states.sum(axis=0)
     squares, runs = (states[:, 1] ** 2).sum(axis=0), (states[:, 0] > 0.0).sum(axis=0)
     comparable = np.argwhere((runs >= MIN_RUNS) & (squares > 0.0)).tolist()
@@ -213,7 +211,6 @@ def compare_with(
 
 
 def _compare_found(found: list[tuple[float, float, str]], level: float) -> Comparison:
-    """Return the comparison with 0 of (correlation, number of pairs, label)."""
     enough = [entry for entry in found if entry[1] >= MIN_COUNT]
     distances = [
         (deviation_interval(0.0, correlation_interval(value, count, level / len(enough))), label)

@@ -175,7 +175,6 @@ def _sum_of_uniforms(times: FloatArray, period: float, jitter: float) -> FloatAr
 
 
 def _distance_from_lattice(law: Lattice, ticks: TickSeries) -> float:
-    """Return the largest distance in seconds of one of K ticks from its allowed times."""
     ticks = TickSeries(*(column[np.isfinite(ticks.times)] for column in ticks))
     if not len(ticks.times):
         return 0.0

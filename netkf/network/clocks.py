@@ -95,7 +95,6 @@ _node_rate = tuple_of(node_id(), _rate, description="a pair [i, rate]")
 
 
 def _one_rate(value: Any) -> tuple[float, ...]:
-    """Return an entry of ``rates``: (node, rate) or (node, peer, rate)."""
     # Which of the two it must be depends on `at`; the clock checks that.
     single = isinstance(value, (list, tuple, np.ndarray)) and len(value) == 2
     rates: tuple[float, ...] = (_node_rate if single else _link_rate).convert(value)
@@ -139,11 +138,9 @@ class Poisson(LinkClock):
 
     @cached_property
     def _entity_rates(self) -> dict[Entity, float]:
-        """The rates per second of the entities that ``rates`` lists."""
         return {self._entity_of(entry): entry[-1] for entry in self.rates}
 
     def _entity_of(self, entry: tuple[float, ...]) -> Entity:
-        """Return the entity that an entry of ``rates`` names."""
         ids = tuple(int(number) for number in entry[:-1])
         return tuple(sorted(ids)) if self.at == "links" else ids
 

@@ -163,7 +163,6 @@ class Contacts(LinkClock):
         return np.array(ticks)
 
     def _next_number(self, origin: float, now: float) -> int:
-        """Return the number of the first tick after ``now``, counted from ``origin``."""
         clock = self.clock
         if now == 0.0:
             return 0

@@ -118,7 +118,6 @@ class EdgelistGraph(GraphFile):
 
 
 def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
-    """Return the links of a networkx graph, read from ``path``; raises ScenarioError."""
     ids = assign_ids(graph.nodes)
     twice = [name for name, count in Counter(map(str, ids)).items() if count > 1]
     if twice:
@@ -149,7 +148,6 @@ def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
 
 
 def _is_probability(value: Any) -> bool:
-    """Return True for a number from 0 to 1."""
     is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     return is_number and 0.0 <= float(value) <= 1.0
 
@@ -199,7 +197,6 @@ def as_graph(value: Any) -> Any:
 
 
 def _convert_graph(value: Any) -> Graph:
-    """Return a Graph, made from a graph of networkx if it is one; raises TypeError for others."""
     graph = as_graph(value)
     if not isinstance(graph, Graph):
         raise TypeError

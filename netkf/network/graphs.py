@@ -160,12 +160,10 @@ class Topology:
 
     @cached_property
     def _receivers(self) -> dict[int, tuple[int, ...]]:
-        """Nodes that hear each node, in the order of ids."""
         return self._ends(0)
 
     @cached_property
     def _senders(self) -> dict[int, tuple[int, ...]]:
-        """Nodes that each node hears, in the order of ids."""
         return self._ends(1)
 
     def _ends(self, end: int) -> dict[int, tuple[int, ...]]:
@@ -237,13 +235,11 @@ class Graph(Component):
 
 
 def _make_topology(nodes: Iterable[int], links: Iterable[Link], **more: Any) -> Topology:
-    """Return the topology of ``nodes`` with undirected ``links``, in any order of their ends."""
     pairs = {(min(link), max(link)) for link in links}
     return Topology(tuple(sorted(nodes)), tuple(sorted(pairs)), **more)
 
 
 def _from_networkx(graph: networkx.Graph[Any], **more: Any) -> Topology:
-    """Return the topology of an undirected networkx graph."""
     return _make_topology(graph.nodes, graph.edges, **more)
 
 
@@ -258,7 +254,6 @@ def _is_list(value: Any) -> bool:
 
 
 def _check_size(nodes: int, links: int) -> None:
-    """Raise ScenarioError for a number of ``nodes`` or ``links`` beyond the limits."""
     if nodes > MAX_NODES or links > MAX_LINKS:
         rule = f"must have at most {MAX_NODES:,} nodes and {MAX_LINKS:,} links"
         raise ScenarioError("", rule, f"{nodes:,} nodes, {links:,} links", "make it smaller")
@@ -342,7 +337,6 @@ class RandomGraph(Graph):
     def _draw(
         self, seed: int, make: Callable[[np.random.RandomState], networkx.Graph[Any]]
     ) -> networkx.Graph[Any]:
-        """Return the graph drawn with its own seed or ``seed``; raises ScenarioError."""
         import networkx
 
         first_seed, tries, entries = seed if self.seed is None else self.seed, 0, 0
@@ -384,7 +378,6 @@ class Regular(RandomGraph):
         _check_size(N, degree * N // 2)
 
         def make(state: np.random.RandomState) -> networkx.Graph[Any]:
-            """Return a random regular graph."""
             if 2 * degree < N:
                 sparse: networkx.Graph[Any] = networkx.random_regular_graph(degree, N, state)
                 return sparse
@@ -431,7 +424,6 @@ class Geometric(RandomGraph):
         _check_size(self.nodes, int(pairs * _probability_within(min(self.radius, 1.0))))
 
         def make(state: np.random.RandomState) -> networkx.Graph[Any]:
-            """Return a geometric graph of uniform points in the unit square."""
             points = {k: tuple(p) for k, p in enumerate(state.random_sample((self.nodes, 2)))}
             return networkx.random_geometric_graph(self.nodes, self.radius, pos=points)
 
@@ -491,7 +483,6 @@ class Edges(Graph):
         return self._topology(ids)
 
     def _topology(self, ids: dict[Any, int]) -> Topology:
-        """Return the topology of nodes with the ``ids``, by label."""
         links = [(ids[i], ids[j]) for i, j in self.edges]
         delivery = self._delivery(links)
         if not self.directed:
@@ -610,7 +601,6 @@ class LinkTable:
         )
 
     def _unknown_direction(self, one_way: list[Link]) -> ScenarioError:
-        """Return the error of pairs that are listed ``one_way`` where others are listed twice."""
         return ScenarioError(
             "path",
             f"{self.rows.path}: some links are listed in both directions and others in one, so "
@@ -621,7 +611,6 @@ class LinkTable:
         )
 
     def _label(self, node: int) -> str:
-        """Return the name of a node in the file."""
         return next((name for name, k in self.names.items() if k == node), str(node))
 
     def _with_reverse_links(self) -> dict[Link, float]:
@@ -670,7 +659,6 @@ class CsvGraph(Graph):
         return self._read().topology(self.minimum, self.positions)
 
     def _read(self) -> LinkTable:
-        """Return the links of the file; raises ScenarioError for wrong or contradictory rows."""
         columns = read_columns(self.path, ("sender", "receiver"), ("delivery_probability",))
         listed = list(zip(columns.integers("sender"), columns.integers("receiver"), strict=True))
         # Numbers below 0 stand for names.
@@ -719,7 +707,6 @@ def _place_nodes(
 
 
 def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]], list[int]]:
-    """Return the coordinates by node of a table, and its nodes; raises ScenarioError."""
     names = tuple(read_header(source)[:3])
     if len(names) < 3:
         rule = f"{source.name} must have the columns node, x, y"
@@ -732,7 +719,6 @@ def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]],
 
 
 def _isolated_note(nodes: Sequence[str], minimum: float) -> tuple[str, ...]:
-    """Return a note on ``nodes`` left out because no link reaches ``minimum``, or none."""
     if not nodes:
         return ()
     plural = "" if len(nodes) == 1 else "s"
@@ -740,13 +726,11 @@ def _isolated_note(nodes: Sequence[str], minimum: float) -> tuple[str, ...]:
 
 
 def _one_way_note(pairs: list[Link], label: Callable[[int], str]) -> tuple[str, ...]:
-    """Return a note on links that are left out because they are listed in one direction, if any."""
     if not pairs:
         return ()
     return (f"links listed in one direction only left out: {_list_directions(pairs, label)}",)
 
 
 def _list_directions(pairs: list[Link], label: Callable[[int], str], max_listed: int = 3) -> str:
-    """Return the first ``max_listed`` directions and the number of the others as text."""
     text = ", ".join(f"{label(i)} to {label(j)}" for i, j in pairs[:max_listed])
     return text if len(pairs) <= max_listed else f"{text} and {len(pairs) - max_listed} more"

@@ -135,7 +135,6 @@ class Matching(SlotActivation):
         return mean
 
     def _pairing_probabilities(self, topology: Topology) -> dict[Link, float]:
-        """Return the exact probability that each link is paired; raises ScenarioError."""
         links, degrees = topology.links, topology.degrees
         if self.protocol == "one-edge":
             return dict.fromkeys(links, (1.0 - (self.lazy or 0.0)) / max(len(links), 1))
@@ -179,7 +178,6 @@ def _random_greedy(topology: Topology, random: np.random.Generator) -> list[Link
 
 
 def _uniform_maximal(topology: Topology, random: np.random.Generator) -> list[Link]:
-    """Return one of all maximal matchings, each with equal probability."""
     matchings = maximal_matchings(topology.links)
     return list(matchings[int(random.integers(len(matchings)))])
 
@@ -204,7 +202,6 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
     matchings: set[tuple[Link, ...]] = set()
 
     def extend(chosen: tuple[Link, ...], free: tuple[Link, ...]) -> None:
-        """Add all maximal matchings of the ``chosen`` links and some ``free`` ones."""
         if not free:
             matchings.add(tuple(sorted(chosen)))
             return
@@ -219,7 +216,6 @@ def maximal_matchings(links: tuple[Link, ...]) -> tuple[tuple[Link, ...], ...]:
 
 
 def _greedy_probabilities(links: tuple[Link, ...]) -> tuple[float, ...]:
-    """Return the probability that each link is in the greedy matching in random order."""
     count = len(links)
     meets = [
         sum(1 << b for b in range(count) if set(links[a]) & set(links[b])) for a in range(count)
@@ -308,7 +304,6 @@ class RecordedSlots(SlotActivation):
         return {key: sorted(listed) for key, listed in pairs.items()}
 
     def _demand_free(self, slot: int, link: Link, line: int, listed: dict[Link, int]) -> None:
-        """Raise ScenarioError if a node of ``link`` is already paired in the slot."""
         other = next((line for pair, line in listed.items() if set(pair) & set(link)), None)
         if other is None and link[0] != link[1]:
             return

@@ -201,7 +201,6 @@ class RecordedDelay(Delay):
 
 
 def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
-    """Return the value of ``message`` on ``link`` in the table, or None; errors name ``key``."""
     # Asked for during a run, so the error must carry the whole path of its key.
     try:
         return table.value(link, message, after)

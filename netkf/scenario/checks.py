@@ -67,7 +67,6 @@ def check_scenario(scenario: DerivedScenario) -> None:
 
 
 def _check_times(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError for too many slots or samples, or for samples after the end."""
     probe, horizon = scenario.probe, scenario.horizon
     if scenario.slotted and horizon / scenario.slot_plant.period > MAX_STEPS:
         raise ScenarioError(
@@ -104,7 +103,6 @@ def _check_times(scenario: DerivedScenario) -> None:
 
 
 def _check_entries(scenario: DerivedScenario, samples: float) -> None:
-    """Raise ScenarioError if the covariances of all nodes at ``samples`` times are too large."""
     nodes, n = len(scenario.nodes), scenario.plant.n
     if samples * nodes * n * n > MAX_ENTRIES:
         raise ScenarioError(
@@ -116,7 +114,6 @@ def _check_entries(scenario: DerivedScenario, samples: float) -> None:
 
 
 def _check_plant(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the shapes of the plant's matrices do not fit."""
     plant, n = scenario.plant, scenario.plant.n
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
@@ -131,7 +128,6 @@ def _check_plant(scenario: DerivedScenario) -> None:
 
 
 def _check_sensors(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a sensor does not fit the state or names an unknown node."""
     n, index_of_node = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
@@ -162,7 +158,6 @@ def _check_sensors(scenario: DerivedScenario) -> None:
 
 
 def _check_speed(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the plant or a filter is too fast for the horizon."""
     delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.diffusion.A
     # A message with a fixed delay is predicted over the delay, which may exceed the horizon.
     longest = max(scenario.horizon, delay)
@@ -196,7 +191,6 @@ def _list_ids(nodes: tuple[int, ...]) -> str:
 
 
 def _check_network(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if graph, activation, channel and filter do not fit."""
     network, topology, node_filter = scenario.network, scenario.topology, scenario.node_filter
     for key, part in (
         ("network.activation", network.activation),
@@ -241,7 +235,6 @@ def _check_network(scenario: DerivedScenario) -> None:
 
 
 def _check_ticks(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the clock of a link, direction or node would tick too often."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     owner = clock.at.removesuffix("s")  # "link", "direction" or "node"
@@ -258,7 +251,6 @@ def _check_ticks(scenario: DerivedScenario) -> None:
 
 
 def _check_filter(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the filter's initial estimates, model or weights do not fit."""
     filtering, n = scenario.filter, scenario.plant.n
     why = f"the state has {n} components"
     for key, value, shape in (
@@ -303,7 +295,6 @@ def _check_filter(scenario: DerivedScenario) -> None:
 
 
 def _check_believed_noise(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the believed R has another shape than the readings."""
     R, sensors = scenario.filter.model.R, scenario.sensors
     if R is None:
         return
@@ -331,7 +322,6 @@ def _check_believed_noise(scenario: DerivedScenario) -> None:
 
 
 def _check_degrees(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a node has more links than the filter allows."""
     algorithm = scenario.filter.algorithm
     if not algorithm.timing.talks or not scenario.topology.links:
         return
@@ -346,7 +336,6 @@ def _check_degrees(scenario: DerivedScenario) -> None:
 
 
 def _check_sensing_period(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the step of increments is too short or too long."""
     period, horizon = scenario.diffusion.sensing_period, scenario.horizon
     assert period is not None
     if horizon / period > MAX_STEPS:
@@ -388,7 +377,6 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
 
 
 def _check_slots(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if state samples are off the slots."""
     plant, node_filter = scenario.slot_plant, scenario.node_filter
     times_off_slots = [
         t

@@ -75,7 +75,6 @@ def check_activation(scenario: DerivedScenario) -> None:
 
 
 def _reject_clock(at: str, clocks: tuple[str, ...], name: str) -> None:
-    """Raise ScenarioError: the filter ``name`` runs under ``clocks`` only, not ``at`` these."""
     settings = [f'at = "{clock}"' for clock in clocks if clock != "readings"]
     settings += ['kind = "readings"'] if "readings" in clocks else []
     key = "kind" if at == "readings" else "at"

@@ -79,7 +79,6 @@ class DerivedScenario(ScenarioModel):
         )
 
     def _slot_model(self, H_and_R: tuple[FloatArray, FloatArray]) -> SlotModel:
-        """Return the believed model in slots of a node with stacked H (p, n) and R (p, p)."""
         return SlotModel(*self.slot_belief, *H_and_R, self.slot_plant.period)
 
     @cached_property
@@ -295,7 +294,6 @@ class DerivedScenario(ScenarioModel):
     def _stack_entries(
         self, entries: tuple[int, ...], believed: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the stacked H (p, n) and block diagonal R (p, p) of ``[[sensors]]`` entries."""
         # Cached, because thousands of nodes may have the sensors of one [[sensors]] entry.
         if (entries, believed) not in self._stacks:
             H = [self.sensors[entry].matrix_of(self.plant.n) for entry in entries]
@@ -306,7 +304,6 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _stacks(self) -> dict[tuple[tuple[int, ...], bool], tuple[FloatArray, FloatArray]]:
-        """Cache of stacked H (p, n) and R (p, p) by entries and by whether R is believed."""
         return {}
 
     def sample_times(self, streams: Streams) -> dict[tuple[int, int], FloatArray]:
@@ -374,14 +371,12 @@ class DerivedScenario(ScenarioModel):
 
     @property
     def _pooled_sensors(self) -> tuple[PlacedSensor, ...]:
-        """The sensors of all nodes, those of one node after those of another."""
         sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
         return tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
 
     def _model(
         self, H_and_R: tuple[FloatArray, FloatArray], models: dict[bytes, FlowModel]
     ) -> FlowModel:
-        """Return the believed model of a node with stacked H (p, n), R (p, p), from ``models``."""
         H, R = H_and_R
         key = b"".join((H.tobytes(), b"|", R.tobytes()))
         if key not in models:
@@ -447,7 +442,6 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _effective_rates(self) -> dict[Link, float]:
-        """Cache of ``effective_rates``: rate of sending times probability of delivery."""
         clock, loss = self.network.activation, self.network.channel.loss
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.timing.talks:
             return {}
@@ -458,7 +452,6 @@ class DerivedScenario(ScenarioModel):
         }
 
     def _send_rate(self, clock: LinkClock, direction: Link) -> float:
-        """Return the mean rate of messages sent on a directed link, per second."""
         sender, receiver = direction
         if clock.at == "readings":
             return sample_rate(self, sender)

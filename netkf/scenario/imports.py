@@ -104,13 +104,11 @@ def offered_kinds(cls: type | None = None) -> list[str]:
 
 @lru_cache(maxsize=8)
 def _offers(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Return the entry points of the group PARTS of the packages on an import path."""
     with _replace_import_path(list(path)):
         return tuple(entry_points(group=PARTS))
 
 
 def _loaded_class(entry: EntryPoint) -> Any:
-    """Return what an entry point names, None if that is not loaded."""
     try:
         return attrgetter(entry.attr)(sys.modules[entry.module])
     # Not loaded, or no "package.module:Class"; importlib_metadata, where loaded, has a ValueError.
@@ -129,7 +127,6 @@ def _is_loaded_from_elsewhere(entry: EntryPoint, path: list[str]) -> bool:
 
 
 def _load(kind: str, load: Callable[[], Any], path: list[str]) -> Any:
-    """Return ``load()``, which imports from ``path``; its errors are those of the key ``kind``."""
     with _replace_import_path(path):
         try:
             return load()
@@ -139,7 +136,6 @@ def _load(kind: str, load: Callable[[], Any], path: list[str]) -> Any:
 
 @contextmanager
 def _replace_import_path(entries: list[str]) -> Iterator[None]:
-    """Set ``sys.path`` to ``entries`` in a block; entries that modules add meanwhile stay."""
     before = list(sys.path)
     sys.path[:] = entries
     try:
@@ -149,7 +145,6 @@ def _replace_import_path(entries: list[str]) -> Iterator[None]:
 
 
 def _import_error(kind: str, error: BaseException) -> ScenarioError:
-    """Return the error for a class "package.module:Class" that could not be imported."""
     if isinstance(error, ContractError):
         return ScenarioError("kind", str(error), kind, "write what the contract asks for")
     rule = f"could not be imported ({type(error).__name__}: {quote(str(error), 300)})"
@@ -198,7 +193,6 @@ def _installed_path(folder: Path) -> list[str]:
 
 
 def _package_folders() -> list[Path]:
-    """Return the folders in which Python installs packages."""
     paths = sysconfig.get_paths()
     folders = {paths["purelib"], paths["platlib"], *site.getsitepackages()}
     if site.ENABLE_USER_SITE:

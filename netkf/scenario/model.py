@@ -167,7 +167,6 @@ class ScenarioModel(Component):
         self._put_on_grid()
 
     def _put_on_grid(self) -> None:
-        """Take horizon and probe times from the grid, and give it to the parts that need it."""
         grid = self.time_grid
         network, filtering = self.network, self.filter
         if isinstance(network.activation, OnGrid):

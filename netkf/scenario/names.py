@@ -50,7 +50,6 @@ def bind_names(value: Any, names: Names | None) -> Any:
 
 
 def _bind_at(key: str, value: Any, names: Names | None) -> Any:
-    """Return ``bind_names(value, names)``; put ``key`` before the keys of its errors."""
     try:
         return bind_names(value, names)
     except ScenarioError as error:
@@ -59,7 +58,6 @@ def _bind_at(key: str, value: Any, names: Names | None) -> Any:
 
 
 def _bind_field(key: str, value: Any, names: Names | None) -> Any:
-    """Return the value of a field of nodes, such as a list of them, with ids for names."""
     if isinstance(value, tuple):
         items = tuple(_bind_field(f"{key}[{k}]", item, names) for k, item in enumerate(value))
         return value if all(a is b for a, b in zip(items, value, strict=True)) else items

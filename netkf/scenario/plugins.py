@@ -164,7 +164,6 @@ def _frames_of(error: BaseException) -> Iterator[tuple[FrameType, int]]:
 
 
 def _name_of(cls: type) -> str:
-    """Return "module:Class", as scenario files name a class."""
     return f"{cls.__module__}:{cls.__qualname__}"
 
 

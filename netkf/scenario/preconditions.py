@@ -46,7 +46,6 @@ def check_preconditions(scenario: DerivedScenario) -> None:
 
 
 def _check_increments(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a filter over a diffusion can use samples only, and has others."""
     name = filter_name(scenario)
     for k, sensor in enumerate(scenario.sensors):
         if scenario.node_filter.needs.samples and not takes_samples(sensor):
@@ -59,7 +58,6 @@ def _check_increments(scenario: DerivedScenario) -> None:
 
 
 def _check_fixed_sensors(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if the H or the R of a sensor varies from reading to reading."""
     for k, sensor in enumerate(scenario.sensors):
         if sensor.varying:
             irregular = sensor.linear and sensor.record is not None
@@ -74,7 +72,6 @@ def _check_fixed_sensors(scenario: DerivedScenario) -> None:
 
 
 def _check_every_reading(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a recorded sensor has no row, or a part of one."""
     nowhere = np.full(scenario.plant.n, np.nan)
     for node, placed_sensors in scenario.placed_sensors.items():
         for placed in placed_sensors:
@@ -96,7 +93,6 @@ def _check_every_reading(scenario: DerivedScenario) -> None:
 
 
 def _check_common_start(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError unless all nodes start with the same mean and the same covariance."""
     starts = [scenario.initial_estimate(node) for node in scenario.nodes]
     for k, key in enumerate(("mean", "cov")):
         different = next(
@@ -113,7 +109,6 @@ def _check_common_start(scenario: DerivedScenario) -> None:
 
 
 def _check_invertible(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if a filter's covariance P may be singular."""
     n = scenario.plant.n
     initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
     singular = next((node for node, P in initial.items() if not bool(is_definite(P))), None)
@@ -140,7 +135,6 @@ def _check_invertible(scenario: DerivedScenario) -> None:
 
 
 def _check_ways(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError unless messages can get from every node to every other one."""
     topology, N = scenario.topology, len(scenario.nodes)
     pairs = np.array([[topology.index[end] for end in way] for way in topology.directions])
     rows, columns = pairs.reshape(-1, 2).T
@@ -163,7 +157,6 @@ def _check_ways(scenario: DerivedScenario) -> None:
 
 
 def _check_heard(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if no node hears one that has a sensor."""
     heard = {sender for sender, _ in scenario.topology.directions}
     for k, sensor in enumerate(scenario.sensors):
         for node in sensor.nodes:

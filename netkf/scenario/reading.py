@@ -62,7 +62,6 @@ def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Sc
 
 
 def _parse_file(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file; raises ScenarioError if it cannot be read."""
     try:
         return parse_toml(_read_text(path))
     except UnicodeDecodeError:
@@ -81,7 +80,6 @@ def _parse_file(path: Path) -> dict[str, Any]:
 
 
 def _read_text(path: Path) -> str:
-    """Return the text of a file; raises ScenarioError if it has more than MAX_BYTES."""
     # Read piece by piece: the size of a device such as /dev/zero is known only by reading it.
     content = b""
     with path.open("rb") as file:
@@ -132,7 +130,6 @@ def _extract_array(line: str, arrays: dict[str, Any], prefix: str) -> str:
 
 
 def _insert_arrays(value: Any, arrays: dict[str, Any]) -> Any:
-    """Return a TOML value with ``arrays`` in place of their placeholders."""
     if not arrays:
         return value
     if isinstance(value, dict):

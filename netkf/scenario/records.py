@@ -40,7 +40,6 @@ def check_records(scenario: DerivedScenario) -> None:
 
 
 def _check_under(key: str, check: Callable[[], object]) -> None:
-    """Call ``check``; put ``key`` before the keys of ScenarioErrors that it raises."""
     try:
         check()
     except ScenarioError as error:
@@ -48,7 +47,6 @@ def _check_under(key: str, check: Callable[[], object]) -> None:
 
 
 def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
-    """Raise ScenarioError if recorded readings do not fit the nodes of the graph, or the slots."""
     record = sensor.record
     assert record is not None
     # Anchors at given positions need not be nodes.
@@ -86,7 +84,6 @@ def sensed_slots(scenario: DerivedScenario) -> range:
 
 
 def _check_exchanges(scenario: DerivedScenario) -> None:
-    """Raise ScenarioError if recorded broadcasts name an exchange that the filter does not have."""
     activation, node_filter = scenario.network.activation, scenario.node_filter
     if not isinstance(activation, RecordedSlots) or activation.matching:
         return

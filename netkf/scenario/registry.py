@@ -200,7 +200,6 @@ def find_kind(
 
 
 def _choose_name(choices: Mapping[str, Mapping[str, str]], table: Mapping[str, Any]) -> str:
-    """Return the first name in ``choices`` whose keys and values are all in ``table``."""
     for name, choice in choices.items():
         if all(table.get(key) == value for key, value in choice.items()):
             return name
@@ -213,7 +212,6 @@ def _choose_name(choices: Mapping[str, Mapping[str, str]], table: Mapping[str, A
 
 
 def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
-    """Return the class ``cls`` that ``kind`` names, or None if it is None: not imported yet."""
     if cls is None:
         return None
     base = FAMILIES[family]

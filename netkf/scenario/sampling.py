@@ -52,7 +52,6 @@ def sample_path(
 
 
 def _iterate_sampled_sensors(scenario: ScenarioModel) -> Iterator[tuple[int, PlacedSensor]]:
-    """Yield (node, sensor) for each sensor that takes samples."""
     for node, placed_sensors in scenario.sampled_sensors.items():
         for placed_sensor in placed_sensors:
             yield node, placed_sensor
@@ -61,7 +60,6 @@ def _iterate_sampled_sensors(scenario: ScenarioModel) -> Iterator[tuple[int, Pla
 def _make_generator(
     streams: Streams, node: int, placed_sensor: PlacedSensor
 ) -> Callable[[str], np.random.Generator]:
-    """Return a function from a purpose to the random generator of one sensor of ``node``."""
     return lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
 
 
@@ -142,7 +140,6 @@ def check_sampling(scenario: ScenarioModel) -> None:
 
 
 def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:
-    """Raise ScenarioError if a sensor's sampling clock does not fit it, the plant or the graph."""
     clock = sensor.sampling
     assert clock is not None
     if scenario.slotted:

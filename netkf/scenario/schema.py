@@ -124,7 +124,6 @@ def list_keys(cls: type[Component]) -> list[TableKey]:
 
 
 def _nested_table_schema(cls: type[Component], key: str) -> Schema | None:
-    """Return the schema of a key of ``cls`` whose value is a component's table, else None."""
     if key == "sampling":
         return SAMPLING
     for (owner, name), schema in NESTED_TABLES.items():
@@ -136,7 +135,6 @@ def _nested_table_schema(cls: type[Component], key: str) -> Schema | None:
 def _table_schema(
     keys: Sequence[TableKey], constants: Mapping[str, Schema] = MappingProxyType({})
 ) -> Schema:
-    """Return the schema of a table with these keys and no others."""
     return {
         "type": "object",
         "properties": {**constants, **{key.name: _value_schema(key) for key in keys}},
@@ -146,7 +144,6 @@ def _table_schema(
 
 
 def _value_schema(key: TableKey) -> Schema:
-    """Return the schema of the value of a key, with its description and its default."""
     has_rule = key.rule and key.rule != "a table"
     sentences = [key.description, f"Must be {key.rule}." if has_rule else ""]
     schema = dict(key.schema)
@@ -158,7 +155,6 @@ def _value_schema(key: TableKey) -> Schema:
 
 
 def _family_schema(name: str, families: Sequence[str]) -> Schema:
-    """Return the schema of a table whose ``kind`` decides which keys it has."""
     shared_keys: list[TableKey] = []
     if name == "filter":  # the table also has the initial estimate and the model
         shared_keys = [key for key in list_keys(Filtering) if key.name != "algorithm"]
@@ -191,12 +187,10 @@ def _time_model_rules() -> list[Schema]:
     recorded = {"enum": ["recorded", "unknown"]}
 
     def plant_schema(kind: Schema, *keys: str) -> Schema:
-        """Return the schema of scenarios whose plant is of this kind and has these keys."""
         plant = {"properties": {"kind": kind}, "required": ["kind", *keys]}
         return {"properties": {"plant": plant}, "required": ["plant"]}
 
     def limit_kinds(activations: Sequence[str], filters: Sequence[str]) -> Schema:
-        """Return the schema of scenarios whose activation and filter are of these kinds."""
         activation = {"activation": _component_schema(activations)}
         network = {"type": "object", "properties": activation}
         return {"properties": {"network": network, "filter": _component_schema(filters)}}
@@ -215,13 +209,11 @@ def _time_model_rules() -> list[Schema]:
 
 
 def _component_schema(kinds: Sequence[str]) -> Schema:
-    """Return the schema of a table whose kind is one of these or a user's class."""
     kind = {"anyOf": [{"enum": [*kinds]}, {"type": "string", "pattern": _user_kinds()}]}
     return {"type": "object", "properties": {"kind": kind}}
 
 
 def _user_kinds() -> str:
-    """Return the pattern of users' classes and of the kinds that installed packages offer."""
     offered = (f"^{re.escape(kind)}$".replace("\\-", "-") for kind in offered_kinds())
     return "|".join([USER_CLASS, *offered])
 

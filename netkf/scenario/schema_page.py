@@ -43,7 +43,6 @@ def schema_page() -> str:
 
 
 def _iterate_page_lines() -> Iterator[str]:
-    """Yield the lines of the page."""
     yield "# Keys of scenario files"
     yield ""
     yield "`netkf schema --markdown` prints this page. Keys whose default is a dash must be given."
@@ -63,7 +62,6 @@ def _iterate_page_lines() -> Iterator[str]:
 
 
 def _iterate_table_lines(keys: Sequence[TableKey]) -> Iterator[str]:
-    """Yield the lines of a Markdown table with one row per key."""
     yield "| key | value | default | |"
     yield "|---|---|---|---|"
     for key in keys:

@@ -36,7 +36,6 @@ LATE = 100.0  # seconds; records that begin earlier need no note
 
 
 def _convert_origin(value: Any) -> int | float | str:
-    """Return an origin as a number or a text that is a number or an ISO 8601 time."""
     if isinstance(value, bool):
         raise TypeError
     if isinstance(value, datetime.datetime | datetime.date):
@@ -54,7 +53,6 @@ def _convert_origin(value: Any) -> int | float | str:
 
 
 def _origin_seconds(value: int | float | str) -> Decimal:
-    """Return an origin in seconds, as written; raises ValueError if it is no time."""
     text = value if isinstance(value, str) else repr(value)
     return TimeBase().exact(text)
 
@@ -68,7 +66,6 @@ _origin = Rule(
 
 
 def _convert_resolution(value: Any) -> float:
-    """Return a resolution, a power of ten within the limits of grids."""
     seconds: float = positive.convert(value)
     exponent = round(math.log10(seconds))
     if seconds != float(f"1e{exponent}") or not FINEST <= exponent <= COARSEST:
@@ -128,7 +125,6 @@ def restamp(value: Any, stamps: TimeBase) -> Any:
 
 
 def _restamp_at(key: str, value: Any, stamps: TimeBase) -> Any:
-    """Return ``restamp(value, stamps)``; put ``key`` before the keys of its errors."""
     try:
         return restamp(value, stamps)
     except ScenarioError as error:
@@ -153,7 +149,6 @@ def stamp_notes(scenario: Any) -> tuple[str, ...]:
 
 
 def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
-    """Yield the times (K,) in seconds of the rows of each recorded table of a scenario."""
     for sensor in scenario.sensors:
         if sensor.record is not None:
             yield sensor.record.columns["t"]

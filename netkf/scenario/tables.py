@@ -98,7 +98,6 @@ def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str,
 
 
 def _set_key(target: Any, keys: list[str], value: Any, path: str) -> Any:
-    """Return a copy of ``target`` with one inner value, where ``keys`` lead, replaced or added."""
     if not keys:
         return value
     if isinstance(target, Component):
@@ -138,7 +137,6 @@ def build_scenario(cls: type[S], table: Mapping[str, Any], origin: Origin) -> S:
 
 
 def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
-    """Return a scenario of class ``cls`` from the tables of a file."""
     values = dict(table)
     version = values.pop("format", None)
     if version is None:
@@ -170,7 +168,6 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
 
 
 def _call_under(key: str, builder: Callable[[Any], Any], value: Any) -> Any:
-    """Return ``builder(value)``; put ``key`` before the keys of ScenarioErrors that it raises."""
     try:
         return builder(value)
     except ScenarioError as error:
@@ -180,7 +177,6 @@ def _call_under(key: str, builder: Callable[[Any], Any], value: Any) -> Any:
 def _build_object(
     cls: type[Any], values: dict[str, Any], origin: Origin, other_keys: tuple[str, ...] = ()
 ) -> Any:
-    """Return an object of class ``cls`` with fields ``values``."""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     _check_keys(fields, values, other_keys)
     rules = {name: fields[name].metadata.get("rule") for name in values}
@@ -204,7 +200,6 @@ def _build_object(
 def _check_keys(
     fields: dict[str, dataclasses.Field[Any]], values: dict[str, Any], other_keys: tuple[str, ...]
 ) -> None:
-    """Raise ScenarioError for a key of ``values`` that is not in ``fields`` (by name)."""
     for key, value in values.items():
         if key not in fields:
             allowed_keys = [*other_keys, *fields]
@@ -224,7 +219,6 @@ def _has_missing_class(value: Any) -> bool:
 
 
 def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
-    """Return ``cls(**values)``; errors in users' classes are raised as ScenarioError."""
     try:
         return cls(**values)
     except ScenarioError:
@@ -242,7 +236,6 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _build_plant(origin: Origin, value: Any) -> Any:
-    """Return the plant of a table, or NOT_IMPORTED if its class must not be imported yet."""
     table = _as_dict(value)
     # Two kinds exist for both models of time; the keys tell which one is meant.
     in_both_times = table.get("kind") in ("recorded", "unknown")
@@ -257,7 +250,6 @@ def _build_component(
     default_kind: str | None = None,
     is_inner: bool = False,
 ) -> Any:
-    """Return the component of a table with the key ``kind``."""
     table = _as_dict(value)
     kind = table.pop("kind", default_kind)
     if kind is None:
@@ -278,7 +270,6 @@ def _build_component(
 
 
 def _as_dict(value: Any) -> dict[str, Any]:
-    """Return a table or component as a new dictionary; raises ScenarioError for other values."""
     if isinstance(value, Component):
         return part_as_table(value)
     if not isinstance(value, Mapping):
@@ -287,7 +278,6 @@ def _as_dict(value: Any) -> dict[str, Any]:
 
 
 def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
-    """Return the sensors of a list of tables."""
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
     builder = partial(_build_sensor, origin)
@@ -295,7 +285,6 @@ def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
 
 
 def _build_sensor(origin: Origin, value: Any) -> Any:
-    """Return the sensor of a table with its sampling clock."""
     table = _as_dict(value)
     if isinstance(table.get("sampling"), (Mapping, Component)):
         builder = partial(_build_component, "sampling", origin)
@@ -304,7 +293,6 @@ def _build_sensor(origin: Origin, value: Any) -> Any:
 
 
 def _build_network(origin: Origin, time: str, value: Any) -> Any:
-    """Return the network of a table, or NOT_IMPORTED if a class in it must not be imported yet."""
     table = _as_dict(value)
     builders: dict[str, Callable[[Any], Any]] = {
         "graph": lambda graph: _build_component("graph", origin, as_graph(graph)),
@@ -318,7 +306,6 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
 
 
 def _build_activation(origin: Origin, time: str, value: Any) -> Any:
-    """Return the activation of a table, or NOT_IMPORTED if its class must not be imported yet."""
     if time == "unknown":
         # Build it if its kind exists for one model of time only.
         kind = _as_dict(value).get("kind")
@@ -338,7 +325,6 @@ def _build_activation(origin: Origin, time: str, value: Any) -> Any:
 
 
 def _build_channel(origin: Origin, value: Any) -> Any:
-    """Return the channel of a table."""
     table = _as_dict(value)
     for family in ("loss", "delay"):
         if family in table:
@@ -348,7 +334,6 @@ def _build_channel(origin: Origin, value: Any) -> Any:
 
 
 def _build_filtering(origin: Origin, value: Any) -> Any:
-    """Return the filter of a table with its initial estimate and model."""
     table = _as_dict(value)
     values = {key: table.pop(key) for key in FILTERING_KEYS if key in table}
     if "model" in values:

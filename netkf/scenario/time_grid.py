@@ -43,7 +43,6 @@ def choose_grid(scenario: Any) -> TimeGrid:
 
 
 def _choose_automatically(scenario: Any) -> TimeGrid:
-    """Return the grid without ``[time] resolution``."""
     refine, horizon = scenario.time.refine or 1, Fraction(scenario.horizon)
     # Not of probes, which no instant depends on, nor of the horizon: what is recorded, and for how
     # long, must not change a run.
@@ -70,7 +69,6 @@ def _odd_part(constant: TimeConstant) -> int:
 
 
 def _time_constants(scenario: Any) -> Iterator[TimeConstant]:
-    """Yield the times that instants of a scenario are made of."""
     yield _constant("horizon", scenario.horizon)
     probe = scenario.probe
     listed = probe[:LISTED].tolist() if isinstance(probe, np.ndarray) else [probe]
@@ -90,12 +88,10 @@ def _time_constants(scenario: Any) -> Iterator[TimeConstant]:
 
 
 def _constant(key: str, seconds: float) -> TimeConstant:
-    """Return a time in the fields of a scenario."""
     return TimeConstant(key, seconds, as_fraction(seconds) if math.isfinite(seconds) else None)
 
 
 def _times_of(key: str, part: Any) -> Iterator[TimeConstant]:
-    """Yield the times in the fields of a component and of the components inside it."""
     if not isinstance(part, Component):
         return
     for field in dataclasses.fields(part):
@@ -110,7 +106,6 @@ def _times_of(key: str, part: Any) -> Iterator[TimeConstant]:
 
 
 def _step_lengths(scenario: Any) -> Iterator[TimeConstant]:
-    """Yield the length of a step of each exchange of a slot."""
     activation, node_filter = scenario.network.activation, scenario.node_filter
     if not (
         scenario.slotted and isinstance(activation, SlotActivation) and node_filter.timing.talks
@@ -216,7 +211,6 @@ def grid_notes(scenario: Any) -> tuple[str, ...]:
 
 
 def _short_times(scenario: Any) -> Iterator[tuple[str, float]]:
-    """Yield the times of a scenario, also mean gaps of clocks and time constants, by name."""
     yield from ((key, value) for key, value, _ in _time_constants(scenario) if value > 0.0)
     clocks = [getattr(sensor, "sampling", None) for sensor in scenario.sensors]
     for clock in (scenario.network.activation, *clocks):

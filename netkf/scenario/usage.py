@@ -136,7 +136,6 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
 
 
 def _make_use(use: RowUse) -> Use:
-    """Return the numbers of rows of one table by their names in summary.json."""
     counts: Use = {"path": use.path, "rows": use.rows}
     if use.merged:
         counts |= {"used": use.used, "merged": use.merged}
@@ -144,7 +143,6 @@ def _make_use(use: RowUse) -> Use:
 
 
 def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
-    """Return the use of the table of a recorded activation, None for other activations."""
     activation, talks = scenario.network.activation, scenario.filter.algorithm.timing.talks
     if isinstance(activation, RecordedClock):
         end = scenario.horizon if talks else 0.0
@@ -159,7 +157,6 @@ def _find_activation_use(scenario: DerivedScenario) -> RowUse | None:
 
 
 def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:
-    """Return the uses of tables of sampling times and of readings, by key path."""
     nodes: dict[tuple[str, Any], set[int]] = {}
     components: dict[tuple[str, Any], tuple[str, RecordedSampling | ReadingTable]] = {}
     for k, sensor in enumerate(scenario.sensors):
@@ -182,7 +179,6 @@ def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:
 def _find_row_use(
     scenario: DerivedScenario, component: RecordedSampling | ReadingTable, nodes: set[int]
 ) -> RowUse:
-    """Return the use of a table of sampling times or readings by the sensors of ``nodes``."""
     rows, horizon = component.row_times, scenario.horizon
     # Rows of a sampling that tell a node twice to sample at one time are one sample; readings are
     # told apart by their row.

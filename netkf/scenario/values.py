@@ -63,14 +63,12 @@ def parse_values(option: str, key: str, text: str) -> list[Any]:
 
 
 def _require_short(option: str, text: str) -> None:
-    """Raise ScenarioError at ``option`` for a text of more than MAX_SETTING characters."""
     if len(text) > MAX_SETTING:
         rule = f"must have at most {MAX_SETTING:,} characters"
         raise ScenarioError(option, rule, len(text), "write long values into the file")
 
 
 def _parse_toml_value(text: str) -> Any:
-    """Return the value of a TOML expression; raises ValueError or RecursionError if invalid."""
     table = parse_toml(f"value = {text}")
     if list(table) != ["value"]:  # the text has a line break and further keys
         raise ValueError

@@ -38,7 +38,6 @@ class _Style(NamedTuple):
 
 
 def _style_of(scenario: DerivedScenario, with_defaults: bool = False) -> _Style:
-    """Return the style of the tables of a scenario, with the names of its nodes."""
     names = scenario.topology.names
     return _Style(with_defaults, {node: name for name, node in names.items()})
 
@@ -78,7 +77,6 @@ def _scenario_table(
     filtering: Filtering,
     style: _Style,
 ) -> dict[str, Any]:
-    """Return the tables of a scenario file, with these components instead of the scenario's own."""
     table = _field_values(scenario, style)
     table.pop("time", None)
     # A run's own copy says its grid.
@@ -116,7 +114,6 @@ def part_as_table(part: Component) -> dict[str, Any]:
 
 
 def _network_table(network: Network, style: _Style) -> dict[str, Any]:
-    """Return the table ``network``."""
     table = {"graph": _kind_table("graph", network.graph, style)}
     if network.activation is not None:
         table["activation"] = _kind_table("activation", network.activation, style)
@@ -124,7 +121,6 @@ def _network_table(network: Network, style: _Style) -> dict[str, Any]:
 
 
 def _channel_table(channel: Channel, style: _Style) -> dict[str, Any]:
-    """Return the table ``network.channel``; all of its own keys are written."""
     table = _field_values(channel, style._replace(with_defaults=True))
     table["loss"] = _kind_table("loss", channel.loss, style)
     table["delay"] = _kind_table("delay", channel.delay, style)
@@ -132,7 +128,6 @@ def _channel_table(channel: Channel, style: _Style) -> dict[str, Any]:
 
 
 def _sensor_table(sensor: Sensor, style: _Style) -> dict[str, Any]:
-    """Return the table of a sensor with its sampling clock."""
     table = _kind_table("sensor", sensor, style)
     clock = getattr(sensor, "sampling", None)
     if clock is not None:
@@ -143,7 +138,6 @@ def _sensor_table(sensor: Sensor, style: _Style) -> dict[str, Any]:
 
 
 def _filter_table(filtering: Filtering, style: _Style) -> dict[str, Any]:
-    """Return the table ``filter``: the algorithm's keys, the initial estimate and the model."""
     table = _kind_table("filter", filtering.algorithm, style)
     for name, value in _field_values(filtering, style).items():
         if name in ("mean", "cov"):
@@ -153,13 +147,11 @@ def _filter_table(filtering: Filtering, style: _Style) -> dict[str, Any]:
 
 
 def _kind_table(family: str, part: Component, style: _Style) -> dict[str, Any]:
-    """Return the table of a component of a family of registry.KINDS, with its key ``kind``."""
     kind, choice = split_choice(name_of(family, part))
     return {"kind": kind, **choice, **_field_values(part, style)}
 
 
 def _field_values(part: Component, style: _Style) -> dict[str, Any]:
-    """Return the fields of a component as TOML values by name."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(part):
         if not field.init:
@@ -177,7 +169,6 @@ def _field_values(part: Component, style: _Style) -> dict[str, Any]:
 
 
 def _toml_value(value: Any, style: _Style) -> Any:
-    """Return the value of a field with lists for arrays and tuples, and tables for filters."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, tuple):
@@ -207,12 +198,10 @@ def to_toml(table: dict[str, Any]) -> str:
 
 
 def _key_lines(table: dict[str, Any]) -> list[str]:
-    """Return the lines ``key = value`` of a table."""
     return [f"{key} = {toml_text(value)}" for key, value in table.items()]
 
 
 def _is_section(value: Any) -> bool:
-    """Return True if a value is a table or a list of tables, which is not empty."""
     if isinstance(value, list):
         return bool(value) and all(isinstance(item, dict) for item in value)
     return isinstance(value, dict)

@@ -109,7 +109,6 @@ def table_entries(topology: Topology) -> dict[Link, float]:
 
 
 def _check_pure(watched: WatchedPart, links: dict[Link, float]) -> None:
-    """Check that delivery probabilities do not depend on earlier calls."""
     calls = [
         (link, message, bad, table_probability)
         for link, table_probability in links.items()
@@ -132,7 +131,6 @@ def _check_pure(watched: WatchedPart, links: dict[Link, float]) -> None:
 
 
 def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    """Check that links with equal entries in the table have equal probabilities."""
     part = watched.part
     ancestors = type(part).__mro__
     mean_owner, probability_owner = (
@@ -158,7 +156,6 @@ def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> Non
 def _check_delivery_probabilities(
     watched: WatchedPart, link: Link, table_probability: float
 ) -> None:
-    """Check that the delivery probabilities of a link are from 0 to 1 in both states."""
     part, where = watched.part, f"{watched.name}.delivery_probability"
     for bad in (False, True):
         for message in (0, 1, 2, 1000):
@@ -180,7 +177,6 @@ def _check_delivery_probabilities(
 
 
 def _check_channel_state(watched: WatchedPart) -> None:
-    """Check that ``next_state`` is a bool, and that each call makes the same draws."""
     part, where = watched.part, f"{watched.name}.next_state"
     histories: list[list[Any]] = []
     for _ in range(2):
@@ -207,7 +203,6 @@ def _check_channel_state(watched: WatchedPart) -> None:
 
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
-    """Check simulated outcomes against ``mean_delivery``, ``independent`` and the stated chain."""
     part, where = watched.part, f"{watched.name}.mean_delivery"
     stated = np.array([part.mean_delivery(link, p) for link, p in links.items()])
     if np.isnan(stated).all() and not part.independent:
@@ -237,7 +232,6 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
 
 
 def _loss_law(part: Loss, links: tuple[Link, ...], lost: FloatArray) -> LossLaw:
-    """Return what a loss states on directed ``links`` that have streams of their own."""
     opposite = np.full(len(links), -1)
     chain = stated_law(part, "loss")
     return LossLaw(
@@ -262,12 +256,10 @@ def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndar
 
 
 def _make_generator(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
-    """Return the random generator for a purpose of a directed link."""
     return streams.generator(purpose, *link)
 
 
 def _check_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    """Check a delay: the delays of messages on all ``links``, its draws and its law."""
     _check_message_delays(watched, links)
     delays, repeated = (_draw_delays(watched) for _ in range(2))
     rule = "must use no generator but the one it is given"
@@ -278,7 +270,6 @@ def _check_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
 
 
 def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    """Check delays against the law that the class states or inherits."""
     stated, part = stated_part(watched.part, "delay"), watched.part
     where = f"{watched.name}.message_delay"
     derives, law = type(stated) is not type(part), stated_law(part, "delay")
@@ -313,7 +304,6 @@ def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
 
 
 def _check_draws(watched: WatchedPart) -> None:
-    """Check that delays come from the given generator, and are independent."""
     where = f"{watched.name}.draw"
     with guard_user_code(where):
         random, other_random = (Streams(6, k).generator("delay") for k in range(2))
@@ -336,7 +326,6 @@ def _check_draws(watched: WatchedPart) -> None:
 
 
 def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    """Check ``message_delay`` on every link."""
     part, where, longest = watched.part, f"{watched.name}.message_delay", watched.part.longest
     drawn_delay = part.fixed or 0.0
     calls = [(link, message) for link in links for message in MESSAGES]
@@ -359,7 +348,6 @@ def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None
 
 
 def _draw_delays(watched: WatchedPart) -> list[float]:
-    """Return DRAWS delays in seconds from a generator with a fixed seed."""
     fixed, where, random = watched.part.fixed, f"{watched.name}.draw", RecordingGenerator(6)
     first_calls, rule = None, "must be a finite number of at least 0 seconds"
     delays: list[float] = []

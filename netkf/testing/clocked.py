@@ -102,7 +102,6 @@ class ClockTrial(Trial):
             self.record_end()
 
     def _check_composition(self, node: int) -> None:
-        """Check that a prediction over two gaps in turn equals that over their sum."""
         watched, state = self.watched, self.states[node]
         for first, second in GAPS:
             in_one_step = watched.call("predict", state, first + second)
@@ -122,7 +121,6 @@ class ClockTrial(Trial):
     def _compare_predictions(
         self, name: str, one_step: FloatArray, two_steps: FloatArray, first: float, second: float
     ) -> None:
-        """Check that predictions in one step and in two are equal up to rounding."""
         difference = float(np.abs(one_step - two_steps).max())
         size = max(float(np.abs(one_step).max()), float(np.abs(two_steps).max()), 1e-300)
         demand(
@@ -135,7 +133,6 @@ class ClockTrial(Trial):
         )
 
     def _pass_time(self, shift: bool) -> None:
-        """Predict all nodes over a random gap, with the readings of their sensors."""
         max_gap = MAX_SAMPLE_GAP
         if self._increments:
             max_gap = min(MAX_INCREMENT_GAP, *(model.interval for model in self.models))
@@ -178,7 +175,6 @@ class ClockTrial(Trial):
             self._in_flight[k] = message._replace(payload=payload)
 
     def _exchange(self, k: int, reliable: bool) -> None:
-        """Let two nodes transmit in round ``k`` and all nodes absorb the messages that arrive."""
         is_conserved = reliable and not self._in_flight
         before = self.conserved_sums() if is_conserved else {}
         payloads = [
@@ -199,7 +195,6 @@ class ClockTrial(Trial):
             self.check_conserved(before, "none")
 
     def _choose_transmissions(self, k: int) -> list[tuple[int, tuple[int, ...]]]:
-        """Return the senders of round ``k``, each with its receivers."""
         a, b = sorted({k % len(self.nodes), (k + 1) % len(self.nodes)})
         if self._clock == "links":
             return [(a, (b,)), (b, (a,))]
@@ -208,7 +203,6 @@ class ClockTrial(Trial):
         return [(node, tuple(peer for peer in self.nodes if peer != node)) for node in (a, b)]
 
     def _absorb_arrivals(self, k: int) -> None:
-        """Let every node absorb the messages that arrive in round ``k``, in order of senders."""
         arrivals = [message for message in self._in_flight if message.arrival <= k]
         self._in_flight = [message for message in self._in_flight if message.arrival > k]
         for node in self.nodes:
@@ -222,7 +216,6 @@ class ClockTrial(Trial):
                 self.absorb(node, messages, Exchange(time=self._time))
 
     def _accept(self, arrival: MessageInFlight) -> Message | None:
-        """Return the message as its receiver gets it, or None if the filter refuses its age."""
         age = self._time - arrival.sent
         accepts = age <= self.part.timing.max_age
         weight = float(self.weights[arrival.sender, arrival.receiver])

@@ -106,7 +106,6 @@ def _all_entities(part: Any) -> tuple[Entity, ...]:
 
 
 def _check_entity(watched: WatchedPart, entity: Entity) -> None:
-    """Check that the ticks of one entity increase, and do not depend on the size of blocks."""
     _check_origin(watched, entity)
     in_one_block = _read_ticks(watched, entity, BLOCKS[0])
     _check_increasing(watched, in_one_block)
@@ -128,7 +127,6 @@ def _check_entity(watched: WatchedPart, entity: Entity) -> None:
 
 
 def _check_interleaved(watched: WatchedPart, entities: tuple[Entity, ...]) -> None:
-    """Check that ticks of entities stay the same when the others tick in between."""
     part, where = watched.part, f"{watched.name}.ticks"
     with guard_user_code(where):
         alone = [list(_iterate_ticks(part, entity, k)) for k, entity in enumerate(entities)]
@@ -148,7 +146,6 @@ def _check_interleaved(watched: WatchedPart, entities: tuple[Entity, ...]) -> No
 
 
 def _iterate_ticks(part: Any, entity: Entity, stream: int) -> Iterator[float]:
-    """Yield the first INTERLEAVED_TICKS ticks of an entity, one call each."""
     random = RecordingGenerator(11, stream)
     position = ClockPosition(float(part.origin(entity, lambda: RecordingGenerator(12, stream))))
     for _ in range(INTERLEAVED_TICKS):
@@ -161,7 +158,6 @@ def _iterate_ticks(part: Any, entity: Entity, stream: int) -> Iterator[float]:
 
 
 def _check_origin(watched: WatchedPart, entity: Entity) -> None:
-    """Check that the origin is a finite number, and the same from equal generators."""
     first, second = (
         watched.call("origin", entity, lambda: RecordingGenerator(8), repeatable=False)
         for _ in range(2)
@@ -173,7 +169,6 @@ def _check_origin(watched: WatchedPart, entity: Entity) -> None:
 
 
 def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -> FloatArray:
-    """Return the ticks (K,) of an entity, asked for in ``blocks``, from one fixed seed."""
     random = RecordingGenerator(9)
     origin = watched.part.origin(entity, lambda: RecordingGenerator(10))
     where, now, has_stopped = f"{watched.name}.ticks", 0.0, False
@@ -195,7 +190,6 @@ def _read_ticks(watched: WatchedPart, entity: Entity, blocks: tuple[int, ...]) -
 
 
 def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
-    """Check that the ticks ``times`` (K,), in seconds, are finite, positive and increasing."""
     where = f"{watched.name}.ticks"
     rule, remedy = "must be finite", "return fewer times when the clock stops"
     demand(np.isfinite(times).all(), where, rule, "nan or inf", remedy)
@@ -211,14 +205,12 @@ def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
 
 
 def _first_difference(one: FloatArray, other: FloatArray) -> int:
-    """Return the first index at which two arrays of times differ."""
     shorter = min(len(one), len(other))
     unequal = np.flatnonzero(one[:shorter] != other[:shorter])
     return int(unequal[0]) if unequal.size else shorter
 
 
 def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:
-    """Check rates and laws of gaps against what the class states, in runs of all ``entities``."""
     part, runs = watched.part, max(2, CHAINS // len(entities))
     rates = np.array([watched.call("mean_rate", entity) for entity in entities])
     wrong, where = rates[rates <= 0.0], f"{watched.name}.mean_rate"
@@ -254,27 +246,23 @@ def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -
 def _draw_ticks(
     part: Any, entity: Entity, seed: int, run: int, stream: int, horizon: float
 ) -> FloatArray:
-    """Return the ticks (K,) of an entity in a run, from generators numbered ``stream``."""
     streams = Streams(seed, run)
     random = streams.generator("testing", stream)
     return generate_ticks(part, entity, lambda: streams.generator("phase", stream), random, horizon)
 
 
 def _count(group: ClockGroup, times: list[FloatArray], horizon: float) -> TickCounts:
-    """Return the counts of one run of all clocks."""
     owners = np.repeat(np.arange(len(times)), [len(ticks) for ticks in times])
     return count_ticks(group, np.concatenate(times), owners, horizon)
 
 
 def _stack(counts: list[TickCounts]) -> TickCounts:
-    """Return the counts of several runs as one, with a first axis over runs."""
     return TickCounts(*(np.array(column) for column in zip(*counts, strict=True)))
 
 
 def _check_generators_used(
     watched: WatchedPart, entities: tuple[Entity, ...], times: list[list[FloatArray]]
 ) -> None:
-    """Check that ticks differ between runs and entities, which have different generators."""
     where, rule = f"{watched.name}.ticks", "must draw from the generator given"
     first, *others = times[0]
     count = min(len(first), len(times[1][0]))
@@ -290,7 +278,6 @@ def _check_generators_used(
 def _check_rates(
     watched: WatchedPart, group: ClockGroup, counts: TickCounts, unknown: np.ndarray, horizon: float
 ) -> None:
-    """Check the rates of all clocks together and of each."""
     where, rule = f"{watched.name}.mean_rate", "must be the mean ticks per second in the long run"
     ticks, distances = counts.ticks.sum(axis=1), []
     slack = slack_of_start(group, ticks)
@@ -312,7 +299,6 @@ def _check_gaps(
     times: list[list[FloatArray]],
     horizon: float,
 ) -> None:
-    """Check gaps against their stated law, and neighbouring ones for independence."""
     law, part, where = group.gaps[0], watched.part, f"{watched.name}.ticks"
     stated = stated_part(part, "activation")
     derives = type(stated) is not type(part)

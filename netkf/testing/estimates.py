@@ -36,7 +36,6 @@ def check_estimate(
 
 
 def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> None:
-    """Raise AssertionError unless an array is float64, finite and of this ``shape``."""
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
     remedy = "return None where the filter has no P" if name == "P" else ""
@@ -44,7 +43,6 @@ def _check_array(where: str, name: str, array: Any, shape: tuple[int, ...]) -> N
 
 
 def _check_covariance(where: str, P: FloatArray) -> None:
-    """Check that ``P`` (n, n) is symmetric and positive semidefinite up to rounding."""
     size = max(float(np.abs(P).max()), np.finfo(float).tiny)
     asymmetry = float(np.abs(P - P.T).max())
     rule, got = "P must be symmetric", f"P - P' of up to {asymmetry:.3g}"

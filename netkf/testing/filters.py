@@ -61,7 +61,6 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
 
 
 def _check_values(watched: WatchedPart) -> None:
-    """Check types and values of what a filter says of its needs and its timing."""
     part, name = watched.part, f"{watched.name}.timing"
     _check_flags(part.needs, Needs, f"{watched.name}.needs")
     _check_flags(part.timing, Timing, name)
@@ -78,7 +77,6 @@ def _check_values(watched: WatchedPart) -> None:
 
 
 def _check_flags(value: Any, kind: type[Any], where: str) -> None:
-    """Check that ``value`` is a ``kind``, and that its fields which are flags are True or False."""
     demand(isinstance(value, kind), where, f"must be a {kind.__name__} of netkf.parts", value)
     for field in dataclasses.fields(kind):
         got = getattr(value, field.name)
@@ -92,7 +90,6 @@ def _check_flags(value: Any, kind: type[Any], where: str) -> None:
 
 
 def _check_schedule(watched: WatchedPart) -> None:
-    """Check the schedule of a user's filter in slots."""
     name = f"{watched.name}.timing"
     schedule, where = watched.part.timing.schedule, f"{name}.schedule"
     are_phases = isinstance(schedule, tuple) and set(schedule) <= set(PHASES)
@@ -111,7 +108,6 @@ def _check_schedule(watched: WatchedPart) -> None:
 
 
 def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
-    """Check that ``predicts`` says if the schedule predicts after it senses."""
     if not {"predict", "sense"} <= set(schedule):
         return
     predicts = schedule.index("sense") < schedule.index("predict")
@@ -122,7 +118,6 @@ def _check_predicts(watched: WatchedPart, schedule: tuple[str, ...]) -> None:
 
 
 def _check_weights(watched: WatchedPart) -> None:
-    """Check the weights of messages."""
     name = f"{watched.name}.link_weights"
     given, where = watched.part.link_weights, f"{name}.of"
     _check_flags(given, Weights, name)
@@ -145,7 +140,6 @@ def _check_weights(watched: WatchedPart) -> None:
 
 
 def _check_matrix(where: str, weights: FloatArray) -> None:
-    """Check that ``weights`` (N, N) are not negative, and that columns sum to at most 1."""
     is_square = weights.ndim == 2 and weights.shape[0] == weights.shape[1]
     demand(is_square, where, "must be a square matrix", str(weights.shape))
     demand((weights >= 0.0).all(), where, "must not be negative", float(weights.min()))

@@ -28,7 +28,6 @@ class RecordingGenerator(np.random.Generator):
             return attribute
 
         def draw(*arguments: Any, **keywords: Any) -> Any:
-            """Call the method ``name`` and record the number of values that it draws."""
             values = attribute(*arguments, **keywords)
             self.calls.append((name, int(np.size(values))))
             return values

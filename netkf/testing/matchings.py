@@ -81,7 +81,6 @@ def check_matching_object(part: Any, topology: Topology | None, seed: int) -> No
 
 
 def _accepts_graph(part: Any, topology: Topology, name: str) -> bool:
-    """Return True if ``check`` of the matching accepts the graph: it raises no ScenarioError."""
     with guard_user_code(f"{name}.check"):
         try:
             part.check(topology)
@@ -91,14 +90,12 @@ def _accepts_graph(part: Any, topology: Topology, name: str) -> bool:
 
 
 def _check_recorded(part: RecordedSlots, name: str) -> None:
-    """Check that no node of a recorded table of matchings is in two pairs of one slot."""
     if part.matching:
         for slot, phase, step in part.recorded:
             _demand_matching(f"{name}.pairs", part.pairs(slot, phase, step), slot)
 
 
 def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: int) -> None:
-    """Check the matchings of one graph: form, repeatability, frequencies, independence."""
     part, where = watched.part, f"{watched.name}.draw"
     first = watched.call("draw", topology, _make_generator(seed, 0), repeatable=False)
     demand(isinstance(first, list), where, "must return a list of pairs", first)
@@ -121,7 +118,6 @@ def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: in
 
 
 def _make_generator(seed: int, run: int) -> np.random.Generator:
-    """Return the random generator of the matchings of a ``run`` (its number) of ``seed``."""
     return Streams(seed, run).generator("matching")
 
 
@@ -147,7 +143,6 @@ def _draw_matchings(
 
 
 def _demand_matching(where: str, pairs: list[Link], slot: int) -> None:
-    """Raise AssertionError if a node is in two of the ``pairs`` of a slot."""
     nodes = [node for pair in pairs for node in pair]
     if len(set(nodes)) < len(nodes):
         fail(where, "must have every node in one pair at most", f"{list(pairs)} in slot {slot}")
@@ -178,7 +173,6 @@ def _stated_mean(watched: WatchedPart, topology: Topology) -> FloatArray | None:
 def _check_frequencies(
     watched: WatchedPart, topology: Topology, is_paired: np.ndarray, mean: FloatArray | None
 ) -> None:
-    """Check ``is_paired`` (slots, L) against ``mean`` (L,), and slots for independence."""
     where, links, runs = f"{watched.name}.draw", topology.links, len(is_paired) // RUN
     graph = f"on {len(topology.nodes)} nodes and {len(links)} links"
     rule = "must pair links as often as mean says"

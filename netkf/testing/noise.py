@@ -86,12 +86,10 @@ def check_white(e: FloatArray, labels: NoiseLabels) -> None:
 
 
 def _names(count: int) -> list[str]:
-    """Return "component 0", "component 1", ..."""
     return [f"component {k}" for k in range(count)]
 
 
 def _check_moments(e: FloatArray, labels: NoiseLabels, when: str) -> None:
-    """Check that noise ``e`` (R, K, q) has mean 0 and covariance 1; ``when`` ends messages."""
     if e.shape[0] * e.shape[1] < MIN_VALUES:
         return
     where, names, level = labels.where, _names(e.shape[-1]), family_level()

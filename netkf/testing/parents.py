@@ -74,13 +74,11 @@ def check_parent(watched: WatchedPart, same_as_parent: bool | None) -> None:
 
 
 def _with_weights(watched: WatchedPart, weights: FloatArray) -> WatchedPart:
-    """Return a filter with the matrix ``weights`` (N, N) in place of its own, as it is watched."""
     changed = dataclasses.replace(watched.part, weights=weights)
     return WatchedPart(changed).unchecked()
 
 
 def _forbid_transposed(name: str, child: WatchedPart, parent: WatchedPart) -> None:
-    """Refuse weights that are those of the parent with rows and columns exchanged."""
     weights = getattr(parent.part, "weights", None)
     if not isinstance(weights, np.ndarray) or np.array_equal(weights, weights.T):
         return
@@ -118,7 +116,6 @@ def largest_difference(child: WatchedPart, parent: WatchedPart) -> Difference | 
 
 
 def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield pairs of equal trials of a filter and of its parent, with the unit of their time."""
     parts = child.part, parent.part
     slots = None
     if all(part.timing.schedule is not None for part in parts):
@@ -144,7 +141,6 @@ def _trial_pairs(child: WatchedPart, parent: WatchedPart) -> Iterator[tuple[Tria
 def _clock_trial_pairs(
     child: WatchedPart, parent: WatchedPart, system: System, clock: str | None
 ) -> Iterator[tuple[Trial, Trial, str]]:
-    """Yield such pairs in continuous time, with samples and with increments."""
     # The clock "readings" ticks when a node has taken a sample.
     needs_samples = child.part.needs.samples or parent.part.needs.samples or clock == "readings"
     for increments in (False,) if needs_samples else (False, True):

@@ -105,7 +105,6 @@ def check_plant_object(part: Any, seed: int) -> None:
 
 
 def _check_form(part: Any, name: str) -> None:
-    """Check the shapes of the matrices of a plant, and that ``start_cov`` is a covariance."""
     n = part.n
     matrix = part.F if isinstance(part, LinearPlant) else getattr(part, "A", np.zeros((n, n)))
     fits = isinstance(n, int) and matrix.shape == (n, n)
@@ -131,12 +130,10 @@ def _move_start(part: Any) -> tuple[Any, FloatArray] | None:
 
 
 def _make_generator(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
-    """Return the random generator of a ``run`` (its number) of ``seed`` for a purpose."""
     return Streams(seed, run).generator(purpose)
 
 
 def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> None:
-    """Check that two paths (K, n) from equal streams are equal."""
     remedy = "use only the generators given, and draw for each step in order"
     demand_close(one, other, where, "must make the same path from equal streams", when, remedy)
 
@@ -161,7 +158,6 @@ def _check_starts(
     start: Callable[[np.random.Generator], FloatArray],
     is_inherited: bool,
 ) -> None:
-    """Check mean and covariance of x(0), which ``start`` draws from a generator."""
     count = STARTS if part.start_cov.any() else FEW_STARTS
     with guard_user_code(where):
         starts = _draw_starts(part, seed, start, is_inherited, count)
@@ -193,7 +189,6 @@ def _draw_starts(
     is_inherited: bool,
     count: int,
 ) -> Sequence[FloatArray]:
-    """Return ``count`` draws of x(0) (n,), with generators of ``seed``."""
     random = _make_generator(seed, 0)
     first = [start(random) for _ in range(min(count, FEW_STARTS))]
     if is_inherited and type(part).starts is Plant.starts:
@@ -208,7 +203,6 @@ def _draw_starts(
 def _check_noise(
     noise: FloatArray, S: FloatArray, states: FloatArray, labels: NoiseLabels, rule: str
 ) -> None:
-    """Check the noise of a user's plant."""
     e = whitened(noise, S, 1.0 + float(np.abs(states).max()), labels.where, rule)
     if not e.size:
         return
@@ -223,11 +217,9 @@ def _check_noise(
 
 
 def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
-    """Check a user's plant in slots."""
     where = f"{name}.truth"
 
     def draw_path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
-        """Return the states (K, n) of number ``run`` of the plant's runs in K ``slots``."""
         with guard_user_code(where):
             truth = plant.truth(_make_generator(seed, run))
             states = [truth.state(slot) for slot in slots]
@@ -265,7 +257,6 @@ def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> 
 
 
 def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any) -> None:
-    """Check the ``truth`` of a run with moving frames against its ``path`` (K, n) without them."""
     frame = truth.frame_slots
     origin = np.zeros(part.n)
     for slot, x in enumerate(path):
@@ -302,7 +293,6 @@ def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, Fl
 
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:
-    """Check a user's plant in continuous time."""
     speed, growth = float(np.abs(eigenvalues(part.A)).max()), growth_rate(part.A)
     time_constant = 1.0 / speed if speed > 0.0 else 1.0
     max_seconds = MAX_LOG_GROWTH / growth if growth > 0.0 else math.inf
@@ -317,7 +307,6 @@ def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> 
 def _check_sampled(
     part: Diffusion, copy: Diffusion, where: str, seed: int, scale: tuple[float, float]
 ) -> None:
-    """Check paths at times of samples."""
     time_constant, max_seconds = scale
     times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
     # At least eight times, two for each gap, however fast the plant grows.
@@ -356,7 +345,6 @@ def _check_sampled(
 
 
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
-    """Check paths on the sensing grid: alone or not, cut or not, and the law of their noise."""
     where, period = f"{name}.paths", float(part.sensing_period or 0.0)
     blocks = -(-steps // BLOCK)
     probe_times = period * np.array([1.3, 4.0, 5.5, 5.7])
@@ -407,7 +395,6 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
 def _check_one_path(
     part: Diffusion, where: str, cut: Any, times: tuple[FloatArray, FloatArray], seed: int
 ) -> None:
-    """Check that ``path`` of one run gives the states of ``cut``, drawn by ``paths``."""
     plant_random, probe_random, sample_random = (
         _make_generator(seed, 1, purpose) for purpose in ("plant", "probe", "samples")
     )

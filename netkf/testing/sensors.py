@@ -129,7 +129,6 @@ def _make_states(seed: int, count: int, n: int, run: int = 0) -> FloatArray:
 def _check_same_readings(
     reader: SensorReader, copy: SensorReader, nodes: tuple[int, ...], seed: int
 ) -> None:
-    """Check that readings depend only on their random streams, numbers and states."""
     node, streams, x = nodes[0], Streams(seed), _make_states(seed, SHORT_LENGTH, reader.n)
     numbers = list(range(SHORT_LENGTH))
     series = reader.read_several(reader.make_path(streams, node), numbers, x)
@@ -163,24 +162,20 @@ def _check_same_readings(
 def _demand_equal(
     reader: SensorReader, one: ReadingSeries, other: ReadingSeries, when: str
 ) -> None:
-    """Check that two series of readings are equal."""
     remedy = "use only the generators given, and draw for each reading in order"
     for name, a, b in zip(("readings", "matrices H"), one, other, strict=True):
         demand_close(a, b, reader.where, f"{name} must be the same for equal streams", when, remedy)
 
 
 def _concatenate(series: list[ReadingSeries]) -> ReadingSeries:
-    """Return several series one after the other, as one."""
     return ReadingSeries(*(np.concatenate(arrays) for arrays in zip(*series, strict=True)))
 
 
 def _select(series: ReadingSeries, ks: list[int]) -> ReadingSeries:
-    """Return the readings of a series at the indices ``ks``."""
     return ReadingSeries(series.y[ks], series.H[ks])
 
 
 def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
-    """Check that another state changes a reading by H times the difference."""
     streams, numbers = Streams(seed), list(range(LENGTH))
     x, other_x = (_make_states(seed, LENGTH, reader.n, run) for run in (0, 1))
     series = reader.read_several(reader.make_path(streams, node), numbers, x)
@@ -198,7 +193,6 @@ def _check_linear(reader: SensorReader, node: int, seed: int) -> None:
 
 
 def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None:
-    """Check that noise is white with the stated R, independent of nodes and a varying H."""
     labels = NoiseLabels(reader.where, "the noise y - H x", "R")
     runs = max(2, READINGS // (LENGTH * len(nodes)))
     factor = whiten(reader.sensor.R).factor
@@ -223,7 +217,6 @@ def _check_laws(reader: SensorReader, nodes: tuple[int, ...], seed: int) -> None
 
 
 def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
-    """Check that increments add up, are repeatable, move by H x, and have white noise."""
     x, other_x = _make_states(seed, 2, reader.n)
     streams = Streams(seed)
     cut = reader.read_pieces(streams, node, x, SHORT_LENGTH, cut=True)
@@ -244,7 +237,6 @@ def _check_increments(reader: IncrementReader, node: int, seed: int) -> None:
 
 
 def _check_increment_noise(reader: IncrementReader, node: int, x: FloatArray, seed: int) -> None:
-    """Check that the noise of increments at the state ``x`` (n,) is white with R."""
     factor = whiten(reader.sensor.R).factor
     noises = []
     for run in range(RUNS):
@@ -294,7 +286,6 @@ def _check_regressors(
 
 
 def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: NoiseLabels) -> None:
-    """Check the noise s[k+1] - A s[k] of H = C s, from ``H`` (runs, slots, n)."""
     m = len(sensor.A)
     if len(sensor.C) < m or np.linalg.cond(sensor.C) > 1e6:
         return
@@ -306,7 +297,6 @@ def _check_regressor_steps(sensor: RegressorSensor, H: FloatArray, labels: Noise
 
 
 def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the sample times of a sensor at ``nodes`` (ids)."""
     where, horizon = f"{name}.sample_times", 30.0
     rate = sensor.sampling.mean_rate((nodes[0], 0)) if isinstance(sensor.sampling, Clock) else 1.0
     if rate > 0.0:
@@ -330,7 +320,6 @@ def _check_times(sensor: Any, name: str, nodes: tuple[int, ...], seed: int) -> N
 
 
 def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: int) -> None:
-    """Check the number of samples of many runs against the rate of the clock."""
     rate = sensor.sampling.mean_rate((nodes[0], 0))
     if not rate > 0.0:
         return
@@ -349,7 +338,6 @@ def _check_sampling_rate(sensor: Any, where: str, nodes: tuple[int, ...], seed: 
 
 
 def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -> FloatArray:
-    """Return the sample times (K,) at ``node`` in a run of ``horizon`` seconds."""
     generator = generators(Streams(seed), node)
     times = np.asarray(call_user_function(where, sensor.sample_times, node, 0, generator, horizon))
     is_vector = times.ndim == 1 and times.dtype == np.float64
@@ -358,7 +346,6 @@ def _read_times(sensor: Any, where: str, node: int, seed: int, horizon: float) -
 
 
 def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
-    """Check ``h`` and ``jacobian``: a function of state and node, shapes, and derivatives."""
     positions = {node: (0.7 * k, -0.4 * k) for k, node in enumerate(sensor.nodes)}
     sensor = sensor.located(positions)
     p, n = len(sensor.R), _find_state_size(sensor, name)
@@ -384,7 +371,6 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
 
 
 def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
-    """Return the smallest number of states, up to MAX_STATES, that the sensor accepts."""
     failure = ""
     for n in range(1, MAX_STATES + 1):
         try:
@@ -397,14 +383,12 @@ def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
 
 
 def _accepts_state_size(sensor: NonlinearSensor, n: int) -> bool:
-    """Return True if ``h`` and ``jacobian`` of a sensor accept states of n components."""
     sensor.check_state(n)
     sensor.h(np.ones(n), sensor.nodes[0])
     return np.shape(sensor.jacobian(np.ones(n), sensor.nodes[0]))[-1:] == (n,)
 
 
 def _derivative_error(sensor: NonlinearSensor, node: int, x: FloatArray, J: FloatArray) -> float:
-    """Return the largest error of ``J`` (p, n) at ``x`` (n,), by differences of ``h``."""
     numerical = np.empty_like(J)
     for k, step in enumerate(np.eye(len(x)) * DERIVATIVE_STEP):
         ahead, behind = (np.asarray(sensor.h(x + sign * step, node)) for sign in (1.0, -1.0))

@@ -51,7 +51,6 @@ def check_shift(watched: WatchedPart, trials: Sequence[Trial]) -> None:
 
 
 def _compare_trials(watched: WatchedPart, trial: Trial, shifted: Trial) -> None:
-    """Check that estimates are those with a shifted truth, less the shift."""
     # The shift itself adds an estimate of each node.
     others = [estimate for estimate in shifted.estimates if estimate.after != "shift"]
     for one, other in zip(trial.estimates, others, strict=True):
@@ -80,5 +79,4 @@ def estimate_differences(
 
 
 def _largest_difference(one: FloatArray, other: FloatArray) -> float:
-    """Return the largest absolute difference of two arrays of one shape."""
     return float(np.abs(one - other).max())

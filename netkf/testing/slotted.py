@@ -49,7 +49,6 @@ class SlotTrial(Trial):
             self.record_end()
 
     def _run_slot(self, slot: int, lost: bool) -> None:
-        """Run the phases of a slot, with all messages delivered or all ``lost``."""
         part, phase = self.part, 0
         for kind in part.timing.schedule:
             if kind == "exchange":
@@ -63,7 +62,6 @@ class SlotTrial(Trial):
                 self._advance(kind, slot)
 
     def _advance(self, kind: str, slot: int) -> None:
-        """Run the phase ``kind`` of a slot, and move the shift of the truth with it."""
         part = self.part
         update_predicts = kind == "sense" and "predict" not in part.timing.schedule
         if kind == "predict" or (update_predicts and not part.timing.predicts):
@@ -79,7 +77,6 @@ class SlotTrial(Trial):
             self.step(node, "update", reading)
 
     def _exchange(self, exchange: Exchange, lost: bool) -> None:
-        """Run a step of an exchange at all nodes; ``conserved`` sums must be kept."""
         before = self.conserved_sums()
         payloads = {node: self.emit(node, exchange) for node in self._talking_nodes(exchange.slot)}
         for node, senders in enumerate(self._choose_senders(exchange.slot)):
@@ -93,14 +90,12 @@ class SlotTrial(Trial):
         self.check_conserved(before, "all" if lost else "none")
 
     def _choose_senders(self, slot: int) -> list[list[int]]:
-        """Return the senders whose messages each node receives."""
         if not self.part.timing.pairwise:
             return [[k for k in self.nodes if k != node] for node in self.nodes]
         pair = self._talking_nodes(slot)
         return [[k for k in pair if k != node] if node in pair else [] for node in self.nodes]
 
     def _talking_nodes(self, slot: int) -> list[int]:
-        """Return the nodes that send: all, or the pair of this slot."""
         count = len(self.nodes)
         if not self.part.timing.pairwise:
             return list(self.nodes)

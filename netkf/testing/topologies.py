@@ -6,7 +6,6 @@ from netkf.network.graphs import Complete, Cycle, Grid, Star, Topology
 
 
 def _renumber(topology: Topology, ids: tuple[int, ...]) -> Topology:
-    """Return the same graph with the node ``ids``, which must increase."""
     new_ids = dict(zip(topology.nodes, ids, strict=True))
     links = tuple((new_ids[i], new_ids[j]) for i, j in topology.links)
     return Topology(nodes=ids, links=links)

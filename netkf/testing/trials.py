@@ -75,7 +75,6 @@ class Trial(ABC):
         """
 
     def _start(self, node: int, models: Sequence[Any]) -> Any:
-        """Return the state that ``init`` makes for a node at time 0."""
         degree = len(self.nodes) - 1
         own_weight = max(0.0, 1.0 - float(self.weights[:, node].sum()))
         information = np.stack([model.information for model in models])
@@ -186,7 +185,6 @@ class Trial(ABC):
 
 
 def _make_network(part: Any) -> tuple[range, FloatArray]:
-    """Return the nodes and weights (N, N) of a complete graph for a filter."""
     given = part.link_weights
     weights = given.matrix
     if weights is None:

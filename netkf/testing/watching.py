@@ -118,7 +118,6 @@ def _add_leaves(
 
 
 def _list_members(value: Any) -> Iterable[tuple[str, Any]]:
-    """Return the members of a value, each with the text that it adds to a path."""
     fields = getattr(value, "_fields", None)
     if fields is not None:
         return [(f".{name}", getattr(value, name)) for name in fields]
@@ -151,7 +150,6 @@ def differing_path(one: Leaves, other: Leaves) -> str | None:
 
 
 def _are_equal(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if two arrays have equal types, shapes (any) and entries; nan equals nan."""
     same_type = one.dtype == other.dtype and one.shape == other.shape
     # Comparing bytes is cheap, and nearly all are equal to the last bit.
     if same_type and one.dtype != object and one.tobytes() == other.tobytes():
@@ -172,7 +170,6 @@ def global_generator_states() -> tuple[Any, Any]:
 
 
 def _python_generator_state() -> Any:
-    """Return the state of the global generator of Python's module ``random``."""
     address = _python_state_address()
     if address is None:
         return random.getstate()
@@ -181,13 +178,11 @@ def _python_generator_state() -> Any:
 
 
 def _python_generator() -> Any:
-    """Return the generator object behind the functions of Python's module ``random``."""
     return cast(Any, random.getstate).__self__
 
 
 @cache
 def _python_state_address() -> int | None:
-    """Return the address of the state of Python's global generator in memory."""
     header, size = object.__basicsize__, random.Random.__basicsize__
     if sys.implementation.name != "cpython" or size < header + MERSENNE_BYTES:
         return None
@@ -198,7 +193,6 @@ def _python_state_address() -> int | None:
 
 @cache
 def _static_attribute(cls: type, name: str) -> Any:
-    """Return an attribute of a class without calling descriptors; None if it is missing."""
     return inspect.getattr_static(cls, name, None)
 
 
@@ -263,7 +257,6 @@ class WatchedPart:
         return {path.strip("[]'"): leaf for path, leaf in collect_leaves(attributes).items()}
 
     def _call_method(self, where: str, method: str, arguments: tuple[Any, ...]) -> Any:
-        """Call a method with these ``arguments`` and return the result."""
         before = global_generator_states()
         try:
             result = attrgetter(method)(self.part)(*arguments)
@@ -280,7 +273,6 @@ class WatchedPart:
         return result
 
     def _parameter_names(self, method: str, count: int) -> list[str]:
-        """Return the names of the first ``count`` parameters of a method."""
         names = list(inspect.signature(attrgetter(method)(self.part)).parameters)
         return [*names, *["an argument"] * count][:count]
 

@@ -53,7 +53,6 @@ def network_clocks(scenario: Scenario) -> ClockGroup:
 
 
 def _contact_time(clock: Contacts, entity: Entity, horizon: float) -> float:
-    """Return the seconds that a link is in contact until the ``horizon``."""
     return float(clock.time_in_contact(entity, np.array([horizon]))[0])
 
 
@@ -226,7 +225,6 @@ def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
 def _in_direction(
     senders: np.ndarray, receivers: np.ndarray, indices: dict[tuple[int, int], int]
 ) -> IntArray:
-    """Return the index (K,) of the direction of each of K messages, of node ids (K,) each."""
     ids = zip(senders.tolist(), receivers.tolist(), strict=True)
     return np.array([indices[direction] for direction in ids], dtype=np.int64)
 

@@ -94,7 +94,6 @@ CONTACT_SENTENCE = "links tick in their contacts only"
 
 @lru_cache(maxsize=4)
 def _drawn_counts(draw: Draw, scenario: Scenario, seed: int, first: int, count: int) -> np.ndarray:
-    """Return the ticks (``count``, E) of E clocks in replicas from number ``first`` on; cached."""
     return np.array([draw(scenario, seed, first + k) for k in range(count)])
 
 
@@ -111,7 +110,6 @@ def _number_drawn(group: ClockGroup, horizon: float, runs: float) -> int:
 
 
 def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
-    """Compare the rates of all ticks, of each window and of each clock, at equal levels."""
     scenario, group = samples.scenario, clocks.group(samples.scenario)
     windows, horizon = getattr(samples, clocks.field).ticks, scenario.horizon
     counts, runs = windows.sum(axis=1), len(windows)
@@ -144,7 +142,6 @@ def _check_rates(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
 
 
 def _check_gaps(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
-    """Compare the law of single gaps, and the correlation of neighbouring ones with 0."""
     shares, correlation = ticks.compare_gaps(getattr(samples, clocks.field), level)
     finding = find(shares, SHARE_TOLERANCE)
     if correlation is None:
@@ -161,7 +158,6 @@ def _check_gaps(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
 
 
 def _check_lattice(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
-    """Compare the times of ticks of deterministic clocks with the stated times, exactly."""
     counts = getattr(samples, clocks.field)
     message = f"{counts.ticks.sum():,.0f} ticks, times in units of the length of a run"
     off = float(counts.off.max()) / samples.scenario.horizon
@@ -169,14 +165,12 @@ def _check_lattice(clocks: Clocks, samples: PartSamples, level: float) -> Findin
 
 
 def _clocks_apart(clocks: Clocks, samples: PartSamples, level: float) -> Finding:
-    """Compare Poisson clocks with independent ones."""
     group, counts = clocks.group(samples.scenario), getattr(samples, clocks.field)
     comparison = ticks.compare_clocks(group, counts.ticks, samples.scenario.horizon, level)
     return find(comparison, DISPERSION_TOLERANCE)
 
 
 def _clock_promises(clocks: Clocks, samples: PartSamples) -> list[Promise]:
-    """Return the promises about clocks, which depend on the kind of their law."""
     counts, group = getattr(samples, clocks.field), clocks.group(samples.scenario)
     # Rows (statement, test, whether it is exact, that is uses none of the level).
     rows: list[tuple[str, Callable[..., Finding], bool]] = []
@@ -198,7 +192,6 @@ def _clock_promises(clocks: Clocks, samples: PartSamples) -> list[Promise]:
 
 
 def _of_losses(compare: Callable[..., Comparison], tolerance: float) -> Test:
-    """Return the test that compares what becomes of messages with the stated law."""
     return lambda samples, level: find(
         compare(loss_law(samples.scenario), samples.fates, level), tolerance
     )
@@ -221,20 +214,17 @@ def pair_probabilities(scenario: Scenario) -> FloatArray | None:
 
 
 def _check_matchings(samples: PartSamples, level: float) -> Finding:
-    """Compare matchings with the stated probabilities of their pairs."""
     p, links = pair_probabilities(samples.scenario), samples.scenario.topology.links
     assert p is not None
     return find(losses.compare_matchings(p, samples.pairs, links, level), PROBABILITY_TOLERANCE)
 
 
 def _check_fixed(samples: PartSamples, level: float) -> Finding:
-    """Compare all delays with the stated constant, exactly."""
     off = float(samples.delays.off.max()) / samples.scenario.horizon
     return find_identity(off, TIME_TOLERANCE, "delays in units of the length of a run")
 
 
 def _check_delays(samples: PartSamples, level: float) -> Finding:
-    """Compare delays with their stated law, in each direction, and with those just before."""
     links = samples.scenario.topology.directions
     law, means = delays.compare_delays(samples.delays, links, level)
     finding = find(law, SHARE_TOLERANCE)
@@ -249,7 +239,6 @@ SAME = "all messages of a link are lost with one probability"
 
 
 def _row(text: str, group: str, test: Test, *needs: str, exact: bool = False) -> Promise:
-    """Return a promise of the scenario."""
     return Promise(text, "the scenario", needs, test, exact, group)
 
 

@@ -86,12 +86,10 @@ def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
 
 
 def _standardise(x: FloatArray, sizes: FloatArray) -> FloatArray:
-    """Return S states ``x`` (S, n) in units of their root mean squares ``sizes``."""
     return np.divide(x, sizes, out=np.zeros_like(x), where=np.broadcast_to(sizes > 0.0, x.shape))
 
 
 def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
-    """Return the true states (S + 1, n) of a run at ``law.times``, drawn again."""
     if scenario.slotted:
         truth = scenario.slot_plant.truth(streams.generator("plant"))
         return np.array([truth.absolute(slot) for slot in range(len(law.times))])

@@ -33,7 +33,6 @@ VARIANCE_TOLERANCE, MEAN_TOLERANCE, CORRELATION_TOLERANCE = 0.1, 0.1, 0.2
 
 @lru_cache(maxsize=4)
 def _start_draws(scenario: Scenario, seed: int) -> NoiseDraws:
-    """Return STARTS states x(0), drawn again from their streams and whitened, as one run."""
     z = whitened_starts(scenario, start_states(scenario, seed, STARTS))
     return NoiseDraws(z[None], np.zeros((1, 2, 0, z.shape[1])))
 
@@ -52,19 +51,16 @@ def _draws(samples: PartSamples, group: str) -> tuple[NoiseDraws, list[str], str
 
 
 def _mean(group: str, samples: PartSamples, level: float) -> Finding:
-    """Compare the means of noises, and their correlations with the states, with 0."""
     draws, labels, *_ = _draws(samples, group)
     return find(compare_means(draws.z, labels, level, draws.states), MEAN_TOLERANCE)
 
 
 def _variance(group: str, samples: PartSamples, level: float) -> Finding:
-    """Compare the variances of whitened noises with 1."""
     draws, labels, noun, gaussian = _draws(samples, group)
     return find(compare_variances(draws.z, labels, level, noun, gaussian), VARIANCE_TOLERANCE)
 
 
 def _correlation(group: str, samples: PartSamples, level: float) -> Finding:
-    """Compare the correlations of noises, between their entries and in time, with 0."""
     draws, labels, *_ = _draws(samples, group)
     return find(compare_correlations(draws.z, labels, level), CORRELATION_TOLERANCE)
 
@@ -99,7 +95,6 @@ def _is_gaussian(samples: PartSamples, group: str) -> bool:
 
 
 def _rows(group: str, *rows: tuple[str, Callable[..., Finding]]) -> tuple[Promise, ...]:
-    """Return promises of the scenario about one noise, from statements and tests."""
     return tuple(
         Promise(text, "the scenario", (), partial(test, group), group=group) for text, test in rows
     )
