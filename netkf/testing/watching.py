@@ -343,16 +343,18 @@ def call_user_function(where: str, function: Callable[..., Any], *arguments: Any
         return function(*arguments)
 
 
-def demand_array(where: str, name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+def demand_array(
+    where: str, name: str, value: Any, shape: tuple[int, ...], remedy: str = ""
+) -> FloatArray:
     """Return ``value`` as an array of the given ``shape``.
 
     Raises AssertionError unless it is float64, finite and of that shape; ``where`` and ``name`` are
-    what messages call its origin and the array.
+    what messages call its origin and the array, ``remedy`` what to do where it is not finite.
     """
     array = np.asarray(value)
     demand(array.shape == shape, where, f"{name} must have the shape {shape}", str(array.shape))
     demand(array.dtype == np.float64, where, f"{name} must be float64", str(array.dtype))
-    demand(np.isfinite(array).all(), where, f"{name} must be finite", "nan or inf")
+    demand(np.isfinite(array).all(), where, f"{name} must be finite", array, remedy)
     return array
 
 
