@@ -6,17 +6,12 @@ import argparse
 import contextlib
 import shlex
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
 from netkf.cli.options import (
     FAILED,
-    Command,
-    add_confidence,
-    add_options,
     load_scenario,
-    parse_count,
     print_json,
     print_notes,
 )
@@ -26,27 +21,6 @@ from netkf.core.errors import ScenarioError
 if TYPE_CHECKING:
     from netkf.checks.check import Verdict
     from netkf.scenario.scenario import Scenario
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--runs", type=parse_count, default=500, help="number of runs (default: 500)"
-    )
-    parser.add_argument(
-        "--until",
-        choices=["decided"],
-        help="begin with --runs and add runs until every row is decided",
-    )
-    parser.add_argument(
-        "--most", type=parse_count, help="runs after which --until ends (default: 20000)"
-    )
-    add_options(parser, "seed")
-    add_confidence(parser, 0.99, "with which all intervals hold together")
-    parser.add_argument("--out", type=Path, help="directory for the verdict, its table and picture")
-    parser.add_argument(
-        "--resume", action="store_true", help="add runs to the verdict in --out, up to --runs"
-    )
-    add_options(parser, "pool", "all", "json", "no-plot")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -166,6 +140,3 @@ def _replay_command(options: argparse.Namespace) -> str:
     if options.trust:
         command.append("--trust")
     return shlex.join([*command, "--replica"])
-
-
-COMMAND = Command("check", "compare simulations with theory, one row per promise", _declare, _run)

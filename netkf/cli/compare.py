@@ -3,15 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from netkf.cli.options import Command, add_confidence, add_options, print_json
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
-    add_confidence(parser, 0.95, "that all marks are right")
-    add_options(parser, "json")
+from netkf.cli.options import print_json
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -25,12 +18,3 @@ def _run(options: argparse.Namespace) -> int:
     else:
         print(format_comparison(comparison))
     return 0
-
-
-COMMAND = Command(
-    "compare",
-    "compare finished runs side by side and mark significant differences",
-    _declare,
-    _run,
-    takes_scenario=False,
-)

@@ -3,36 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from netkf.cli import pictures
 from netkf.cli.options import (
-    Command,
-    add_confidence,
-    add_options,
     load_scenario,
-    parse_count,
     print_json,
     print_table_notes,
     print_title,
 )
 from netkf.cli.progress import ProgressLine
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--filters",
-        required=True,
-        metavar="F1,F2,...",
-        help='kinds of filters, or tables such as {kind="hcmci",steps=3}; the first is compared '
-        "with each of the others",
-    )
-    parser.add_argument(
-        "--runs", type=parse_count, default=100, help="runs of each filter (default: 100)"
-    )
-    add_confidence(parser, 0.95, "that all marks are right")
-    parser.add_argument("--out", type=Path, help="directory for tables and a picture")
-    add_options(parser, "no-plot", "seed", "engine", "pool", "json")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -75,11 +54,3 @@ def _compare(options: argparse.Namespace) -> int:
     if options.out is not None and not options.json:
         print(f"written to {options.out}")
     return 0
-
-
-COMMAND = Command(
-    "compare-filters",
-    "compare filters on one truth and one network, with intervals of their differences",
-    _declare,
-    _run,
-)

@@ -29,11 +29,6 @@ if TYPE_CHECKING:
 
 BAD_USAGE = 2
 """Exit status of bad usage, bad files and failures."""
-COMMANDS = (
-    *("run", "check", "theory", "sweep", "size", "consistency", "compare", "compare_filters"),
-    *("plot", "report", "why", "schema", "new"),
-)
-"""Modules of this package, each with a COMMAND."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -125,9 +120,8 @@ def _error_reason(error: BaseException | None) -> str:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line, with one subparser for each of COMMANDS."""
-    from importlib import import_module
-
     import netkf
+    from netkf.cli.commands import COMMANDS
     from netkf.cli.completion import add_completion
     from netkf.cli.options import Parser
 
@@ -139,6 +133,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"netkf {netkf.__version__}")
     add_completion(parser)
     commands: Any = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
-    for name in COMMANDS:
-        import_module(f"netkf.cli.{name}").COMMAND.add_to(commands)
+    for command in COMMANDS:
+        command.add_to(commands)
     return parser

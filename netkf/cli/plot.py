@@ -6,25 +6,8 @@ import argparse
 from importlib.util import find_spec
 from pathlib import Path
 
-from netkf.cli.options import Command, add_trust
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.figures.names import FIGURE_NAMES, FORMATS
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="run directory")
-    parser.add_argument(
-        "--figure",
-        action="append",
-        default=[],
-        metavar="NAME[,NAME]",
-        help=f"figures to draw: {', '.join(FIGURE_NAMES)} (default: all)",
-    )
-    parser.add_argument(
-        "--out", type=Path, help="file or directory of the figures (default: DIR/figures)"
-    )
-    parser.add_argument("--format", choices=FORMATS, help="format of the files (default: png)")
-    add_trust(parser, "DIR")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -80,12 +63,3 @@ def _figure_names(text: str) -> list[str]:
             remedy = f"{hint}figures are {', '.join(FIGURE_NAMES)}"
             raise ScenarioError("figure", "is not known", name, remedy)
     return names
-
-
-COMMAND = Command(
-    "plot",
-    "draw figures of finished runs, ensembles and sweeps",
-    _declare,
-    _run,
-    takes_scenario=False,
-)

@@ -7,16 +7,11 @@ import sys
 import threading
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from netkf.cli import pictures
 from netkf.cli.options import (
-    Command,
-    add_options,
     load_scenario,
-    parse_count,
-    parse_replica,
     print_notes,
     print_title,
 )
@@ -29,25 +24,6 @@ if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
 
 MIN_RATED_EVENTS = 10_000  # of fewer events a run takes as long as its preparations
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--runs", type=parse_count, help="number of independent runs (default: 1)")
-    parser.add_argument(
-        "--replica", type=parse_replica, help="run this replica of an ensemble (default: 0)"
-    )
-    add_options(parser, "seed", "engine")
-    parser.add_argument("--out", type=Path, help="directory of the run (default: runs/NAME-k)")
-    add_options(parser, "pool")
-    parser.add_argument(
-        "--trace",
-        choices=["full", "first", "none"],
-        help="runs that keep tables of events and states (default: full for one run, else first)",
-    )
-    parser.add_argument(
-        "--resume", action="store_true", help="continue the runs of --out that were stopped"
-    )
-    add_options(parser, "no-plot")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -179,6 +155,3 @@ def _describe_divergence(completed: CompletedRun, nodes: Sequence[int]) -> str:
         f"{completed.status}, {problem} at {samples.times[-1]:g} s and the run ended "
         f"there{averaging}"
     )
-
-
-COMMAND = Command("run", "simulate a scenario and keep the results", _declare, _run)

@@ -7,41 +7,12 @@ import sys
 
 from netkf.cli.options import (
     FAILED,
-    Command,
-    add_confidence,
-    add_options,
-    add_vary,
     load_scenario,
-    parse_count,
     print_json,
     print_table_notes,
 )
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    add_vary(parser, "KEY.PATH=LOW:HIGH", "the key to search and its range")
-    parser.add_argument(
-        "--target",
-        required=True,
-        metavar="QUANTITY<=LIMIT",
-        help="quantities: worst_rms, mean_rms, worst_trace, mean_trace, within_central",
-    )
-    parser.add_argument(
-        "--by",
-        choices=["theory", "simulation"],
-        help="decide by theory or by simulation alone (default: the exact quantity or a bound, "
-        "and simulation where the bound does not reach the target)",
-    )
-    parser.add_argument(
-        "--runs",
-        type=parse_count,
-        default=1000,
-        help="at most this many runs per value (default: 1000)",
-    )
-    add_confidence(parser, 0.95, "that all decisions are right")
-    add_options(parser, "seed", "engine", "pool", "json")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -82,8 +53,3 @@ def _run(options: argparse.Namespace) -> int:
     if not sizing:
         print(f"netkf: {format_answer(sizing)}", file=sys.stderr)
     return 0 if sizing else FAILED
-
-
-COMMAND = Command(
-    "size", "find the smallest (or largest) value of a key that meets a target", _declare, _run
-)

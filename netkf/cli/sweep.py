@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
 from netkf.cli.options import (
-    Command,
-    add_options,
-    add_vary,
     load_scenario,
-    parse_count,
     print_json,
     print_table_notes,
     print_title,
@@ -23,20 +18,6 @@ from netkf.cli.progress import ProgressLine
 if TYPE_CHECKING:
     from netkf.scenario.scenario import Scenario
     from netkf.studies.sweep import CompletedSweep
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    add_vary(
-        parser,
-        "KEY.PATH=V1,V2,...",
-        "values of a key, or START:STOP:COUNT; repeat it for a grid over several keys; all on one "
-        "truth, or the status says another",
-    )
-    parser.add_argument(
-        "--runs", type=parse_count, default=1, help="runs at each point (default: 1)"
-    )
-    parser.add_argument("--out", type=Path, help="directory (default: runs/NAME-sweep-k)")
-    add_options(parser, "no-plot", "seed", "engine", "pool", "json")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -86,8 +67,3 @@ def _print_sweep(
     line = f"{points:,} point{'s' if points > 1 else ''} of {runs:,} run{'s' if runs > 1 else ''}"
     line += f" in {completed.seconds:.2f} s, all with the same random draws"
     print(line + ("; +- one standard error" if runs > 1 else ""))
-
-
-COMMAND = Command(
-    "sweep", "simulate every point of a grid of parameters, one row per point", _declare, _run
-)

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from netkf.cli.options import Command, add_options, load_scenario, print_json, print_notes
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, "json")
+from netkf.cli.options import load_scenario, print_json, print_notes
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -25,8 +21,3 @@ def _run(options: argparse.Namespace) -> int:
     else:
         print(promises_text(scenario, promises))
     return 0
-
-
-COMMAND = Command(
-    "theory", "check assumptions and compute bounds and limits; no simulation", _declare, _run
-)

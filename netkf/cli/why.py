@@ -7,66 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from netkf.cli.options import (
-    Command,
-    add_options,
-    add_trust,
-    parse_count,
-    parse_replica,
     print_json,
     print_notes,
 )
-from netkf.core.errors import ScenarioError, quote
-from netkf.core.printable import MAX_NAME, shorten
+from netkf.core.errors import ScenarioError
+from netkf.core.printable import shorten
 
 if TYPE_CHECKING:
     from netkf.studies.why import Why
     from netkf.trace.run import Run
-
-
-def _declare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("directory", type=Path, metavar="DIR", help="run directory")
-    parser.add_argument(
-        "--node",
-        type=_parse_node,
-        metavar="I",
-        help="id or name of the node (default: the worst node)",
-    )
-    parser.add_argument(
-        "--at",
-        type=float,
-        metavar="T",
-        help="simulated time in seconds (default: the worst sample of that node)",
-    )
-    parser.add_argument(
-        "--replica", type=parse_replica, help="run of an ensemble with all traces (default: 0)"
-    )
-    parser.add_argument(
-        "--below",
-        type=float,
-        metavar="X",
-        help="trace of P that the smallest set of messages has to reach (default: 5 percent above "
-        "that without losses)",
-    )
-    parser.add_argument(
-        "--most", type=int, default=3, choices=(1, 2, 3), help="messages of the set (default: 3)"
-    )
-    parser.add_argument(
-        "--replays",
-        type=parse_count,
-        help="largest number of replays that search the set (default: 10 to 1000, by the events "
-        "of the run)",
-    )
-    add_trust(parser, "DIR")
-    parser.add_argument("--out", type=Path, help="directory for the answer and its table")
-    add_options(parser, "json")
-
-
-def _parse_node(text: str) -> str:
-    """Return the id or the name of a node; raises ArgumentTypeError for a text that is neither."""
-    if not text.strip() or len(text) > MAX_NAME:
-        rule = f"must be the id or the name of a node, of at most {MAX_NAME} characters"
-        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
-    return text.strip()
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -137,12 +86,3 @@ def _write_explanation(explanation: Why, directory: Path) -> None:
     write_json(directory / "why.json", explanation.to_dict())
     with write_atomically(directory / "why.csv") as temporary:
         explanation.table.to_csv(temporary, index=False)
-
-
-COMMAND = Command(
-    "why",
-    "explain the estimate of a node at a time: the messages that it received, and those missing",
-    _declare,
-    _run,
-    takes_scenario=False,
-)

@@ -1,0 +1,358 @@
+"""The table of commands and their options."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from netkf.core.errors import quote
+from netkf.core.printable import MAX_NAME
+from netkf.figures.names import FIGURE_NAMES, FORMATS
+
+ENGINES = ("auto", "simpy", "processes", "compiled")
+MAX_RUNS = 100_000_000  # larger numbers are typing errors
+WORKERS_PER_CORE = 8  # more processes only fill the memory
+
+
+class Option(NamedTuple):
+    """An argument of a command: its name, and the arguments of ``add_argument``."""
+
+    name: str
+    settings: dict[str, Any]
+
+
+class Command(NamedTuple):
+    """A command: its name, its help, and its options; those in a tuple exclude each other.
+
+    The module of this package with its name has ``_run``, which runs it with the parsed options and
+    returns the exit status. Unless it ``takes_scenario``, there are no scenario file, ``--set`` and
+    ``--trust``.
+    """
+
+    name: str
+    help: str
+    options: tuple[Option | tuple[Option, ...], ...]
+    takes_scenario: bool = True
+
+    def add_to(self, commands: Any) -> None:
+        """Add the parser of the command to ``commands``; namespaces have its function ``run``."""
+        parser = commands.add_parser(self.name, help=self.help, description=self.help)
+        for entry in (*(SCENARIO if self.takes_scenario else ()), *self.options):
+            if isinstance(entry, Option):
+                parser.add_argument(entry.name, **entry.settings)
+                continue
+            group = parser.add_mutually_exclusive_group()
+            for name, settings in entry:
+                group.add_argument(name, **settings)
+        parser.set_defaults(run=self.run)
+
+    def run(self, options: argparse.Namespace) -> int:
+        """Run the command with the parsed options; return the exit status."""
+        # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
+        module: Any = import_module(f"netkf.cli.{self.name.replace('-', '_')}")
+        status: int = module._run(options)
+        return status
+
+
+def _option(name: str, text: str, **settings: Any) -> Option:
+    if isinstance(settings.get("default"), (int, float)):
+        text = f"{text} (default: {settings['default']})"
+    return Option(name, {"help": text, **settings})
+
+
+def _flag(name: str, text: str) -> Option:
+    return _option(name, text, action="store_true")
+
+
+def _integer(text: str, least: int, largest: int) -> int:
+    """Return an integer from ``least`` to ``largest``; raises ArgumentTypeError."""
+    # Twenty digits suffice to compare: Python refuses to convert texts of thousands.
+    if not text.isdecimal() or not least <= int(text[:20]) <= largest:
+        rule = f"must be an integer of at least {least} and at most {largest:,}"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return int(text)
+
+
+def parse_count(text: str) -> int:
+    """Return a number of runs or replays; raises ArgumentTypeError unless it is 1 .. MAX_RUNS."""
+    return _integer(text, 1, MAX_RUNS)
+
+
+def parse_workers(text: str) -> int:
+    """Return the value of ``--workers``; raises ArgumentTypeError."""
+    return _integer(text, 1, max(64, WORKERS_PER_CORE * (os.cpu_count() or 1)))
+
+
+def parse_seed(text: str) -> int:
+    """Return the value of ``--seed``; raises ArgumentTypeError for any text but digits."""
+    if not text.isdecimal() or len(text) > 30:
+        rule = "must be a non-negative integer of at most 30 digits"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return int(text)
+
+
+def parse_replica(text: str) -> int:
+    """Return the value of ``--replica``; raises ArgumentTypeError."""
+    if not text.isdecimal() or len(text) > 12:
+        rule = "must be an integer of at least 0"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return int(text)
+
+
+def parse_node(text: str) -> str:
+    """Return the id or the name of a node; raises ArgumentTypeError for a text that is neither."""
+    if not text.strip() or len(text) > MAX_NAME:
+        rule = f"must be the id or the name of a node, of at most {MAX_NAME} characters"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return text.strip()
+
+
+def _trust(folder: str) -> Option:
+    text = f"import classes that the scenario names, also from {folder} or the current one"
+    return _flag("--trust", text)
+
+
+def _directories(text: str) -> Option:
+    return _option("directories", text, type=Path, nargs="+", metavar="DIR")
+
+
+def _runs(text: str, default: int | None) -> Option:
+    return _option("--runs", text, type=parse_count, default=default)
+
+
+def _confidence(default: float, what: str) -> Option:
+    return _option("--confidence", f"probability {what}", type=float, default=default)
+
+
+def _out(text: str) -> Option:
+    return _option("--out", text, type=Path)
+
+
+def _vary(metavar: str, text: str) -> Option:
+    return _option("--vary", text, action="append", required=True, metavar=metavar)
+
+
+def _replica(text: str) -> Option:
+    return _option("--replica", text, type=parse_replica)
+
+
+CHANGES = "override a key of the scenario; VALUE is written as in TOML"
+UNTIL = "begin with --runs and add runs until every row is decided"
+FOLDER = "folder of the files (default: the current one)"
+FIGURES = f"figures to draw: {', '.join(FIGURE_NAMES)} (default: all)"
+SCENARIO = (
+    _option("scenario", "scenario file (TOML)", type=Path),
+    _option("--set", CHANGES, action="append", default=[], metavar="KEY.PATH=VALUE"),
+    _trust("its folder"),
+)
+SEED = _option("--seed", "root seed (default: the scenario's)", type=parse_seed)
+ENGINE = _option(
+    "--engine",
+    "auto takes the compiled engine if it can run the scenario, else SimPy",
+    default="auto",
+    choices=ENGINES,
+)
+POOL = (
+    _option("--workers", "number of processes (default: one per core)", type=parse_workers),
+    _option("--scheduler", "Dask scheduler, tcp://HOST:PORT", metavar="ADDRESS"),
+)
+JSON = _flag("--json", "print one JSON document only")
+ALL = _flag("--all", "show all rows with all that they say")
+NO_PLOT = _flag("--no-plot", "do not draw a picture")
+
+COMMANDS = (
+    Command(
+        "run",
+        "simulate a scenario and keep the results",
+        (
+            _runs("number of independent runs (default: 1)", None),
+            _replica("run this replica of an ensemble (default: 0)"),
+            SEED,
+            ENGINE,
+            _out("directory of the run (default: runs/NAME-k)"),
+            POOL,
+            _option(
+                "--trace",
+                "runs that keep tables of events and states (default: full for one run, else "
+                "first)",
+                choices=["full", "first", "none"],
+            ),
+            _flag("--resume", "continue the runs of --out that were stopped"),
+            NO_PLOT,
+        ),
+    ),
+    Command(
+        "check",
+        "compare simulations with theory, one row per promise",
+        (
+            _runs("number of runs", 500),
+            _option("--until", UNTIL, choices=["decided"]),
+            _option("--most", "runs after which --until ends (default: 20000)", type=parse_count),
+            SEED,
+            _confidence(0.99, "with which all intervals hold together"),
+            _out("directory for the verdict, its table and picture"),
+            _flag("--resume", "add runs to the verdict in --out, up to --runs"),
+            POOL,
+            ALL,
+            JSON,
+            NO_PLOT,
+        ),
+    ),
+    Command("theory", "check assumptions and compute bounds and limits; no simulation", (JSON,)),
+    Command(
+        "sweep",
+        "simulate every point of a grid of parameters, one row per point",
+        (
+            _vary(
+                "KEY.PATH=V1,V2,...",
+                "values of a key, or START:STOP:COUNT; repeat it for a grid over several keys; all "
+                "on one truth, or the status says another",
+            ),
+            _runs("runs at each point", 1),
+            _out("directory (default: runs/NAME-sweep-k)"),
+            NO_PLOT,
+            SEED,
+            ENGINE,
+            POOL,
+            JSON,
+        ),
+    ),
+    Command(
+        "size",
+        "find the smallest (or largest) value of a key that meets a target",
+        (
+            _vary("KEY.PATH=LOW:HIGH", "the key to search and its range"),
+            _option(
+                "--target",
+                "quantities: worst_rms, mean_rms, worst_trace, mean_trace, within_central",
+                required=True,
+                metavar="QUANTITY<=LIMIT",
+            ),
+            _option(
+                "--by",
+                "decide by theory or by simulation alone (default: the exact quantity or a bound, "
+                "and simulation where the bound does not reach the target)",
+                choices=["theory", "simulation"],
+            ),
+            _runs("at most this many runs per value", 1000),
+            _confidence(0.95, "that all decisions are right"),
+            SEED,
+            ENGINE,
+            POOL,
+            JSON,
+        ),
+    ),
+    Command(
+        "consistency",
+        "test if P describes the errors: NEES and NIS against their expected values",
+        (
+            _runs("number of runs", 50),
+            _confidence(0.99, "that no consistent filter is called broken"),
+            SEED,
+            ENGINE,
+            POOL,
+            ALL,
+            JSON,
+        ),
+    ),
+    Command(
+        "compare",
+        "compare finished runs side by side and mark significant differences",
+        (_directories("run directory"), _confidence(0.95, "that all marks are right"), JSON),
+        takes_scenario=False,
+    ),
+    Command(
+        "compare-filters",
+        "compare filters on one truth and one network, with intervals of their differences",
+        (
+            _option(
+                "--filters",
+                'kinds of filters, or tables such as {kind="hcmci",steps=3}; the first is compared '
+                "with each of the others",
+                required=True,
+                metavar="F1,F2,...",
+            ),
+            _runs("runs of each filter", 100),
+            _confidence(0.95, "that all marks are right"),
+            _out("directory for tables and a picture"),
+            NO_PLOT,
+            SEED,
+            ENGINE,
+            POOL,
+            JSON,
+        ),
+    ),
+    Command(
+        "plot",
+        "draw figures of finished runs, ensembles and sweeps",
+        (
+            _directories("run directory"),
+            _option("--figure", FIGURES, action="append", default=[], metavar="NAME[,NAME]"),
+            _out("file or directory of the figures (default: DIR/figures)"),
+            _option("--format", "format of the files (default: png)", choices=FORMATS),
+            _trust("DIR"),
+        ),
+        takes_scenario=False,
+    ),
+    Command(
+        "report",
+        "write a page with the network in motion, figures and verdicts of a run",
+        (
+            _directories(
+                "directory of a run, an ensemble, a sweep, a verdict or compared filters; a second "
+                "one to compare with, or the verdict of the first"
+            ),
+            _out("file of the page (default: DIR/report.html)"),
+            _replica("recorded run to show (default: the first)"),
+            _trust("the directory"),
+        ),
+        takes_scenario=False,
+    ),
+    Command(
+        "why",
+        "explain the estimate of a node at a time: the messages that it received, and those "
+        "missing",
+        (
+            _option("directory", "run directory", type=Path, metavar="DIR"),
+            _option("--node", "id or name (default: the worst node)", type=parse_node, metavar="I"),
+            _option("--at", "seconds (default: its worst sample)", type=float, metavar="T"),
+            _replica("run of an ensemble with all traces (default: 0)"),
+            _option(
+                "--below",
+                "trace of P that the smallest set of messages has to reach (default: 5 percent "
+                "above that without losses)",
+                type=float,
+                metavar="X",
+            ),
+            _option("--most", "messages of the set", type=int, default=3, choices=(1, 2, 3)),
+            _option(
+                "--replays",
+                "largest number of replays that search the set (default: 10 to 1000, by the events "
+                "of the run)",
+                type=parse_count,
+            ),
+            _trust("DIR"),
+            _out("directory for the answer and its table"),
+            JSON,
+        ),
+        takes_scenario=False,
+    ),
+    Command(
+        "schema",
+        "print the JSON Schema of scenario files, for editors",
+        (_flag("--markdown", "print a reference of all keys instead"),),
+        takes_scenario=False,
+    ),
+    Command(
+        "new",
+        "write a commented scenario and its tests",
+        (
+            _option("name", "NAME.toml and test_NAME.py are written", metavar="NAME"),
+            _option("--folder", FOLDER, type=Path, default=Path()),
+        ),
+        takes_scenario=False,
+    ),
+)
