@@ -34,6 +34,8 @@ LAGS, PARTS = (2, 3, 4), 4
 """Lags of the autocorrelation of each entry beside 1, and equal parts of a series in which the
 pooled variance is tested.
 """
+NEGLIGIBLE = 1e-8
+"""Share of a standard deviation that counts as rounding."""
 MIN_COUNT_OF_ANY_LAW = 200
 """Values from which variances of numbers of an unknown law are tested."""
 
@@ -88,6 +90,22 @@ def transition_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray
     E = scipy.linalg.expm(np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * gap)
     W = E[n:, n:].T @ E[:n, n:]
     return E[n:, n:].T, 0.5 * (W + W.T)
+
+
+def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
+    """Return the law of the state after ``gap`` seconds together with the two moments of x over
+    them: its response (3 n, n) to the state before, and the covariance (3 n, 3 n) of its noise.
+
+    The plant is dx = A x dt + B dw with A (n, n) and B (n, m). The moments are the integrals of x
+    and of x times the Legendre polynomial P_1 over the gap.
+    """
+    n, zero, eye = len(A), np.zeros_like(A), np.eye(len(A))
+    # x, I = int x ds and J = int I ds: int s x ds = g I - J.
+    chain = np.block([[A, zero, zero], [eye, zero, zero], [zero, eye, zero]])
+    Phi, S = transition_law(chain, np.concatenate([B, np.zeros((2 * n, B.shape[1]))]), gap)
+    # int (2 s / g - 1) x ds = I - 2 J / g.
+    T = np.block([[eye, zero, zero], [zero, eye, zero], [zero, eye, -2.0 / gap * eye]])
+    return (T @ Phi)[:, :n], T @ S @ T.T
 
 
 def compare_variances(
@@ -243,6 +261,23 @@ def compare_cells(u: FloatArray, labels: Sequence[str], level: float, noun: str)
                 distances.append((found, f"{label}, {cell_label(k)}"))
     text = f"{counts.sum():,.0f} {noun}, largest difference of a share from 1/{CELLS}"
     return Comparison(distances, text, overall=CELLS)
+
+
+def compare_sides(e: FloatArray, others: FloatArray, level: float) -> Iterator[Comparison]:
+    """Compare mean and variance of noise ``e`` (N, q) where each of the numbers ``others`` (N, r)
+    is above its median with those where it is below: noise that does not depend on them has none.
+    """
+    varies = others.std(axis=0) > NEGLIGIBLE * (1.0 + np.abs(others).max(axis=0, initial=0.0))
+    sides = np.sign(others[:, varies] - np.median(others[:, varies], axis=0))
+    labels = [f"that component {k} is above its median" for k in np.flatnonzero(varies)]
+    for moment, values in (("mean", e), ("variance", e**2 - (e**2).mean(axis=0))):
+        found = compare_with(values, sides, component_labels(e), labels, level)
+        yield found._replace(text=f"its {moment}: correlation")
+
+
+def component_labels(e: FloatArray) -> list[str]:
+    """Return "component 0", "component 1", ... for the entries of the last axis."""
+    return [f"component {k}" for k in range(e.shape[-1])]
 
 
 def correlate(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -69,19 +69,13 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(channel, (Channel, Loss, Delay), settings)
-    check_channel_object(part, topology, 0)
+    _check_channel(part, topology, 0)
 
 
-def check_channel_object(part: Any, topology: Topology | None, seed: int) -> None:
-    """Check a Channel, Loss or Delay ``part``: delivery probabilities, delays, and simulated
-    outcomes against them, with random streams of ``seed``.
-
-    Without a ``topology`` the links are those of a complete graph of 4 nodes. Raises AssertionError
-    for the first rule that is broken; ``check_channel`` lists them.
-    """
+def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
     if isinstance(part, Channel):
-        check_channel_object(part.loss, topology, seed)
-        check_channel_object(part.delay, topology, seed)
+        _check_channel(part.loss, topology, seed)
+        _check_channel(part.delay, topology, seed)
         return
     watched = WatchedPart(part)
     watched.pickle_copy()

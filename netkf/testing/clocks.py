@@ -70,16 +70,10 @@ def check_clock(clock: Any, /, link: Link | None = None, **settings: Any) -> Non
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
-    check_clock_object(make_part(clock, (LinkClock,), settings), link, 0)
+    _check_clock(make_part(clock, (LinkClock,), settings), link, 0)
 
 
-def check_clock_object(part: Any, link: Link | None, seed: int) -> None:
-    """Check a LinkClock ``part``: increasing ticks, repeatable from equal generators, at the stated
-    rates and laws, with random streams of ``seed``.
-
-    ``link`` is the only entity to check; None: all entities of a complete graph of 4 nodes. Raises
-    AssertionError for the first rule that is broken; ``check_clock`` lists them.
-    """
+def _check_clock(part: Any, link: Link | None, seed: int) -> None:
     watched = WatchedPart(part)
     watched.pickle_copy()
     entities = _all_entities(part) if link is None else (link,)

@@ -50,16 +50,10 @@ def check_matching(matching: Any, /, topology: Topology | None = None, **setting
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(matching, (SlotActivation,), settings)
-    check_matching_object(part, topology, 0)
+    _check_matching(part, topology, 0)
 
 
-def check_matching_object(part: Any, topology: Topology | None, seed: int) -> None:
-    """Check a slot activation ``part``: the form of its matchings, their repeatability from equal
-    generators, and their frequencies and independence over slots, with random streams of ``seed``.
-
-    Without a ``topology`` it is checked on several small networks. Raises AssertionError for the
-    first rule that is broken; ``check_matching`` lists them.
-    """
+def _check_matching(part: Any, topology: Topology | None, seed: int) -> None:
     watched = WatchedPart(part)
     copy = watched.pickle_copy()
     networks = small_networks() if topology is None else (topology,)

@@ -17,8 +17,10 @@ from netkf.laws.noise import (
     PARTS,
     compare_entries,
     compare_means,
+    compare_sides,
     compare_variances,
     compare_with,
+    component_labels,
     whiten,
 )
 from netkf.linalg.arrays import FloatArray
@@ -29,8 +31,6 @@ LAGS = (2, 3, 7)
 """Steps apart, beside 1, at which correlations in time are tested."""
 CERTAIN = 1e-6
 """Noise in directions without any, relative to what it is added to, that counts as rounding."""
-NEGLIGIBLE = 1e-8
-"""Share of a standard deviation that counts as rounding."""
 MIN_VALUES = 1000
 """Smallest number of values whose mean is close enough to normal so far in its tails."""
 
@@ -85,14 +85,10 @@ def check_white(e: FloatArray, labels: NoiseLabels) -> None:
         check_uncorrelated(e[:, :-lag], e[:, lag:], labels, f"{lag} steps apart")
 
 
-def _names(count: int) -> list[str]:
-    return [f"component {k}" for k in range(count)]
-
-
 def _check_moments(e: FloatArray, labels: NoiseLabels, when: str) -> None:
     if e.shape[0] * e.shape[1] < MIN_VALUES:
         return
-    where, names, level = labels.where, _names(e.shape[-1]), family_level()
+    where, names, level = labels.where, component_labels(e), family_level()
     rule = f"{labels.noise} must have the mean 0{when}"
     demand_agreement(compare_means(e, names, level), where, rule)
     rule = f"{labels.noise} must have the covariance that {labels.field} states{when}"
@@ -108,7 +104,7 @@ def check_uncorrelated(one: FloatArray, other: FloatArray, labels: NoiseLabels, 
     if one[..., 0].size < MIN_VALUES:
         return
     rule = f"{labels.noise} must be uncorrelated with {labels.noise} {apart}"
-    names = _names(one.shape[-1]), _names(other.shape[-1])
+    names = component_labels(one), component_labels(other)
     demand_agreement(compare_with(one, other, *names, family_level()), labels.where, rule)
 
 
@@ -120,15 +116,9 @@ def check_independent(
     These are values before the noise is drawn, which messages call ``name``. Noise is compared
     where a covariate is above its median and where it is below.
     """
-    deviations = covariates.std(axis=0)
-    varies = deviations > NEGLIGIBLE * (1.0 + np.abs(covariates).max(axis=0, initial=0.0))
-    sides = np.sign(covariates[:, varies] - np.median(covariates[:, varies], axis=0))
-    others = [f"that component {k} is above its median" for k in np.flatnonzero(varies)]
-    for moment, values in (("mean", e), ("variance", e**2 - (e**2).mean(axis=0))):
-        comparison = compare_with(values, sides, _names(e.shape[1]), others, family_level())
-        if len(e) >= MIN_VALUES:
-            text, rule = f"its {moment}: correlation", f"{labels.noise} must not depend on {name}"
-            demand_agreement(comparison._replace(text=text), labels.where, rule)
+    rule = f"{labels.noise} must not depend on {name}"
+    for comparison in compare_sides(e, covariates, family_level()) if len(e) >= MIN_VALUES else ():
+        demand_agreement(comparison, labels.where, rule)
 
 
 def whitened(

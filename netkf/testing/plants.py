@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.core.errors import NetkfError
-from netkf.laws.noise import transition_law, whiten
+from netkf.laws.noise import moment_law, transition_law, whiten
 from netkf.linalg.arrays import FloatArray, is_semidefinite
 from netkf.linalg.spectra import eigenvalues, growth_factor, growth_rate
 from netkf.plants.diffusion import Diffusion
@@ -80,15 +80,10 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
     part = make_part(plant, (Plant,), settings)
-    check_plant_object(part, 0)
+    _check_plant(part, 0)
 
 
-def check_plant_object(part: Any, seed: int) -> None:
-    """Check a Plant ``part``: repeatable paths, and the stated laws of x(0) and of the noise, with
-    random streams of ``seed``.
-
-    Raises AssertionError for the first rule that is broken; ``check_plant`` lists them.
-    """
+def _check_plant(part: Any, seed: int) -> None:
     watched = WatchedPart(part)
     copy = watched.pickle_copy()
     name = watched.name
@@ -274,22 +269,6 @@ def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any)
             is_zero = not np.any(truth.local(slot))
             rule = "the local state must be 0 where a frame begins"
             demand(is_zero, where, rule, truth.local(slot))
-
-
-def moment_law(A: FloatArray, B: FloatArray, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the law of the state after ``gap`` seconds together with the two moments of x over
-    them: its response (3 n, n) to the state before, and the covariance (3 n, 3 n) of its noise.
-
-    The plant is dx = A x dt + B dw with A (n, n) and B (n, m). The moments are the integrals of x
-    and of x times the Legendre polynomial P_1 over the gap.
-    """
-    n, zero, eye = len(A), np.zeros_like(A), np.eye(len(A))
-    # x, I = int x ds and J = int I ds: int s x ds = g I - J.
-    chain = np.block([[A, zero, zero], [eye, zero, zero], [zero, eye, zero]])
-    Phi, S = transition_law(chain, np.concatenate([B, np.zeros((2 * n, B.shape[1]))]), gap)
-    # int (2 s / g - 1) x ds = I - 2 J / g.
-    T = np.block([[eye, zero, zero], [zero, eye, zero], [zero, eye, -2.0 / gap * eye]])
-    return (T @ Phi)[:, :n], T @ S @ T.T
 
 
 def _check_diffusion(part: Diffusion, copy: Diffusion, name: str, seed: int) -> None:

@@ -9,8 +9,8 @@ import pytest
 from netkf import parts
 from netkf.laws.losses import compare_coincidences
 from netkf.testing import noise
-from netkf.testing.channels import check_channel_object
-from netkf.testing.clocks import check_clock_object
+from netkf.testing.channels import _check_channel
+from netkf.testing.clocks import _check_clock
 
 LABELS = noise.NoiseLabels("Some.path", "the noise", "R")
 SEEDS = 10
@@ -129,7 +129,7 @@ def found_by(checker, part):
 
 
 def test_one_lossier_direction_is_found():
-    assert found_by(check_channel_object, OneLossier(0.8)) >= 7
+    assert found_by(_check_channel, OneLossier(0.8)) >= 7
 
 
 @pytest.mark.parametrize("cls", [Slower, OneSlower])
@@ -138,16 +138,16 @@ def test_slower_clocks_are_found(cls, monkeypatch):
     # in another order.
     monkeypatch.setattr("netkf.testing.clocks._check_entity", lambda *_: None)
     monkeypatch.setattr("netkf.testing.clocks._check_gaps", lambda *_: None)
-    assert found_by(check_clock_object, cls(rate=2.0)) >= 7
+    assert found_by(_check_clock, cls(rate=2.0)) >= 7
 
 
 def test_sound_channels_and_clocks_pass_at_other_seeds(monkeypatch):
     monkeypatch.setattr(noise, "LEVEL", 1e-4)
     monkeypatch.setattr("netkf.testing.clocks._check_entity", lambda *_: None)
     for seed in range(3):
-        check_channel_object(parts.Bernoulli(0.7), None, seed)
-        check_channel_object(parts.GilbertElliott(mean_loss=0.1, mean_burst=20.0), None, seed)
-        check_channel_object(parts.LognormalDelay(0.3, 1.5), None, seed)
-        check_clock_object(parts.Poisson(rate=3.0), None, seed)
-        check_clock_object(parts.Renewal("gamma", rate=2.0, shape=0.2), None, seed)
-        check_clock_object(parts.Poisson(rate=3.0, at="nodes"), None, seed)
+        _check_channel(parts.Bernoulli(0.7), None, seed)
+        _check_channel(parts.GilbertElliott(mean_loss=0.1, mean_burst=20.0), None, seed)
+        _check_channel(parts.LognormalDelay(0.3, 1.5), None, seed)
+        _check_clock(parts.Poisson(rate=3.0), None, seed)
+        _check_clock(parts.Renewal("gamma", rate=2.0, shape=0.2), None, seed)
+        _check_clock(parts.Poisson(rate=3.0, at="nodes"), None, seed)

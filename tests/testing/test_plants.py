@@ -5,9 +5,9 @@ import pytest
 
 from netkf import parts
 from netkf.testing import check_matching, check_plant, check_sensor, noise
-from netkf.testing.matchings import check_matching_object
-from netkf.testing.plants import check_plant_object
-from netkf.testing.sensors import check_sensor_object
+from netkf.testing.matchings import _check_matching
+from netkf.testing.plants import _check_plant
+from netkf.testing.sensors import _check_sensor
 from tests.testing.broken_plants import FLOW, LINEAR, MATCHINGS, PLANTS, REGRESSOR, SENSORS
 from tests.testing.sound_parts import HEALTHY_MATCHINGS, HEALTHY_PLANTS, HEALTHY_SENSORS
 from tests.testing.test_channels import refused
@@ -134,7 +134,7 @@ def test_false_alarms_are_as_rare_as_stated(seed, monkeypatch):
 
 
 CHECKERS = (
-    check_sensor_object,
-    check_plant_object,
-    lambda part, seed: check_matching_object(part, None, seed),
+    _check_sensor,
+    _check_plant,
+    lambda part, seed: _check_matching(part, None, seed),
 )
