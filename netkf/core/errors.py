@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from netkf.core.printable import cut_middle, shorten
 
@@ -73,6 +74,17 @@ class ScenarioError(NetkfError, ValueError):
         got = "" if self.value is None else f"; got {quote(self.value)}"
         message = f"{rule}{got}; {remedy}" if remedy else f"{rule}{got}"
         return ": ".join(text for text in (file, key, message) if text)
+
+
+@contextmanager
+def errors_under(prefix: str) -> Iterator[None]:
+    """Put ``prefix``, the table that a block of code reads or checks, before the keys of the
+    ScenarioErrors that it raises.
+    """
+    try:
+        yield
+    except ScenarioError as error:
+        raise error.under(prefix) from None
 
 
 MAX_WORD = 100

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -18,7 +20,7 @@ from typing import Any, Self
 import numpy as np
 
 from netkf.core.contracts import hold_to_contract, is_netkf_class
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.instants import as_written
 from netkf.core.printable import MAX_NAME
 from netkf.core.stamps import TimeBase
@@ -127,6 +129,39 @@ class Component:
     def __hash__(self) -> int:
         """Return a hash that equal components share: values may be arrays, which have none."""
         return hash((type(self), len(dataclasses.fields(self))))
+
+
+def walk(value: Any) -> Iterator[Any]:
+    """Yield a value and all that is inside it, in components and tuples, outer ones first."""
+    yield value
+    if isinstance(value, Component):
+        value = tuple(getattr(value, field.name) for field in dataclasses.fields(value))
+    for item in value if isinstance(value, tuple) else ():
+        yield from walk(item)
+
+
+def rebuild(part: Any, change: Callable[[Any, dataclasses.Field[Any], Any], Any]) -> Any:
+    """Return a component, or a tuple of components, with ``change(part, field, value)`` in place of
+    the values of its fields; the same object if nothing changes. Errors are under the field's key.
+    """
+    if isinstance(part, tuple) and part and isinstance(part[0], Component):
+        items = []
+        for k, item in enumerate(part):
+            with errors_under(f"[{k}]"):
+                items.append(rebuild(item, change))
+        return part if all(map(operator.is_, items, part)) else tuple(items)
+    if not isinstance(part, Component):
+        return part
+    changed = {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        # The keys of the kind of a filter stand beside those that all filters have.
+        key = nullcontext() if field.name == "algorithm" else errors_under(field.name)
+        with key:
+            new = change(part, field, value) if field.init else value
+        if new is not value:
+            changed[field.name] = new
+    return dataclasses.replace(part, **changed) if changed else part
 
 
 def _check_settings(cls: type, values: Sequence[Any], named: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from netkf.core.clock import Entity
 from netkf.core.csv_files import read_columns
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import SourceFile, field, instance_of, source_file
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
@@ -177,10 +177,8 @@ class Contacts(LinkClock):
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every pair of the table is a link, and the clock fits."""
         demand_links(self.path, self._rows[1], topology)
-        try:
+        with errors_under("clock"):
             self.clock.check(topology)
-        except ScenarioError as error:
-            raise error.under("clock") from None
 
     def notes(self, topology: Topology) -> tuple[str, ...]:
         """Return lines on rows that overlap, and on links that have no contact."""

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from netkf.core.csv_files import read_columns
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.network.channels import Delay, Loss
@@ -202,7 +202,5 @@ class RecordedDelay(Delay):
 
 def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
     # Asked for during a run, so the error must carry the whole path of its key.
-    try:
+    with errors_under(key):
         return table.value(link, message, after)
-    except ScenarioError as error:
-        raise error.under(key) from None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.algorithms.kernels.gains import longest_interval
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
 from netkf.linalg.spectra import growth_rate
 from netkf.network.clocks import LinkClock
@@ -198,10 +198,8 @@ def _check_network(scenario: DerivedScenario) -> None:
         ("network.channel.delay", network.channel.delay),
     ):
         if part is not None:
-            try:
+            with errors_under(key):
                 part.check(topology)
-            except ScenarioError as error:
-                raise error.under(key) from None
     if not node_filter.timing.talks:
         return
     name = filter_name(scenario)

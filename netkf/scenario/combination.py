@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.derived import DerivedScenario
@@ -39,12 +39,10 @@ def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor
 
     ``key`` is the key path of the sensor.
     """
-    try:
+    with errors_under(key):
         # First as it is: a wrong field is reported before positions that the graph lacks.
         for candidate in (sensor, sensor.located(scenario.topology.positions)):
             candidate.check_state(scenario.plant.n)
-    except ScenarioError as error:
-        raise error.under(key) from None
 
 
 def check_weights(scenario: DerivedScenario) -> None:

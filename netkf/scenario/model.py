@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter
-from netkf.core.errors import ScenarioError, TheoryError
+from netkf.core.errors import TheoryError, errors_under
 from netkf.core.fields import (
     Component,
     array,
@@ -151,19 +151,15 @@ class ScenarioModel(Component):
         """
         super().__post_init__()
         for name in ("plant", "sensors", "network", "filter"):
-            value = getattr(self, name)
-            try:
-                object.__setattr__(self, name, restamp(value, self.time.stamps))
-            except ScenarioError as error:
-                raise error.under(name) from None
+            with errors_under(name):
+                restamped = restamp(getattr(self, name), self.time.stamps)
+            object.__setattr__(self, name, restamped)
         # Only graphs that are read, or made in Python, have nodes with names.
         names = self.topology.names if self.network.graph.may_name_nodes else None
         for name in ("sensors", "network", "filter"):
-            value = getattr(self, name)
-            try:
-                object.__setattr__(self, name, bind_names(value, names))
-            except ScenarioError as error:
-                raise error.under(name) from None
+            with errors_under(name):
+                bound = bind_names(getattr(self, name), names)
+            object.__setattr__(self, name, bound)
         self._put_on_grid()
 
     def _put_on_grid(self) -> None:
@@ -209,10 +205,8 @@ class ScenarioModel(Component):
     @cached_property
     def topology(self) -> Topology:
         """The nodes and links; raises ScenarioError if the graph cannot be built."""
-        try:
+        with errors_under("network.graph"):
             return self.network.graph.build(self.seed)
-        except ScenarioError as error:
-            raise error.under("network.graph") from None
 
     @cached_property
     def nodes(self) -> tuple[int, ...]:

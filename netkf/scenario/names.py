@@ -3,64 +3,49 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from netkf.core.errors import ScenarioError, suggest_nearest
-from netkf.core.fields import Component, SourceFile
+from netkf.core.fields import SourceFile, rebuild
 from netkf.network.graphs import Graph
 
 Names = Mapping[str, int]
 """The ids of nodes by name."""
 
 
-def bind_names(value: Any, names: Names | None) -> Any:
+def bind_names(part: Any, names: Names | None) -> Any:
     """Return a component, or a tuple of components, with ids in place of ``names`` of nodes, in its
     fields and in the tables that it reads; the same object if it has none. Graphs, which know
     their own names, are left as they are. ``names`` is None if nodes cannot have any.
 
     Raises ScenarioError for a name that the graph does not have.
     """
-    if isinstance(value, SourceFile):
-        # A table that was read with other names, or without those that it has, is read again.
-        ids = names or {}
-        is_read = value.node_ids == ids or not (ids or value.node_ids or value.unknown)
-        return value if is_read else dataclasses.replace(value, node_ids=ids, unknown={})
-    if isinstance(value, tuple) and value and isinstance(value[0], Component):
-        items = tuple(_bind_at(f"[{k}]", item, names) for k, item in enumerate(value))
-        return value if all(a is b for a, b in zip(items, value, strict=True)) else items
-    if not isinstance(value, Component) or isinstance(value, Graph):
-        return value
-    changed = {}
-    for field in dataclasses.fields(value):
-        if not field.init:
-            continue
-        item = getattr(value, field.name)
+    ids = names or {}
+
+    def change(owner: Any, field: dataclasses.Field[Any], value: Any) -> Any:
+        if isinstance(value, Graph):
+            return value
+        if isinstance(value, SourceFile):
+            # A table that was read with other names, or without those that it has, is read again.
+            is_read = value.node_ids == ids or not (ids or value.node_ids or value.unknown)
+            return value if is_read else dataclasses.replace(value, node_ids=ids, unknown={})
         rule = field.metadata.get("rule")
-        if rule is not None and rule.of_nodes:
-            # Nodes that were taken from a table are taken again, when it is read again.
-            codes = set(getattr(getattr(value, "path", None), "unknown", {}).values())
-            is_taken = isinstance(item, tuple) and bool(codes.intersection(item))
-            bound = None if is_taken else _bind_field(field.name, item, names)
-        else:
-            bound = _bind_at(field.name, item, names)
-        if bound is not item:
-            changed[field.name] = bound
-    return dataclasses.replace(value, **changed) if changed else value
+        if rule is None or not rule.of_nodes:
+            return rebuild(value, change)
+        # Nodes that were taken from a table are taken again, when it is read again.
+        codes = set(getattr(getattr(owner, "path", None), "unknown", {}).values())
+        is_taken = isinstance(value, tuple) and bool(codes.intersection(value))
+        return None if is_taken else _bind_nodes(value, names)
+
+    return rebuild(part, change)
 
 
-def _bind_at(key: str, value: Any, names: Names | None) -> Any:
-    try:
-        return bind_names(value, names)
-    except ScenarioError as error:
-        # The keys of the kind of a filter stand beside those that all filters have.
-        raise (error if key == "algorithm" else error.under(key)) from None
-
-
-def _bind_field(key: str, value: Any, names: Names | None) -> Any:
+def _bind_nodes(value: Any, names: Names | None, key: str = "") -> Any:
     if isinstance(value, tuple):
-        items = tuple(_bind_field(f"{key}[{k}]", item, names) for k, item in enumerate(value))
-        return value if all(a is b for a, b in zip(items, value, strict=True)) else items
+        items = tuple(_bind_nodes(item, names, f"{key}[{k}]") for k, item in enumerate(value))
+        return value if all(map(operator.is_, items, value)) else items
     if not isinstance(value, str):
         return value
     if names is None:
@@ -79,5 +64,5 @@ def map_nodes(value: Any, change: Callable[[Any], Any]) -> Any:
     """
     if isinstance(value, tuple):
         items = tuple(map_nodes(item, change) for item in value)
-        return value if all(a is b for a, b in zip(items, value, strict=True)) else items
+        return value if all(map(operator.is_, items, value)) else items
     return value if isinstance(value, float) else change(value)

@@ -14,7 +14,7 @@ from typing import Any
 
 from netkf.core.contracts import ContractError, is_netkf_class, last_call, place_of, place_of_error
 from netkf.core.errors import quote
-from netkf.core.fields import Component
+from netkf.core.fields import Component, walk
 
 
 def user_components(value: Any) -> list[Component]:
@@ -22,14 +22,8 @@ def user_components(value: Any) -> list[Component]:
 
     Each comes before the components inside it.
     """
-    if isinstance(value, Component):
-        own = [] if is_netkf_class(type(value)) else [value]
-        items = [getattr(value, field.name) for field in dataclasses.fields(value)]
-    elif isinstance(value, tuple):
-        own, items = [], list(value)
-    else:
-        return []
-    return [*own, *(component for item in items for component in user_components(item))]
+    parts = (part for part in walk(value) if isinstance(part, Component))
+    return [part for part in parts if not is_netkf_class(type(part))]
 
 
 def find_unimportable_class(scenario: Any, in_script: bool = True) -> str | None:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.contacts import Contacts
@@ -34,16 +31,10 @@ def check_records(scenario: DerivedScenario) -> None:
             )
     plant = scenario.plant
     if isinstance(plant, RecordedPlant):
-        _check_under("plant", lambda: plant.require_slots(sorted(_state_slots(scenario))))
+        with errors_under("plant"):
+            plant.require_slots(sorted(_state_slots(scenario)))
     if scenario.slotted and scenario.filter.algorithm.timing.talks:
         _check_exchanges(scenario)
-
-
-def _check_under(key: str, check: Callable[[], object]) -> None:
-    try:
-        check()
-    except ScenarioError as error:
-        raise error.under(key) from None
 
 
 def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None:
@@ -62,8 +53,9 @@ def _check_readings(scenario: DerivedScenario, key: str, sensor: Sensor) -> None
                 rule = f"{record.path.name} names a node that the graph does not have, {where}"
                 raise ScenarioError(f"{key}.path", rule, node, "correct the row or the graph")
     if scenario.slotted:
-        for node in sensor.nodes:
-            _check_under(key, partial(record.slots, node, scenario.slot_plant.period))
+        with errors_under(key):
+            for node in sensor.nodes:
+                record.slots(node, scenario.slot_plant.period)
 
 
 def sensed_slots(scenario: DerivedScenario) -> range:

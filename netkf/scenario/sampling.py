@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.recorded import RecordedDiffusion
@@ -32,10 +32,8 @@ def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, i
     for node, placed_sensor in _iterate_sampled_sensors(scenario):
         sensor = scenario.sensors[placed_sensor.entry]
         generator = _make_generator(streams, node, placed_sensor)
-        try:
+        with errors_under(f"sensors[{placed_sensor.entry}]"):
             times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
-        except ScenarioError as error:
-            raise error.under(f"sensors[{placed_sensor.entry}]") from None
         times = scenario.time_grid.before(scenario.horizon, times)
         if isinstance(getattr(sensor, "sampling", None), RecordedSampling):
             times = np.unique(times)  # rows of one instant are one sample
@@ -101,13 +99,11 @@ def require_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatAr
     plant = scenario.plant
     if not isinstance(plant, RecordedDiffusion):
         return
-    try:
+    with errors_under("plant"):
         plant.require_times(scenario.times, "the probe")
         for node, placed_sensor in _iterate_sampled_sensors(scenario):
             if scenario.sensors[placed_sensor.entry].is_random:
                 plant.require_times(times[node, placed_sensor.ordinal], f"a sample of node {node}")
-    except ScenarioError as error:
-        raise error.under("plant") from None
 
 
 def check_sampling(scenario: ScenarioModel) -> None:

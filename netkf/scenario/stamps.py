@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import math
-import operator
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
@@ -13,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     MAX_SECONDS,
     Component,
@@ -23,6 +21,7 @@ from netkf.core.fields import (
     integer,
     one_of,
     positive,
+    rebuild,
 )
 from netkf.core.instants import COARSEST, FINEST, MAX_REFINE
 from netkf.core.stamps import UNITS, TimeBase
@@ -107,28 +106,17 @@ class Time(Component):
         )
 
 
-def restamp(value: Any, stamps: TimeBase) -> Any:
+def restamp(part: Any, stamps: TimeBase) -> Any:
     """Return a component, or a tuple of components, whose tables are read with these ``stamps``;
     the same object if they are already. Raises ScenarioError for what a table then has wrong.
     """
-    if isinstance(value, SourceFile):
-        return value if value.stamps == stamps else dataclasses.replace(value, stamps=stamps)
-    if isinstance(value, tuple) and value and isinstance(value[0], Component):
-        items = tuple(_restamp_at(f"[{k}]", item, stamps) for k, item in enumerate(value))
-        return value if all(map(operator.is_, items, value)) else items
-    if not isinstance(value, Component):
-        return value
-    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-    changed = {name: _restamp_at(name, item, stamps) for name, item in fields.items()}
-    changed = {name: item for name, item in changed.items() if item is not fields[name]}
-    return dataclasses.replace(value, **changed) if changed else value
 
+    def change(_: Any, __: Any, value: Any) -> Any:
+        if isinstance(value, SourceFile):
+            return value if value.stamps == stamps else dataclasses.replace(value, stamps=stamps)
+        return rebuild(value, change)
 
-def _restamp_at(key: str, value: Any, stamps: TimeBase) -> Any:
-    try:
-        return restamp(value, stamps)
-    except ScenarioError as error:
-        raise error.under(key) from None
+    return rebuild(part, change)
 
 
 def stamp_notes(scenario: Any) -> tuple[str, ...]:

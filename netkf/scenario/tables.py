@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from netkf.core.contracts import is_netkf_class, place_of_error
-from netkf.core.errors import ScenarioError, suggest_nearest
-from netkf.core.fields import Component, SourceFile, integer, source_file
+from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
+from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
 from netkf.scenario.derived import DerivedScenario
@@ -72,14 +72,7 @@ def explain_left_over(error: ScenarioError, changes: Mapping[str, Any]) -> Scena
 
 def source_files(value: Any) -> list[SourceFile]:
     """Return all files that a scenario, or a value inside one, refers to."""
-    if isinstance(value, SourceFile):
-        return [value]
-    if isinstance(value, tuple):
-        return [source for item in value for source in source_files(item)]
-    if isinstance(value, Component):
-        items = [getattr(value, field.name) for field in dataclasses.fields(value)]
-        return [source for item in items for source in source_files(item)]
-    return []
+    return [item for item in walk(value) if isinstance(item, SourceFile)]
 
 
 def change_table(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -145,13 +138,10 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
         raise ScenarioError("format", f"must be {FORMAT}", version, "this netkf reads no other")
     values.setdefault("sensors", [])
     # First of all: tables are read with it.
+    values = _build_inner(values, {"time": partial(_build_table, Time, origin)})
     if "time" in values:
-        values["time"] = _call_under(
-            "time", lambda value: _build_object(Time, _as_dict(value), origin), values["time"]
-        )
         origin = origin._replace(stamps=values["time"].stamps)
-    if "plant" in values:
-        values["plant"] = _call_under("plant", partial(_build_plant, origin), values["plant"])
+    values = _build_inner(values, {"plant": partial(_build_plant, origin)})
     plant = values.get("plant")
     time = "slot " if isinstance(plant, SLOTTED) else ""
     if plant is NOT_IMPORTED:
@@ -161,17 +151,29 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
         "network": partial(_build_network, origin, time),
         "filter": partial(_build_filtering, origin),
     }
+    return _build_object(cls, _build_inner(values, builders), origin, ("format",))
+
+
+def _build_inner(
+    table: dict[str, Any], builders: Mapping[str, Callable[[Any], Any]]
+) -> dict[str, Any]:
+    """Return a table with the objects that ``builders`` make of the values of its keys."""
+    built = dict(table)
     for key, builder in builders.items():
-        if key in values:
-            values[key] = _call_under(key, builder, values[key])
-    return _build_object(cls, values, origin, ("format",))
+        if key in table:
+            with errors_under(key):
+                built[key] = builder(table[key])
+    return built
 
 
-def _call_under(key: str, builder: Callable[[Any], Any], value: Any) -> Any:
-    try:
-        return builder(value)
-    except ScenarioError as error:
-        raise error.under(key) from None
+def _build_table(cls: type[Any], origin: Origin, value: Any) -> Any:
+    return _build_object(cls, _as_dict(value), origin)
+
+
+def _build_part(family: str, origin: Origin, value: Any) -> Any:
+    """Return the part of a table or a component, any other value as it is."""
+    is_table = isinstance(value, (Mapping, Component))
+    return _build_component(family, origin, value, is_inner=True) if is_table else value
 
 
 def _build_object(
@@ -263,9 +265,8 @@ def _build_component(
     other_keys = ("kind", *choice_keys)
     if family == "filter" and not is_inner:
         other_keys = (*other_keys, *FILTERING_KEYS)
-    if family == "filter" and isinstance(table.get("inner"), (Mapping, Component)):
-        builder = partial(_build_component, family, origin, is_inner=True)
-        table["inner"] = _call_under("inner", builder, table["inner"])
+    if family == "filter":
+        table = _build_inner(table, {"inner": partial(_build_part, family, origin)})
     return NOT_IMPORTED if cls is None else _build_object(cls, table, origin, other_keys)
 
 
@@ -280,29 +281,23 @@ def _as_dict(value: Any) -> dict[str, Any]:
 def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
         raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
-    builder = partial(_build_sensor, origin)
-    return tuple(_call_under(f"[{k}]", builder, item) for k, item in enumerate(value))
+    tables = {f"[{k}]": item for k, item in enumerate(value)}
+    builders = dict.fromkeys(tables, partial(_build_sensor, origin))
+    return tuple(_build_inner(tables, builders).values())
 
 
 def _build_sensor(origin: Origin, value: Any) -> Any:
-    table = _as_dict(value)
-    if isinstance(table.get("sampling"), (Mapping, Component)):
-        builder = partial(_build_component, "sampling", origin)
-        table["sampling"] = _call_under("sampling", builder, table["sampling"])
+    table = _build_inner(_as_dict(value), {"sampling": partial(_build_part, "sampling", origin)})
     return _build_component("sensor", origin, table, default_kind="linear")
 
 
 def _build_network(origin: Origin, time: str, value: Any) -> Any:
-    table = _as_dict(value)
     builders: dict[str, Callable[[Any], Any]] = {
         "graph": lambda graph: _build_component("graph", origin, as_graph(graph)),
         "activation": partial(_build_activation, origin, time),
         "channel": partial(_build_channel, origin),
     }
-    for key, builder in builders.items():
-        if key in table:
-            table[key] = _call_under(key, builder, table[key])
-    return _build_object(Network, table, origin)
+    return _build_object(Network, _build_inner(_as_dict(value), builders), origin)
 
 
 def _build_activation(origin: Origin, time: str, value: Any) -> Any:
@@ -317,28 +312,18 @@ def _build_activation(origin: Origin, time: str, value: Any) -> Any:
         if len(prefixes) > 1:
             return NOT_IMPORTED
         time = prefixes[0] if prefixes else ""
-    table = _as_dict(value)
-    if isinstance(table.get("clock"), (Mapping, Component)):
-        builder = partial(_build_component, "activation", origin)
-        table["clock"] = _call_under("clock", builder, table["clock"])
+    table = _build_inner(_as_dict(value), {"clock": partial(_build_part, "activation", origin)})
     return _build_component(f"{time}activation", origin, table)
 
 
 def _build_channel(origin: Origin, value: Any) -> Any:
-    table = _as_dict(value)
-    for family in ("loss", "delay"):
-        if family in table:
-            builder = partial(_build_component, family, origin)
-            table[family] = _call_under(family, builder, table[family])
-    return _build_object(Channel, table, origin)
+    builders = {key: partial(_build_component, key, origin) for key in ("loss", "delay")}
+    return _build_object(Channel, _build_inner(_as_dict(value), builders), origin)
 
 
 def _build_filtering(origin: Origin, value: Any) -> Any:
     table = _as_dict(value)
     values = {key: table.pop(key) for key in FILTERING_KEYS if key in table}
-    if "model" in values:
-        values["model"] = _call_under(
-            "model", lambda v: _build_object(Belief, _as_dict(v), origin), values["model"]
-        )
+    values = _build_inner(values, {"model": partial(_build_table, Belief, origin)})
     algorithm = _build_component("filter", origin, table)
     return _build_object(Filtering, {"algorithm": algorithm, **values}, origin)
