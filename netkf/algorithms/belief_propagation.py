@@ -47,6 +47,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, load_flags, select, spread, store
 from netkf.linalg.small import copy_matrix, multiply_square
+from netkf.linalg.structs import Size
 
 MAX_STEPS = 10_000
 """Far beyond the diameter of any tree of use: a larger value is a mistake."""
@@ -79,10 +80,12 @@ def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
 
 
 @kernel
-def add_part(lanes: Lanes, total: FloatArray, part: FloatArray, work: FloatArray) -> None:
+def add_part(
+    lanes: Lanes, size: Size, total: FloatArray, part: FloatArray, work: FloatArray
+) -> None:
     """Add the independent evidence ``part`` to ``total``; ``work`` is scratch of that shape."""
     copy_part(lanes, part, work)
-    merge_lanes(lanes, total, work)
+    merge_lanes(lanes, size, total, work)
 
 
 @kernel
@@ -105,7 +108,12 @@ def write_prior(lanes: Lanes, root: FloatArray, part: FloatArray) -> None:
 
 @kernel
 def predict_part(
-    lanes: Lanes, part: FloatArray, back: FloatArray, total: FloatArray, work: FloatArray
+    lanes: Lanes,
+    size: Size,
+    part: FloatArray,
+    back: FloatArray,
+    total: FloatArray,
+    work: FloatArray,
 ) -> None:
     """Predict a part to a later state of a plant without noise, ``Z <- Z back``, with the inverse
     transition ``back`` (n, n); the caller predicts the centre. Two parts are scratch.
@@ -123,7 +131,7 @@ def predict_part(
                 entry += load(lanes, part, k, i) * back[i, j]
             store(lanes, work, n - 1, j, entry)
         store(lanes, work, n - 1, n, load(lanes, part, k, n))
-        merge_lanes(lanes, total, work)
+        merge_lanes(lanes, size, total, work)
     copy_part(lanes, total, part)
 
 
@@ -200,10 +208,10 @@ def predict(record: Any, h: int, run: Any) -> None:
         # The inverse transition of the modes that grow.
         fill_transition(record, record.back, run.gap)
         back = record.maps[0]
-        predict_part(lanes, record.prior[h], back, run.total, run.whitened)
-        predict_part(lanes, record.own[h], back, run.total, run.whitened)
+        predict_part(lanes, run.size, record.prior[h], back, run.total, run.whitened)
+        predict_part(lanes, run.size, record.own[h], back, run.total, run.whitened)
         for w in range(first, stop):
-            predict_part(lanes, record.received[w], back, run.total, run.whitened)
+            predict_part(lanes, run.size, record.received[w], back, run.total, run.whitened)
     if record.clocked == 1:
         record.elapsed[h, 0] += run.gap
 
@@ -241,7 +249,7 @@ def update(record: Any, h: int, run: Any) -> None:
                 entry += load(lanes, run.H, matrix, k, i) * W[i, j]
             store(lanes, work, n - 1, j, entry)
         store(lanes, work, n - 1, n, innovation)
-        merge_lanes(lanes, record.own[h], work)
+        merge_lanes(lanes, run.size, record.own[h], work)
     if record.clocked == 1:
         believe(record, h, run)
 
@@ -253,17 +261,17 @@ def believe(record: Any, h: int, run: Any) -> None:
     # may be so far off that digits are lost.
     lanes, n, total, work, W = run.lanes, len(run.size), run.total, run.whitened, record.W
     copy_part(lanes, record.prior[h], total)
-    add_part(lanes, total, record.own[h], work)
+    add_part(lanes, run.size, total, record.own[h], work)
     for w in range(run.first[h], run.first[h + 1]):
-        add_part(lanes, total, record.received[w], work)
+        add_part(lanes, run.size, total, record.received[w], work)
     if record.keeps == 0:
         # root = Z^-1 and xhat = base + Z^-1 z in all lanes (False: none keeps its estimate).
-        finish_lanes(lanes, record.root, record.xhat, h, record.base, total, work, False)
+        finish_lanes(lanes, run.size, record.root, record.xhat, h, record.base, total, work, False)
         return
     step = record.step
     for i in range(n):
         store(lanes, step, h, i, 0.0)
-    finish_lanes(lanes, record.root, step, h, step, total, work, False)
+    finish_lanes(lanes, run.size, record.root, step, h, step, total, work, False)
     # root = W Z^-1, made triangular, and xhat = base + W Z^-1 z.
     read_frame(record, h)
     for i in range(n):
@@ -286,7 +294,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
         copy_part(lanes, record.own[h], evidence[m])
         for w in range(first, stop):
             if w != run.receiver:
-                add_part(lanes, evidence[m], record.received[w], work)
+                add_part(lanes, run.size, evidence[m], record.received[w], work)
         return
     D = stop - first
     for k in range(D + 1):
@@ -300,12 +308,12 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     for k in range(D - 1, 0, -1):
         copy_part(lanes, record.received[first + k], suffix[k])
         if k < D - 1:
-            add_part(lanes, suffix[k], suffix[k + 1], work)
+            add_part(lanes, run.size, suffix[k], suffix[k + 1], work)
     for k in range(D):
         copy_part(lanes, prefix, evidence[m + k])
         if k < D - 1:
-            add_part(lanes, evidence[m + k], suffix[k + 1], work)
-        add_part(lanes, prefix, record.received[first + k], work)
+            add_part(lanes, run.size, evidence[m + k], suffix[k + 1], work)
+        add_part(lanes, run.size, prefix, record.received[first + k], work)
 
 
 @kernel
@@ -341,7 +349,7 @@ def predict_message(record: Any, m: int, run: Any, age: float) -> None:
     carry_mean(run.model, run, payload.xhat, m, age)
     if age > 0.0 and record.growing > 0:
         fill_transition(record, record.back, age)
-        predict_part(lanes, payload.evidence[m], record.maps[0], run.total, run.whitened)
+        predict_part(lanes, run.size, payload.evidence[m], record.maps[0], run.total, run.whitened)
     set_growing(record, lanes, payload.centre[m], payload.xhat[m])
 
 

@@ -27,6 +27,7 @@ from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, any_lane, load, load_flags, select, spread
+from netkf.linalg.local import local_lanes_pair
 
 
 @kernel
@@ -34,7 +35,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     """Send the estimate, and the inverse of its root, computed once for all receivers."""
     payload = record.payload
     copy_estimate(run, payload.xhat, payload.root, m, record.xhat, record.root, h, True)
-    invert_lanes(run.lanes, payload.inverse, m, record.root, h)
+    invert_lanes(run.lanes, run.size, payload.inverse, m, record.root, h)
 
 
 @kernel
@@ -49,20 +50,22 @@ def absorb(record: Any, h: int, run: Any) -> None:
     # sum w_j P_j^-1 as a root [Z, z] relative to the own estimate: the own term first, then the
     # others are merged into it.
     x, root = record.xhat, record.root
-    invert_lanes(lanes, record.inverse, h, root, h)
-    whiten(lanes, run.total, own, record.inverse, x, h, x, h)
+    total = local_lanes_pair(run.size, lanes, run.total)
+    whitened = local_lanes_pair(run.size, lanes, run.whitened)
+    invert_lanes(lanes, run.size, record.inverse, h, root, h)
+    whiten(lanes, run.size, total, own, record.inverse, x, h, x, h)
     for k in range(run.count):
         # A weight of 0 adds no information.
         if run.message_weight[k] > 0.0:
             m = run.message[k]
             if run.age[k] > 0.0:
                 carry(run.model, run, payload.xhat, payload.root, m, run.age[k])
-                invert_lanes(lanes, payload.inverse, m, payload.root, m)
+                invert_lanes(lanes, run.size, payload.inverse, m, payload.root, m)
             arrived = load_flags(lanes, run.arrived, k)
             weight = select(arrived, run.message_weight[k] / divisor, 0.0)
-            whiten(lanes, run.whitened, weight, payload.inverse, payload.xhat, m, x, h)
-            merge_lanes(lanes, run.total, run.whitened)
-    finish_lanes(lanes, root, x, h, x, run.total, run.whitened, own == 1.0)
+            whiten(lanes, run.size, whitened, weight, payload.inverse, payload.xhat, m, x, h)
+            merge_lanes(lanes, run.size, total, whitened)
+    finish_lanes(lanes, run.size, root, x, h, x, total, whitened, own == 1.0)
 
 
 @kernel(inlined=True)

@@ -86,17 +86,17 @@ def absorb(record: Any, h: int, run: Any) -> None:
     if not any_lane(copied > 0.0):
         return
     own = select(copied < 1.0, 1.0 - copied, 0.0)
-    invert_lanes(lanes, record.inverse, h, record.root, h)
-    whiten(lanes, run.total, own, record.inverse, x, h, x, h)
+    invert_lanes(lanes, run.size, record.inverse, h, record.root, h)
+    whiten(lanes, run.size, run.total, own, record.inverse, x, h, x, h)
     for w in range(first[h], first[h + 1]):
         if any_lane(load_flags(lanes, record.has_copy, w)):
             # The covariance of a silent neighbour's copy is enlarged by 1 / share.
             share = select(load_flags(lanes, record.fresh, w), 1.0, record.share)
-            invert_lanes(lanes, inverse, w, copy_root, w)
+            invert_lanes(lanes, run.size, inverse, w, copy_root, w)
             weight = share * load(lanes, record.weight, w)
-            whiten(lanes, run.whitened, weight, inverse, copy_x, w, x, h)
-            merge_lanes(lanes, run.total, run.whitened)
-    finish_lanes(lanes, record.root, x, h, x, run.total, run.whitened, copied == 0.0)
+            whiten(lanes, run.size, run.whitened, weight, inverse, copy_x, w, x, h)
+            merge_lanes(lanes, run.size, run.total, run.whitened)
+    finish_lanes(lanes, run.size, record.root, x, h, x, run.total, run.whitened, copied == 0.0)
 
 
 @kernel

@@ -74,7 +74,7 @@ def recipe(shares: Sequence[Sequence[float]], counts: Sequence[float]) -> Recipe
 def begin_pairs(record: Any, h: int, run: Any) -> None:
     """Make the pairs with which node ``h`` begins a slot, of its prediction and its reading."""
     lanes, shares = run.lanes, record.shares
-    invert_lanes(lanes, record.inverse, h, record.root, h)
+    invert_lanes(lanes, run.size, record.inverse, h, record.root, h)
     for k in range(len(shares)):
         write_information(lanes, run.total, shares[k, 0], record.inverse, h)
         if shares[k, 1] > 0.0:
@@ -112,7 +112,7 @@ def mix_pairs(record: Any, h: int, run: Any) -> None:
                 weigh_part(
                     lanes, work, weight, payload.parts, run.message[k], p, payload.xhat, x, h
                 )
-                merge_lanes(lanes, total, work)
+                merge_lanes(lanes, run.size, total, work)
         store_part(lanes, parts, h, p, total)
     if run.step == record.steps - 1:
         # The information of the estimate is the sum of the prediction's and that of the pairs.
@@ -120,8 +120,8 @@ def mix_pairs(record: Any, h: int, run: Any) -> None:
         write_information(lanes, total, counts[K], record.inverse, h)
         for p in range(K):
             weigh_part(lanes, work, spread(lanes, counts[p]), parts, h, p, x, x, h)
-            merge_lanes(lanes, total, work)
-        finish_lanes(lanes, record.root, x, h, x, total, work, False)
+            merge_lanes(lanes, run.size, total, work)
+        finish_lanes(lanes, run.size, record.root, x, h, x, total, work, False)
 
 
 def information_consensus_record(

@@ -204,7 +204,7 @@ def store_reading(record: Any, h: int, run: Any, e: int, r: int) -> None:
             for i in range(n - 1):
                 row[i, j, 0] = row[i, n, 0] = 0.0
         row[n - 1, n, 0] = run.y[first, k, 0]
-        merge_lanes(run.lanes, total, row)
+        merge_lanes(run.lanes, run.size, total, row)
     for i in range(n):
         y[h, e, i, 0] = total[i, n, 0]
         for j in range(n):

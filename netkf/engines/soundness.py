@@ -36,6 +36,7 @@ def sound_mask(
     P: FloatArray,
     without: BoolArray | bool = False,
     error: FloatArray | None = None,
+    of_roots: bool = False,
 ) -> BoolArray:
     """Return a mask (...) of sound pairs of estimates ``xhat`` (..., n) and covariances ``P``
     (..., n, n).
@@ -50,7 +51,7 @@ def sound_mask(
         with np.errstate(over="ignore", invalid="ignore"):
             finite &= np.isfinite((error * error).sum(axis=-1))
     whole = np.asarray(np.isfinite(P).all(axis=(-1, -2)))
-    semidefinite = _semidefinite(np.where(whole[..., None, None], P, 0.0))
+    semidefinite = of_roots or _semidefinite(np.where(whole[..., None, None], P, 0.0))
     return np.asarray(finite & ((whole & semidefinite) | np.asarray(without)))
 
 

@@ -44,6 +44,11 @@ def local_lanes_vector(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatAr
     return _local(size, scratch, len(size), len(lanes))
 
 
+def local_lanes_pair(size: Size, lanes: Lanes, scratch: FloatArray) -> FloatArray:
+    """Return an uninitialised array (n, n + 1, L) for L lanes, as ``local_lanes_matrix``."""
+    return _local(size, scratch, len(size), len(size) + 1, len(lanes))
+
+
 def _local(size: Size, scratch: FloatArray, *shape: int) -> FloatArray:
     """Return a new array of this ``shape`` if the size is a tuple, else ``scratch``."""
     return np.full(shape, np.nan) if isinstance(size, tuple) else scratch

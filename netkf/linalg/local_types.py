@@ -19,6 +19,7 @@ from netkf.linalg.array_layout import DATA, I64, array_without_owner
 from netkf.linalg.lanes import ALIGNMENT
 from netkf.linalg.local import (
     local_lanes_matrix,
+    local_lanes_pair,
     local_lanes_vector,
     local_matrix,
     local_vector,
@@ -26,8 +27,12 @@ from netkf.linalg.local import (
 from netkf.linalg.structs import WORD
 
 
-def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> None:
-    """Register a function of arrays with so many ``dimensions`` of n, and L with ``lanes``."""
+def _register(
+    function: Callable[..., Any], dimensions: int, lanes: bool, more_columns: int = 0
+) -> None:
+    """Register a function of arrays with so many ``dimensions`` of n, the last of them longer by
+    ``more_columns``, and L with ``lanes``.
+    """
 
     @type_callable(function)
     def _typer(_: Any) -> Callable[..., Any]:
@@ -50,7 +55,8 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
     def _on_stack(context: Any, builder: Any, sig: Any, _args: Any) -> Any:
         """Emit an array of constant shape in the stack frame of the calling function."""
         n, array_type = len(sig.args[0]), sig.return_type
-        shape = [n] * dimensions + [len(lane_tuple) for lane_tuple in sig.args[1:-1]]
+        shape = [n] * (dimensions - 1) + [n + more_columns]
+        shape += [len(lane_tuple) for lane_tuple in sig.args[1:-1]]
         array = context.get_value_type(array_type)
         memory = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), math.prod(shape)))
         # Lines of the cache, for values of several lanes.
@@ -68,4 +74,5 @@ def _register(function: Callable[..., Any], dimensions: int, lanes: bool) -> Non
 _register(local_matrix, 2, False)
 _register(local_vector, 1, False)
 _register(local_lanes_matrix, 2, True)
+_register(local_lanes_pair, 2, True, more_columns=1)
 _register(local_lanes_vector, 1, True)

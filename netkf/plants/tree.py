@@ -20,10 +20,11 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.local import local_vector
 from netkf.linalg.portable import apply, norm, product
 from netkf.linalg.structs import Size, sized
 from netkf.plants.transitions import Transitions, noise_factors
-from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
+from netkf.rng.numbers import NormalZiggurat, first_normals, normal_ziggurat
 from netkf.rng.streams import BLOCK_WORDS, USED
 
 MAX_TICKS = 1e15  # ticks of the finest cells up to the horizon
@@ -43,24 +44,22 @@ class Cells(NamedTuple):
     """The laws of C kinds of cells, smallest first, of n states.
 
     length, before, unit : (C,), ticks of a cell and of its first part, and the unit of its decade
-    left, right : (C,), kinds of its parts; -1: a tick, which is not divided
+    parts : (C, 2), kinds of its parts; -1: a tick, which is not divided
     level : (C,), second id of the streams of points that divide it
     Phi : (C, n, n), transposed, of the first part
-    middle, first, second : (C, 2 n, n), transposed: the effect of [z; w] on the state at the end of
-                            the first part, on its normals, and on those of the second
+    middle : (C, 2 n, n), transposed, the effect of [z; w] on the state at the end of the first part
+    inner : (C, 2, 2 n, n), transposed, the effect of [z; w] on the normals of each part
     knot_Phi, knot_L : (n, n), transposed, of the largest cell, between two knots
     """
 
     length: IntArray
     before: IntArray
     unit: FloatArray
-    left: IntArray
-    right: IntArray
+    parts: IntArray
     level: IntArray
     Phi: FloatArray
     middle: FloatArray
-    first: FloatArray
-    second: FloatArray
+    inner: FloatArray
     knot_Phi: FloatArray
     knot_L: FloatArray
 
@@ -68,16 +67,19 @@ class Cells(NamedTuple):
 class Walk(NamedTuple):
     """The cells around the present instant, from one between knots inwards, at most S.
 
-    kind, start, end : (S,), kind of each cell and the ticks at its ends
-    x, z : (S, n), the state at its start and the normals that move it to its end
-    v : (2 n,) scratch
+    kind, part : (S,), kind of each cell, and which part of the one before it it is (0, 1)
+    start, point, end : (S,), ticks at its ends and where it is divided
+    x : (S, n), the state at its start
+    v : (S, 2 n), [z; w]: the normals that move it to its end, and those of the point that divides
+        it
     """
 
     kind: IntArray
+    part: IntArray
     start: IntArray
+    point: IntArray
     end: IntArray
     x: FloatArray
-    z: FloatArray
     v: FloatArray
 
 
@@ -107,9 +109,8 @@ class Tree:
         which the state is taken to 0. ``stream`` (1, WIDTH) is the state of the plant's stream.
         """
         n, depth = len(start), len(self._cells.length) + 1
-        kind, begin, end = (np.zeros(depth, dtype=np.int64) for _ in range(3))
-        x, z = np.zeros((depth, n)), np.zeros((depth, n))
-        walk = Walk(kind, begin, end, x, z, np.zeros(2 * n))
+        cells = (np.zeros(depth, dtype=np.int64) for _ in range(5))
+        walk = Walk(*cells, x=np.zeros((depth, n)), v=np.zeros((depth, 2 * n)))
         states, offsets = np.empty((len(times), n)), np.zeros((frames, n))
         walk.x[0] = start
         ticks = np.rint(times * self._per_second).astype(np.int64)
@@ -143,8 +144,7 @@ def draw_normals_of_point(
     """
     stream[0, 0], stream[0, USED] = _ZERO, _FULL
     stream[0, 1], stream[0, 2] = np.uint64(first) + _ONE, np.uint64(second + 1)
-    for i in range(len(size)):
-        out[begin + i] = next_normal(stream, 0, ziggurat)
+    first_normals(size, stream, 0, ziggurat, out, begin)
 
 
 @kernel
@@ -177,9 +177,18 @@ def fill_states(
                 frame += 1
         while tick >= walk.end[depth]:
             depth -= 1
-        while walk.start[depth] != tick:
-            divide_cell(size, cells, stream, ziggurat, walk, depth, tick)
-            depth += 1
+        # Each in a loop of its own: cells and their normals depend on the tick only, so that a
+        # processor works on several at once.
+        outer, depth = depth, enter_cells(cells, walk, depth, tick)
+        for d in range(outer, depth):
+            point, kind = (
+                max(walk.start[d + 1], walk.end[d + 1] * (1 - walk.part[d + 1])),
+                walk.kind[d],
+            )
+            first = int(point / cells.unit[kind])  # exact: both are below 2^53
+            draw_normals_of_point(size, stream, first, cells.level[kind], ziggurat, walk.v[d], n)
+        for d in range(outer, depth):
+            divide_cell(size, cells, walk, d)
         for i in range(n):
             states[k, i] = walk.x[depth, i]
 
@@ -192,69 +201,66 @@ def enter_knot(
     kind = len(cells.length) - 1
     walk.kind[0], walk.start[0] = kind, knot * cells.length[kind]
     walk.end[0] = walk.start[0] + cells.length[kind]
-    draw_normals_of_point(size, stream, knot, -1, ziggurat, walk.z[0], 0)
+    draw_normals_of_point(size, stream, knot, -1, ziggurat, walk.v[0], 0)
 
 
 @kernel
 def move_to_knot(size: Size, cells: Cells, walk: Walk) -> None:
     """Move the state ``walk.x[0]`` of the first cell to its end."""
-    n = len(size)
+    n, x = len(size), walk.x
+    # The second row is free until the cell is divided.
     for i in range(n):
-        walk.v[i], walk.v[n + i] = walk.x[0, i], walk.z[0, i]
-        walk.x[0, i] = 0.0
-    for j in range(n):
-        for i in range(n):
-            walk.x[0, i] += cells.knot_Phi[j, i] * walk.v[j]
-    for j in range(n):
-        for i in range(n):
-            walk.x[0, i] += cells.knot_L[j, i] * walk.v[n + j]
+        total = 0.0
+        for j in range(n):
+            total += cells.knot_Phi[j, i] * x[0, j]
+        for j in range(n):
+            total += cells.knot_L[j, i] * walk.v[0, j]
+        x[1, i] = total
+    for i in range(n):
+        x[0, i] = x[1, i]
 
 
 @kernel
-def divide_cell(
-    size: Size,
-    cells: Cells,
-    stream: np.ndarray,
-    ziggurat: NormalZiggurat,
-    walk: Walk,
-    depth: int,
-    tick: int,
-) -> None:
-    """Divide cell number ``depth`` of the ``walk`` and put that of its two parts after it in which
-    ``tick`` lies.
+def enter_cells(cells: Cells, walk: Walk, depth: int, tick: int) -> int:
+    """Put the parts of cell number ``depth`` of the ``walk`` after it in which ``tick`` lies, down
+    to one that begins there; return the number of that.
     """
-    n, kind, v, inner = len(size), walk.kind[depth], walk.v, depth + 1
-    point = walk.start[depth] + cells.before[kind]
-    # v = [z; w]
-    first = int(point / cells.unit[kind])  # exact: both are below 2^53
-    draw_normals_of_point(size, stream, first, cells.level[kind], ziggurat, v, n)
+    while walk.start[depth] != tick:
+        kind, start, end = walk.kind[depth], walk.start[depth], walk.end[depth]
+        point = walk.point[depth] = start + cells.before[kind]
+        part = 1 if tick >= point else 0
+        depth += 1
+        walk.kind[depth], walk.part[depth] = cells.parts[kind, part], part
+        walk.start[depth] = point if part == 1 else start
+        walk.end[depth] = end if part == 1 else point
+    return depth
+
+
+@kernel
+def divide_cell(size: Size, cells: Cells, walk: Walk, depth: int) -> None:
+    """Write the state and normals of that part of cell number ``depth`` of the ``walk`` that is the
+    next of it.
+    """
+    n, kind, inner, part = len(size), walk.kind[depth], depth + 1, walk.part[depth + 1]
+    x, z = local_vector(size, walk.x[inner]), local_vector(size, walk.v[inner])
     for i in range(n):
-        v[i] = walk.z[depth, i]
-    if tick < point:
-        walk.kind[inner], walk.start[inner], walk.end[inner] = (
-            cells.left[kind],
-            walk.start[depth],
-            point,
-        )
+        x[i] = z[i] = 0.0
+    for j in range(2 * n):
+        v = walk.v[depth, j]
         for i in range(n):
-            walk.x[inner, i], total = walk.x[depth, i], 0.0
-            for j in range(2 * n):
-                total += cells.first[kind, j, i] * v[j]
-            walk.z[inner, i] = total
-        return
-    walk.kind[inner], walk.start[inner], walk.end[inner] = (
-        cells.right[kind],
-        point,
-        walk.end[depth],
-    )
-    for i in range(n):
-        x = z = 0.0
+            z[i] += cells.inner[kind, part, j, i] * v
+    if part == 1:
         for j in range(n):
-            x += cells.Phi[kind, j, i] * walk.x[depth, j]
+            v = walk.x[depth, j]
+            for i in range(n):
+                x[i] += cells.Phi[kind, j, i] * v
         for j in range(2 * n):
-            x += cells.middle[kind, j, i] * v[j]
-            z += cells.second[kind, j, i] * v[j]
-        walk.x[inner, i], walk.z[inner, i] = x, z
+            v = walk.v[depth, j]
+            for i in range(n):
+                x[i] += cells.middle[kind, j, i] * v
+    for i in range(n):
+        walk.x[inner, i] = x[i] if part == 1 else walk.x[depth, i]
+        walk.v[inner, i] = z[i]
 
 
 def _cells(moves: Transitions, digits: int, decades: int) -> Cells:
@@ -273,13 +279,11 @@ def _cells(moves: Transitions, digits: int, decades: int) -> Cells:
         length=np.array(SHARES)[share] * unit,
         before=before,
         unit=unit.astype(np.float64),
-        left=np.maximum(4 * exponent + left, -1),
-        right=np.maximum(4 * exponent + right, -1),
+        parts=np.stack([np.maximum(4 * exponent + part, -1) for part in (left, right)], axis=1),
         level=exponent - digits + LEVELS,
         Phi=_transposed(Phi_1),
         middle=np.ascontiguousarray(product(turn[:, :, :n], _transposed(L_1))),
-        first=np.ascontiguousarray(turn[:, :, :n]),
-        second=np.ascontiguousarray(turn[:, :, n:]),
+        inner=np.ascontiguousarray(np.stack([turn[:, :, :n], turn[:, :, n:]], axis=1)),
         knot_Phi=_transposed(knot_Phi)[0],
         knot_L=_transposed(knot_L)[0],
     )

@@ -58,7 +58,7 @@ def ziggurat() -> Ziggurat:
         return Ziggurat(tables["fe"], tables["we"], tables["ke"])
 
 
-@kernel
+@kernel(inlined=True)
 def philox(a: Any, b: Any, c: Any, d: Any, key: Any, other: Any) -> tuple[Any, Any, Any, Any]:
     """Return the four words that Philox4x64-10 makes of the counter (a, b, c, d), lowest word
     first, under the key (key, other); all are 64-bit words.

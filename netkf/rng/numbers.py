@@ -17,8 +17,9 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.rng.draws import LAYER, ONE, S8, next_unit, next_word
-from netkf.rng.streams import HALF
+from netkf.linalg.structs import Size
+from netkf.rng.draws import LAYER, ONE, S8, next_unit, next_word, philox
+from netkf.rng.streams import BLOCK_WORDS, HALF
 
 _U = np.uint64
 # MANTISSA masks the lower 52 bits of a word, LOWER its lower half; S1 and S32 are shift counts.
@@ -51,27 +52,52 @@ def normal_ziggurat() -> NormalZiggurat:
         return NormalZiggurat(tables["fi"], tables["wi"], tables["ki"])
 
 
+@kernel(inlined=True)
+def layer_normal(word: Any, ziggurat: NormalZiggurat) -> tuple[float, int, Any, bool]:
+    """Return the normal number x that a 64-bit ``word`` makes, its layer and its integer across the
+    layer, and whether it is inside the curve; else x is not accepted without a test.
+    """
+    # 8 bits choose a layer, one the sign, 52 a point across the layer.
+    layer, rest = int(word & LAYER), word >> S8
+    size = (rest >> S1) & MANTISSA
+    # A product and not a branch, half of which would be predicted wrongly.
+    sign = 1.0 - 2.0 * float(rest & ONE)
+    return sign * (float(size) * ziggurat.width[layer]), layer, size, size < ziggurat.inside[layer]
+
+
 @kernel
 def next_normal(states: np.ndarray, k: int, ziggurat: NormalZiggurat) -> float:
     """Return the next standard normal number of stream ``k`` of the ``states`` (K, WIDTH)."""
     while True:
-        # 8 bits choose a layer, one the sign, 52 a point across the layer.
-        word = next_word(states, k)
-        layer = int(word & LAYER)
-        word >>= S8
-        negative = (word & ONE) == ONE
-        size = (word >> S1) & MANTISSA
-        x: float = float(size) * ziggurat.width[layer]
-        if negative:
-            x = -x
-        if size < ziggurat.inside[layer]:
-            return x
+        x, layer, size, is_inside = layer_normal(next_word(states, k), ziggurat)
+        if is_inside:
+            return float(x)
         if layer == 0:  # the sign bit of the tail is another one than that of the layers
             return _tail(states, k, ((size >> S8) & ONE) == ONE)
         # At the edge of a layer: accept x if a uniform height in the layer is below exp(-x^2 / 2).
         above, height = ziggurat.height[layer - 1], ziggurat.height[layer]
         if (above - height) * next_unit(states, k) + height < math.exp(-0.5 * x * x):
-            return x
+            return float(x)
+
+
+@kernel(inlined=True)
+def first_normals(
+    size: Size, states: np.ndarray, k: int, ziggurat: NormalZiggurat, out: FloatArray, begin: int
+) -> None:
+    """Write the first n standard normals of stream ``k``, of which nothing was drawn (its words 0
+    and USED are 0 and BLOCK_WORDS), into ``out`` from ``begin`` on; ``size`` has the length n.
+    """
+    is_done = len(size) <= BLOCK_WORDS
+    if is_done:
+        # One block, word by word, without the memory of a stream.
+        names, keys = (states[k, 1], states[k, 2], states[k, 3]), (states[k, 4], states[k, 5])
+        words = philox(ONE, names[0], names[1], names[2], keys[0], keys[1])
+        for i in range(len(size)):
+            x, _, _, is_inside = layer_normal(words[i], ziggurat)
+            out[begin + i], is_done = x, is_done and is_inside
+    if not is_done:
+        for i in range(len(size)):
+            out[begin + i] = next_normal(states, k, ziggurat)
 
 
 @kernel

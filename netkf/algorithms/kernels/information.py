@@ -60,7 +60,7 @@ def add_reading_pair(
             innovation -= entry * load(lanes, centre, h, j)
             store(lanes, work, n - 1, j, factor * entry)
         store(lanes, work, n - 1, n, factor * innovation)
-        merge_lanes(lanes, total, work)
+        merge_lanes(lanes, run.size, total, work)
 
 
 @kernel(inlined=True)

@@ -16,6 +16,7 @@ from typing import Any
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, store, with_sign
+from netkf.linalg.structs import Size
 
 SINGULAR = 2.0**-25
 """Least pivot of a root that is inverted, relative to the length of its row: the square root of
@@ -25,15 +26,17 @@ NEGLIGIBLE = 1e-40  # share of a squared pivot that changes neither it nor the r
 TINY = 1e-200  # the same for a pivot of 0, yet above underflow
 
 
-@kernel(inlined=True)
-def invert_lanes(lanes: Lanes, out: FloatArray, k: int, root: FloatArray, m: int) -> None:
+@kernel(inlined=True, fused=True)
+def invert_lanes(
+    lanes: Lanes, size: Size, out: FloatArray, k: int, root: FloatArray, m: int
+) -> None:
     """Write the inverse of the lower triangular ``root[m]`` (n, n, L) into ``out[k]``.
 
     Pivots are raised to SINGULAR (2^-25) times the length of their row: soon after a start from
     P = 0 some are rounding. That makes P no smaller.
     """
     # The floor grows with the whole root, so that a zero row is not inverted on its own scale.
-    n, smallest = root.shape[1], spread(lanes, TINY)
+    n, smallest = len(size), spread(lanes, TINY)
     for i in range(n):
         for j in range(i + 1):
             entry = load(lanes, root, m, i, j)
@@ -55,9 +58,10 @@ def invert_lanes(lanes: Lanes, out: FloatArray, k: int, root: FloatArray, m: int
         store(lanes, out, k, i, i, inverse)
 
 
-@kernel(inlined=True)
+@kernel(inlined=True, fused=True)
 def whiten(
     lanes: Lanes,
+    size: Size,
     out: FloatArray,
     weight: Any,
     inverse: FloatArray,
@@ -70,7 +74,7 @@ def whiten(
     ``weight`` (L,) times the information of the estimate ``x[m]`` (n, L), relative to ``centre[h]``
     (n, L), with the inverse Z = ``inverse[m]`` (n, n, L) of its root.
     """
-    n, factor = inverse.shape[1], root_of(weight)
+    n, factor = len(size), root_of(weight)
     for i in range(n):
         mean = spread(lanes, 0.0)
         # sqrt(w) S^-1, a root of w P^-1.
@@ -81,15 +85,15 @@ def whiten(
         store(lanes, out, i, n, mean)
 
 
-@kernel(inlined=True)
-def merge_lanes(lanes: Lanes, total: FloatArray, whitened: FloatArray) -> None:
+@kernel(inlined=True, fused=True)
+def merge_lanes(lanes: Lanes, size: Size, total: FloatArray, whitened: FloatArray) -> None:
     """Replace ``total`` (n, n + 1, L), a root [Z, z] of information (Z lower triangular,
     information Z' Z, z = Z times the mean), by a root of the sum of it and ``whitened``
     (n, n + 1, L), which is overwritten.
     """
     # Reflections from the left zero the columns of ``whitened`` from the last one on, so that both
     # stay lower triangular.
-    n = len(total)
+    n = len(size)
     for j in range(n - 1, -1, -1):
         pivot, below = load(lanes, total, j, j), spread(lanes, 0.0)
         for r in range(j, n):
@@ -98,9 +102,11 @@ def merge_lanes(lanes: Lanes, total: FloatArray, whitened: FloatArray) -> None:
         # Lanes whose column is zero already do not change.
         idle = below <= NEGLIGIBLE * pivot * pivot + TINY
         length = root_of(pivot * pivot + below)
-        # pivot - length without cancellation: pivots of ``total`` are never negative.
-        first = select(idle, 0.0, -below / (pivot + length))
-        scale = select(idle, 0.0, 2.0 / (first * first + below))
+        # pivot - length without cancellation: pivots of ``total`` are never negative. Of both
+        # divisions neither waits for the other.
+        head = pivot + length
+        first = select(idle, 0.0, -below / head)
+        scale = select(idle, 0.0, head / (length * below))  # 2 / (first^2 + below)
         store(lanes, total, j, j, select(idle, pivot, length))
         # Reflect the columns left of j and, in the place of column j itself, that of the means.
         for column in range(j + 1):
@@ -115,9 +121,10 @@ def merge_lanes(lanes: Lanes, total: FloatArray, whitened: FloatArray) -> None:
                 store(lanes, whitened, r, c, entry)
 
 
-@kernel(inlined=True)
+@kernel(inlined=True, fused=True)
 def finish_lanes(
     lanes: Lanes,
+    size: Size,
     root: FloatArray,
     xhat: FloatArray,
     h: int,
@@ -134,7 +141,7 @@ def finish_lanes(
     scratch.
     """
     # S = Z^-1: the total is lower triangular, so P = Z^-1 Z^-T has the lower root Z^-1.
-    n = len(total)
+    n = len(size)
     for i in range(n):
         inverse = 1.0 / load(lanes, total, i, i)
         for j in range(i):

@@ -904,12 +904,14 @@ def transform_root(
             store(lanes, wide, i, j, total)
     # Triangularise [F S, T] from the right by one Householder reflection for each row.
     for i in range(n):
-        square = spread(lanes, 0.0)
+        # Two sums, neither of which waits for the other.
+        square = of_noise = spread(lanes, 0.0)
         for j in range(i, n):
             square += load(lanes, wide, i, j) * load(lanes, wide, i, j)
         # T is lower triangular: its columns beyond i are 0 in row i.
         for j in range(i + 1):
-            square += load(lanes, T, i, j) * load(lanes, T, i, j)
+            of_noise += load(lanes, T, i, j) * load(lanes, T, i, j)
+        square += of_noise
         # A zero row needs no reflection.
         reflect_row(lanes, size, i, n, wide, T, square, square != 0.0)
         for j in range(i + 1):

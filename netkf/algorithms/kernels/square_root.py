@@ -17,7 +17,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, store
+from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, store
 from netkf.linalg.structs import Size
 
 
@@ -99,11 +99,13 @@ def reflect_row(
     store(lanes, wide, i, i, select(active, length, pivot))
     for r in range(i + 1, n):
         first = load(lanes, wide, r, i)
-        inner = pivot * first
+        # Two sums, neither of which waits for the other.
+        inner, of_noise = pivot * first, spread(lanes, 0.0)
         for j in range(i + 1, end):
             inner += load(lanes, wide, i, j) * load(lanes, wide, r, j)
         for j in range(i + 1):
-            inner += load(lanes, T, i, j) * load(lanes, T, r, j)
+            of_noise += load(lanes, T, i, j) * load(lanes, T, r, j)
+        inner += of_noise
         share = (inner + signed * first) * scale  # v' (row r) 2 / v' v
         # Entry (r, i) is the part of row r along row i: row i becomes (length, 0, ..., 0), and the
         # product of both rows is kept.

@@ -53,8 +53,7 @@ def flow_batches(
     the first batch is the first run alone, and has the fingerprint of its events.
     """
     keep_freed_memory()
-    size, start = batch_size(scenario), replicas.start
-    workspace = _workspace(scenario) if size > 1 else Workspace(scenario)
+    size, start, workspace = batch_size(scenario), replicas.start, _workspace(scenario)
     if fingerprint and replicas:
         yield _simulate(scenario, workspace, seed, replicas[:1], rows=True)
         start += 1
@@ -172,14 +171,17 @@ def drawn_together(scenario: Scenario) -> bool:
 
 @once_per_scenario
 def batch_size(scenario: Scenario) -> int:
-    """Return the number of runs that are drawn together, at least 1: as many as fit MAX_BATCH_BYTES
-    with their random numbers and samples.
+    """Return the number of runs of a batch, at least 1: as many as fit MAX_BATCH_BYTES with their
+    random numbers and samples.
     """
-    if not drawn_together(scenario):
-        return 1
-    # An estimate of the floats that one run draws and stores as samples.
-    n, period = scenario.plant.n, scenario.diffusion.sensing_period
+    n = scenario.plant.n
     filters = 1 if scenario.node_filter.timing.pooled else len(scenario.nodes)
+    sample_floats = len(scenario.times) * filters * n * (n + 2)
+    # Runs that are drawn one by one: as many as statistics process side by side.
+    if not drawn_together(scenario):
+        return LANES if 8.0 * LANES * sample_floats < MAX_BATCH_BYTES else 1
+    # An estimate of the floats that one run draws and stores as samples.
+    period = scenario.diffusion.sensing_period
     # One piece for each step, and one more for each sample that cuts a step.
     steps = BLOCK + len(scenario.times) + (scenario.horizon / period if period else 0.0)
     sensors = sum(len(placed) for placed in scenario.placed_sensors.values())
@@ -187,7 +189,6 @@ def batch_size(scenario: Scenario) -> int:
     # Per piece: two states, two moments and the three coefficients of the cubic, of n entries each;
     # per step the two moments of each sensor's noise.
     floats = steps * (7 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
-    sample_floats = len(scenario.times) * filters * n * (n + 2)
     # At least one run, however large it is. A multiple of L, since statistics process L runs side
     # by side and fewer take as long.
     size = max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (floats + sample_floats)))))

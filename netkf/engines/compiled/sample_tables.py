@@ -43,11 +43,7 @@ class SampleTables:
         if not scenario.sampled_sensors:
             self._sensors, self.instants = [], _no_instants(scenario)
             return
-        placed = [
-            (node, placed_sensor)
-            for node, sensors in scenario.sampled_sensors.items()
-            for placed_sensor in sensors
-        ]
+        placed = _placed_sensors(scenario)
         counts = [len(times[node, placed_sensor.ordinal]) for node, placed_sensor in placed]
         # All samples of all sensors in one list, sensor by sensor.
         t = np.concatenate([times[n, placed_sensor.ordinal] for n, placed_sensor in placed])
@@ -67,7 +63,7 @@ class SampleTables:
             )
             for (node, placed_sensor), indices in zip(placed, parts, strict=True)
         ]
-        self.instants = _make_instants(scenario, placed, t[order], sensor[order])
+        self.instants = _make_instants(scenario, t[order], sensor[order])
         for (_, placed_sensor), sampled in zip(placed, self._sensors, strict=True):
             if isinstance(sampled.samples, RecordedSamples) and sampled.varying:
                 R = scenario.noise_covariance(placed_sensor.entry, believed=True)
@@ -113,17 +109,35 @@ def _add_noises(
 @once_per_scenario
 def _no_instants(scenario: Scenario) -> Instants:
     """Return the instants of all runs of a scenario without sampled sensors: none."""
-    return _make_instants(scenario, [], np.empty(0), np.empty(0, dtype=np.int64))
+    return _make_instants(scenario, np.empty(0), np.empty(0, dtype=np.int64))
 
 
-def _make_instants(
-    scenario: Scenario, placed: list[tuple[int, PlacedSensor]], t: FloatArray, sensor: np.ndarray
-) -> Instants:
-    """Return the instants: times at which a node uses one or several samples at once."""
+class SensorTables(NamedTuple):
+    """What a scenario says of its S sampling sensors, of up to p rows: ``node`` (id) and ``filter``
+    (index) of each (S,), ``rows`` (S,), whether its H varies, the Cholesky factor ``root``
+    (S, p, p) of the R that filters believe, and H (S, p, n).
+    """
+
+    node: np.ndarray
+    filter: np.ndarray
+    rows: np.ndarray
+    varying: np.ndarray
+    root: FloatArray
+    H: FloatArray
+
+
+@once_per_scenario
+def _placed_sensors(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
+    """Return (node, sensor) of all sensors that sample."""
+    return [(node, placed) for node, many in scenario.sampled_sensors.items() for placed in many]
+
+
+@once_per_scenario
+def _sensor_tables(scenario: Scenario) -> SensorTables:
+    """Return the tables of all sensors that sample, in the order of ``_placed_sensors``."""
+    placed = _placed_sensors(scenario)
     index = scenario.topology.index if placed else {}
     pooled, n = scenario.node_filter.timing.pooled, scenario.plant.n
-    node = np.array([node for node, _ in placed], dtype=np.int64)
-    filters = np.array([0 if pooled else index[k] for k in node.tolist()], dtype=np.int64)
     parts = [
         (scenario.sensors[p.entry], scenario.noise_covariance(p.entry, believed=True))
         for _, p in placed
@@ -131,28 +145,42 @@ def _make_instants(
     rows = np.array([len(R) for _, R in parts], dtype=np.int64)
     max_rows = int(rows.max(initial=1))
     root, H = np.zeros((len(parts), max_rows, max_rows)), np.zeros((len(parts), max_rows, n))
-    # The Cholesky factor of the R that filters believe, once for each sensor.
     for k, (part, R) in enumerate(parts):
         root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.H
+    return SensorTables(
+        node=np.array([node for node, _ in placed], dtype=np.int64),
+        filter=np.array([0 if pooled else index[node] for node, _ in placed], dtype=np.int64),
+        rows=rows,
+        varying=np.array([part.varying for part, _ in parts], dtype=bool),
+        root=root,
+        H=H,
+    )
+
+
+def _make_instants(scenario: Scenario, t: FloatArray, sensor: np.ndarray) -> Instants:
+    """Return the instants: times at which a node uses one or several samples at once."""
+    tables = _sensor_tables(scenario)
     # Sensors whose H varies get a matrix for each sample, behind the fixed ones.
-    has_varying_H = np.array([part.varying for part, _ in parts], dtype=bool)
-    matrix, varying = sensor.copy(), has_varying_H[sensor] if parts else np.zeros(0, dtype=bool)
-    matrix[varying] = len(parts) + np.arange(int(varying.sum()))
-    H = np.concatenate([H, np.zeros((int(varying.sum()), max_rows, n))])
-    filter_index = filters[sensor] if parts else sensor
+    varying, count = tables.varying[sensor], len(tables.rows)
+    own = int(varying.sum())
+    matrix, H = sensor.copy(), tables.H
+    if own:
+        matrix[varying] = count + np.arange(own)
+        H = np.concatenate([H, np.zeros((own, *H.shape[1:]))])
+    filters = tables.filter[sensor]
     # Samples of one node at one time are one instant, and one update.
     begins = np.ones(len(t), dtype=bool)
-    begins[1:] = (np.diff(t) != 0.0) | (np.diff(filter_index) != 0)
+    begins[1:] = (np.diff(t) != 0.0) | (np.diff(filters) != 0)
     first = np.flatnonzero(begins)
     return Instants(
         t=t[first],
-        index=filter_index[first],
+        index=filters[first],
         first=np.append(first, len(t)),
-        node=node[sensor] if parts else sensor,
-        y=np.zeros((len(t), max_rows)),
+        node=tables.node[sensor],
+        y=np.zeros((len(t), tables.H.shape[1])),
         sensor=sensor,
         matrix=matrix,
-        rows=rows,
-        root=root,
+        rows=tables.rows,
+        root=tables.root,
         H=H,
     )

@@ -36,7 +36,8 @@ def record_samples(
     # The loop may stop for other reasons than samples.
     if not len(times):
         return True
-    sound_filters = sound_mask(xhat, P, error=error if scenario.plant.truth_known else None)
+    known = error if scenario.plant.truth_known else None
+    sound_filters = sound_mask(xhat, P, error=known, of_roots=True)
     sound = sound_filters.all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.
     if scenario.node_filter.timing.pooled:
