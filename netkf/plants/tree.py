@@ -109,8 +109,9 @@ class Tree:
         which the state is taken to 0. ``stream`` (1, WIDTH) is the state of the plant's stream.
         """
         n, depth = len(start), len(self._cells.length) + 1
-        cells = (np.zeros(depth, dtype=np.int64) for _ in range(5))
-        walk = Walk(*cells, x=np.zeros((depth, n)), v=np.zeros((depth, 2 * n)))
+        kind, part, begin, point, end = (np.zeros(depth, dtype=np.int64) for _ in range(5))
+        x, v = np.zeros((depth, n)), np.zeros((depth, 2 * n))
+        walk = Walk(kind, part, begin, point, end, x, v)
         states, offsets = np.empty((len(times), n)), np.zeros((frames, n))
         walk.x[0] = start
         ticks = np.rint(times * self._per_second).astype(np.int64)
