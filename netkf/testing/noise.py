@@ -7,12 +7,11 @@ million checks.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from netkf.laws.intervals import Comparison, Interval, deviation_interval, student_interval
+from netkf.laws.intervals import Comparison
 from netkf.laws.noise import (
     PARTS,
     compare_entries,
@@ -133,12 +132,3 @@ def whitened(
     error = float(np.abs(noise @ whitening.null_space.T).max(initial=0.0)) / size
     demand(error <= CERTAIN, where, rule, f"{error:.3g} of its size left over", remedy)
     return np.asarray(noise @ whitening.factor.T)
-
-
-def mean_interval(values: FloatArray, expected: float, level: float) -> Interval:
-    """Return Student's interval, at ``level``, for the distance of the mean of ``values`` (N,) from
-    the ``expected`` one.
-    """
-    error = float(values.std(ddof=1)) / math.sqrt(len(values))
-    spread = student_interval(float(values.mean()), error, len(values), level)
-    return deviation_interval(expected, spread)

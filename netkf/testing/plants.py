@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -45,8 +45,6 @@ FEW_STARTS = 10
 """Draws of x(0) where it is not random."""
 GRID_STEPS, MAX_RUNS = 51_200, 2000
 """Steps on the sensing grid in all runs together, and largest number of runs off that grid."""
-SHORT_LENGTH = 130
-"""Slots in which paths are compared exactly."""
 FRAME_TOLERANCE = 1e-6
 """Relative difference of equal paths in frames."""
 MAX_LOG_GROWTH = math.log(1e6)
@@ -113,17 +111,6 @@ def _check_form(part: Any, name: str) -> None:
     demand(is_covariance, where, "must be symmetric and positive semidefinite", cov)
 
 
-def _move_start(part: Any) -> tuple[Any, FloatArray] | None:
-    """Return the plant with another mean of x(0), and the difference (n,); or None."""
-    mean = part.start_mean + 3.0 * (1.0 + np.sqrt(np.diag(part.start_cov)))
-    try:
-        moved = dataclasses.replace(part, mean=mean)
-    except (NetkfError, TypeError, ValueError):
-        return None
-    offset = moved.start_mean - part.start_mean
-    return (moved, offset) if offset.any() else None
-
-
 def _make_generator(seed: int, run: int, purpose: str = "plant") -> np.random.Generator:
     return Streams(seed, run).generator(purpose)
 
@@ -133,11 +120,24 @@ def _demand_same(where: str, one: FloatArray, other: FloatArray, when: str) -> N
     demand_close(one, other, where, "must make the same path from equal streams", when, remedy)
 
 
-def _demand_moved(
-    where: str, x: FloatArray, moved: FloatArray, Phi: FloatArray, offset: FloatArray, law: str
+def _check_moved(
+    part: Any,
+    where: str,
+    draw: Callable[[Any], FloatArray],
+    x: FloatArray,
+    transitions: Sequence[FloatArray],
+    law: str,
 ) -> None:
-    """Check that ``moved`` (K, n) is ``x`` plus ``Phi`` (K, n, n) times ``offset`` (n,)."""
-    expected = Phi @ offset
+    """Check that a moved start moves the path ``x`` (K, n) by ``transitions`` (K, n, n) from it."""
+    mean = part.start_mean + 3.0 * (1.0 + np.sqrt(np.diag(part.start_cov)))
+    try:
+        plant = dataclasses.replace(part, mean=mean)
+    except (NetkfError, TypeError, ValueError):
+        return
+    expected = np.array(transitions) @ (plant.start_mean - part.start_mean)
+    if not expected.any():
+        return
+    moved = draw(plant)
     error = np.abs(moved - x - expected)
     worst = int(error.max(axis=1).argmax())
     rule = f"a start that is moved must move the path by {law}, and the noise not at all"
@@ -155,9 +155,19 @@ def _check_starts(
 ) -> None:
     count = STARTS if part.start_cov.any() else FEW_STARTS
     with guard_user_code(where):
-        starts = _draw_starts(part, seed, start, is_inherited, count)
+        random = _make_generator(seed, 0)
+        starts = np.array([start(random) for _ in range(min(count, FEW_STARTS))])
+        more = np.empty((0, *starts.shape[1:]))
+        if is_inherited and type(part).starts is Plant.starts:
+            # Drawing them one by one would take most of the time of a check.
+            together = part.starts(_SharedNormals(_make_generator(seed, 0), count))
+            same = together[: len(starts)]
+            if starts.shape == same.shape and scaled_difference(starts, same) <= ROUNDING:
+                more = together[len(starts) :]
+        rest = count - len(starts) - len(more)
+        starts = np.array([*starts, *more, *(start(random) for _ in range(rest))])
     demand_array(where, "x(0)", starts[0], (part.n,))
-    deviations = np.array(starts) - part.start_mean
+    deviations = starts - part.start_mean
     size = 1.0 + float(np.abs(part.start_mean).max())
     rule = "x(0) must be its mean in the directions in which cov has no variance"
     remedy = "start at mean + root of cov times normals"
@@ -177,24 +187,6 @@ class _SharedNormals:
         return self._random.standard_normal((self._count, *shape))
 
 
-def _draw_starts(
-    part: Any,
-    seed: int,
-    start: Callable[[np.random.Generator], FloatArray],
-    is_inherited: bool,
-    count: int,
-) -> Sequence[FloatArray]:
-    random = _make_generator(seed, 0)
-    first = [start(random) for _ in range(min(count, FEW_STARTS))]
-    if is_inherited and type(part).starts is Plant.starts:
-        # Drawing them one by one would take most of the time of a check.
-        together = part.starts(_SharedNormals(_make_generator(seed, 0), count))
-        same = together[: len(first)]
-        if np.shape(first) == same.shape and scaled_difference(np.array(first), same) <= ROUNDING:
-            return [*first, *together[len(first) :]]
-    return [*first, *(start(random) for _ in range(count - len(first)))]
-
-
 def _check_noise(
     noise: FloatArray, S: FloatArray, states: FloatArray, labels: NoiseLabels, rule: str
 ) -> None:
@@ -211,44 +203,71 @@ def _check_noise(
         check_uncorrelated(start, e[:, 0], labels._replace(noise="x(0) and the noise"), "after it")
 
 
-def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
-    where = f"{name}.truth"
+class Steps(NamedTuple):
+    """The steps ``x[k+1] = Phi x[k] + w`` of paths: Phi and the covariance of w, both (n, n), and
+    what messages call w, of each law in turn; the field that states the noise, and texts of the
+    rule that a step follows its law, and of the powers of Phi.
+    """
 
-    def draw_path(plant: Any, slots: Sequence[int], run: int = 0) -> FloatArray:
+    laws: list[tuple[FloatArray, FloatArray, str]]
+    field: str
+    rule: str
+    power: str
+
+
+def _check_paths(
+    plants: tuple[Any, Any],
+    where: str,
+    draw: Callable[..., FloatArray],
+    at: FloatArray,
+    subsets: Mapping[str, list[int]],
+    steps: Steps,
+    runs: int,
+) -> None:
+    """Check the paths of a plant and its copy, ``draw(plant, at, run)`` (K, n) ``at`` K times."""
+    part, copy = plants
+    path = draw(part, at)
+    _demand_same(where, path, draw(part, at), "at the second call")
+    _demand_same(where, path, draw(copy, at), "of a pickled plant")
+    for when, subset in subsets.items():
+        _demand_same(where, path[subset], draw(part, at[subset]), when)
+    transitions, laws = [np.eye(part.n)], steps.laws
+    for k in range(len(at) - 1):
+        transitions.append(laws[k % len(laws)][0] @ transitions[-1])
+    _check_moved(part, where, lambda plant: draw(plant, at), path, transitions, steps.power)
+    states = np.array([draw(part, at, run) for run in range(runs)])
+    for k, (Phi, S, noise) in enumerate(laws):
+        after = states[:, k + 1 :: len(laws)]
+        before = states[:, k : -1 : len(laws)][:, : after.shape[1]]
+        labels = NoiseLabels(where, noise, steps.field)
+        _check_noise(after - before @ Phi.T, S, before, labels, steps.rule)
+
+
+def _check_slots(part: LinearPlant, copy: LinearPlant, name: str, seed: int) -> None:
+    where, factor = f"{name}.truth", growth_factor(part.F)
+
+    def draw(plant: Any, slots: FloatArray, run: int = 0) -> FloatArray:
         with guard_user_code(where):
             truth = plant.truth(_make_generator(seed, run))
-            states = [truth.state(slot) for slot in slots]
+            states = [truth.state(slot) for slot in map(int, slots)]
         demand_array(where, "a state", states[0], (part.n,))
         return np.array([np.asarray(x).reshape(-1) for x in states])
 
-    factor = growth_factor(part.F)
     length = LENGTH
     if factor > 1.0:
         length = max(8, min(LENGTH, int(MAX_LOG_GROWTH / math.log(factor))))
-    last = min(SHORT_LENGTH, length)
-    slots = list(range(last + 1))
-    path = draw_path(part, slots)
-    _demand_same(where, path, draw_path(part, slots), "at the second call")
-    _demand_same(where, path, draw_path(copy, slots), "of a pickled plant")
-    gaps = [0, 0, 3, last // 2, last // 2, last]
-    when = "when slots are left out or asked for twice"
-    _demand_same(where, path[gaps], draw_path(part, gaps), when)
+    slots = np.arange(length + 1.0)
+    subset = [0, 0, 3, length // 2, length // 2, length]
+    subsets = {"when slots are left out or asked for twice": subset}
+    law, runs = (part.F, part.Q, "the noise x[k+1] - F x[k]"), min(MAX_RUNS, STEPS // length)
+    steps = Steps([law], "Q", "x[k+1] must be F x[k] where Q has no noise", "powers of F")
+    is_inherited = type(part).truth is LinearPlant.truth
+    _check_paths((part, copy), where, draw, slots, subsets, steps, max(2, runs))
+    path = draw(part, slots)
     with guard_user_code(where):
         # The same run once more, in frames.
         _compare_frames(part, where, path, part.truth(_make_generator(seed, 0), True))
-    moved = _move_start(part)
-    if moved is not None:
-        plant, offset = moved
-        Phi = np.array([np.linalg.matrix_power(part.F, k) for k in slots])
-        _demand_moved(where, path, draw_path(plant, slots), Phi, offset, "powers of F")
-    is_inherited = type(part).truth is LinearPlant.truth
     _check_starts(part, where, seed, lambda random: part.truth(random).state(0), is_inherited)
-    runs = max(2, min(MAX_RUNS, STEPS // length))
-    states = np.array([draw_path(part, range(length + 1), run) for run in range(runs)])
-    noise = states[:, 1:] - states[:, :-1] @ part.F.T
-    labels = NoiseLabels(where, "the noise x[k+1] - F x[k]", "Q")
-    rule = "x[k+1] must be F x[k] where Q has no noise"
-    _check_noise(noise, part.Q, states[:, :-1], labels, rule)
 
 
 def _compare_frames(part: LinearPlant, where: str, path: FloatArray, truth: Any) -> None:
@@ -289,38 +308,24 @@ def _check_sampled(
     time_constant, max_seconds = scale
     times = np.cumsum(time_constant * np.tile(GAPS, LENGTH // len(GAPS)))
     # At least eight times, two for each gap, however fast the plant grows.
-    times = times[times <= max(max_seconds, times[7])]
+    times = np.concatenate([[0.0], times[times <= max(max_seconds, times[7])]])
     horizon = float(times[-1]) * 1.01
 
-    def draw_path(plant: Any, at: FloatArray, run: int = 0) -> FloatArray:
+    def draw(plant: Any, at: FloatArray, run: int = 0) -> FloatArray:
         random = _make_generator(seed, run)
-        truth = call_user_function(where, plant.sampled_truth, random, at, horizon)
-        with_start = np.concatenate([[0.0], at])
-        states = np.asarray(call_user_function(where, truth.states, with_start)[1])
-        return demand_array(where, "states", states, (len(with_start), part.n))
+        truth = call_user_function(where, plant.sampled_truth, random, at[1:], horizon)
+        states = np.asarray(call_user_function(where, truth.states, at)[1])
+        return demand_array(where, "states", states, (len(at), part.n))
 
-    path = draw_path(part, times)
-    _demand_same(where, path, draw_path(part, times), "at the second call")
-    _demand_same(where, path, draw_path(copy, times), "of a pickled plant")
-    _demand_same(where, path[::3], draw_path(part, times[2::3]), "at every third time alone")
-    laws = [transition_law(part.A, part.B, time_constant * gap) for gap in GAPS]
-    moved = _move_start(part)
-    if moved is not None:
-        plant, offset = moved
-        Phi_from_start = [np.eye(part.n)]
-        for k in range(len(times)):
-            Phi_from_start.append(laws[k % len(GAPS)][0] @ Phi_from_start[-1])
-        moved_path = draw_path(plant, times)
-        _demand_moved(where, path, moved_path, np.array(Phi_from_start), offset, "e^{A t}")
+    laws = []
+    for gap in (time_constant * np.array(GAPS)).tolist():
+        text = f"the noise x(t + g) - e^(A g) x(t) over {gap:.3g} s"
+        laws.append((*transition_law(part.A, part.B, gap), text))
+    rule = "x(t + g) must be e^(A g) x(t) where B has no noise"
+    subsets = {"at every third time alone": list(range(0, len(times), 3))}
     runs = max(2, min(MAX_RUNS, STEPS // (2 * len(times))))
-    states = np.array([draw_path(part, times, run) for run in range(runs)])
-    # The gaps repeat after four steps: one law for all steps of each gap.
-    for k, (Phi, S) in enumerate(laws):
-        after = states[:, k + 1 :: 4]
-        before = states[:, k:-1:4][:, : after.shape[1]]
-        text = f"the noise x(t + g) - e^(A g) x(t) over {time_constant * GAPS[k]:.3g} s"
-        rule = "x(t + g) must be e^(A g) x(t) where B has no noise"
-        _check_noise(after - before @ Phi.T, S, before, NoiseLabels(where, text, "B"), rule)
+    steps = Steps(laws, "B", rule, "e^{A t}")
+    _check_paths((part, copy), where, draw, times, subsets, steps, runs)
 
 
 def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
@@ -349,14 +354,14 @@ def _check_grid(part: Diffusion, name: str, seed: int, steps: int) -> None:
     when = "at the points of its grid when cut"
     _demand_same(where, alone.x_end[0], cut.x_end[0][is_last_piece], when)
     _check_one_path(part, f"{name}.path", cut, (probe_times, sample_times), seed)
-    moved = _move_start(part)
-    if moved is not None:
-        plant, offset = moved
+
+    def draw_alone(plant: Any) -> FloatArray:
         normals = (GeneratorNormals([_make_generator(seed, 1, p)]) for p in ("plant", "probe"))
-        moved_path = plant.paths(*normals, probe_times[:0]).following(blocks)
-        Phi = np.array([scipy.linalg.expm(part.A * period * k) for k in range(1, steps + 1)])
-        x, moved_x = alone.x_end[0][:steps], moved_path.x_end[0][:steps]
-        _demand_moved(where, x, moved_x, Phi, offset, "e^{A t}")
+        path = plant.paths(*normals, probe_times[:0]).following(blocks)
+        return np.asarray(path.x_end[0][:steps])
+
+    powers = [scipy.linalg.expm(part.A * period * k) for k in range(1, steps + 1)]
+    _check_moved(part, where, draw_alone, alone.x_end[0][:steps], powers, "e^{A t}")
     runs = max(2, GRID_STEPS // (BLOCK * blocks))
     drawn = draw_paths(range(runs))
     start, end = drawn.x_start[:, :steps], drawn.x_end[:, :steps]
