@@ -131,7 +131,8 @@ def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
         ends, p = [str(first), str(second)], 1.0 if value is None else value
         if first == second:
             raise ScenarioError("", "a link must join two nodes", ends, "correct the edge")
-        if has_probabilities and not _is_probability(value):
+        is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        if has_probabilities and not (is_number and 0.0 <= float(value) <= 1.0):
             rule = f"every edge must have a {PROBABILITY} from 0 to 1, or none"
             raise ScenarioError("", rule, [*ends, value], "correct the edge")
         link = ids[first], ids[second]
@@ -145,11 +146,6 @@ def _read_links(graph: networkx.Graph[Any], path: str) -> LinkTable:
     names = {str(label): k for label, k in ids.items() if str(k) != str(label)}
     use = count_rows(path, pairs, probability.__contains__)
     return LinkTable(use, probability, has_probabilities, directed, alone, names)
-
-
-def _is_probability(value: Any) -> bool:
-    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return is_number and 0.0 <= float(value) <= 1.0
 
 
 def from_networkx(graph: networkx.Graph[Any]) -> Edges:

@@ -572,8 +572,16 @@ class LinkTable:
             rule = "needs a column delivery_probability in the table"
             raise ScenarioError("minimum", rule, minimum, "add the column or leave minimum out")
         named = {node for link in self.probability for node in link}
-        delivery = self._with_reverse_links()
-        links = self._links(delivery, minimum or 0.0)
+        delivery = self.probability
+        # Unless links are listed both ways each row counts both ways.
+        if not self.directed and not any((j, i) in delivery for i, j in delivery):
+            delivery = delivery | {(j, i): p for (i, j), p in delivery.items()}
+        least = minimum or 0.0
+        links = {
+            (i, j)
+            for (i, j), p in delivery.items()
+            if p >= least and (self.directed or delivery.get((j, i), 0.0) >= least)
+        }
         if not links and not self.alone:
             key, rule = "path" if minimum is None else "minimum", "no link of the table is left"
             raise ScenarioError(key, rule, minimum, "lower minimum or add rows")
@@ -612,21 +620,6 @@ class LinkTable:
 
     def _label(self, node: int) -> str:
         return next((name for name, k in self.names.items() if k == node), str(node))
-
-    def _with_reverse_links(self) -> dict[Link, float]:
-        """Return the table with each row reversed too, unless links are listed both ways."""
-        probability = self.probability
-        if self.directed or any((j, i) in probability for i, j in probability):
-            return probability
-        return probability | {(j, i): p for (i, j), p in probability.items()}
-
-    def _links(self, delivery: dict[Link, float], minimum: float) -> set[Link]:
-        """Return the directions whose probability reaches the minimum, both ways if undirected."""
-        return {
-            (i, j)
-            for (i, j), p in delivery.items()
-            if p >= minimum and (self.directed or delivery.get((j, i), 0.0) >= minimum)
-        }
 
     def _delivery(self, delivery: dict[Link, float], links: set[Link]) -> dict[Link, float]:
         """Return the delivery probability of each of ``links``, 0 where it is not listed."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from netkf.algorithms.filter import Filter
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import walk
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import SlotActivation
 from netkf.scenario.derived import DerivedScenario
@@ -17,9 +19,8 @@ def filter_name(scenario: DerivedScenario) -> str:
     wraps.
     """
     algorithm = scenario.filter.algorithm
-    inner = getattr(algorithm, "inner", None)
-    around = "" if inner is None else f" around {kind_name(inner)}"
-    return f"{kind_name(algorithm)} filter{around}"
+    filters = [kind_name(part) for part in walk(algorithm) if isinstance(part, Filter)]
+    return " around ".join([f"{filters[0]} filter", *filters[1:]])
 
 
 def check_time(scenario: DerivedScenario) -> None:
@@ -62,7 +63,13 @@ def check_activation(scenario: DerivedScenario) -> None:
             " or ".join(["give an undirected graph", *remedies]),
         )
     if clock.at not in node_filter.timing.clocks:
-        _reject_clock(clock.at, node_filter.timing.clocks, name)
+        clocks, at = node_filter.timing.clocks, clock.at
+        settings = [f'at = "{one}"' for one in clocks if one != "readings"]
+        settings += ['kind = "readings"'] if "readings" in clocks else []
+        key = "kind" if at == "readings" else "at"
+        rule, remedy = f"must be one that the {name} runs under", "write that, or change the filter"
+        listed = " or ".join(settings)
+        raise ScenarioError(f"network.activation.{key}", f"{rule}: {listed}", at, remedy)
     # A filter that needs samples says so itself, of the sensors that there are.
     says_so = bool(scenario.sensors) and node_filter.needs.samples
     if clock.at == "readings" and not says_so and not any(map(takes_samples, scenario.sensors)):
@@ -72,11 +79,3 @@ def check_activation(scenario: DerivedScenario) -> None:
             "readings",
             f"add {SAMPLING} to a sensor, or choose clocks",
         )
-
-
-def _reject_clock(at: str, clocks: tuple[str, ...], name: str) -> None:
-    settings = [f'at = "{clock}"' for clock in clocks if clock != "readings"]
-    settings += ['kind = "readings"'] if "readings" in clocks else []
-    key = "kind" if at == "readings" else "at"
-    rule = f"must be one that the {name} runs under: {' or '.join(settings)}"
-    raise ScenarioError(f"network.activation.{key}", rule, at, "write that, or change the filter")

@@ -84,15 +84,14 @@ def find_module_files(scenario: Component) -> dict[str, Path | None]:
     files: dict[str, Path | None] = {}
     for component in user_components(scenario):
         name = type(component).__module__
-        file = None if folder is None or "." in name else folder / f"{name}.py"
-        files[name] = file if file is not None and _is_file_of(file, name) else None
+        files[name] = None
+        if folder is None or "." in name or not (path := folder / f"{name}.py").is_file():
+            continue
+        file = getattr(sys.modules.get(name), "__file__", None)
+        # The loaded module may be it where no other file is known.
+        if file is None or not Path(file).is_file() or path.samefile(file):
+            files[name] = path
     return files
-
-
-def _is_file_of(path: Path, module_name: str) -> bool:
-    """Return True if ``path`` exists and the loaded module may be it: no other file is known."""
-    file = getattr(sys.modules.get(module_name), "__file__", None)
-    return path.is_file() and (file is None or not Path(file).is_file() or path.samefile(file))
 
 
 def explain_user_error(scenario: Any, error: Exception) -> str | None:

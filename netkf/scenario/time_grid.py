@@ -152,14 +152,17 @@ def check_grid(scenario: Any) -> None:
         )
     is_coarse = given is not None and given > least
     for key, seconds, exact in _time_constants(scenario):
-        if is_coarse and not _is_held(grid, seconds, exact):
+        # Up to rounding where a time is not known.
+        rounding = abs(grid.instant(seconds) - seconds)
+        is_held = rounding <= 1e-15 * seconds if exact is None else grid.holds(exact)
+        if is_coarse and not is_held:
             raise ScenarioError(
                 key,
                 f"must be a multiple of the resolution {given:g} of [time]",
                 seconds,
                 f"give a finer resolution, at least {least:g}, or leave it out",
             )
-        if seconds > 0.0 and _is_off(grid, seconds):
+        if seconds > 0.0 and rounding * FAR > seconds:
             raise ScenarioError(
                 key,
                 f"must be far above {grid.resolution:g} s, the finest resolution of time that "
@@ -167,18 +170,6 @@ def check_grid(scenario: Any) -> None:
                 seconds,
                 "lengthen it or shorten the horizon",
             )
-
-
-def _is_held(grid: TimeGrid, seconds: float, exact: Fraction | None) -> bool:
-    """Return True if a time is a whole number of ticks, up to rounding where it is not known."""
-    if exact is not None:
-        return grid.holds(exact)
-    return abs(grid.instant(seconds) - seconds) <= 1e-15 * seconds
-
-
-def _is_off(grid: TimeGrid, seconds: float) -> bool:
-    """Return True if the nearest whole number of ticks is far from a time."""
-    return abs(grid.instant(seconds) - seconds) * FAR > seconds
 
 
 def grid_notes(scenario: Any) -> tuple[str, ...]:

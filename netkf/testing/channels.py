@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from netkf.laws.losses import (
 )
 from netkf.laws.noise import compare_with
 from netkf.laws.stating import stated_law, stated_part
-from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import Channel, ChannelSampler, Delay, Loss
 from netkf.network.channels import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
@@ -82,7 +81,16 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
     graph = Complete(nodes=4).build(seed=0) if topology is None else topology
     links = table_entries(graph)
     if isinstance(part, Delay):
-        _check_delays(watched, tuple(links))
+        _check_message_delays(watched, tuple(links))
+        delays, repeated = (_draw_delays(watched) for _ in range(2))
+        rule, got = (
+            "must use no generator but the one it is given",
+            "other delays from an equal generator",
+        )
+        demand(delays == repeated, f"{watched.name}.draw", rule, got)
+        if part.is_random:
+            _check_draws(watched)
+        _check_delay_law(watched, tuple(links))
         return
     for link, table_probability in links.items():
         _check_delivery_probabilities(watched, link, table_probability)
@@ -203,10 +211,14 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
         return
     with guard_user_code(watched.name):
         lost = _simulate_losses(part, links, seed)
-    law, known = _loss_law(part, tuple(links), 1.0 - stated), np.flatnonzero(~np.isnan(stated))
-    if len(known):
-        counts = count_outcomes(lost[..., known], np.full(len(known), -1))
-        of_known = law._replace(lost=law.lost[known], links=[law.links[k] for k in known.tolist()])
+    # Links have streams of their own.
+    chain, none, known = stated_law(part, "loss"), np.full(len(links), -1), ~np.isnan(stated)
+    law = LossLaw(
+        1.0 - stated, part.independent, chain, False, False, False, none, False, tuple(links)
+    )
+    if known.any():
+        counts = count_outcomes(lost[..., known], none[known])
+        of_known = law._replace(lost=law.lost[known], links=list(compress(links, known)))
         shares = compare_losses(of_known, counts, family_level())
         demand_agreement(shares, where, "must be the delivered fraction in the long run")
     if part.independent:
@@ -215,7 +227,7 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
         coincidences = compare_coincidences(lost, range(MAX_LAG + 1), labels, family_level())
         remedy = "return False: theory relies on it"
         demand_agreement(coincidences, f"{watched.name}.independent", rule, remedy)
-    elif law.chain is not None and len(known) == len(links):
+    elif law.chain is not None and known.all():
         stated = stated_part(part, "loss")
         derives = type(stated) is not type(part)
         parent = f"{type(stated).__name__}, from which it derives" if derives else "its `chain`"
@@ -225,21 +237,13 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
         demand_agreement(bursts, f"{watched.name}.next_state", rule, remedy)
 
 
-def _loss_law(part: Loss, links: tuple[Link, ...], lost: FloatArray) -> LossLaw:
-    opposite = np.full(len(links), -1)
-    chain = stated_law(part, "loss")
-    return LossLaw(
-        lost, part.independent, chain, False, False, False, opposite, at_once=False, links=links
-    )
-
-
 def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndarray:
     """Return the mask (CHAINS, LENGTH, L) of messages that the engine would lose."""
     lost, channel = np.zeros((CHAINS, LENGTH, len(links)), dtype=bool), Channel(loss=part)
     for chain in range(CHAINS):
         streams = Streams(seed + 7, chain)
         for k, (link, table_probability) in enumerate(links.items()):
-            sampler = ChannelSampler(channel, partial(_make_generator, streams, link))
+            sampler = ChannelSampler(channel, lambda purpose: streams.generator(purpose, *link))  # noqa: B023
             uniform, bad, _ = sampler.draws(LENGTH)
             probabilities = [
                 part.delivery_probability(link, message, is_bad, table_probability)
@@ -247,20 +251,6 @@ def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndar
             ]
             lost[chain, :, k] = uniform >= probabilities
     return lost
-
-
-def _make_generator(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
-    return streams.generator(purpose, *link)
-
-
-def _check_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
-    _check_message_delays(watched, links)
-    delays, repeated = (_draw_delays(watched) for _ in range(2))
-    rule = "must use no generator but the one it is given"
-    demand(delays == repeated, f"{watched.name}.draw", rule, "other delays from an equal generator")
-    if watched.part.is_random:
-        _check_draws(watched)
-    _check_delay_law(watched, links)
 
 
 def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:

@@ -110,7 +110,9 @@ def _check_entity(watched: WatchedPart, entity: Entity) -> None:
     for blocks in BLOCKS[1:]:
         in_blocks = _read_ticks(watched, entity, blocks)
         if not np.array_equal(in_one_block, in_blocks):
-            k = _first_difference(in_one_block, in_blocks)
+            pairs = zip(in_one_block, in_blocks, strict=False)
+            shorter = min(len(in_one_block), len(in_blocks))
+            k = next((k for k, (one, other) in enumerate(pairs) if one != other), shorter)
             texts = [f"{t[k]:.17g}" if k < len(t) else "nothing" for t in (in_one_block, in_blocks)]
             fail(
                 f"{watched.name}.ticks",
@@ -198,12 +200,6 @@ def _check_increasing(watched: WatchedPart, times: FloatArray) -> None:
     )
 
 
-def _first_difference(one: FloatArray, other: FloatArray) -> int:
-    shorter = min(len(one), len(other))
-    unequal = np.flatnonzero(one[:shorter] != other[:shorter])
-    return int(unequal[0]) if unequal.size else shorter
-
-
 def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -> None:
     part, runs = watched.part, max(2, CHAINS // len(entities))
     rates = np.array([watched.call("mean_rate", entity) for entity in entities])
@@ -213,10 +209,13 @@ def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -
         horizon = LENGTH / float(np.nanmedian(rates)) if not np.isnan(rates).all() else 0.0
         if not horizon:
             horizon = float(_read_ticks(watched, entities[0], (LENGTH,))[-1])
-        times = [
-            [_draw_ticks(part, entity, seed, run, k, horizon) for k, entity in enumerate(entities)]
-            for run in range(runs)
-        ]
+
+        def draw(run: int, k: int, entity: Entity) -> FloatArray:
+            streams = Streams(seed, run)
+            phase = lambda: streams.generator("phase", k)  # noqa: E731
+            return generate_ticks(part, entity, phase, streams.generator("testing", k), horizon)
+
+        times = [[draw(run, *item) for item in enumerate(entities)] for run in range(runs)]
     # Clocks without a stated rate are compared with the median of all.
     found = np.median(np.mean([[len(ticks) for ticks in one] for one in times], axis=0)) / horizon
     law = stated_law(part, "activation")
@@ -235,14 +234,6 @@ def _check_laws(watched: WatchedPart, entities: tuple[Entity, ...], seed: int) -
             compare_clocks(group, counts.ticks, horizon, family_level()), where, rule, REMEDY
         )
         demand_agreement(_compare_gaps_of_links(group, times), where, rule, REMEDY)
-
-
-def _draw_ticks(
-    part: Any, entity: Entity, seed: int, run: int, stream: int, horizon: float
-) -> FloatArray:
-    streams = Streams(seed, run)
-    random = streams.generator("testing", stream)
-    return generate_ticks(part, entity, lambda: streams.generator("phase", stream), random, horizon)
 
 
 def _count(group: ClockGroup, times: list[FloatArray], horizon: float) -> TickCounts:

@@ -59,7 +59,8 @@ def _check_matching(part: Any, topology: Topology | None, seed: int) -> None:
     networks = small_networks() if topology is None else (topology,)
     accepted = [network for network in networks if _accepts_graph(part, network, watched.name)]
     if isinstance(part, RecordedSlots):
-        _check_recorded(part, watched.name)
+        for slot, phase, step in part.recorded if part.matching else ():
+            _demand_matching(f"{watched.name}.pairs", part.pairs(slot, phase, step), slot)
         return
     demand(accepted, f"{watched.name}.check", "must accept one of the networks", "none accepted")
     if isinstance(part, Broadcast):
@@ -81,12 +82,6 @@ def _accepts_graph(part: Any, topology: Topology, name: str) -> bool:
         except ScenarioError:
             return False
     return True
-
-
-def _check_recorded(part: RecordedSlots, name: str) -> None:
-    if part.matching:
-        for slot, phase, step in part.recorded:
-            _demand_matching(f"{name}.pairs", part.pairs(slot, phase, step), slot)
 
 
 def _check_network(watched: WatchedPart, copy: Any, topology: Topology, seed: int) -> None:

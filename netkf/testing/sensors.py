@@ -345,7 +345,11 @@ def _check_nonlinear(sensor: NonlinearSensor, name: str, seed: int) -> None:
             remedy = "return what is read without noise, which netkf adds"
             demand(is_same, f"{name}.h", "must be the same for a state", repeated, remedy)
             demand(J.shape == (p, n), f"{name}.jacobian", f"must be {p} x {n}", str(J.shape))
-            error = _derivative_error(sensor, node, x, J)
+            numerical = np.empty_like(J)
+            for k, step in enumerate(np.eye(n) * DERIVATIVE_STEP):
+                ahead, behind = (np.asarray(sensor.h(x + move, node)) for move in (step, -step))
+                numerical[:, k] = sensor.difference(ahead, behind) / (2.0 * DERIVATIVE_STEP)
+            error = float(np.abs(numerical - J).max())
             demand(
                 error <= DERIVATIVE_TOLERANCE * (1.0 + float(np.abs(J).max())),
                 f"{name}.jacobian",
@@ -359,23 +363,11 @@ def _find_state_size(sensor: NonlinearSensor, name: str) -> int:
     failure = ""
     for n in range(1, MAX_STATES + 1):
         try:
-            if _accepts_state_size(sensor, n):
+            sensor.check_state(n)
+            sensor.h(np.ones(n), sensor.nodes[0])
+            if np.shape(sensor.jacobian(np.ones(n), sensor.nodes[0]))[-1:] == (n,):
                 return n
         except Exception as error:  # of a user's class
             failure = f"; for a state of {n} the class {describe_failure(error)}"
     rule = f"h and jacobian must read a state of at most {MAX_STATES} components{failure}"
     return fail(name, rule)
-
-
-def _accepts_state_size(sensor: NonlinearSensor, n: int) -> bool:
-    sensor.check_state(n)
-    sensor.h(np.ones(n), sensor.nodes[0])
-    return np.shape(sensor.jacobian(np.ones(n), sensor.nodes[0]))[-1:] == (n,)
-
-
-def _derivative_error(sensor: NonlinearSensor, node: int, x: FloatArray, J: FloatArray) -> float:
-    numerical = np.empty_like(J)
-    for k, step in enumerate(np.eye(len(x)) * DERIVATIVE_STEP):
-        ahead, behind = (np.asarray(sensor.h(x + sign * step, node)) for sign in (1.0, -1.0))
-        numerical[:, k] = sensor.difference(ahead, behind) / (2.0 * DERIVATIVE_STEP)
-    return float(np.abs(numerical - J).max())
