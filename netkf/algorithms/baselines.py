@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Timing
+from netkf.algorithms.traits import Timing
 
 
 @built_in("local")
@@ -17,7 +17,6 @@ class Local(Filter):
     are filtered.
     """
 
-    analysis = Analysis(combination="none")
     timing = Timing(schedule=("predict", "sense"), clocks=(), talks=False)
     kernels = Kernels()
 

@@ -448,7 +448,7 @@ class BeliefPropagation(Filter):
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)
     memory: str = field(one_of(SLOT, ALL), default=SLOT)
 
-    analysis = Analysis(paper="belief_propagation", combination="beliefs")
+    analysis = Analysis(paper="belief_propagation")
     kernels = Kernels(
         predict=predict,
         update=update,

@@ -481,7 +481,6 @@ class ConsensusInnovations(Filter):
 
     analysis = Analysis(
         paper="consensus_innovations",
-        combination="pseudo-states",
         payload_numbers=lambda n, *_: n,
     )
     timing = Timing(clocks=())

@@ -166,9 +166,7 @@ class ConstantGain(Filter):
         either(matrix, list_of(matrix, "matrices"), has_depth(3))
     )
 
-    analysis = Analysis(
-        paper="constant_gain", combination="constant gain", P_by_design=("larger", "larger")
-    )
+    analysis = Analysis(paper="constant_gain", P_by_design=("larger", "larger"))
     kernels = Kernels(
         update=use_sample,
         absorb=combine_convex,

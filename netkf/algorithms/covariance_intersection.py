@@ -34,7 +34,6 @@ class CovarianceIntersection(Hybrid):
     the error, paper H (10).
     """
 
-    analysis = replace(Hybrid.analysis, combination="intersection")
     needs = Needs(inverts=True)
     kernels = replace(
         DiffusionFilter.kernels,

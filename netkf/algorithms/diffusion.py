@@ -131,7 +131,7 @@ class DiffusionFilter(Filter):
     )
     on_loss: str = field(one_of("renormalise", "keep-own"), default="renormalise")
 
-    analysis = Analysis(paper="diffusion", combination="shares", P_by_design=("larger", "larger"))
+    analysis = Analysis(paper="diffusion", P_by_design=("larger", "larger"))
     timing = Timing(
         schedule=("sense", "predict", "exchange"),
         clocks=("directions", "nodes", "readings"),

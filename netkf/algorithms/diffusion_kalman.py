@@ -83,7 +83,7 @@ class DiffusionKalman(Filter):
 
     analysis = Analysis(
         paper="diffusion_kalman",
-        combination="readings, then estimates",
+        tells_estimates=lambda phase: phase != READINGS,
         payload_numbers=message_size,
     )
     timing = Timing(

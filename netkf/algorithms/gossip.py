@@ -35,7 +35,7 @@ class Gossip(Filter):
     and the other is gone. Of several pairs that arrive at one instant the last sender's counts.
     """
 
-    analysis = Analysis(paper="gossip", combination="swap")
+    analysis = Analysis(paper="gossip", swaps=True)
     timing = Timing(
         schedule=("exchange", "sense", "predict"), clocks=("links",), predicts=True, pairwise=True
     )

@@ -28,7 +28,7 @@ class Hybrid(Filter):
 
     epsilon: float = field(number(above=0.0, high=1.0))
 
-    analysis = Analysis(paper="hybrid", combination="convex", P_by_design=("", "larger"))
+    analysis = Analysis(paper="hybrid", P_by_design=("", "larger"))
     timing = Timing(schedule=None)
     kernels = Kernels(absorb=combine_convex, unrolled=True)
 

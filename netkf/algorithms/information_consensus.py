@@ -193,7 +193,6 @@ class InformationConsensus(Filter):
         """Its paper, and the size of a message."""
         return Analysis(
             paper="information_consensus",
-            combination="intersection",
             payload_numbers=self._message_size,
         )
 

@@ -304,7 +304,9 @@ class Intermittent(Filter):
     late: str = field(one_of("exact", "drop"), default="exact")
     window: float | None = field(of_time(positive), default=None)
 
-    analysis = Analysis(paper="intermittent", combination="readings", payload_numbers=reading_size)
+    analysis = Analysis(
+        paper="intermittent", tells_estimates=lambda _: False, payload_numbers=reading_size
+    )
     needs = Needs(one_way=True, samples=True)
     kernels = Kernels(
         emit=send_reading,

@@ -150,9 +150,7 @@ class Kcf(Filter):
     @property
     def analysis(self) -> Analysis:
         """Its paper, and the size of a message."""
-        return Analysis(
-            paper="kalman_consensus", combination="predictions", payload_numbers=self._message_size
-        )
+        return Analysis(paper="kalman_consensus", payload_numbers=self._message_size)
 
     def _message_size(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message about n states in numbers of 64 bits: (u, U, xbar) with

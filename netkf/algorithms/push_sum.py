@@ -517,7 +517,6 @@ class PushSum(Filter):
 
     analysis = Analysis(
         paper="push_sum",
-        combination="sums",
         P_by_design=("", "smaller"),
         payload_numbers=message_size,
         conserved=masses,

@@ -1,8 +1,7 @@
 """The built-in filters: each registers in its own file, and everything else finds it here.
 
-A filter's file says what the rest of the package must know of it: its name in scenario files, the
-paper whose theory and checks apply to it (packages ``netkf.theory.<paper>`` and
-``netkf.checks.<paper>``), and how it combines messages (``Filter.analysis``).
+A filter's file says what the rest of the package must know of it: its name in scenario files, and
+the paper whose theory and checks apply to it (``Filter.analysis``).
 
 A user's class that derives from a built-in one is still covered by its theorems unless it overrides
 a method or class variable on which they rely: ``own_attributes`` and ``overridden`` tell.

@@ -249,7 +249,6 @@ class ScheduledReadings(Filter):
 
     analysis = Analysis(
         paper="stochastic_trigger",
-        combination="scheduled readings",
         payload_numbers=lambda _, rows, __: rows,
     )
     timing = Timing(clocks=(), randomised=True)
@@ -448,6 +447,8 @@ class TriggeredMessages(Filter):
         given = self.inner.analysis
         # Which messages are sent depends on data, so that no comparison of P is proved.
         return Analysis(
+            swaps=given.swaps,
+            tells_estimates=given.tells_estimates,
             payload_numbers=given.payload_numbers,
             conserved=lambda state: given.conserved(state.inner),
             stopped=lambda state: given.stopped(state.inner),

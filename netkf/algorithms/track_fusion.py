@@ -132,7 +132,7 @@ class OptimisedIntersection(PairFusion):
     """
 
     analysis = replace(
-        PairFusion.analysis, combination="best intersection", P_by_design=("larger", "larger")
+        PairFusion.analysis, source="Julier and Uhlmann 1997", P_by_design=("larger", "larger")
     )
 
 
@@ -146,7 +146,7 @@ class InverseIntersection(PairFusion):
     independent besides. For a network that fuses over and over no bound is proved.
     """
 
-    analysis = replace(PairFusion.analysis, combination="inverse intersection")
+    analysis = replace(PairFusion.analysis, source="Noack et al. 2017")
     inverse: ClassVar[bool] = True
 
 
@@ -330,7 +330,12 @@ class BarShalomCampo(Filter):
     not enter the tracks. Of more than two tracks it is the combination with the least covariance.
     """
 
-    analysis = Analysis(paper="track_fusion", combination="tracks", payload_numbers=lambda n, *_: n)
+    analysis = Analysis(
+        paper="track_fusion",
+        source="Bar-Shalom and Campo 1986",
+        P_by_design=("equal", ""),
+        payload_numbers=lambda n, *_: n,
+    )
     timing = Timing(clocks=())
     needs = Needs(
         one_way=True, fixed_sensors=True, every_reading=True, common_start=True, network=True

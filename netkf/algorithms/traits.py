@@ -86,15 +86,23 @@ def never(_: Any) -> bool:
     return False
 
 
+def always(*_: object) -> bool:
+    """Return True."""
+    return True
+
+
 @dataclass(frozen=True)
 class Analysis:
     """What theory, checks and comparisons know of a filter; no state depends on it.
 
     paper : name of its packages in netkf.theory and netkf.checks, "" if there are none
-    combination : how it combines messages: "convex", "intersection", "swap", "shares", "readings",
-                  "sums", "none", ...; "" if only its methods define it
-    P_by_design : how P compares with the covariance of its error in slots and under clocks:
-                  "larger", "smaller", or "" if they are equal or nothing is proved
+    source : who published it, where its paper's folder holds several filters
+    swaps : nodes exchange their whole states: what a node had before it heard a message is gone
+    tells_estimates : ``tells_estimates(phase)``, False if messages of exchange number ``phase`` of
+                      a slot (-1 under clocks) tell of nothing but the sender's reading of that
+                      instant
+    P_by_design : how P compares with the covariance of its error given the events, in slots and
+                  under clocks: "larger", "smaller", "equal", or "" if nothing is proved
     payload_numbers : ``payload_numbers(n, rows, phase)``, the size, in numbers of 64 bits, of a
                       message that a node with ``rows`` rows of readings sends about n states in
                       exchange number ``phase`` of a slot (-1 under clocks), which comparisons of
@@ -107,7 +115,9 @@ class Analysis:
     """
 
     paper: str = ""
-    combination: str = ""
+    source: str = ""
+    swaps: bool = False
+    tells_estimates: Callable[[int], bool] = always
     P_by_design: tuple[str, str] = ("", "")
     payload_numbers: Callable[[int, int, int], float] = estimate_numbers
     conserved: Callable[[Any], Mapping[str, float | Sequence[float]]] = nothing_conserved
@@ -122,11 +132,6 @@ CLOCKS = ("links", "directions", "nodes", "readings")
 def once(_: int) -> int:
     """Return 1: an exchange is not repeated."""
     return 1
-
-
-def always(*_: object) -> bool:
-    """Return True."""
-    return True
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ def find_checks(scenario: Scenario) -> PaperChecks:
         return WITHOUT_PAPER
     promised = promised_filter(scenario.filter.algorithm)
     # Without messages the equations of a Kalman filter are all that is promised.
-    if promised.analysis.combination == "none":
+    if not promised.timing.talks:
         return UNDER_CLOCKS
     if promised.analysis.paper not in OF_PAPERS:
         name = kind_name(promised)

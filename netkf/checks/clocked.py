@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from netkf.algorithms.traits import nothing_conserved
 from netkf.checks.evidence import Assumption, Finding, Promise
 from netkf.checks.exact import (
     check_bias,
@@ -104,9 +105,12 @@ class ClockedChecks(PaperChecks):
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the statements about a scenario's filter that are tested."""
-        if with_promised_filter(scenario).node_filter.analysis.combination == "sums":
-            return (MASS_CONSERVED, *PROMISES)
-        return (*PROMISES[:1], UPPER_BOUND, *PROMISES[1:])
+        analysis = with_promised_filter(scenario).node_filter.analysis
+        mass = () if analysis.conserved is nothing_conserved else (MASS_CONSERVED,)
+        in_slots, in_continuous_time = analysis.P_by_design
+        is_below = (in_slots if scenario.slotted else in_continuous_time) == "smaller"
+        bound = () if is_below else (UPPER_BOUND,)
+        return (*mass, *PROMISES[:1], *bound, *PROMISES[1:])
 
 
 CHECKS = ClockedChecks()

@@ -39,9 +39,8 @@ from netkf.laws.intervals import POWER, Interval, deviation_interval, scale_inte
 from netkf.laws.noise import MIN_VARIANCE_SHARE, whiten
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.errors import diagonal_blocks, error_law
 from netkf.theory.common.increments import integration_steps
-from netkf.theory.common.replay import ErrorLaw
+from netkf.theory.errors import ErrorLaw, diagonal_blocks, error_law
 from netkf.trace.nees import errors
 from netkf.trace.run import BLUR, Run, blurred_samples
 

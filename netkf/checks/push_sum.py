@@ -376,8 +376,9 @@ class PushSumChecks(PaperChecks):
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario."""
         promised = with_promised_filter(scenario)
+        algorithm: Any = promised.filter.algorithm
         promises: tuple[Promise, ...] = PROMISES
-        if getattr(promised.filter.algorithm, "running_sums", False):
+        if algorithm.running_sums:
             # Running sums conserve mass (the first promise) whatever is lost.
             promises = (dataclasses.replace(PROMISES[0], needs=()), *PROMISES[1:])
         if not searches_gamma(promised):

@@ -85,7 +85,8 @@ STEADY = Promise(
     check_steady,
     exact=True,
 )
-BY_COMBINATION = {"best intersection": (UPPER_BOUND,), "tracks": (EXACT, STEADY)}
+BY_DESIGN = {"larger": (UPPER_BOUND,), "equal": (EXACT, STEADY)}
+"""Promises about P, by how it compares with the covariance of the error."""
 
 
 class FusionChecks(EquationChecks):
@@ -93,9 +94,8 @@ class FusionChecks(EquationChecks):
 
     def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
         """Return the promises about a scenario: those about the filter's equations."""
-        about_errors = BY_COMBINATION.get(
-            with_promised_filter(scenario).node_filter.analysis.combination, ()
-        )
+        in_slots, under_clocks = with_promised_filter(scenario).node_filter.analysis.P_by_design
+        about_errors = BY_DESIGN.get(in_slots if scenario.slotted else under_clocks, ())
         # This is the order of rows in the report.
         return (*PROMISES[:1], *about_errors, *PROMISES[1:])
 

@@ -205,11 +205,9 @@ def _flow_kind(source: ReportSource) -> str:
     node_filter = source.scenario.node_filter
     if node_filter.timing.pooled:
         return "pooled"
-    return (
-        node_filter.analysis.combination
-        if node_filter.analysis.combination in ("swap", "readings")
-        else "combine"
-    )
+    if node_filter.analysis.swaps:
+        return "swap"
+    return "combine" if node_filter.analysis.tells_estimates(-1) else "readings"
 
 
 def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None) -> list[int]:

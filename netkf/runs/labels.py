@@ -17,7 +17,8 @@ def covariance_bias(scenario: Scenario) -> str:
     if overridden(algorithm) or not scenario.topology.links or not scenario.is_linear:
         return ""
     # With a wrong model P need not be larger.
-    return "" if design == "larger" and not scenario.filters_know_the_truth else design
+    is_known = design == "smaller" or (design == "larger" and scenario.filters_know_the_truth)
+    return design if is_known else ""
 
 
 def covariance_notes(scenario: Scenario) -> tuple[str, ...]:

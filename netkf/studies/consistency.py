@@ -31,7 +31,7 @@ from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, simulate
 from netkf.runs.summary import NO_COVARIANCE, nees_bounds
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.errors import error_squares
+from netkf.theory.errors import error_squares
 from netkf.trace.nees import errors
 from netkf.trace.run import Run, blurred_samples
 

@@ -180,17 +180,16 @@ def find_flow(
     """
     used = messages.outcome == USED if used is None else used
     nodes = np.array(scenario.nodes)
-    combination = scenario.node_filter.analysis.combination
-    if combination == "swap":
+    analysis = scenario.node_filter.analysis
+    if analysis.swaps:
         return _swap_flow(nodes, len(log), messages, np.asarray(used))
     # One segment for each node, the whole run; its index is that of the node.
     node = nodes
     start = np.zeros(len(nodes), dtype=np.int64)
     origin = np.searchsorted(nodes, messages.sender)
     # Messages that carry the sender's reading and nothing else.
-    readings = np.full(len(messages), combination == "readings")
-    if combination == "readings, then estimates":
-        readings = np.asarray(messages.phase == 0)
+    phases = messages.phase.tolist()
+    readings = np.array([not analysis.tells_estimates(phase) for phase in phases], dtype=bool)
     if readings.any():
         # A message that carries only the reading of its instant comes from a segment of its own,
         # which receives no messages.

@@ -19,7 +19,7 @@ from netkf.runs.simulate import simulate
 from netkf.scenario.model import Filtering
 from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, riccati_step
-from netkf.theory.common.errors import error_squares
+from netkf.theory.errors import error_squares
 from netkf.theory.hybrid.path_moments import expected_squares
 from netkf.trace.run import Run
 from netkf.trace.schema import KINDS

@@ -88,8 +88,7 @@ class Replayer:
     def delayed(self) -> Chosen:
         """Messages not lost but unused because of their delay; replays deliver them at once."""
         scenario = self.scenario
-        swaps = scenario.node_filter.analysis.combination == "swap"
-        messages = match_messages(self.log, swaps, scenario.slotted)
+        messages = match_messages(self.log, scenario.node_filter.analysis.swaps, scenario.slotted)
         unused = np.flatnonzero(np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY)))
         return frozenset(messages.key(m) for m in unused.tolist())
 

@@ -214,7 +214,7 @@ class _Evidence:
         talks, links = self.scenario.node_filter.timing.talks, self.scenario.topology.directions
         self._links = frozenset(links if talks else ())
         swaps, slotted = (
-            self.scenario.node_filter.analysis.combination == "swap",
+            self.scenario.node_filter.analysis.swaps,
             self.scenario.slotted,
         )
         self.messages = match_messages(replayer.log, swaps, slotted)

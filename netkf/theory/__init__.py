@@ -1,11 +1,10 @@
 """Results of the papers, computed for scenarios and for plain matrices."""
 
 from netkf.theory.assumptions import assumptions
-from netkf.theory.common.errors import error_covariance
-from netkf.theory.common.mean_square import mean_square_radius, steady_error_covariance
 from netkf.theory.common.requirements import require_scenario
 from netkf.theory.diffusion.information import information_level
 from netkf.theory.diffusion.tracking import TrackingLevel, tracking_level
+from netkf.theory.errors import error_covariance
 from netkf.theory.gossip.invariant import SwitchedSamples, switched_samples
 from netkf.theory.gossip.matchings import detecting_walk, mean_matching
 from netkf.theory.hybrid.bounds import covariance_bound
@@ -29,6 +28,7 @@ from netkf.theory.intermittent.riccati import (
     support,
 )
 from netkf.theory.intermittent.scalar_law import scalar_law
+from netkf.theory.mean_square import mean_square_radius, steady_error_covariance
 from netkf.theory.numerics.matrices import riccati_flow
 from netkf.theory.one_bit.covariances import one_bit_update
 from netkf.theory.push_sum.broadcasts import leader_agreement, mass_totals

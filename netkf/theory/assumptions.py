@@ -17,8 +17,8 @@ from netkf.theory.common.evidence import (
     judge_plant,
     true_model_row,
 )
-from netkf.theory.common.papers import paper_function
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
+from netkf.theory.folders import theory_of
 from netkf.theory.hybrid.coupled import concerns_hybrid_paper, has_balanced_rates
 from netkf.theory.hybrid.samples import (
     randomly_sampled_sensors,
@@ -39,7 +39,7 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
     """Return a table with a row for each assumption: assumption, source, holds, evidence.
 
     ``holds`` is None where it is not known. The paper of the scenario's filter decides which
-    assumptions there are (``netkf.theory.<paper>.assumptions``).
+    assumptions there are.
     """
     import pandas as pd
 
@@ -60,11 +60,10 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows for slots: those of the filter's paper, or of any filter in slots."""
-    paper_rows = paper_function(scenario, "assumptions", "slot_rows")
+    paper_rows = theory_of(scenario).slot_rows
     if paper_rows is None:
         return [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
-    rows: list[AssumptionRow] = paper_rows(scenario)
-    return rows
+    return paper_rows(scenario)
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -104,8 +103,8 @@ def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the assumptions of the filter's paper on its weights, as rows of the table."""
-    rows = paper_function(scenario, "assumptions", "weight_rows")
-    return [] if rows is None else list(rows(scenario))
+    rows = theory_of(scenario).weight_rows
+    return [] if rows is None else rows(scenario)
 
 
 def _reach_row(scenario: Scenario) -> AssumptionRow:

@@ -31,10 +31,11 @@ from netkf.theory import (
     true_limit_covariance,
 )
 from netkf.theory.assumptions import assumption_rows
-from netkf.theory.common.mean_square import has_linear_errors, is_quickly_solved
-from netkf.theory.common.papers import paper_function, paper_legend
+from netkf.theory.common.papers import paper_legend
+from netkf.theory.folders import theory_of
 from netkf.theory.hybrid.coupled import concerns_hybrid_paper
 from netkf.theory.hybrid.steady import steady_by_node
+from netkf.theory.mean_square import has_linear_errors, is_quickly_solved
 from netkf.theory.traces import delay_suffix, limit_label
 
 CLOSE_TO_S = 0.1  # distance from S, as a share of its Frobenius norm, to find link rates for
@@ -74,8 +75,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
         ],
     }
     if scenario.slotted:
-        # The modules of a paper on filters in slots have functions of these names, if any.
-        slot_promises = paper_function(scenario, "promises", "slot_promises")
+        slot_promises = theory_of(scenario).slot_promises
         if slot_promises is not None:
             promises[scenario.node_filter.analysis.paper] = slot_promises(scenario)
         else:
@@ -176,8 +176,8 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
     lines += paper_legend(row["source"] for row in promises["assumptions"])
     paper = scenario.node_filter.analysis.paper
-    if paper and paper in promises:
-        slot_lines = paper_function(scenario, "promises", "slot_lines")
+    slot_lines = theory_of(scenario).slot_lines
+    if paper in promises and slot_lines is not None:
         return "\n".join([*lines, "", *slot_lines(promises[paper], format_number)])
     if scenario.slotted:
         central = promises["slot_central_covariance"]

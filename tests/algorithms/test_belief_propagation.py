@@ -8,7 +8,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.rng.streams import Streams
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from netkf.trace.schema import CODES
 from tests.algorithms.test_literature import (
     CENTRAL,

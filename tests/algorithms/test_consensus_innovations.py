@@ -7,7 +7,7 @@ import netkf
 from netkf import theory
 from netkf.algorithms.consensus_innovations import design_of, gain_sequence, optimal_gain
 from netkf.algorithms.filter import Exchange, Reading
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from tests.algorithms.test_literature import (
     CENTRAL,
     GRAPH,

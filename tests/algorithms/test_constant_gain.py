@@ -8,7 +8,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from tests.algorithms.test_literature import clocked, heard_by_slot, scenario_of, textbook
 from tests.engines.linearity import engine_covariance
 from tests.theory.test_replay import close

@@ -7,7 +7,7 @@ import netkf
 from netkf import theory
 from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from netkf.trace.schema import CODES
 from tests import reference
 from tests.engines.linearity import engine_covariance
@@ -77,9 +77,7 @@ def heard_by_slot(scenario, run, steps):
         if kind == CODES["send"]:
             slot = int(t)
             place = sent.setdefault((node, peer), {})
-            silent = steps == 2 and scenario.filter.algorithm.analysis.combination.startswith(
-                "readings"
-            )
+            silent = steps == 2 and not scenario.filter.algorithm.analysis.tells_estimates(0)
             place[slot] = (
                 place.get(slot, int(silent and node not in scenario.placed_sensors) - 1) + 1
             )

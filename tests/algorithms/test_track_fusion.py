@@ -12,7 +12,7 @@ from netkf import theory
 from netkf.algorithms.kernels.pair_fusion import fuse_pair
 from netkf.algorithms.track_fusion import best_combination
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from tests.algorithms.test_literature import (
     LOSSY,
     clocked,

@@ -15,7 +15,7 @@ from netkf.checks.points import check_times, errors_at_once, probe_times
 from netkf.checks.samples import stack_summaries
 from netkf.laws.ticks import count_interval
 from netkf.scenario.reading import load
-from netkf.theory.common.replay import ErrorLaw
+from netkf.theory.errors import ErrorLaw
 from tests.checks.power import STUDIES, measured_power
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

@@ -7,7 +7,7 @@ import pytest
 
 import netkf
 from netkf.scenario.reading import from_table
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from tests.engines.agreement import assert_agree
 from tests.engines.linearity import engine_covariance
 from tests.theory.test_replay import close

@@ -101,7 +101,7 @@ class EventGraph:
 
     def __init__(self, scenario, events, used):
         self.graph = nx.DiGraph()
-        self.scenario, self.kind = scenario, scenario.node_filter.analysis.combination
+        self.scenario, self.analysis = scenario, scenario.node_filter.analysis
         self.now = {node: (node, -1) for node in scenario.nodes}
         self.graph.add_nodes_from(self.now.values())
         self.cargo, self.waiting, self.reading = {}, {node: [] for node in scenario.nodes}, {}
@@ -121,7 +121,7 @@ class EventGraph:
             self.graph.add_edge(self.reading[row.node], here, weight=0)
         elif row.kind == "send":
             key = (row.node, row.peer, row.message)
-            if self.kind == "readings" or (self.kind[:9] == "readings," and row.phase == 0):
+            if not self.analysis.tells_estimates(row.phase):
                 self.cargo[key] = self.reading[row.node]  # the one just taken, and no more
             else:
                 self.step(here)
@@ -130,12 +130,12 @@ class EventGraph:
             self.waiting[row.node].append((row.peer, row.node, row.message))
         elif row.kind in ("absorb", "swap"):
             came, self.waiting[row.node] = self.waiting[row.node], []
-            if self.kind == "swap":
+            if self.analysis.swaps:
                 replaced = [key for key in came if key in used]
                 sender = max((key[0] for key in replaced), default=None)
                 newest = max((key for key in replaced if key[0] == sender), default=None)
                 came = [key for key in came if key == newest or key not in used]
-            self.step(here, keep=not (self.kind == "swap" and any(key in used for key in came)))
+            self.step(here, keep=not (self.analysis.swaps and any(key in used for key in came)))
             for key in came:
                 self.graph.add_edge(self.cargo[key], here, weight=int(key not in used))
 
@@ -173,9 +173,7 @@ def used_messages(scenario, events):
             waiting[row.node].append((row.peer, row.node, row.message))
         elif row.kind in ("absorb", "swap"):
             came, waiting[row.node] = waiting[row.node], []
-            used |= (
-                {max(came)} if scenario.node_filter.analysis.combination == "swap" else set(came)
-            )
+            used |= {max(came)} if scenario.node_filter.analysis.swaps else set(came)
     return used
 
 
@@ -198,9 +196,7 @@ def test_the_newest_readings_are_those_of_a_search_in_a_graph_of_events(runs, na
         count = rows_before(scenario, run.events, at)
         log = rows_until(scenario, run.log, at)
         assert len(log) == count
-        messages = match_messages(
-            log, scenario.node_filter.analysis.combination == "swap", scenario.slotted
-        )
+        messages = match_messages(log, scenario.node_filter.analysis.swaps, scenario.slotted)
         reach = search_back(find_flow(scenario, log, messages), node)
         found = newest_information(reach, log, KeptReadings(scenario, log, at), 0)
         ours = {n: f.reading for n, f in found.items() if not math.isnan(f.reading)}

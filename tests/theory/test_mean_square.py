@@ -11,7 +11,8 @@ from scipy.integrate import quad
 import netkf
 from netkf import theory
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.theory.common import delayed_jumps, mean_square
+from netkf.theory import mean_square
+from netkf.theory.common import delayed_jumps
 from netkf.theory.promises import compute_promises, promises_text
 from tests.algorithms.test_literature import ROTATION, discretised, scenario_of
 

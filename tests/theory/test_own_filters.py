@@ -6,7 +6,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from netkf.trace.schema import CODES
 
 # Constant gains, and a memory of the newest estimate heard over each link, used again and again.

@@ -7,7 +7,7 @@ import scipy.linalg
 import netkf
 from netkf import theory
 from netkf.scenario.reading import from_table
-from netkf.theory.common.errors import error_law
+from netkf.theory.errors import error_law
 from tests.engines.linearity import engine_covariance, engine_joint
 
 POISSON = {"kind": "poisson", "rate": 2.0}

@@ -1,17 +1,10 @@
-"""The five papers and their letters, and lookup of modules of ``netkf.theory.<paper>`` by the paper
-that the filter's class names.
-"""
+"""The five papers and their letters."""
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import re
 import textwrap
 from collections.abc import Iterable
-from typing import Any
-
-from netkf.scenario.scenario import Scenario
 
 PAPERS = {
     "H": "Tanwani: Error bounds for locally optimal distributed filters with random communication "
@@ -39,13 +32,3 @@ def paper_legend(sources: Iterable[str]) -> list[str]:
         if re.search(rf"(^|[;,] |from ){letter}[ (]", joined)
         for line in textwrap.wrap(f"[{letter} ...]: {title}", 100, subsequent_indent=" " * 13)
     ]
-
-
-def paper_function(scenario: Scenario, module: str, name: str) -> Any:
-    """Return the function ``name`` of a ``module`` of the paper of the scenario's filter, or None
-    if paper, module or function is missing.
-    """
-    paper = scenario.node_filter.analysis.paper
-    if not paper or importlib.util.find_spec(f"netkf.theory.{paper}.{module}") is None:
-        return None
-    return getattr(importlib.import_module(f"netkf.theory.{paper}.{module}"), name, None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
@@ -155,8 +157,8 @@ def _arrival_row(scenario: Scenario) -> AssumptionRow:
     if is_recorded(scenario.network.channel):
         return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
     all_arrive = all_messages_arrive(scenario)
-    policy = getattr(scenario.filter.algorithm, "on_loss", "")
-    evidence = f"a message may be lost or late; weights then change ({policy}): P stays consistent"
+    algorithm: Any = scenario.filter.algorithm
+    evidence = f"a message may be lost or late; weights then change ({algorithm.on_loss}): P stays consistent"
     if not all_arrive:
         evidence += ", but D's theorems are about fixed weights"
     return (

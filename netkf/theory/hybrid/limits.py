@@ -58,7 +58,8 @@ def _require_limit(scenario: Scenario) -> None:
     algorithm = scenario.filter.algorithm
     if not algorithm.timing.talks:
         return
-    if scenario.node_filter.analysis.combination != "convex":
+    kernels = scenario.node_filter.kernels
+    if kernels is None or not kernels.is_convex:
         raise TheoryError(
             f"Tanwani's H(13) is about the hybrid filter, not about {kind_name(algorithm)}"
         )

@@ -56,9 +56,8 @@ def _require_exact_model(scenario: Scenario) -> None:
     """Raise TheoryError unless the quadrature holds: increments, messages without delay."""
     if scenario.slotted or scenario.sampled_sensors or not scenario.is_random:
         raise TheoryError("mean squares by quadrature are for random increments")
-    if scenario.node_filter.analysis.combination != "convex" or overridden(
-        scenario.filter.algorithm
-    ):
+    kernels = scenario.node_filter.kernels
+    if kernels is None or not kernels.is_convex or overridden(scenario.filter.algorithm):
         raise TheoryError("mean squares by quadrature are for the hybrid filter")
     if scenario.network.channel.delay.fixed != 0.0:
         raise TheoryError("mean squares by quadrature are for messages that take no time")

@@ -7,18 +7,12 @@ from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import model_and_start_rows
 from netkf.theory.common.random_links import all_messages_arrive
 
-SOURCES = {
-    "best intersection": "Julier and Uhlmann 1997",
-    "inverse intersection": "Noack et al. 2017",
-    "tracks": "Bar-Shalom and Campo 1986",
-}
-
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the assumptions, as rows of the table, about the model and the first covariances."""
-    source = SOURCES[scenario.node_filter.analysis.combination]
-    rows = model_and_start_rows(scenario, source)
-    if scenario.node_filter.analysis.combination != "tracks":
+    analysis = scenario.node_filter.analysis
+    source, rows = analysis.source, model_and_start_rows(scenario, analysis.source)
+    if analysis.P_by_design[0] != "equal":
         return rows
     lossless = all_messages_arrive(scenario)
     evidence = "every message arrives in its slot" if lossless else "P depends on who is heard"

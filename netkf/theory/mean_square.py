@@ -1,8 +1,7 @@
 """Exact steady mean squares of errors over random losses, bursts and clocks.
 
 Where the gains of a filter do not depend on data or on what happens in the network, its errors are
-a linear system with jumps (theory/common/jumps.py). A paper's folder makes that system in a module
-``linear_errors``: ``slot_jumps(scenario)`` and ``clock_jumps(scenario)``.
+a linear system with jumps (theory/common/jumps.py), which the folder of the paper makes.
 """
 
 from __future__ import annotations
@@ -12,6 +11,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.records import Kernels
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import contracts, growth_rate
@@ -19,10 +20,9 @@ from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.alone import silent_jumps
 from netkf.theory.common.delayed_jumps import DelayedJumps
-from netkf.theory.common.errors import diagonal_blocks
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse, SlotJumps
-from netkf.theory.common.papers import paper_function
-from netkf.theory.common.replay import require_known_filter
+from netkf.theory.errors import diagonal_blocks, require_known_filter
+from netkf.theory.folders import LinearErrors, theory_of
 from netkf.theory.numerics.positive_maps import (
     PositiveMap,
     fixed_point,
@@ -35,8 +35,6 @@ MAX_NUMBERS, QUICK_NUMBERS = 4_000_000, 40_000
 """Largest number of entries of the second moments of all modes, and that up to which a solution
 takes a second.
 """
-
-LinearErrors = SlotJumps | ClockJumps | DelayedJumps
 
 
 def mean_square_radius(scenario: Scenario) -> float:
@@ -170,25 +168,20 @@ def is_quickly_solved(scenario: Scenario) -> bool:
 def _choose_solver(
     scenario: Scenario,
 ) -> Callable[[Scenario], tuple[float, FloatArray | None]] | None:
-    """Return the special solver of the filter's paper (``steady_errors``), or None."""
-    if not scenario.slotted:
-        return None
-    combination = scenario.node_filter.analysis.combination.replace(" ", "_")
-    solver: Callable[[Scenario], tuple[float, FloatArray | None]] | None = paper_function(
-        scenario, "steady_errors", f"{combination}_in_slots"
-    )
-    return solver
+    """Return the special solver of the filter's paper, or None."""
+    is_exact = scenario.node_filter.analysis.P_by_design[0] == "equal"
+    return theory_of(scenario).steady_slots if scenario.slotted and is_exact else None
 
 
 def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
     """Return the function that makes the linear system of a scenario, if there is one."""
-    if scenario.node_filter.analysis.combination == "none":
-        return silent_jumps if scenario.slotted else None
-    name = "slot_jumps" if scenario.slotted else "clock_jumps"
-    maker: Callable[[Scenario], LinearErrors] | None = paper_function(
-        scenario, "linear_errors", name
-    )
-    return maker
+    node_filter, paper = scenario.node_filter, theory_of(scenario)
+    if not scenario.slotted:
+        return paper.clock_jumps
+    # A Kalman filter on own readings, and nothing else.
+    if compiled_kernels(node_filter, clocked=False) == Kernels() and not node_filter.timing.talks:
+        return silent_jumps
+    return paper.slot_jumps
 
 
 def _require_size(shape: tuple[int, int, int]) -> None:

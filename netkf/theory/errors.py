@@ -1,0 +1,131 @@
+"""The exact covariance of all errors of one run, given when its messages arrived.
+
+Given the events, covariances P_i and gains are deterministic, and the errors e_i = x - xhat_i are
+linear in the noises. Their joint covariance Sigma therefore follows without simulation, from the
+filter's own verbs (theory/common/slot_columns.py, theory/common/clock_columns.py).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.registry import built_in_class, overridden
+from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.arrivals import with_last_exchanges
+from netkf.theory.common.clock_columns import ClockColumns, has_clock_columns
+from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.evidence import NONLINEAR
+from netkf.theory.common.slot_columns import SlotColumns, has_columns
+from netkf.theory.folders import theory_of
+from netkf.trace.run import Run
+
+
+class ErrorLaw(NamedTuple):
+    """The Gaussian law of the errors of M estimators at T times given the events of a run.
+
+    ``mean`` (T M n,) and ``covariance`` (T M n, T M n) of all errors together, ``P`` (T, M, n, n).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    P: FloatArray
+
+
+def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> FloatArray:
+    """Return the covariance (T, N, n, n) of x - xhat_i at ``run.times``, given the run's events.
+
+    With ``stacked``, (T, N n, N n): the errors of all nodes together. Paper H (10) says that each
+    block stays below P_i, which this shows without Monte Carlo. Regressors are those of the run;
+    delays, losses and filter models that differ from the truth are included; recorded states and
+    readings are treated as if they had the law that the scenario gives them. Raises TheoryError for
+    filters that are not affine and for those whose verbs are plain Python, also where a user's
+    subclass overrides one.
+    """
+    joint = _joint_moments(scenario, run, about_mean=True)
+    return joint if stacked else diagonal_blocks(joint, len(scenario.nodes))
+
+
+def error_squares(scenario: Scenario, run: Run) -> FloatArray:
+    """Return E[(x - xhat_i)(x - xhat_i)'] (T, N, n, n) at ``run.times``, given the run's events:
+    :func:`error_covariance` and the square of the mean error, which is not 0 where filters start
+    elsewhere than the plant. Raises the errors of that function.
+    """
+    return diagonal_blocks(_joint_moments(scenario, run, about_mean=False), len(scenario.nodes))
+
+
+def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
+    """Return the joint Gaussian law of all errors at all T ``run.times``, of which there must be
+    some, given the run's events, and P_i by the filter's equations, independently of the engine.
+
+    Unlike :func:`error_covariance` it relates different times, and includes the mean of errors.
+    Nodes that share one pooled filter count once. Raises the errors of :func:`error_covariance`.
+    """
+    errors, P = _errors_of(scenario, run), []
+    for _ in errors.replay():
+        errors.keep()
+        P.append(errors.covariances())
+    return ErrorLaw(*errors.law(), np.array(P))
+
+
+def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
+    """Return the diagonal blocks (T, N, n, n) of T stacked covariances (T, N n, N n) of N
+    ``nodes``: block (t, i) is the covariance of the error of node i at time t.
+    """
+    n = stacked.shape[-1] // nodes
+    # Entry (t, i, a, j, b) is the covariance of entry a of e_i and entry b of e_j.
+    blocks = stacked.reshape(len(stacked), nodes, n, nodes, n)
+    return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
+
+
+def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray:
+    """Return the joint covariance (T, N n, N n) of all errors, or their second moments."""
+    errors = _errors_of(scenario, run)
+    # The generator stops at each sample, when the errors have their values of that time.
+    joint = errors.covariance if about_mean else errors.second_moments
+    moments, size = [joint() for _ in errors.replay()], errors.estimators * errors.n
+    # A pooled filter is replayed once; all nodes share its estimate, and so its error.
+    copies = len(scenario.nodes) // errors.estimators
+    return np.tile(np.array(moments).reshape(-1, size, size), (1, copies, copies))
+
+
+def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
+    """Return the errors at time 0 of all estimators (the filters of the nodes, or a pooled one)."""
+    if not isinstance(run, Run):
+        raise TheoryError(
+            f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
+        )
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        raise TheoryError("the run is of another scenario: its nodes or its state differ")
+    if not scenario.is_linear:
+        raise TheoryError(NONLINEAR)
+    if scenario.slotted:
+        run = with_last_exchanges(scenario, run)
+        if has_columns(scenario):
+            return SlotColumns(scenario, run)
+    elif has_clock_columns(scenario):
+        return ClockColumns(scenario, run)
+    require_known_filter(scenario)
+    make = theory_of(scenario).error_columns
+    if make is None:
+        name = type(scenario.filter.algorithm).__name__
+        raise TheoryError(f"no exact error covariance for {name}")
+    return make(scenario, run)
+
+
+def require_known_filter(scenario: Scenario) -> None:
+    """Raise TheoryError if the equations of the scenario's filter are not known here."""
+    algorithm = scenario.filter.algorithm
+    name = type(algorithm).__name__
+    if not scenario.is_linear:
+        raise TheoryError(NONLINEAR)
+    if built_in_class(algorithm) is None:
+        raise TheoryError(f"no exact error covariance for {name}")
+    overridden_names = overridden(algorithm)
+    if overridden_names:
+        raise TheoryError(
+            f"the exact error covariance is not known: {name} defines {overridden_names[0]} itself"
+        )
