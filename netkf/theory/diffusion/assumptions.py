@@ -158,9 +158,10 @@ def _arrival_row(scenario: Scenario) -> AssumptionRow:
         return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
     all_arrive = all_messages_arrive(scenario)
     algorithm: Any = scenario.filter.algorithm
-    evidence = f"a message may be lost or late; weights then change ({algorithm.on_loss}): P stays consistent"
-    if not all_arrive:
-        evidence += ", but D's theorems are about fixed weights"
+    evidence = (
+        f"a message may be lost or late; weights then change ({algorithm.on_loss}): P stays "
+        "consistent, but D's theorems are about fixed weights"
+    )
     return (
         "every message arrives",
         "D (8)",
