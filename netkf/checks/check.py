@@ -14,23 +14,16 @@ import numpy as np
 
 from netkf.algorithms.registry import LINK_WEIGHTS, own_attributes
 from netkf.checks import (
-    belief_propagation,
-    consensus_innovations,
-    constant_gain,
     diffusion,
-    diffusion_kalman,
     event_triggered,
     gossip,
     hybrid,
-    information_consensus,
     intermittent,
-    kalman_consensus,
-    one_bit,
     push_sum,
     stochastic_trigger,
     track_fusion,
 )
-from netkf.checks.clocked import CHECKS as UNDER_CLOCKS
+from netkf.checks.equations import OF_EQUATIONS, UNDER_CLOCKS, WITHOUT_PAPER
 from netkf.checks.evidence import (
     BASE,
     BROKEN,
@@ -47,7 +40,6 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.exact import promised_filter, with_base_filter, with_promised_filter
 from netkf.checks.looks import MAX_LOOKED_RUNS, is_decided, keep_decisions, level_of_look, next_runs
-from netkf.checks.nonlinear import CHECKS as WITHOUT_PAPER
 from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.rows import gaussian_noises, part_assumptions, part_promises
 from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
@@ -123,25 +115,15 @@ class Verdict(NotebookTable):
         return pd.DataFrame([dataclasses.astuple(row) for row in self.rows], columns=names)
 
 
-OF_PAPERS: dict[str, PaperChecks] = {
-    module.__name__.rpartition(".")[2]: module.CHECKS
-    for module in (
-        belief_propagation,
-        consensus_innovations,
-        constant_gain,
-        diffusion,
-        diffusion_kalman,
-        event_triggered,
-        gossip,
-        hybrid,
-        information_consensus,
-        intermittent,
-        kalman_consensus,
-        one_bit,
-        push_sum,
-        stochastic_trigger,
-        track_fusion,
-    )
+OF_PAPERS: dict[str, PaperChecks] = OF_EQUATIONS | {
+    "diffusion": diffusion.CHECKS,
+    "event_triggered": event_triggered.CHECKS,
+    "gossip": gossip.CHECKS,
+    "hybrid": hybrid.CHECKS,
+    "intermittent": intermittent.CHECKS,
+    "push_sum": push_sum.CHECKS,
+    "stochastic_trigger": stochastic_trigger.CHECKS,
+    "track_fusion": track_fusion.CHECKS,
 }
 """The checks of each paper, by the name that filters give it (``Analysis.paper``)."""
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from netkf.checks.equations import error_promises
 from netkf.checks.evidence import (
     COMPUTED,
     Assumption,
@@ -20,8 +20,6 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.exact import (
     MIN_REPLAYED,
-    check_bias,
-    check_error_covariance,
     check_expected_nees,
     check_upper_bound,
     few_errors,
@@ -29,8 +27,8 @@ from netkf.checks.exact import (
     summarise_exactly,
     with_promised_filter,
 )
-from netkf.checks.laws import LAW_TOLERANCE, Pair, compare_growth, exact_start
-from netkf.checks.paper import PaperChecks
+from netkf.checks.laws import LAW_TOLERANCE, Pair, compare_growth
+from netkf.checks.paper import PaperChecks, usual_assumptions
 from netkf.checks.points import sampled_indices
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_growth, check_replay
 from netkf.core.errors import TheoryError
@@ -39,6 +37,7 @@ from netkf.rng.streams import Streams
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.theory import error_covariance, information_level, tracking_level
+from netkf.theory.common.evidence import TRUE_MODEL
 from netkf.theory.diffusion.information import MAX_REGRESSORS, few_regressors
 from netkf.trace.run import Run
 
@@ -50,13 +49,6 @@ PASTS = 400
 """Number of drawn pasts of the regressors from which the excitation, D (19), is estimated."""
 DRAWS = 20
 """Number of errors drawn from each exact covariance."""
-
-
-@dataclass(frozen=True, eq=False)
-class DiffusionSummary(ReplicaSummary):
-    """Adds ``alone`` (N, n, n): exact covariances of the errors at the end without cooperation."""
-
-    alone: FloatArray
 
 
 def _without_cooperation(scenario: Scenario) -> Scenario:
@@ -143,18 +135,7 @@ PROMISES = (
         check_upper_bound,
         exact=True,
     ),
-    Promise(
-        "errors have the covariance that the equations give them",
-        "D (6)-(9), derived",
-        (REACH,),
-        check_error_covariance,
-    ),
-    Promise(
-        "errors have no bias that the equations do not give them",
-        "D (6)-(9), derived",
-        (REACH,),
-        check_bias,
-    ),
+    *error_promises("D (6)-(9), derived"),
     Promise(
         "NEES has the mean that exact errors say, at most n",
         "derived",
@@ -191,52 +172,45 @@ PROMISES = (
 )
 
 
-class DiffusionChecks(PaperChecks):
-    """Promises of D, Algorithm 1, Lemma 4.1 and Theorem 4.2."""
+def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
+    """Return the summary of a run with ``alone`` (N, n, n): exact covariances of the errors at the
+    end without cooperation.
+    """
+    summary, sampled = summarise_exactly(scenario, run), sampled_indices(scenario)
+    summary.alone = np.full(summary.P[0].shape, np.nan)
+    if run.replica < ALONE and few_errors(scenario).holds:
+        silent = _without_cooperation(scenario)
+        last = error_covariance(silent, simulate(silent, run.seed, run.replica))[-1]
+        summary.alone = last[sampled]
+    return summary
 
-    summary_type = DiffusionSummary
 
-    def summarise(self, scenario: Scenario, run: Run) -> DiffusionSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
-        sampled = sampled_indices(scenario)
-        alone = np.full(run.P[0, sampled].shape, np.nan)
-        if run.replica < ALONE and few_errors(scenario).holds:
-            silent = _without_cooperation(scenario)
-            last = error_covariance(silent, simulate(silent, run.seed, run.replica))[-1]
-            alone = last[sampled]
-        return DiffusionSummary(**vars(summarise_exactly(scenario, run)), alone=alone)
+def _assumptions(scenario: Scenario) -> list[Assumption]:
+    models_agree = scenario.filters_know_the_truth
+    try:
+        _require_few_regressors(scenario)
+        # The excitation by each sensor alone, D (5); node -1 is the network of all sensors.
+        levels = information_level(scenario, runs=100, seed=0)
+        highest = float(levels.loc[levels["node"] != -1, "level"].max())
+        needs_others = highest <= 0.0
+        evidence = f"the best sensor alone has level {highest:.3g} of D (5)"
+    except TheoryError as error:
+        needs_others, evidence = False, str(error)
+    model = "same F, Q and R" if models_agree else "filter.model differs from the truth"
+    return [
+        Assumption(TRUE_MODEL, "D Algorithm 1", models_agree, model),
+        *usual_assumptions(scenario),
+        Assumption("no sensor would do alone", "D VI", needs_others, evidence),
+    ]
 
-    def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the diffusion paper."""
-        models_agree = scenario.filters_know_the_truth
-        try:
-            _require_few_regressors(scenario)
-            # The excitation by each sensor alone, D (5); node -1 is the network of all sensors.
-            levels = information_level(scenario, runs=100, seed=0)
-            highest = float(levels.loc[levels["node"] != -1, "level"].max())
-            needs_others = highest <= 0.0
-            evidence = f"the best sensor alone has level {highest:.3g} of D (5)"
-        except TheoryError as error:
-            needs_others = False
-            evidence = str(error)
-        model = "same F, Q and R" if models_agree else "filter.model differs from the truth"
-        return [
-            Assumption(
-                "the filters know the plant and the sensors", "D Algorithm 1", models_agree, model
-            ),
-            exact_start(scenario),
-            few_errors(scenario),
-            Assumption("no sensor would do alone", "D VI", needs_others, evidence),
-        ]
 
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about a scenario's filter that are tested."""
-        try:
-            _require_few_regressors(scenario)
-            information_level(scenario, runs=2, seed=0)
-        except TheoryError:
-            return tuple(p for p in PROMISES if p.source != "D (19)")
-        return PROMISES
+def _promises(scenario: Scenario) -> tuple[Promise, ...]:
+    try:
+        _require_few_regressors(scenario)
+        information_level(scenario, runs=2, seed=0)
+    except TheoryError:
+        return tuple(p for p in PROMISES if p.source != "D (19)")
+    return PROMISES
 
 
 def _require_few_regressors(scenario: Scenario) -> None:
@@ -245,4 +219,4 @@ def _require_few_regressors(scenario: Scenario) -> None:
         raise TheoryError(f"not looked at beyond {MAX_REGRESSORS} sensors whose H varies")
 
 
-CHECKS = DiffusionChecks()
+CHECKS = PaperChecks(_promises, _assumptions, _summarise)

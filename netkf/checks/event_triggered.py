@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 
-from netkf.checks.evidence import Assumption, Finding, Promise, error_test, find_nothing
+from netkf.checks.evidence import Finding, Promise, error_test, find_nothing
 from netkf.checks.laws import NEES_TOLERANCE, exact_start
 from netkf.checks.paper import PaperChecks
 from netkf.checks.samples import RunSamples
 from netkf.laws.intervals import student_interval
-from netkf.scenario.scenario import Scenario
 
 
 @error_test
@@ -53,20 +51,4 @@ BOUND = Promise(
     ("the filters know", "no message is lost", "the filters start"),
     check_nees_bound,
 )
-
-
-class TriggeredChecks(PaperChecks):
-    """The promise that P bounds the mean-square error for any thresholds."""
-
-    slots_only: ClassVar[bool] = True
-
-    def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests."""
-        return [exact_start(scenario)]
-
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario."""
-        return (BOUND,)
-
-
-CHECKS = TriggeredChecks()
+CHECKS = PaperChecks(lambda _: (BOUND,), lambda scenario: [exact_start(scenario)], slots_only=True)

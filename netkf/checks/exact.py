@@ -6,8 +6,10 @@ covariance, and P, from the events alone, without the engine.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -31,13 +33,13 @@ from netkf.checks.points import (
     probe_times,
     sampled_indices,
 )
-from netkf.checks.rounding import EPS, OPERATIONS, compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples, with_departure
+from netkf.checks.rounding import EPS, OPERATIONS
+from netkf.checks.samples import ReplicaSummary, RunSamples, compare_points
 from netkf.checks.statistics import quadratic_interval
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import POWER, Interval, deviation_interval, scale_interval
 from netkf.laws.noise import MIN_VARIANCE_SHARE, whiten
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.increments import integration_steps
 from netkf.theory.errors import ErrorLaw, diagonal_blocks, error_law
@@ -56,9 +58,9 @@ MAX_ERRORS = 64
 """Largest number of errors of all nodes for which the joint covariance is computed."""
 MIN_VARIANCE = 1e-8
 """Relative variance below which a direction is left out, because its errors are rounding."""
-BOUND_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
-"""Shortfall of P relative to tr Sigma that rounding may cause in any case, and tolerated bias in
-standard deviations of an error.
+EXACT_TOLERANCE, BIAS_TOLERANCE = 1e-8, 0.5
+"""Difference of P from Sigma, relative to its trace, that rounding may cause in any case, and
+tolerated bias in standard deviations of an error.
 """
 SINGULAR = 1e-12
 """Ratio of smallest to largest eigenvalue below which a covariance counts as singular."""
@@ -72,24 +74,57 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     computes their covariance. This is left out (nan) for later replicas, if the nodes have too many
     errors together, and if the equations of the filter are not known.
     """
-    time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
-    _, nees = errors(run.error, run.P)
+    times, nodes, n = run.xhat.shape
+    at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
     e = np.where(blurred_samples(run, run.P)[..., None], np.nan, run.error)
-    nees = np.where(np.isnan(e).any(axis=-1) | _nearly_singular(run.P), np.nan, nees)
-    P, e, nees = (
-        run.P[time_indices][:, sampled],
-        e[time_indices][:, sampled],
-        nees[time_indices][:, sampled],
-    )
-    # A summary without exact law has a field for the errors of all nodes at all sample times.
-    error_count = len(run.times) * errors_at_once(scenario)
+    law = None
     if run.replica < max_replayed(scenario) and few_errors(scenario).holds:
-        try:
+        # Where there is none an assumption says so, and rows that need it are not promised.
+        with contextlib.suppress(TheoryError):
             law = error_law(with_promised_filter(scenario), run)
-        except TheoryError:  # an assumption says so, and rows that need them are not promised
-            return _summary_without_replay(P, e, nees, error_count)
-        return _replayed_summary(scenario, run, law, e, nees)
-    return _summary_without_replay(P, e, nees, error_count)
+    if law is None:
+        by_node = {name: np.full(run.P.shape, np.nan) for name in ("replayed", "Sigma")}
+        by_node["mean"] = np.full(e.shape, np.nan)
+        # One weight for each error of all nodes at all sample times.
+        size = times * errors_at_once(scenario)
+        shapes = {"whole": (len(at), 2), "joint": (2,), "quadratic": (1 + size,)}
+        pooled = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
+        pooled["bias"] = np.full((n, n + 1), np.nan)
+    else:
+        by_node, pooled = _exact_statistics(scenario, run, law, at)
+        # All nodes share one pooled filter.
+        copies = nodes // law.P.shape[1]
+        by_node = {name: np.repeat(part, copies, axis=1) for name, part in by_node.items()}
+        blurred = blurred_samples(run, by_node["Sigma"])
+        e = np.where(blurred[..., None], np.nan, e)
+        if blurred[at][:, sampled].any():  # the sum over all errors is spoilt by any of them
+            pooled["quadratic"] = np.full_like(pooled["quadratic"], np.nan)
+    unknown = np.isnan(e).any(axis=-1) | _nearly_singular(run.P)
+    by_node |= {"P": run.P, "e": e, "nees": np.where(unknown, np.nan, errors(run.error, run.P)[1])}
+    kept = {name: part[at][:, sampled] for name, part in by_node.items()}
+    return ReplicaSummary(**kept, **pooled)
+
+
+def _exact_statistics(
+    scenario: Scenario, run: Run, law: ErrorLaw, at: IntArray
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Return the fields of a summary by time (T) and estimator (M), and those of all together."""
+    times, M, n = law.P.shape[:3]
+    size = M * n
+    # The covariance (times, size, size) at each time is a diagonal block of that over all times.
+    stacked = np.einsum("kakb->kab", law.covariance.reshape(times, size, times, size))
+    mean = law.mean.reshape(times, M, n)
+    # Errors less their exact mean are normal with mean 0.
+    centred = run.error[:, :M] - mean
+    floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
+    joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
+    pooled = {
+        "whole": whiten_errors(centred[at], stacked[at], MIN_VARIANCE, floor[at]),
+        "joint": joint,
+        "quadratic": _pool_nees(centred, run.P[:, :M], law),
+        "bias": bias,
+    }
+    return {"replayed": law.P, "mean": mean, "Sigma": diagonal_blocks(stacked, M)}, pooled
 
 
 def max_replayed(scenario: Scenario) -> int:
@@ -106,74 +141,6 @@ def max_replayed(scenario: Scenario) -> int:
     affordable = MAX_REPLAYED_STEPS // max(steps, 1)
     needed = max(math.ceil(ENOUGH_ERRORS / per_run), min_replicas)
     return max(MIN_REPLAYED, min(MAX_REPLAYED, needed, affordable))
-
-
-def _summary_without_replay(
-    P: FloatArray, e: FloatArray, nees: FloatArray, size: int
-) -> ReplicaSummary:
-    """Return a summary of one run without exact covariances: the fields for them are nan."""
-    times, n = len(P), P.shape[-1]
-    unknown, pair = np.full(P.shape, np.nan), np.full(2, np.nan)
-    return ReplicaSummary(
-        P,
-        e,
-        nees,
-        replayed=unknown,
-        mean=np.full(e.shape, np.nan),
-        Sigma=unknown,
-        whole=np.tile(pair, (times, 1)),
-        joint=pair,
-        # A sum of squares and as many weights as errors, as in a summary with exact covariances.
-        quadratic=np.full(1 + size, np.nan),
-        bias=np.full((n, n + 1), np.nan),
-    )
-
-
-def _replayed_summary(
-    scenario: Scenario, run: Run, law: ErrorLaw, e: FloatArray, nees: FloatArray
-) -> ReplicaSummary:
-    """Return the summary of a run with the exact ``law`` of its errors."""
-    time_indices, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
-    nodes, times, estimators, n = (
-        len(scenario.nodes),
-        len(run.times),
-        law.P.shape[1],
-        scenario.plant.n,
-    )
-    size = estimators * n
-    # The covariance (times, size, size) at each time is a diagonal block of that over all times.
-    stacked = np.einsum("kakb->kab", law.covariance.reshape(times, size, times, size))
-    mean = law.mean.reshape(times, estimators, n)
-    Sigma, replayed = diagonal_blocks(stacked, estimators), law.P
-    # Errors less their exact mean are normal with mean 0.
-    centred = run.error[:, :estimators] - mean
-    floor = np.maximum((BLUR * run.rounding) ** 2, _variance_floor(scenario))
-    squares = whiten_errors(
-        centred[time_indices], stacked[time_indices], MIN_VARIANCE, floor[time_indices]
-    )
-    joint, bias = _pool_times(centred, law.covariance, float(floor.max()))
-    quadratic = _pool_nees(centred, run.P[:, :estimators], law)
-    if estimators < nodes:  # all share one pooled filter
-        mean, Sigma, replayed = (np.repeat(part, nodes, axis=1) for part in (mean, Sigma, replayed))
-    blurred = blurred_samples(run, Sigma)[time_indices][:, sampled]
-    if blurred.any():  # the sum over all errors is spoilt by any of them
-        quadratic = np.full_like(quadratic, np.nan)
-    e = np.where(blurred[..., None], np.nan, e)
-    nees = np.where(np.isnan(e).any(axis=-1), np.nan, nees)
-    replayed, mean, Sigma = (part[time_indices][:, sampled] for part in (replayed, mean, Sigma))
-    P = run.P[time_indices][:, sampled]
-    return ReplicaSummary(
-        P,
-        e,
-        nees,
-        replayed,
-        mean,
-        Sigma,
-        whole=squares,
-        joint=joint,
-        quadratic=quadratic,
-        bias=bias,
-    )
 
 
 def _pool_times(
@@ -315,27 +282,42 @@ def promised_filter(algorithm: Any) -> Any:
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
     """Check that P of the runs is at least Sigma, the exact covariance of the errors given the
-    events of the run, by the least eigenvalue of P - Sigma. The finding names the first run, time
-    and node where P is smaller by more than rounding.
-
-    ``runs.P`` and ``runs.Sigma`` are (R, K, N, n, n); only the first ``max_replayed`` runs have a
-    Sigma. No interval is estimated, so that ``level`` is not used.
+    events of the run, by the least eigenvalue of P - Sigma; no interval is estimated.
     """
+
+    def shortfall(gap: FloatArray) -> FloatArray:
+        # Covariances that are not finite count as below Sigma; eigvalsh needs finite entries.
+        finite = np.nan_to_num(gap, nan=-1e300, posinf=1e300, neginf=-1e300)
+        return np.asarray(np.maximum(-np.linalg.eigvalsh(finite)[..., 0], 0.0))
+
+    return _compare_with_exact(samples, shortfall, "least eigenvalue")
+
+
+def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
+    """Check that P of the runs is Sigma, the exact covariance of the error given the events of the
+    run, up to rounding; no interval is estimated.
+    """
+
+    def largest(gap: FloatArray) -> FloatArray:
+        deviations = np.abs(gap).max(axis=(-1, -2))
+        return np.asarray(np.nan_to_num(deviations, nan=1e300, posinf=1e300))
+
+    return _compare_with_exact(samples, largest, "largest entry")
+
+
+def _compare_with_exact(
+    samples: RunSamples, measure: Callable[[FloatArray], FloatArray], name: str
+) -> Finding:
+    """Return the finding on a ``measure`` of P - Sigma (R, K, N, n, n), which should be 0."""
     max_runs = max_replayed(samples.scenario)
     P, Sigma = samples.runs.P[:max_runs], samples.runs.Sigma[:max_runs]
     known = np.isfinite(Sigma).all(axis=(-1, -2))
     if not known.any():
         return find_unknown("no exact covariance could be computed")
     size = np.where(known, np.trace(Sigma, axis1=-2, axis2=-1), 0.0)
-    # Covariances that are not finite count as below Sigma; eigvalsh needs finite entries.
-    gap = np.nan_to_num(P - Sigma, nan=-1e300, posinf=1e300, neginf=-1e300)
-    shortfall = np.maximum(-np.linalg.eigvalsh(gap)[..., 0], 0.0) * known
-    count = f"{known.sum():,} covariances"
-    message = f"least eigenvalue of P - Sigma relative to trace(Sigma) in {count}"
-    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
-    limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), BOUND_TOLERANCE
-    finding = compare_identities(shortfall, *limits, message)
-    return with_departure(finding, samples, shortfall, limits)
+    limits = size, samples.largest_terms(samples.runs.replayed[:max_runs]), EXACT_TOLERANCE
+    message = f"{name} of P - Sigma relative to trace(Sigma) in {known.sum():,} covariances"
+    return compare_points(samples, measure(P - Sigma) * known, limits, message)
 
 
 @error_test

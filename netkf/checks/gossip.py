@@ -5,46 +5,43 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from netkf.checks.equations import error_promises
 from netkf.checks.evidence import Assumption, Finding, Promise
 from netkf.checks.exact import (
-    check_bias,
-    check_error_covariance,
     check_nees,
-    few_errors,
     summarise_exactly,
 )
 from netkf.checks.laws import (
     FIXED_READINGS,
     LAW_TOLERANCE,
     Pair,
-    compare_growth,
     compare_laws,
     diagonal_distances,
-    exact_start,
     find_largest,
     fixed_readings,
-    growth_intervals,
 )
 from netkf.checks.mode_sequences import (
     FAR_START,
     MIN_CHAINS,
+    SwitchedSamples,
+    check_bounded,
+    check_initial_condition,
+    check_law,
     gossip_modes,
+    growth_of,
     initial_roots,
-    kept_reference,
     pair_sources,
     reference_count,
     token_positions,
     trace_tokens,
-    with_horizon,
 )
-from netkf.checks.paper import PaperChecks
+from netkf.checks.paper import PaperChecks, usual_assumptions
 from netkf.checks.points import all_sampled, check_slots, sampled_indices
-from netkf.checks.rounding import compare_identities
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay, with_departure
+from netkf.checks.samples import ReplicaSummary, check_replay, compare_points
 from netkf.checks.statistics import band_around, band_width, round_digits
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import deviation_interval, probability_interval
@@ -66,11 +63,11 @@ BOUND_TOLERANCE = 1e-8  # of P, relative: rounding of a long product
 PROBABILITY_TOLERANCE = 0.05  # of a probability: smaller errors change no conclusion
 
 
-@dataclass(frozen=True, eq=False)
-class GossipSummary(ReplicaSummary):
-    """Adds values at the K slots and at the last one; ``replayed`` is the recursion of the gossip
-    paper, G (10), along the swaps of the run: neighbours swap their pairs (estimate, covariance),
-    then each node updates the pair that it holds with its own reading.
+def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
+    """Return the summary of a run at K slots and N sampled nodes, with values at the K slots and at
+    the last one; ``replayed`` is the recursion of the gossip paper, G (10), along the swaps of the
+    run: neighbours swap their pairs (estimate, covariance), then each node updates the pair that it
+    holds with its own reading.
 
     bounds    : (K, N, n, n) covariances that the last WINDOW readings of each node's pair give
                 alone, from an unknown state on: upper bounds on P
@@ -80,24 +77,14 @@ class GossipSummary(ReplicaSummary):
                 the M (i, j) of :func:`_pairs_to_count`
     slots     : number of slots counted in ``moves``
     """
-
-    bounds: FloatArray
-    tokens: FloatArray
-    moves: np.ndarray
-    slots: int
-
-
-def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
-    """Return the summary of a run at K slots and N sampled nodes."""
-    slots, exact = list(check_slots(scenario)), vars(summarise_exactly(scenario, run))
+    slots, summary = list(check_slots(scenario)), summarise_exactly(scenario, run)
     sources = pair_sources(scenario, run, slots[-1])
-    counts: dict[str, Any] = {
-        "moves": _count_moves(scenario, sources[1 : slots[-1]]),
-        "slots": slots[-1] - 1,
-    }
+    summary.moves = _count_moves(scenario, sources[1 : slots[-1]])
+    summary.slots = slots[-1] - 1
     if not fixed_readings(scenario).holds:
-        unknown = np.full(exact["P"].shape, np.nan)
-        return GossipSummary(**exact, **counts, bounds=unknown, tokens=unknown[0])
+        summary.bounds = np.full(summary.P.shape, np.nan)
+        summary.tokens = summary.bounds[0]
+        return summary
     table = gossip_modes(scenario)
     # Square roots of P(0), (N', n, n) for all N' nodes.
     starts, n, sampled = initial_roots(scenario), scenario.plant.n, sampled_indices(scenario)
@@ -115,12 +102,9 @@ def _summarise(scenario: Scenario, run: Run) -> GossipSummary:
     # replay differs from P and the covariances of tokens mean nothing.
     positions = token_positions(sources, slots[-1])
     holders = np.full(len(starts), -1) if positions is None else positions
-    return GossipSummary(
-        **exact | {"replayed": np.array(replayed)},
-        **counts,
-        bounds=np.array(bounds),
-        tokens=run.P[-1, holders[sampled]],
-    )
+    summary.replayed, summary.bounds = np.array(replayed), np.array(bounds)
+    summary.tokens = run.P[-1, holders[sampled]]
+    return summary
 
 
 def _pairs_to_count(scenario: Scenario) -> tuple[IntArray, IntArray]:
@@ -146,26 +130,48 @@ def _count_moves(scenario: Scenario, sources: np.ndarray) -> np.ndarray:
     return np.where(codes[positions] == i * size + j, counts[positions], 0)
 
 
-class ChainSamples(NamedTuple):
+class Chains(NamedTuple):
     """S simulations of the switched chain of paper G (20): the node that holds one pair (estimate,
     covariance) is a Markov chain with transition matrix Abar (the mean matching: entry (i, j) is
     the probability that i gets j's pair in a slot), and that node's reading updates the covariance.
 
-    P         : (K, S, n, n) covariances at the K slots
+    P         : (K, S, n, n) covariances at the K ``slots``
     restarted : (S, n, n) covariances at the last slot from a start about 1000 times larger
     positions : (S, slots) node of each chain in each slot
     """
 
+    slots: list[int]
     P: FloatArray
     restarted: FloatArray
     positions: np.ndarray
 
+    def at(self, k: int, i: int) -> FloatArray:
+        """Return the covariances whose last reading was that of node i."""
+        return np.asarray(self.P[k, self.positions[:, self.slots[k] - 1] == i])
+
+    def restarted_at(self, i: int) -> FloatArray:
+        """Return the same from the larger start."""
+        return np.asarray(self.restarted[self.positions[:, -1] == i])
+
+    def growth(self) -> float:
+        """Return the growth of the law of the chain's covariance between its last two slots."""
+        return growth_of(self.P[-2], self.P[-1])
+
+    def memory(self) -> float:
+        """Return the distance of the laws from P(0) and from a far larger start at the end."""
+        return float(diagonal_distances(self.P[-1], self.restarted).max())
+
+    def token_memory(self) -> float:
+        """Return the largest distance of the law of chains from one node to that of all."""
+        last, origin = self.P[-1], self.positions[:, 0]
+        starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
+        distances = (float(diagonal_distances(last[origin == k], last).max()) for k in starts)
+        return max(distances, default=math.nan)
+
 
 @dataclass(frozen=True)
-class GossipSamples(RunSamples):
-    """Adds samples of the switched chain (:class:`ChainSamples`), with whose laws those of P in the
-    runs are compared.
-    """
+class GossipSamples(SwitchedSamples):
+    """Adds samples of the switched chain."""
 
     @cached_property
     def matching(self) -> FloatArray:
@@ -174,23 +180,16 @@ class GossipSamples(RunSamples):
         """
         return effective_matching(self.scenario)
 
-    @cached_property
-    def reference(self) -> ChainSamples:
-        """Samples of the switched chain of paper G (20)."""
-        cls: Any = type(self)
-        chains: ChainSamples = kept_reference(cls, self.scenario, self.seed)
-        return chains
-
-    def draw_reference(self) -> ChainSamples:
-        """Return the samples of :attr:`reference`, drawn from a random stream of their own;
-        :func:`kept_reference` calls this once for all looks at the runs of a seed.
-        """
+    def draw_reference(self) -> Chains:
+        """Return chains at the checked slots: one law, that of one which wanders over all nodes."""
         slots = list(check_slots(self.scenario))
-        # One law is represented: that of one chain that wanders over all nodes.
         return self._draw_paths("switched chain", slots, reference_count(self.scenario, laws=1))
 
-    def _draw_paths(self, purpose: str, slots: list[int], count: int) -> ChainSamples:
-        """Return covariances (K, S, n, n) of S switched chains after K ``slots``."""
+    def later(self, slots: int) -> Chains:
+        """Return a few chains after half of ``slots`` and after all of them."""
+        return self._draw_paths("later chain", [slots // 2, slots], MIN_CHAINS // 4)
+
+    def _draw_paths(self, purpose: str, slots: list[int], count: int) -> Chains:
         # Square roots of P(0) (N, n, n), which the recursions work with.
         starts, random = initial_roots(self.scenario), Streams(self.seed).generator(purpose)
         positions = _draw_chains(self.matching, slots[-1], count, random)
@@ -198,14 +197,8 @@ class GossipSamples(RunSamples):
         # The identity makes the second start larger even where P(0) = 0.
         larger_roots = FAR_START * start_roots + np.eye(start_roots.shape[-1])
         restarted = table.covariances(larger_roots, positions, slots[-1:])[0]
-        return ChainSamples(table.covariances(start_roots, positions, slots), restarted, positions)
-
-    def later(self, slots: int) -> ChainSamples:
-        """Return a few chains, with their covariances after half of ``slots`` and after all of
-        them; :func:`with_horizon` calls this with more and more slots to find out how long a
-        horizon must be until the law of the covariances has settled.
-        """
-        return self._draw_paths("later chain", [slots // 2, slots], MIN_CHAINS // 4)
+        P = table.covariances(start_roots, positions, slots)
+        return Chains(slots, P, restarted, positions)
 
 
 def _draw_chains(
@@ -243,8 +236,7 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
     terms = np.maximum(UNKNOWN * np.sqrt(size), samples.largest_terms(P))
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, terms, BOUND_TOLERANCE
-    finding = compare_identities(shortfall, *limits, message)
-    return with_departure(finding, samples, shortfall, limits)
+    return compare_points(samples, shortfall, limits, message)
 
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
@@ -269,19 +261,6 @@ def _random_sensor(samples: GossipSamples, level: float) -> Finding:
     pairs = [
         Pair(f"slot {slot}", samples.runs.P[runs, k, picks[k]], samples.reference.P[k])
         for k, slot in enumerate(check_slots(samples.scenario))
-    ]
-    return compare_laws(pairs, level, samples.first_trace)
-
-
-def _each_sensor(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law of P at each node with that of the switched chains there, G (19)."""
-    P, positions = samples.reference.P, samples.reference.positions
-    pairs = [
-        Pair(
-            f"slot {slot}, node {node}", samples.runs.P[:, k, i], P[k, positions[:, slot - 1] == i]
-        )
-        for k, slot in enumerate(check_slots(samples.scenario))
-        for i, node in enumerate(samples.nodes)
     ]
     return compare_laws(pairs, level, samples.first_trace)
 
@@ -322,56 +301,7 @@ def _check_tokens(samples: GossipSamples, level: float) -> Finding:
         token_covariances = samples.runs.tokens[:, i]
         pairs.append(Pair(f"token {node}", token_covariances, chain, chain[origin == i]))
     finding = compare_laws(pairs, level, samples.first_trace)
-    if not finding.early:
-        return finding
-    return with_horizon(samples, finding, _token_memory, LAW_TOLERANCE)
-
-
-def _check_initial_condition(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law of P at the end with that of chains from a far larger start."""
-    P, restarted, positions = samples.reference
-    pairs = []
-    for i, node in enumerate(samples.nodes):
-        here = positions[:, -1] == i  # chains whose last reading was that of this node
-        pairs.append(Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[here], P[-1, here]))
-    finding = compare_laws(pairs, level, samples.first_trace)
-    return (
-        with_horizon(samples, finding, _start_memory, LAW_TOLERANCE) if finding.early else finding
-    )
-
-
-def _check_bounded(samples: GossipSamples, level: float) -> Finding:
-    """Test that P stays stochastically bounded."""
-    runs, chain, positions = samples.runs.P, samples.reference.P, samples.reference.positions
-    half = check_slots(samples.scenario)[-2]
-    pairs, expected = [], []
-    for i, node in enumerate(samples.nodes):
-        pairs.append(Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]))
-        at_half, at_end = positions[:, half - 1] == i, positions[:, -1] == i
-        expected.append((chain[-2, at_half], chain[-1, at_end]))
-    finding = compare_growth(pairs, expected, level)
-    return with_horizon(samples, finding, _growth_of, LAW_TOLERANCE) if finding.early else finding
-
-
-def _growth_of(chain: ChainSamples) -> float:
-    """Return the growth of the law of the chain's covariance between its last two slots."""
-    # Only the value of each interval is used, for which the level does not matter.
-    intervals = growth_intervals(chain.P[-2], chain.P[-1], level=0.5)
-    return max(interval.value for interval in intervals)
-
-
-def _start_memory(chain: ChainSamples) -> float:
-    """Return the distance of the laws from P(0) and from a far larger start at the end."""
-    return float(diagonal_distances(chain.P[-1], chain.restarted).max())
-
-
-def _token_memory(chain: ChainSamples) -> float:
-    """Return the largest distance of the law of chains from one node to that of all."""
-    last, origin = chain.P[-1], chain.positions[:, 0]
-    starts = [start for start in np.unique(origin) if (origin == start).sum() >= MIN_TOKENS]
-    return max(
-        (float(diagonal_distances(last[origin == k], last).max()) for k in starts), default=math.nan
-    )
+    return samples.with_horizon(finding, lambda chains: chains.token_memory())
 
 
 # What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
@@ -416,7 +346,7 @@ PROMISES = (
         "each sensor has the law of the switched chain that is there",
         "derived from G (19)",
         LAWS,
-        _each_sensor,
+        check_law,
     ),
     Promise(
         "every token has the same law in the end", "G Theorem 10 [ii], (25)", ERGODIC, _check_tokens
@@ -425,26 +355,15 @@ PROMISES = (
         "covariances are stochastically bounded: their laws do not grow any more",
         "G Theorem 10 [iii], (26)",
         STABLE,
-        _check_bounded,
+        check_bounded,
     ),
     Promise(
         "the law in the end does not depend on the start",
         "G Theorem 8",
         ERGODIC,
-        _check_initial_condition,
+        check_initial_condition,
     ),
-    Promise(
-        "errors have the covariance that swaps and readings give them",
-        "G (8), (10), derived",
-        ("exact errors are within reach",),
-        check_error_covariance,
-    ),
-    Promise(
-        "errors have no bias that the equations do not give them",
-        "G (8), (10), derived",
-        ("exact errors are within reach",),
-        check_bias,
-    ),
+    *error_promises("G (8), (10), derived", by="swaps and readings give them"),
     Promise(
         "errors are as large as P says: the mean NEES is n",
         "G (9)",
@@ -454,42 +373,18 @@ PROMISES = (
 )
 
 
-class GossipChecks(PaperChecks):
-    """Promises of the gossip paper G, Propositions 6, 7, Theorems 8, 10."""
-
-    summary_type = GossipSummary
-
-    slots_only = True
-
-    def summarise(self, scenario: Scenario, run: Run) -> GossipSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
-        return _summarise(scenario, run)
-
-    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> GossipSamples:
-        """Return the object that every test of a promise gets."""
-        return GossipSamples(scenario, stacked, seed)
-
-    def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the gossip paper."""
-        try:
-            effective_matching(scenario)
-            is_known, evidence = (
-                True,
-                "drawn afresh in each slot, and lost with a known probability",
-            )
-        except TheoryError as error:
-            is_known, evidence = False, str(error)
-        return [
-            Assumption("slots are independent and Abar is known", "G II-A", is_known, evidence),
-            exact_start(scenario),
-            few_errors(scenario),
-            fixed_readings(scenario),
-            all_sampled(scenario),
-        ]
-
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about the gossip filter that are tested."""
-        return PROMISES
+def _assumptions(scenario: Scenario) -> list[Assumption]:
+    is_known, evidence = True, "drawn afresh in each slot, and lost with a known probability"
+    try:
+        effective_matching(scenario)
+    except TheoryError as error:
+        is_known, evidence = False, str(error)
+    return [
+        Assumption("slots are independent and Abar is known", "G II-A", is_known, evidence),
+        *usual_assumptions(scenario),
+        fixed_readings(scenario),
+        all_sampled(scenario),
+    ]
 
 
-CHECKS = GossipChecks()
+CHECKS = PaperChecks(lambda _: PROMISES, _assumptions, _summarise, GossipSamples, slots_only=True)

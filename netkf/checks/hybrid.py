@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -11,6 +12,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
+from netkf.checks.equations import error_promises
 from netkf.checks.evidence import (
     COMPUTED,
     Assumption,
@@ -20,15 +22,12 @@ from netkf.checks.evidence import (
     find_unknown,
 )
 from netkf.checks.exact import (
-    check_bias,
-    check_error_covariance,
     check_expected_nees,
     check_upper_bound,
-    few_errors,
     with_promised_filter,
 )
-from netkf.checks.laws import exact_start, find_largest
-from netkf.checks.paper import PaperChecks
+from netkf.checks.laws import find_largest
+from netkf.checks.paper import PaperChecks, usual_assumptions
 from netkf.checks.points import check_times, sampled_indices
 from netkf.checks.samples import RunSamples, check_replay
 from netkf.checks.statistics import affine, eigenvalue_interval
@@ -260,18 +259,7 @@ PROMISES = (
         check_upper_bound,
         exact=True,
     ),
-    Promise(
-        "errors have the covariance that the equations give them",
-        "H (4a), (7), derived",
-        ("exact errors are within reach",),
-        check_error_covariance,
-    ),
-    Promise(
-        "errors have no bias that the equations do not give them",
-        "H (4a), (7), derived",
-        ("exact errors are within reach",),
-        check_bias,
-    ),
+    *error_promises("H (4a), (7), derived"),
     Promise(
         "NEES has the mean that exact errors say, at most n",
         "H (10), derived",
@@ -309,40 +297,28 @@ LIMITS = (
 )
 
 
-class HybridChecks(PaperChecks):
-    """Promises of H, Theorems 2, 3 and Proposition 4."""
+def _assumptions(scenario: Scenario) -> list[Assumption]:
+    promised = with_promised_filter(scenario)
+    # H(12) are the coupled Riccati equations that bound the mean of P.
+    reason = reason_without_bound(promised)
+    speaks = "H(12) speaks about the scenario"
+    return [
+        Assumption(speaks, "H (12)", reason is None, reason or "it does"),
+        *usual_assumptions(scenario),
+        _variance_exists(promised),
+        *_settling_rows(promised),
+    ]
 
-    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> HybridSamples:
-        """Return the object that every test of a promise gets."""
-        return HybridSamples(scenario, stacked, seed)
 
-    def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the hybrid paper."""
-        promised = with_promised_filter(scenario)
-        # H(12) are the coupled Riccati equations that bound the mean of P.
-        reason = reason_without_bound(promised)
-        return [
-            Assumption(
-                "H(12) speaks about the scenario", "H (12)", reason is None, reason or "it does"
-            ),
-            exact_start(scenario),
-            few_errors(scenario),
-            _variance_exists(promised),
-            *_settling_rows(promised),
-        ]
-
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about a scenario's filter that are tested."""
-        listed, promised = list(PROMISES), with_promised_filter(scenario)
-        # One function for each of LIMITS raises TheoryError if its subject does not exist.
-        requirements = has_steady_state, _require_constant_gains, _require_limit
-        for promise, require in zip(LIMITS, requirements, strict=True):
-            try:
-                require(promised)
-            except TheoryError:
-                continue
+def _promises(scenario: Scenario) -> tuple[Promise, ...]:
+    listed, promised = list(PROMISES), with_promised_filter(scenario)
+    # One function for each of LIMITS raises TheoryError if its subject does not exist.
+    requirements = has_steady_state, _require_constant_gains, _require_limit
+    for promise, require in zip(LIMITS, requirements, strict=True):
+        with contextlib.suppress(TheoryError):
+            require(promised)
             listed.append(promise)
-        return tuple(listed)
+    return tuple(listed)
 
 
 def _settling_rows(scenario: Scenario) -> list[Assumption]:
@@ -376,4 +352,4 @@ def _require_limit(scenario: Scenario) -> None:
     steady_covariance_bound(faster)
 
 
-CHECKS = HybridChecks()
+CHECKS = PaperChecks(_promises, _assumptions, collect=HybridSamples)

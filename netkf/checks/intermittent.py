@@ -6,49 +6,44 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.kernels.chains import trace_paths
+from netkf.checks.equations import error_promises
 from netkf.checks.evidence import COMPUTED, Assumption, Finding, Promise
 from netkf.checks.exact import (
-    check_bias,
-    check_error_covariance,
     check_nees,
-    few_errors,
     summarise_exactly,
 )
 from netkf.checks.laws import (
     FIXED_READINGS,
     LAW_TOLERANCE,
-    Pair,
-    compare_growth,
-    compare_laws,
     diagonal_distances,
-    exact_start,
     find_largest,
     fixed_readings,
-    growth_intervals,
 )
 from netkf.checks.mode_sequences import (
     FAR_START,
     MIN_CHAINS,
     ModeTable,
-    all_arrivals,
+    SwitchedSamples,
+    check_bounded,
+    check_initial_condition,
+    check_law,
     find_arrivals,
+    growth_of,
     initial_roots,
     intermittent_modes,
-    kept_reference,
     reference_count,
     sensing_neighbours,
-    with_horizon,
 )
-from netkf.checks.paper import PaperChecks
+from netkf.checks.paper import PaperChecks, usual_assumptions
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
 from netkf.checks.rounding import compare_identities, first_wrong
-from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay, with_departure
+from netkf.checks.samples import ReplicaSummary, check_replay, compare_points
 from netkf.checks.statistics import distance_to_law, law_distance, pearson_test
 from netkf.core.errors import TheoryError
 from netkf.laws.intervals import deviation_interval, probability_interval
@@ -77,28 +72,6 @@ CELLS = 12
 Direction = tuple[int, int]
 
 
-@dataclass(frozen=True, eq=False)
-class IntermittentSummary(ReplicaSummary):
-    """Adds values at the last slot, and counts for the D directed links that can carry readings.
-
-    ``replayed`` is the Riccati recursion, R (15)-(18), with the readings that arrived in the run,
-    from P(0). With the same readings:
-
-    in_support : (N, n, n) P from the start P*, the steady covariance of a node that gets all
-                 readings: a point of the support of the invariant law, R Theorem 10
-    spread     : (N,) trace of the difference between P from a very large start and P from 0; the
-                 recursion is monotone, so that any other start ends between these two
-    averages   : (N,) averages of 1 / (1 + tr P) over the second half of the slots
-    sent, arrived : (D,) readings sent and delivered in time
-    """
-
-    in_support: FloatArray
-    spread: FloatArray
-    averages: FloatArray
-    sent: np.ndarray
-    arrived: np.ndarray
-
-
 def _heard_directions(scenario: Scenario) -> list[Direction]:
     """Return (sender, receiver) of all D directed links that can carry readings."""
     senders = sensing_neighbours(scenario)
@@ -109,7 +82,7 @@ def _heard_directions(scenario: Scenario) -> list[Direction]:
 def _least_roots(scenario: Scenario) -> FloatArray:
     """Return for each sampled node the Cholesky root (n, n) of P*, nan without one."""
     # Without losses all slots are alike: one slot has the readings of each node.
-    arrivals, n = all_arrivals(scenario, slots=1), scenario.plant.n
+    arrivals, n = find_arrivals(scenario, None, slots=1), scenario.plant.n
     F, Q = scenario.slot_belief
     modes = arrivals.table.modes
     roots = np.full((len(arrivals.sequences), n, n), np.nan)
@@ -123,21 +96,28 @@ def _least_roots(scenario: Scenario) -> FloatArray:
     return roots
 
 
-def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
-    """Return the summary of a run at K slots and N sampled nodes."""
-    slots, exact = list(check_slots(scenario)), vars(summarise_exactly(scenario, run))
-    last, counts = (
-        slots[-1:],
-        {
-            "sent": _count_messages(scenario, run, "send", slots[-1]),
-            "arrived": _count_messages(scenario, run, "deliver", slots[-1]),
-        },
-    )
+def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
+    """Return the summary of a run at K slots and N sampled nodes, with values at the last slot, and
+    counts for the D directed links that can carry readings.
+
+    ``replayed`` is the Riccati recursion, R (15)-(18), with the readings that arrived in the run,
+    from P(0). With the same readings:
+
+    in_support : (N, n, n) P from the start P*, the steady covariance of a node that gets all
+                 readings: a point of the support of the invariant law, R Theorem 10
+    spread     : (N,) trace of the difference between P from a very large start and P from 0; the
+                 recursion is monotone, so that any other start ends between these two
+    averages   : (N,) averages of 1 / (1 + tr P) over the second half of the slots
+    sent, arrived : (D,) readings sent and delivered in time
+    """
+    slots, summary = list(check_slots(scenario)), summarise_exactly(scenario, run)
+    last = slots[-1:]
+    summary.sent = _count_messages(scenario, run, "send", slots[-1])
+    summary.arrived = _count_messages(scenario, run, "deliver", slots[-1])
     if not fixed_readings(scenario).holds:
-        nodes, n = len(sampled_indices(scenario)), scenario.plant.n
-        unknown = np.full((nodes, n, n), np.nan)
-        nothing = {"spread": unknown[:, 0, 0], "averages": unknown[:, 0, 0]}
-        return IntermittentSummary(**exact, **counts, **nothing, in_support=unknown)
+        summary.in_support = np.full(summary.P[-1].shape, np.nan)
+        summary.spread = summary.averages = summary.in_support[:, 0, 0]
+        return summary
     table, sequences, _ = find_arrivals(scenario, run, slots[-1])
     # Roots of the covariances at the start, (W, n, n) each.
     starts = initial_roots(scenario)[sampled_indices(scenario)]
@@ -145,14 +125,11 @@ def _summarise(scenario: Scenario, run: Run) -> IntermittentSummary:
     larger_roots = _roots_above(starts, np.nan_to_num(steady_roots))
     from_above = table.covariances(larger_roots, sequences, last)[0]
     from_zero = table.covariances(np.zeros(starts.shape), sequences, last)[0]
-    replayed = table.covariances(starts, sequences, slots)
-    return IntermittentSummary(
-        **exact | {"replayed": replayed},
-        **counts,
-        in_support=table.covariances(steady_roots, sequences, last)[0],
-        spread=np.trace(from_above - from_zero, axis1=-2, axis2=-1),
-        averages=_path_averages(table, starts, sequences),
-    )
+    summary.replayed = table.covariances(starts, sequences, slots)
+    summary.in_support = table.covariances(steady_roots, sequences, last)[0]
+    summary.spread = np.trace(from_above - from_zero, axis1=-2, axis2=-1)
+    summary.averages = _path_averages(table, starts, sequences)
+    return summary
 
 
 def _roots_above(*roots: FloatArray) -> FloatArray:
@@ -194,31 +171,41 @@ class ArrivalSamples(NamedTuple):
     restarted: FloatArray
     averages: FloatArray
 
+    def at(self, k: int, i: int) -> FloatArray:
+        """Return the covariances of node i at slot number k."""
+        return np.asarray(self.P[i, k])
+
+    def restarted_at(self, i: int) -> FloatArray:
+        """Return the same at the last slot from the larger start."""
+        return np.asarray(self.restarted[i])
+
+    def growth(self) -> float:
+        """Return the largest growth of the law of P between the last two numbers of slots."""
+        return max(growth_of(P[-2], P[-1]) for P in self.P)
+
+    def memory(self) -> float:
+        """Return the largest distance at the end of the laws from P(0) and a far larger start."""
+        pairs = zip(self.P, self.restarted, strict=True)
+        return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
+
 
 @dataclass(frozen=True)
-class IntermittentSamples(RunSamples):
-    """Adds simulated covariances with independent arrivals (:class:`ArrivalSamples`), with whose
-    laws those of P in the runs are compared.
-    """
-
-    @cached_property
-    def reference(self) -> ArrivalSamples:
-        """Samples of filters with independent arrivals, paper R (12)."""
-        cls: Any = type(self)
-        arrivals: ArrivalSamples = kept_reference(cls, self.scenario, self.seed)
-        return arrivals
+class IntermittentSamples(SwitchedSamples):
+    """Adds simulated covariances with independent arrivals, paper R (12)."""
 
     def draw_reference(self) -> ArrivalSamples:
-        """Return the samples of :attr:`reference`, drawn from random streams of their own;
-        :func:`kept_reference` calls this once for all looks at the runs of a seed.
-        """
+        """Return covariances at the checked slots, drawn from random streams of their own."""
         count = reference_count(self.scenario, laws=len(self.nodes))
         return self._draw_arrivals("arrivals", list(check_slots(self.scenario)), count, MAX_PATHS)
+
+    def later(self, slots: int) -> ArrivalSamples:
+        """Return a few covariances after half of ``slots`` and all of them, without averages."""
+        halves, samples = [slots // 2, slots], MIN_CHAINS // 4
+        return self._draw_arrivals("later arrivals", halves, samples, paths=0)
 
     def _draw_arrivals(
         self, purpose: str, slots: list[int], samples: int, paths: int
     ) -> ArrivalSamples:
-        """Return simulated covariances (N, K, S, n, n) and averages (N, S')."""
         sampled = sampled_indices(self.scenario).tolist()
         per_node = [self._draw_node(purpose, k, slots, samples, paths) for k in sampled]
         return ArrivalSamples(*(np.array(values) for values in zip(*per_node, strict=True)))
@@ -251,14 +238,6 @@ class IntermittentSamples(RunSamples):
         averages = _path_averages(table, start_roots[:paths], sequences[:paths])
         return table.covariances(start_roots, sequences, slots), restarted, averages
 
-    def later(self, slots: int) -> ArrivalSamples:
-        """Return a few simulated covariances after half of ``slots`` and after all of them, without
-        averages; :func:`with_horizon` calls this with more and more slots to find out how long a
-        horizon must be until their law has settled.
-        """
-        halves, samples = [slots // 2, slots], MIN_CHAINS // 4
-        return self._draw_arrivals("later arrivals", halves, samples, paths=0)
-
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
     """Return the probability that a reading on a direction arrives within its slot."""
@@ -275,7 +254,7 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:
     """Check that no P is below that of a filter without losses from the same start."""
     slots = list(check_slots(samples.scenario))
-    table, sequences, _ = all_arrivals(samples.scenario, slots[-1])
+    table, sequences, _ = find_arrivals(samples.scenario, None, slots[-1])
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
     without_loss = table.covariances(starts, sequences, slots)
     size = np.trace(samples.runs.P, axis1=-2, axis2=-1)
@@ -287,8 +266,7 @@ def _above_least(samples: IntermittentSamples, level: float) -> Finding:
     message = f"{size.size:,} covariances against the path without losses"
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = np.nan_to_num(size), samples.largest_terms(samples.runs.P), BOUND_TOLERANCE
-    finding = compare_identities(shortfall, *limits, message)
-    return with_departure(finding, samples, shortfall, limits)
+    return compare_points(samples, shortfall, limits, message)
 
 
 def _in_support(samples: IntermittentSamples, level: float) -> Finding:
@@ -337,50 +315,6 @@ def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding
         intervals.append((deviation, f"from node {pair[0]} to {pair[1]}"))
     message = f"largest difference in {int(sent.sum()):,} messages"
     return find_largest(intervals, PROBABILITY_TOLERANCE, message)
-
-
-def _law_of_arrivals(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law of P at each node and slot with that of simulated arrivals."""
-    pairs = [
-        Pair(f"slot {slot}, node {node}", samples.runs.P[:, k, i], samples.reference.P[i, k])
-        for k, slot in enumerate(check_slots(samples.scenario))
-        for i, node in enumerate(samples.nodes)
-    ]
-    return compare_laws(pairs, level, samples.first_trace)
-
-
-def _check_bounded(samples: IntermittentSamples, level: float) -> Finding:
-    """Test that P stays stochastically bounded."""
-    runs, reference_P = samples.runs.P, samples.reference.P
-    pairs = [
-        Pair(f"node {node}", runs[:, -2, i], runs[:, -1, i]) for i, node in enumerate(samples.nodes)
-    ]
-    expected = [(reference_P[i, -2], reference_P[i, -1]) for i in range(len(pairs))]
-    finding = compare_growth(pairs, expected, level)
-    return with_horizon(samples, finding, _growth_of, LAW_TOLERANCE) if finding.early else finding
-
-
-def _check_initial_condition(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the law of P at the end with that from a far larger start."""
-    P, restarted = samples.reference.P, samples.reference.restarted
-    pairs = [
-        Pair(f"node {node}", samples.runs.P[:, -1, i], restarted[i], P[i, -1])
-        for i, node in enumerate(samples.nodes)
-    ]
-    finding = compare_laws(pairs, level, samples.first_trace)
-    return with_horizon(samples, finding, _memory_of, LAW_TOLERANCE) if finding.early else finding
-
-
-def _growth_of(reference: ArrivalSamples) -> float:
-    """Return the largest growth of the law of P between the last two numbers of slots."""
-    # Only the value of each interval is used, for which the level does not matter.
-    return max(g.value for P in reference.P for g in growth_intervals(P[-2], P[-1], level=0.5))
-
-
-def _memory_of(reference: ArrivalSamples) -> float:
-    """Return the largest distance at the end of the laws from P(0) and a far larger start."""
-    pairs = zip(reference.P, reference.restarted, strict=True)
-    return max(float(diagonal_distances(P[-1], restarted).max()) for P, restarted in pairs)
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
@@ -542,19 +476,19 @@ PROMISES = (
         "the law of P is that of independent arrivals, at every time",
         "R (18)",
         FIXED,
-        _law_of_arrivals,
+        check_law,
     ),
     Promise(
         "P is stochastically bounded: its law does not grow any more",
         "R Proposition 8, Theorem 9 [i]",
         LIMIT,
-        _check_bounded,
+        check_bounded,
     ),
     Promise(
         "the law in the end does not depend on the start",
         "R Theorem 9 [i]",
         LIMIT,
-        _check_initial_condition,
+        check_initial_condition,
     ),
     Promise(
         "averages over one path are those of the law of independent arrivals",
@@ -562,18 +496,7 @@ PROMISES = (
         FIXED,
         _averages_of_paths,
     ),
-    Promise(
-        "errors have the covariance that the readings give them",
-        "R (15)-(18), derived",
-        ("exact errors are within reach",),
-        check_error_covariance,
-    ),
-    Promise(
-        "errors have no bias that the equations do not give them",
-        "R (15)-(18), derived",
-        ("exact errors are within reach",),
-        check_bias,
-    ),
+    *error_promises("R (15)-(18), derived", by="the readings give them"),
     Promise("errors are as large as P says: the mean NEES is n", "R (14)", KNOWN, check_nees),
 )
 SCALAR = (
@@ -597,47 +520,28 @@ DIVERGES = Promise(
 )
 
 
-class IntermittentChecks(PaperChecks):
-    """Promises of the paper R on intermittent observations: Theorems 9, 10, Propositions 8, 24, 25
-    and (29).
-    """
-
-    summary_type = IntermittentSummary
-
-    slots_only = True
-
-    def summarise(self, scenario: Scenario, run: Run) -> IntermittentSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
-        return _summarise(scenario, run)
-
-    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> IntermittentSamples:
-        """Return the object that every test of a promise gets."""
-        return IntermittentSamples(scenario, stacked, seed)
-
-    def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the paper."""
-        try:
-            is_known, evidence = True, "a known probability for each direction"
-            for direction in _heard_directions(scenario):
-                _delivery_probability(scenario, direction)
-        except TheoryError as error:
-            is_known, evidence = False, str(error)
-        # A derived class may choose its broadcasts in any way.
-        if type(scenario.network.activation) is not Broadcast:
-            is_known, evidence = False, "links are up as recorded"
-        stated = "readings arrive independently, as often as stated"
-        return [
-            Assumption(stated, "R (12)", is_known, evidence),
-            exact_start(scenario),
-            few_errors(scenario),
-            fixed_readings(scenario),
-        ]
-
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the statements about a scenario's filter that are tested."""
-        grows = not contracts(max(_outage_factors(scenario).values(), default=0.0))
-        divergence = (DIVERGES,) if grows else ()
-        return PROMISES + divergence + (SCALAR if _scalar_laws(scenario) else ())
+def _assumptions(scenario: Scenario) -> list[Assumption]:
+    try:
+        is_known, evidence = True, "a known probability for each direction"
+        for direction in _heard_directions(scenario):
+            _delivery_probability(scenario, direction)
+    except TheoryError as error:
+        is_known, evidence = False, str(error)
+    # A derived class may choose its broadcasts in any way.
+    if type(scenario.network.activation) is not Broadcast:
+        is_known, evidence = False, "links are up as recorded"
+    stated = "readings arrive independently, as often as stated"
+    return [
+        Assumption(stated, "R (12)", is_known, evidence),
+        *usual_assumptions(scenario),
+        fixed_readings(scenario),
+    ]
 
 
-CHECKS = IntermittentChecks()
+def _promises(scenario: Scenario) -> tuple[Promise, ...]:
+    grows = not contracts(max(_outage_factors(scenario).values(), default=0.0))
+    divergence = (DIVERGES,) if grows else ()
+    return PROMISES + divergence + (SCALAR if _scalar_laws(scenario) else ())
+
+
+CHECKS = PaperChecks(_promises, _assumptions, _summarise, IntermittentSamples, slots_only=True)

@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from netkf.algorithms.kernels.chains import ReadingModes, move_roots, reading_modes
 from netkf.checks.evidence import Finding
+from netkf.checks.laws import LAW_TOLERANCE, Pair, compare_growth, compare_laws, growth_intervals
 from netkf.checks.points import MAX_NODES, check_slots, sampled_nodes
+from netkf.checks.samples import RunSamples
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
@@ -75,34 +78,104 @@ def reference_count(scenario: Scenario, laws: int) -> int:
     return int(np.clip(affordable, MIN_CHAINS, MAX_CHAINS))
 
 
-@lru_cache(maxsize=1)
-def kept_reference(samples: type[Any], scenario: Scenario, seed: int) -> Any:
-    """Return the simulated covariances that those of the runs are compared with; cached, so that
-    all looks at runs of one seed share them.
+class Reference(Protocol):
+    """Simulated covariances whose laws those of the runs should have."""
 
-    ``samples`` is a subclass of RunSamples, whose ``draw_reference`` needs no runs (None).
+    def at(self, k: int, i: int) -> FloatArray:
+        """Return the covariances (S, n, n) at the k-th checked slot and the i-th sampled node."""
+
+    def restarted_at(self, i: int) -> FloatArray:
+        """Return those at the last slot from a start about 1000 times larger (S, n, n)."""
+
+    def growth(self) -> float:
+        """Return the growth of the law of P between the last two slots."""
+
+    def memory(self) -> float:
+        """Return the distance at the end of the laws from P(0) and from the larger start."""
+
+
+@dataclass(frozen=True)
+class SwitchedSamples(RunSamples):
+    """Adds simulated covariances with whose laws those of P in the runs are compared; derived
+    classes draw them.
     """
+
+    @property
+    def reference(self) -> Any:
+        """The :class:`Reference` of all looks at the runs of a seed."""
+        cls: Any = type(self)
+        return _kept_reference(cls, self.scenario, self.seed)
+
+    def draw_reference(self) -> Reference:
+        """Return the covariances at the checked slots; it needs no runs."""
+        raise NotImplementedError
+
+    def later(self, slots: int) -> Reference:
+        """Return a few covariances after half of ``slots`` and after all of them."""
+        raise NotImplementedError
+
+    def with_horizon(self, finding: Finding, distance: Callable[[Any], float]) -> Finding:
+        """Return a finding, if it says that the limit of a law is not reached, with the horizon in
+        seconds at which it would be; nan if that cannot be computed in a few seconds.
+
+        ``distance`` of a reference tells how far its law is from its limit.
+        """
+        if not finding.early:
+            return finding
+        slots = slots_until(
+            lambda count: distance(self.later(count)),
+            check_slots(self.scenario)[-1],
+            self.scenario.plant.n,
+            LAW_TOLERANCE,
+        )
+        return finding._replace(horizon=slots * self.scenario.slot_plant.period)
+
+
+@lru_cache(maxsize=1)
+def _kept_reference(samples: type[SwitchedSamples], scenario: Scenario, seed: int) -> Reference:
     return samples(scenario, None, seed).draw_reference()
 
 
-def with_horizon(
-    samples: Any, finding: Finding, distance: Callable[[Any], float], tolerance: float
-) -> Finding:
-    """Return a finding that the limit of a law is not reached, with the horizon in seconds added at
-    which it would be; nan if that cannot be computed in a few seconds.
+def check_law(samples: SwitchedSamples, level: float) -> Finding:
+    """Compare the law of P at each node and slot with that of the reference there."""
+    pairs = [
+        Pair(f"slot {slot}, node {node}", samples.runs.P[:, k, i], samples.reference.at(k, i))
+        for k, slot in enumerate(check_slots(samples.scenario))
+        for i, node in enumerate(samples.nodes)
+    ]
+    return compare_laws(pairs, level, samples.first_trace)
 
-    ``samples.later(slots)`` simulates a few covariances for a number of slots; ``distance`` is a
-    function of its result and returns how far their law is from its limit, which is to become half
-    of ``tolerance``.
-    """
-    scenario = samples.scenario
-    slots = slots_until(
-        lambda count: distance(samples.later(count)),
-        check_slots(scenario)[-1],
-        scenario.plant.n,
-        tolerance,
-    )
-    return finding._replace(horizon=slots * scenario.slot_plant.period)
+
+def check_bounded(samples: SwitchedSamples, level: float) -> Finding:
+    """Test that P stays stochastically bounded."""
+    P, last = samples.runs.P, len(check_slots(samples.scenario)) - 1
+    nodes = list(enumerate(samples.nodes))
+    pairs = [Pair(f"node {node}", P[:, -2, i], P[:, -1, i]) for i, node in nodes]
+    expected = [[samples.reference.at(k, i) for k in (last - 1, last)] for i, _ in nodes]
+    finding = compare_growth(pairs, [(half, end) for half, end in expected], level)
+    return samples.with_horizon(finding, lambda reference: reference.growth())
+
+
+def check_initial_condition(samples: SwitchedSamples, level: float) -> Finding:
+    """Compare the law of P at the end with that from a far larger start."""
+    reference, last = samples.reference, len(check_slots(samples.scenario)) - 1
+    pairs = [
+        Pair(
+            f"node {node}",
+            samples.runs.P[:, -1, i],
+            reference.restarted_at(i),
+            reference.at(last, i),
+        )
+        for i, node in enumerate(samples.nodes)
+    ]
+    finding = compare_laws(pairs, level, samples.first_trace)
+    return samples.with_horizon(finding, lambda reference: reference.memory())
+
+
+def growth_of(earlier: FloatArray, later: FloatArray) -> float:
+    """Return the largest growth of an entry between two samples of covariances (S, n, n)."""
+    # Only the value of each interval is used, for which the level does not matter.
+    return max(interval.value for interval in growth_intervals(earlier, later, level=0.5))
 
 
 def slots_until(distance: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:
@@ -230,41 +303,28 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
     return ModeTable(F, square_root(Q), reading_modes(readings, len(F)))
 
 
-def find_arrivals(scenario: Scenario, run: Run, slots: int) -> Arrivals:
+def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> Arrivals:
     """Return the readings that W sampled nodes used in the first ``slots`` slots of a run: in each
-    slot a node's own and those that the trace says were delivered to it. Each set of readings that
-    occurs is one mode, and ``sequences`` (W, slots) has the index of the mode of each node and
+    slot a node's own and those that the trace says were delivered to it; without a run those that
+    they would use if none were lost, which gives the smallest covariances. Each set of readings
+    that occurs is one mode, and ``sequences`` (W, slots) has the index of the mode of each node and
     slot.
     """
-    delivered = run.log[run.log["kind"] == CODES["deliver"]]
-    # A reading belongs to the slot in which it was sent, not to that of its arrival.
-    slot = scenario.slot_plant.slots_of(delivered["t"] - np.nan_to_num(delivered["age"]))
     arrived: dict[tuple[int, int], list[int]] = {}
-    columns = (slot.tolist(), delivered["node"].tolist(), delivered["peer"].tolist())
-    for t, node, peer in zip(*columns, strict=True):
-        arrived.setdefault((node, t), []).append(peer)
-    modes: dict[tuple[int, ...], int] = {}
+    if run is not None:
+        delivered = run.log[run.log["kind"] == CODES["deliver"]]
+        # A reading belongs to the slot in which it was sent, not to that of its arrival.
+        slot = scenario.slot_plant.slots_of(delivered["t"] - np.nan_to_num(delivered["age"]))
+        columns = (slot.tolist(), delivered["node"].tolist(), delivered["peer"].tolist())
+        for t, node, peer in zip(*columns, strict=True):
+            arrived.setdefault((node, t), []).append(peer)
+    neighbours, modes = sensing_neighbours(scenario), dict[tuple[int, ...], int]()
     sampled = sampled_nodes(scenario)
     sequences = np.empty((len(sampled), slots), dtype=int)
     for k, node in enumerate(sampled):
         own_reading = (node,) if node in scenario.placed_sensors else ()
         for t in range(slots):
-            nodes = tuple(sorted((*own_reading, *arrived.get((node, t), ()))))
+            heard = neighbours[node] if run is None else arrived.get((node, t), ())
+            nodes = tuple(sorted((*own_reading, *heard)))
             sequences[k, t] = modes.setdefault(nodes, len(modes))
-    return Arrivals(intermittent_modes(scenario, list(modes)), sequences, list(modes))
-
-
-def all_arrivals(scenario: Scenario, slots: int) -> Arrivals:
-    """Return the readings that W sampled nodes would use in each of ``slots`` slots if none were
-    lost, which gives the smallest covariances. Each set of readings is one mode, and ``sequences``
-    (W, slots) has the index of the mode of each node and slot.
-    """
-    neighbours = sensing_neighbours(scenario)
-    modes: dict[tuple[int, ...], int] = {}
-    sampled = sampled_nodes(scenario)
-    sequences = np.empty((len(sampled), slots), dtype=int)
-    for k, node in enumerate(sampled):
-        own_reading = (node,) if node in scenario.placed_sensors else ()
-        nodes = tuple(sorted((*own_reading, *neighbours[node])))
-        sequences[k] = modes.setdefault(nodes, len(modes))
     return Arrivals(intermittent_modes(scenario, list(modes)), sequences, list(modes))

@@ -1,48 +1,39 @@
-"""The contract of the modules that check the promises of one paper."""
+"""What is checked of the filters of one paper."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from netkf.checks.evidence import Assumption, Promise
-from netkf.checks.exact import summarise_exactly
+from netkf.checks.exact import few_errors, summarise_exactly
+from netkf.checks.laws import exact_start
 from netkf.checks.samples import ReplicaSummary, RunSamples
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run
 
 
-class PaperChecks(ABC):
+def usual_assumptions(scenario: Scenario) -> list[Assumption]:
+    """Return the assumptions of tests of exact errors: where filters start, how many errors."""
+    return [exact_start(scenario), few_errors(scenario)]
+
+
+@dataclass(frozen=True)
+class PaperChecks:
     """The promises of one paper and what their tests need of each run.
 
-    ``slots_only``: the paper is about slots; under clocks only the equations are checked.
-    ``summary_type``: class of the summaries of runs.
+    promises : ``promises(scenario)``, those that are tested for a scenario
+    assumptions : ``assumptions(scenario)``, those of the tests beyond those of the paper itself,
+                  each with whether it holds: a promise is tested only if those it ``needs`` hold
+    summarise : ``summarise(scenario, run)``, what the tests need of one run with samples at
+                ``probe_times``
+    collect : ``collect(scenario, stacked, seed)`` returns what every test of a promise gets, of
+              summaries whose fields have a first axis over the runs of ``seed``
+    slots_only : the paper is about slots; under clocks only the equations are checked
     """
 
-    slots_only: ClassVar[bool] = False
-    summary_type: ClassVar[type[ReplicaSummary]] = ReplicaSummary
-
-    def summarise(self, scenario: Scenario, run: Run) -> ReplicaSummary:
-        """Return what the tests need of one ``run``, an instance of ``summary_type``; called once
-        for each run, whose samples are at ``probe_times``.
-        """
-        return summarise_exactly(scenario, run)
-
-    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> RunSamples:
-        """Return the object that every test of a promise gets; called once, after the last run.
-
-        ``stacked`` is a ``summary_type`` with the summaries of all R runs: each field has a first
-        axis of length R. ``seed`` is that of the runs; tests that simulate reference samples seed
-        their random streams with it.
-        """
-        return RunSamples(scenario, stacked, seed)
-
-    @abstractmethod
-    def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the paper itself, each with whether
-        it holds for the scenario: a promise is tested only if those that it ``needs`` hold.
-        """
-
-    @abstractmethod
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises of the paper that are tested for a scenario."""
+    promises: Callable[[Scenario], tuple[Promise, ...]]
+    assumptions: Callable[[Scenario], list[Assumption]] = usual_assumptions
+    summarise: Callable[[Scenario, Run], ReplicaSummary] = summarise_exactly
+    collect: Callable[[Scenario, ReplicaSummary, int], RunSamples] = RunSamples
+    slots_only: bool = False

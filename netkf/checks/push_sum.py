@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.checks.equations import error_promises
 from netkf.checks.evidence import (
     COMPUTED,
     Assumption,
@@ -23,17 +24,14 @@ from netkf.checks.evidence import (
 )
 from netkf.checks.exact import (
     MIN_VARIANCE,
-    check_bias,
-    check_error_covariance,
     detectable_length,
-    few_errors,
     gaussian_radius,
     max_replayed,
     summarise_exactly,
     with_promised_filter,
 )
-from netkf.checks.laws import exact_start, find_largest
-from netkf.checks.paper import PaperChecks
+from netkf.checks.laws import find_largest
+from netkf.checks.paper import PaperChecks, usual_assumptions
 from netkf.checks.points import check_slots, sampled_indices
 from netkf.checks.rounding import compare_identities, first_wrong
 from netkf.checks.samples import (
@@ -69,16 +67,6 @@ SQUARE_TOLERANCE, BIAS_TOLERANCE = 0.3, 0.45
 """Tolerated relative difference of mean squares, and bias in standard deviations of an error."""
 MAX_STEPS = 4096
 """Averaging steps up to which errors are compared with those of the central filter."""
-
-
-@dataclass(frozen=True, eq=False)
-class PushSumSummary(ReplicaSummary):
-    """Adds ``drift`` (2,): how far the totals over all nodes of the push-sum weight w and of the
-    push-sum number n~ are at the end from those at the start, relative; exchanges should conserve
-    both.
-    """
-
-    drift: FloatArray
 
 
 @dataclass(frozen=True)
@@ -288,17 +276,10 @@ PROMISES = (
         check_replay,
         exact=True,
     ),
-    Promise(
-        "errors have the covariance that the steps give them",
+    *error_promises(
         "P (7)-(9), derived",
         ("mass is exchanged in every slot", "the filters know", "exact errors are within reach"),
-        check_error_covariance,
-    ),
-    Promise(
-        "errors have no bias that the equations do not give them",
-        "P (7)-(9), derived",
-        ("mass is exchanged in every slot", "the filters know", "exact errors are within reach"),
-        check_bias,
+        by="the steps give them",
     ),
     Promise(
         "every node comes to the covariance P_inf",
@@ -338,61 +319,51 @@ CERTIFIED = Promise(
 )
 
 
-class PushSumChecks(PaperChecks):
-    """Promises of P, Lemmas 4, 10 and Theorems 1, 2, 4, 5, 6."""
+def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
+    """Return the summary of a run with ``drift`` (2,): how far the totals over all nodes of the
+    push-sum weight w and number n~ are at the end from those at the start, relative; exchanges
+    should conserve both.
+    """
+    summary = summarise_exactly(scenario, run)
+    drift = [(total - exact) / exact for exact, total in run.sums.values()]
+    summary.drift = np.array(drift) if drift else np.full(2, np.nan)
+    return summary
 
-    summary_type = PushSumSummary
 
-    slots_only = True
+def _assumptions(scenario: Scenario) -> list[Assumption]:
+    try:
+        # Errors have a steady mean square if the mean-square radius is below 1, and a fourth
+        # moment, as a test of mean squares needs, if it is well below.
+        radius = push_sum_radius(with_promised_filter(scenario))
+        light = radius <= HEAVY_TAIL_RADIUS
+        evidence = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAIL_RADIUS}"
+    except TheoryError as error:
+        light, evidence = False, str(error)
+    return [
+        _every_slot(scenario),
+        Assumption("mean squares have a variance", "derived", light, evidence),
+        *usual_assumptions(scenario),
+    ]
 
-    def summarise(self, scenario: Scenario, run: Run) -> PushSumSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
-        # ``sums`` are the totals of weight and number at the start (exact) and at the end.
-        drift = np.array([(total - exact) / exact for exact, total in run.sums.values()])
-        drift = drift if len(drift) else np.full(2, np.nan)
-        return PushSumSummary(**vars(summarise_exactly(scenario, run)), drift=drift)
 
-    def collect(self, scenario: Scenario, stacked: Any, seed: int) -> PushSumSamples:
-        """Return the object that every test of a promise gets."""
-        return PushSumSamples(scenario, stacked, seed)
-
-    def assumptions(self, scenario: Scenario) -> list[Assumption]:
-        """Return the assumptions of the tests beyond those of the push-sum paper."""
-        try:
-            # Errors have a steady mean square if the mean-square radius is below 1, and a fourth
-            # moment, as a test of mean squares needs, if it is well below.
-            radius = push_sum_radius(with_promised_filter(scenario))
-            light = radius <= HEAVY_TAIL_RADIUS
-            evidence = f"mean-square radius {radius:.4g}, light tails below {HEAVY_TAIL_RADIUS}"
-        except TheoryError as error:
-            light, evidence = False, str(error)
-        return [
-            _every_slot(scenario),
-            Assumption("mean squares have a variance", "derived", light, evidence),
-            exact_start(scenario),
-            few_errors(scenario),
-        ]
-
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario."""
-        promised = with_promised_filter(scenario)
-        algorithm: Any = promised.filter.algorithm
-        promises: tuple[Promise, ...] = PROMISES
-        if algorithm.running_sums:
-            # Running sums conserve mass (the first promise) whatever is lost.
-            promises = (dataclasses.replace(PROMISES[0], needs=()), *PROMISES[1:])
-        if not searches_gamma(promised):
-            return promises
-        # These functions raise TheoryError where the limit or the gamma does not exist.
-        with contextlib.suppress(TheoryError):
-            large_gamma_limits(promised)
-            promises = (*promises, LIMIT)
-        try:
-            minimum_gamma(promised, "mean-square")
-            exact_minimum_gamma(promised, most=MAX_CERTIFIED)
-        except TheoryError:
-            return promises
-        return (*promises, CERTIFIED)
+def _promises(scenario: Scenario) -> tuple[Promise, ...]:
+    promised = with_promised_filter(scenario)
+    algorithm: Any = promised.filter.algorithm
+    promises: tuple[Promise, ...] = PROMISES
+    if algorithm.running_sums:
+        # Running sums conserve mass (the first promise) whatever is lost.
+        promises = (dataclasses.replace(PROMISES[0], needs=()), *PROMISES[1:])
+    if not searches_gamma(promised):
+        return promises
+    # These functions raise TheoryError where the limit or the gamma does not exist.
+    with contextlib.suppress(TheoryError):
+        large_gamma_limits(promised)
+        promises = (*promises, LIMIT)
+    with contextlib.suppress(TheoryError):
+        minimum_gamma(promised, "mean-square")
+        exact_minimum_gamma(promised, most=MAX_CERTIFIED)
+        promises = (*promises, CERTIFIED)
+    return promises
 
 
 def _every_slot(scenario: Scenario) -> Assumption:
@@ -407,4 +378,4 @@ def _every_slot(scenario: Scenario) -> Assumption:
     return Assumption("mass is exchanged in every slot", "P step 2", holds, evidence)
 
 
-CHECKS = PushSumChecks()
+CHECKS = PaperChecks(_promises, _assumptions, _summarise, PushSumSamples, slots_only=True)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from netkf.scenario.scenario import Scenario
 REPLAY_TOLERANCE = 1e-7  # of P, relative: two ways to compute it differ by roundings only
 
 
-@dataclass(frozen=True, eq=False)
-class ReplicaSummary:
+class ReplicaSummary(SimpleNamespace):
     """The statistics of one run at K times and N sampled nodes.
 
     P, e       : (K, N, n, n), (K, N, n) covariances, and errors: nan where rounding blurs them
@@ -36,29 +35,13 @@ class ReplicaSummary:
                  vector (that matrix times the estimate of the bias)
 
     Fields after ``nees`` are nan for a run that is not replayed. Papers add fields of their own.
-    Summaries of R runs are stacked: every field gets a first axis of length R.
     """
 
-    P: FloatArray
-    e: FloatArray
-    nees: FloatArray
-    replayed: FloatArray
-    mean: FloatArray
-    Sigma: FloatArray
-    whole: FloatArray
-    joint: FloatArray
-    quadratic: FloatArray
-    bias: FloatArray
 
-
-Summary = TypeVar("Summary", bound=ReplicaSummary)
-
-
-def stack_summaries(summaries: Sequence[Summary]) -> Summary:
+def stack_summaries(summaries: Sequence[ReplicaSummary]) -> ReplicaSummary:
     """Return one summary whose fields have a first axis over the replicas."""
-    names = [field.name for field in dataclasses.fields(summaries[0])]
-    columns = {name: np.array([getattr(summary, name) for summary in summaries]) for name in names}
-    return type(summaries[0])(**columns)
+    names = vars(summaries[0])
+    return ReplicaSummary(**{name: np.array([vars(s)[name] for s in summaries]) for name in names})
 
 
 @dataclass(frozen=True)
@@ -133,7 +116,6 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
     P, expected = np.where(unknown, 0.0, P), np.where(unknown, 0.0, expected)
     with np.errstate(invalid="ignore"):
         gap = np.abs(P - expected).max(axis=(-1, -2))
-        size = np.abs(expected).max(axis=(-1, -2))
     differences = relative_difference(P, expected).max(axis=(-1, -2))
     run, time, node = np.unravel_index(int(np.argmax(differences)), differences.shape)
     label = samples.point_labels[int(time) * len(samples.nodes) + int(node)]
@@ -141,26 +123,29 @@ def check_replay(samples: RunSamples, level: float) -> Finding:
         f"{gap.size:,} covariances replayed from the events of their runs; the worst in run "
         f"{np.flatnonzero(replayed)[run]} at {label}"
     )
-    # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
-    limits = size, samples.largest_terms(expected), REPLAY_TOLERANCE
-    finding = compare_identities(gap, *limits, message)
-    return with_departure(finding, samples, gap, limits, replicas=np.flatnonzero(replayed))
+    limits = (
+        np.abs(expected).max(axis=(-1, -2)),
+        samples.largest_terms(expected),
+        REPLAY_TOLERANCE,
+    )
+    return compare_points(samples, gap, limits, message, replicas=np.flatnonzero(replayed))
 
 
-def with_departure(
-    finding: Finding,
+def compare_points(
     samples: RunSamples,
     gap: FloatArray,
     limits: tuple[FloatArray, ArrayLike, float],
+    message: str,
     replicas: IntArray | None = None,
 ) -> Finding:
-    """Return a finding on covariances that should equal others up to rounding, with the run, time
-    and node added at which the first deviation is too large, so that this run can be replayed.
+    """Return the finding on covariances that should equal others up to rounding. It names the run,
+    time and node at which the first deviation is too large, so that this run can be replayed.
 
-    ``gap`` (R, K', N) are absolute deviations at the last K' checked times, ``limits`` the
-    arguments of :func:`allowed_deviation`, and ``replicas`` (R,) the numbers of the runs, 0 to
-    R - 1 by default. The finding is returned unchanged if rounding explains all deviations.
+    ``gap`` (R, K', N) are absolute deviations at the last K' checked times; ``limits`` the sizes of
+    the values, those of the terms whose rounding errors they inherit, and a relative tolerance
+    (:func:`allowed_deviation`); ``replicas`` (R,) the numbers of the runs, 0 to R - 1 by default.
     """
+    finding = compare_identities(gap, *limits, message)
     wrong = ~(gap <= allowed_deviation(*limits))
     if not wrong.any():
         return finding

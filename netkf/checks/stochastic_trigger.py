@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
-from netkf.checks.clocked import PROMISES, REACH
+from netkf.checks.equations import ERRORS, EXACT, FOLLOWS_EVENTS, REACH
 from netkf.checks.evidence import Finding, Promise, find_unknown
 from netkf.checks.exact import summarise_exactly, with_promised_filter
-from netkf.checks.kalman_consensus import EquationChecks
 from netkf.checks.laws import find_largest
+from netkf.checks.paper import PaperChecks
 from netkf.checks.samples import ReplicaSummary, RunSamples
-from netkf.checks.track_fusion import EXACT
 from netkf.laws.intervals import deviation_interval, student_interval
 from netkf.scenario.scenario import Scenario
 from netkf.theory.stochastic_trigger.errors import all_hear_all
@@ -22,15 +20,6 @@ from netkf.theory.stochastic_trigger.rates import expected_sends
 from netkf.trace.run import Run
 
 RATE_TOLERANCE = 0.05  # of the share of slots with a message
-
-
-@dataclass(frozen=True, eq=False)
-class TriggerSummary(ReplicaSummary):
-    """Adds ``sends`` (2,): the number of messages sent, and the sum of the probabilities of sending
-    given the past.
-    """
-
-    sends: np.ndarray
 
 
 def check_rate(samples: RunSamples, level: float) -> Finding:
@@ -56,7 +45,7 @@ def check_rate(samples: RunSamples, level: float) -> Finding:
 
 
 NEEDS = ("the filters know", "every node hears", "the filters start", REACH)
-SILENCE = dataclasses.replace(EXACT, source="Han et al. 2015, Theorem 2", needs=NEEDS)
+SILENCE = replace(EXACT, source="Han et al. 2015, Theorem 2", needs=NEEDS)
 RATE = Promise(
     "nodes send with probability 1 - det(I + Pi Y)^-1/2",
     "Han et al. 2015",
@@ -65,32 +54,22 @@ RATE = Promise(
 )
 
 
-class TriggerChecks(EquationChecks):
-    """Promises about the equations, about P after silent slots, and about the rate of messages.
-
-    They need a network without losses, in which silence is information.
+def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
+    """Return the summary of a run with ``sends`` (2,): the number of messages sent, and the sum of
+    the probabilities of sending given the past.
     """
-
-    summary_type = TriggerSummary
-
-    def summarise(self, scenario: Scenario, run: Run) -> TriggerSummary:
-        """Return what the tests need of one ``run``, which was sampled at ``probe_times``."""
-        sends = np.full(2, np.nan)
-        if all_hear_all(scenario):
-            sends[:] = expected_sends(with_promised_filter(scenario), run)
-        return TriggerSummary(**vars(summarise_exactly(scenario, run)), sends=sends)
-
-    def promises(self, scenario: Scenario) -> tuple[Promise, ...]:
-        """Return the promises about a scenario."""
-        # ``needs`` are parts of the names of assumptions in the table of the report.
-        equations = [
-            dataclasses.replace(
-                promise,
-                needs=(*promise.needs, "every node hears", "the filters know", "one estimate"),
-            )
-            for promise in PROMISES
-        ]
-        return (*equations[:1], SILENCE, RATE, *equations[1:])
+    summary = summarise_exactly(scenario, run)
+    summary.sends = np.full(2, np.nan)
+    # Without losses, and if all hear all, silence is information.
+    if all_hear_all(scenario):
+        summary.sends[:] = expected_sends(with_promised_filter(scenario), run)
+    return summary
 
 
-CHECKS = TriggerChecks()
+def _promises(_: Scenario) -> tuple[Promise, ...]:
+    more = "every node hears", "the filters know", "one estimate"
+    follows, *errors = (replace(p, needs=(*p.needs, *more)) for p in (FOLLOWS_EVENTS, *ERRORS))
+    return (follows, SILENCE, RATE, *errors)
+
+
+CHECKS = PaperChecks(_promises, summarise=_summarise)

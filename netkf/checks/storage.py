@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.check import ReplicaResult, Verdict, find_checks, with_check_times
+from netkf.checks.check import ReplicaResult, Verdict
 from netkf.checks.evidence import Evidence
 from netkf.checks.parts.samples import PART_TYPES, PartSummary
 from netkf.checks.records.rows import audit_columns, read_audit
 from netkf.checks.report import verdict_json, verdict_text
+from netkf.checks.samples import ReplicaSummary
 from netkf.core.errors import ScenarioError
 from netkf.core.interrupts import defer_signals
 from netkf.ensembles.resume import remove_unfinished
@@ -68,7 +69,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     np.savez_compressed(results, **columns)
     with write_atomically(directory / RESULTS) as part:
         part.write_bytes(results.getvalue())
-        _require_same(part, columns, scenario)
+        _require_same(part, columns)
     with write_atomically(directory / "verdict.csv") as part:
         verdict.table.to_csv(part, index=False)
     write_text(directory / "verdict.txt", text + "\n")
@@ -88,9 +89,9 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     write_sealed(directory / VERDICT, document)
 
 
-def _require_same(path: Path, columns: dict[str, Any], scenario: Scenario) -> None:
+def _require_same(path: Path, columns: dict[str, Any]) -> None:
     """Raise ScenarioError unless the results read back are those that were written."""
-    again = _result_columns(tuple(_read_results(path, scenario)))
+    again = _result_columns(tuple(_read_results(path)))
     for name in sorted(columns.keys() | again.keys()):
         one, other = (np.asarray(part.get(name, ())) for part in (columns, again))
         is_real = one.dtype.kind == other.dtype.kind == "f"
@@ -135,7 +136,7 @@ def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
         check_files(directory, document)
         looks, spent = int(document["looks"]), float(document["spent"])
         rows = _read_rows(document)
-        results = _read_results(directory / RESULTS, scenario)
+        results = _read_results(directory / RESULTS)
         count, confidence = int(document["runs"]), float(document["confidence"])
     except Exception as error:  # the files may hold anything
         reason = str(error) if isinstance(error, DamagedError) else type(error).__name__
@@ -191,13 +192,11 @@ def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]
     return columns
 
 
-def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
+def _read_results(path: Path) -> list[ReplicaResult]:
     """Return the results of the replicas in the file ``path``, in order."""
     with np.load(path, allow_pickle=False) as file:
         columns = {name: file[name] for name in file.files}
     audits = {name: columns.pop(name) for name in list(columns) if name.startswith("audit.")}
-    chosen = with_check_times(scenario)
-    summary_type = find_checks(chosen).summary_type
     results, index = [], 0
     for k, diverged in enumerate(columns["diverged"].tolist()):
         difference, expected = float(columns["difference"][k]), bool(columns["expected"][k])
@@ -206,7 +205,7 @@ def _read_results(path: Path, scenario: Scenario) -> list[ReplicaResult]:
             results.append(ReplicaResult(None, difference, expected, audit=audit))
             continue
         values_of_replica = {name: v[index] for name, v in columns.items() if "." in name}
-        summary = summary_type(**_select_fields(values_of_replica, "summary"))
+        summary = ReplicaSummary(**_select_fields(values_of_replica, "summary"))
         parts = {
             part: cls(**_select_fields(values_of_replica, part))
             if _select_fields(values_of_replica, part)

@@ -8,7 +8,7 @@ import pytest
 import netkf
 from netkf.checks import diffusion, gossip, hybrid, intermittent, push_sum
 from netkf.checks.points import check_times
-from netkf.checks.samples import stack_summaries
+from netkf.checks.samples import ReplicaSummary, stack_summaries
 from tests.conftest import SCENARIOS
 
 LEVEL = 0.01
@@ -24,6 +24,11 @@ def collect(checks, scenario, runs, judged=None):
     probed = dataclasses.replace(scenario, probe=np.array(check_times(scenario)))
     found = [checks.summarise(scenario, netkf.simulate(probed, 5, k)) for k in range(runs)]
     return checks.collect(judged or scenario, stack_summaries(found), 5)
+
+
+def changed(summary, **fields):
+    """A summary with other values of some fields."""
+    return ReplicaSummary(**vars(summary) | fields)
 
 
 def is_broken(finding):
@@ -73,10 +78,10 @@ def test_tracking_errors_stay_bounded():
     assert not is_broken(found)
     assert "sigma_p of D (29)" in found.message
     grown = samples.runs.e * np.array([1.0, 1.0, 1.0, 100.0])[:, None, None]
-    broken = dataclasses.replace(samples, runs=dataclasses.replace(samples.runs, e=grown))
+    broken = dataclasses.replace(samples, runs=changed(samples.runs, e=grown))
     assert is_broken(diffusion._errors_bounded(broken, LEVEL))
     Sigma = samples.runs.Sigma * np.array([1.0, 1.0, 1.0, 1e4])[:, None, None, None]
-    early = dataclasses.replace(broken, runs=dataclasses.replace(broken.runs, Sigma=Sigma))
+    early = dataclasses.replace(broken, runs=changed(broken.runs, Sigma=Sigma))
     assert diffusion._errors_bounded(early, LEVEL).early
 
 

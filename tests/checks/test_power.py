@@ -1,6 +1,5 @@
 """What rows would have found at the default number of runs, and what it takes to know."""
 
-import dataclasses
 import math
 import re
 from pathlib import Path
@@ -12,7 +11,7 @@ import scipy.stats
 from netkf.checks.check import find_checks, judge_replicas, run_replica, with_check_times
 from netkf.checks.exact import _compare_pooled, _pool_nees, check_expected_nees, max_replayed
 from netkf.checks.points import check_times, errors_at_once, probe_times
-from netkf.checks.samples import stack_summaries
+from netkf.checks.samples import ReplicaSummary, stack_summaries
 from netkf.laws.ticks import count_interval
 from netkf.scenario.reading import load
 from netkf.theory.errors import ErrorLaw
@@ -148,7 +147,8 @@ def test_covariances_that_are_too_large_or_too_small_change_the_nees(ring, facto
         summary = one.summary
         # P by the engine is off by a factor: so is the NEES, and not what is expected of it.
         quadratic = np.append(summary.quadratic[0] / factor, summary.quadratic[1:])
-        found = dataclasses.replace(summary, quadratic=quadratic, nees=summary.nees / factor)
+        fields = {"quadratic": quadratic, "nees": summary.nees / factor}
+        found = ReplicaSummary(**vars(summary) | fields)
         changed.append(one._replace(summary=found))
     summaries = stack_summaries([one.summary for one in changed])
     samples = find_checks(scenario).collect(scenario, summaries, 5)

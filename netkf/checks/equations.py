@@ -1,0 +1,194 @@
+"""Filters against their equations, in slots and under clocks, and what their papers say of P.
+
+Statements that are exact given the events of a run hold for every filter whose verbs are known;
+papers about slots are checked by these under clocks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+
+import numpy as np
+
+from netkf.algorithms.traits import nothing_conserved
+from netkf.checks.evidence import Assumption, Finding, Promise, find_unknown
+from netkf.checks.exact import (
+    check_bias,
+    check_error_covariance,
+    check_exact_covariance,
+    check_expected_nees,
+    check_upper_bound,
+    max_replayed,
+    summarise_exactly,
+    with_promised_filter,
+)
+from netkf.checks.paper import PaperChecks
+from netkf.checks.points import checked_samples, sampled_indices
+from netkf.checks.rounding import compare_identities, first_wrong
+from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
+from netkf.core.errors import TheoryError
+from netkf.network.clocks import LinkClock
+from netkf.scenario.scenario import Scenario
+from netkf.theory.common.evidence import NONLINEAR
+from netkf.theory.one_bit.covariances import bit_covariances
+from netkf.trace.run import Run
+
+MASS_TOLERANCE = 1e-9  # drift of the total, relative: rounding of many exchanges
+
+# What promises need: parts of names or sources in the table of assumptions, see ``Promise.needs``.
+REACH, START, KNOWN = "exact errors are within reach", "the filters start", "the filters know"
+NO_LOSS = "no message is lost"
+
+
+def error_promises(
+    source: str, needs: tuple[str, ...] = (REACH,), by: str = "the equations give them"
+) -> tuple[Promise, Promise]:
+    """Return the promises that errors have the covariance that is known ``by`` something, and no
+    bias beyond it, from the equations of a ``source``.
+    """
+    covariance = f"errors have the covariance that {by}"
+    bias = "errors have no bias that the equations do not give them"
+    return (
+        Promise(covariance, source, needs, check_error_covariance),
+        Promise(bias, source, needs, check_bias),
+    )
+
+
+FOLLOWS_EVENTS = Promise(
+    "P follows the equations along the events of each run",
+    "derived",
+    (REACH,),
+    check_replay,
+    exact=True,
+)
+ERRORS = (
+    *error_promises("derived"),
+    Promise("NEES has the mean that exact errors say", "derived", (REACH,), check_expected_nees),
+)
+UPPER_BOUND = Promise(
+    "P is at least the covariance of the error, given the events",
+    "derived",
+    (KNOWN, START, REACH),
+    check_upper_bound,
+    exact=True,
+)
+EXACT = Promise(
+    "P is the covariance of the error, given the events",
+    "Bar-Shalom and Campo 1986",
+    (KNOWN, START, REACH),
+    check_exact_covariance,
+    exact=True,
+)
+
+
+def about_equations(*about_P: Promise, slots_only: bool = False) -> PaperChecks:
+    """Return the checks of a filter's equations, and of promises about its P."""
+    return PaperChecks(lambda _: (FOLLOWS_EVENTS, *about_P, *ERRORS), slots_only=slots_only)
+
+
+def design_of(scenario: Scenario) -> str:
+    """Return how P of the promised filter compares with the covariance of its error by design."""
+    in_slots, under_clocks = with_promised_filter(scenario).node_filter.analysis.P_by_design
+    return in_slots if scenario.slotted else under_clocks
+
+
+def _mass_conserved(samples: RunSamples, level: float) -> Finding:
+    """Check that exchanges conserve mass."""
+    drift, scenario = np.abs(samples.runs.drift), samples.scenario
+    message = f"drift of the total weight in {samples.count} runs"
+    # Running totals grow with every broadcast, and their rounding remains in their differences.
+    clock, rate = scenario.network.activation, 0.0
+    if isinstance(clock, LinkClock):
+        rate = sum(clock.mean_rate(entity) for entity in clock.entities(scenario.topology))
+    terms = 1.0 + scenario.horizon * float(np.nan_to_num(rate))
+    # Size of the compared values, of the terms whose rounding errors they inherit, and relative
+    # tolerance; the drift is relative already.
+    limits = np.ones_like(drift), terms, MASS_TOLERANCE
+    finding = compare_identities(drift, *limits, message)
+    return finding._replace(replica=first_wrong(drift, *limits))
+
+
+MASS_CONSERVED = Promise("mass is conserved", "P (67), derived", (), _mass_conserved, exact=True)
+
+
+def _summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
+    """Return the summary of a run with ``drift``, the largest relative one of conserved sums."""
+    drift = [abs(total - start) / abs(start) for start, total in run.sums.values()]
+    summary = summarise_exactly(scenario, run)
+    summary.drift = max(drift, default=0.0)
+    return summary
+
+
+def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
+    conserved = with_promised_filter(scenario).node_filter.analysis.conserved
+    mass = () if conserved is nothing_conserved else (MASS_CONSERVED,)
+    bound = () if design_of(scenario) == "smaller" else (UPPER_BOUND,)
+    return (*mass, FOLLOWS_EVENTS, *bound, *ERRORS)
+
+
+UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=_summarise_drift)
+"""Filters under clocks whose papers are about slots, and filters that hear nothing."""
+
+
+def _summarise_bits(scenario: Scenario, run: Run) -> ReplicaSummary:
+    """Return the summary of a run in which P is replayed from the bits that arrived."""
+    summary = summarise_exactly(scenario, run)
+    if run.replica < max_replayed(scenario):
+        at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
+        # If H differs from slot to slot, the row says that nothing was replayed.
+        with contextlib.suppress(TheoryError):
+            summary.replayed = bit_covariances(scenario, run)[at][:, sampled]
+    return summary
+
+
+BITS = Promise(
+    "a bit lowers P by 2/pi of what its reading would, along the bits of each run",
+    "Ribeiro et al. 2006",
+    (),
+    check_replay,
+    exact=True,
+)
+LINEAR = "readings are linear in the state"
+FOLLOWS_DATA = Promise(
+    "P and errors follow the equations",
+    "all papers",
+    (LINEAR,),
+    lambda *_: find_unknown(NONLINEAR),
+)
+WITHOUT_PAPER = PaperChecks(
+    lambda _: (FOLLOWS_DATA,), lambda _: [Assumption(LINEAR, "all papers", False, NONLINEAR)]
+)
+"""Scenarios whose readings are not linear: gains, P and errors follow the data, so that no paper
+promises anything; their clocks, channels, noises and records are judged as everywhere.
+"""
+OF_EQUATIONS = {
+    # On trees P is the covariance of the error.
+    "belief_propagation": about_equations(
+        replace(
+            EXACT,
+            source="Weiss and Freeman 2001, derived",
+            needs=(KNOWN, "the graph has no loops", START, REACH),
+        )
+    ),
+    "consensus_innovations": about_equations(
+        replace(EXACT, source="Das and Moura 2017", needs=(KNOWN, NO_LOSS, START, REACH))
+    ),
+    # H (10) holds for any gains.
+    "constant_gain": about_equations(UPPER_BOUND),
+    "diffusion_kalman": about_equations(),
+    "information_consensus": about_equations(
+        replace(
+            UPPER_BOUND,
+            source="Battistelli and Chisci 2014, derived",
+            needs=(KNOWN, "no reading counts more than once", "P_i(0) >=", REACH),
+        ),
+        slots_only=True,
+    ),
+    "kalman_consensus": about_equations(),
+    # Errors are not Gaussian, and P only approximates their covariance.
+    "one_bit": PaperChecks(
+        lambda _: (BITS,), lambda _: [], summarise=_summarise_bits, slots_only=True
+    ),
+}
+"""The checks of papers that promise nothing but equations and what P is, by the paper's name."""
