@@ -223,7 +223,6 @@ def _error_difference(run: Run, twin: Run) -> float:
 
 
 def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
-    """Compare errors of a user's filter with those of the built-in one it derives from."""
     differences = [result.difference for result in results]
     if np.isnan(differences).all():
         return find_nothing(0.0)
@@ -235,7 +234,6 @@ def _same_as_base(results: list[ReplicaResult], level: float) -> Finding:
 
 
 def _none_diverged(results: list[ReplicaResult], level: float) -> Finding:
-    """Count the runs that ended early because they diverged."""
     diverged = sum(result.diverged for result in results)
     message = f"{diverged} of {len(results)} runs ended early, so no other promise is looked at"
     margin = -diverged / len(results)
@@ -319,7 +317,6 @@ def judge_replicas(
 def _run_departed(
     scenario: Scenario, results: list[ReplicaResult], rows: list[Evidence], seed: int
 ) -> list[ReplicaResult]:
-    """Return results with differences from the base also where broken rows name a replica."""
     departed = {row.replica for row in rows if row.verdict == BROKEN} - {None}
     if not own_attributes(scenario.filter.algorithm):
         return results
@@ -333,7 +330,6 @@ def _run_departed(
 
 
 def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Evidence]:
-    """Return the row that compares a user's filter class with its built-in base, if any."""
     overridden = own_attributes(scenario.filter.algorithm)
     if not overridden:
         return []
@@ -347,7 +343,6 @@ def _judge_base(scenario: Scenario, results: list[ReplicaResult]) -> list[Eviden
 
 
 def _transposes(scenario: Scenario) -> bool:
-    """Return True if weights are those of the base with rows and columns exchanged."""
     own, base = (
         chosen.node_filter.link_weights.matrix for chosen in (scenario, with_base_filter(scenario))
     )
@@ -432,7 +427,6 @@ def _look_again(
     confidence: float,
     may_continue: bool,
 ) -> Verdict:
-    """Return the verdict on all results so far, with the decisions of earlier looks kept."""
     look, level = (earlier.looks if earlier is not None else 0) + 1, 1.0 - confidence
     # A single look may spend the whole level, unless others are planned.
     level_now = level_of_look(level, look) if may_continue or earlier is not None else level
@@ -460,7 +454,6 @@ def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, run
 
 
 def _require_laws(scenario: Scenario) -> None:
-    """Raise an error before anything runs if there is nothing to check."""
     find_checks(scenario)
     if not scenario.is_random:
         raise TheoryError(

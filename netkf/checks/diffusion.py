@@ -52,7 +52,6 @@ DRAWS = 20
 
 
 def _without_cooperation(scenario: Scenario) -> Scenario:
-    """Return the scenario without weights for others, sampled at the last time only."""
     promised: Any = with_promised_filter(scenario).filter.algorithm
     algorithm = dataclasses.replace(promised, weights=np.eye(len(scenario.nodes)))
     chosen = dataclasses.replace(scenario.filter, algorithm=algorithm)
@@ -60,7 +59,6 @@ def _without_cooperation(scenario: Scenario) -> Scenario:
 
 
 def _sensors_excite(samples: RunSamples, level: float) -> Finding:
-    """Check that the sensors of the network together excite every direction of the state."""
     levels = information_level(samples.scenario, PASTS, samples.seed)
     network = levels[levels["node"] == -1].iloc[0]  # the row of all sensors together
     best_sensor = float(levels.loc[levels["node"] != -1, "level"].max())
@@ -75,7 +73,6 @@ def _sensors_excite(samples: RunSamples, level: float) -> Finding:
 
 
 def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
-    """Compare exact mean-square errors at the end with those without cooperation."""
     Sigma, Sigma_alone = samples.runs.Sigma[:ALONE, -1], samples.runs.alone[:ALONE]
     cooperative = np.trace(Sigma, axis1=-2, axis2=-1).mean(axis=0)
     separate = np.trace(Sigma_alone, axis1=-2, axis2=-1).mean(axis=0)
@@ -89,7 +86,6 @@ def _cooperation_helps(samples: RunSamples, level: float) -> Finding:
 
 @error_test
 def _errors_bounded(samples: RunSamples, level: float) -> Finding:
-    """Test that errors stay bounded."""
     e, Sigma = samples.runs.e[:, -2:], samples.runs.Sigma[: max_replayed(samples.scenario), -2:]
     if np.isnan(e).all():
         return find_nothing(LAW_TOLERANCE)

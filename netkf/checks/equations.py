@@ -94,7 +94,6 @@ def design_of(scenario: Scenario) -> str:
 
 
 def _mass_conserved(samples: RunSamples, level: float) -> Finding:
-    """Check that exchanges conserve mass."""
     drift, scenario = np.abs(samples.runs.drift), samples.scenario
     message = f"drift of the total weight in {samples.count} runs"
     # Running totals grow with every broadcast, and their rounding remains in their differences.
@@ -132,7 +131,6 @@ UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=_summarise_drift)
 
 
 def _summarise_bits(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run in which P is replayed from the bits that arrived."""
     summary = summarise_exactly(scenario, run)
     if run.replica < max_replayed(scenario):
         at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)

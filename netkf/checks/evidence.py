@@ -241,13 +241,11 @@ def _run_test(promise: Promise, samples: Any, level: float) -> Finding:
 
 
 def _is_needed(promise: Promise, row: Assumption) -> bool:
-    """Return True if a promise relies on an assumption."""
     needs = (*promise.needs, GAUSSIAN) if promise.test in GAUSSIAN_TESTS else promise.needs
     return any(need in f"{row.assumption} [{row.source}]" for need in needs)
 
 
 def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
-    """Return the row with the verdict that follows from the interval of a finding."""
     margin, low, high = finding.margin
     verdict, needed, message = _decide(finding, runs)
     off = finding.off
@@ -278,7 +276,6 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
 
 
 def _decide(finding: Finding, runs: int) -> tuple[str, int | None, str]:
-    """Return the verdict on a finding, the runs that would decide it, and the message."""
     (_, low, high), message = finding.margin, finding.message
     if finding.blurred:
         return UNDECIDED, None, message
@@ -318,7 +315,6 @@ def _factor_needed(finding: Finding, max_factor: float) -> float:
 
 
 def _unpromised_row(promise: Promise, reason: str) -> Evidence:
-    """Return the row of a promise that was not tested because assumptions fail, with the reason."""
     nan = math.nan
     return Evidence(
         promise.statement,

@@ -146,7 +146,6 @@ def max_replayed(scenario: Scenario) -> int:
 def _pool_times(
     e: FloatArray, covariance: FloatArray, floor: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return statistics of the errors at all times together, fields of ReplicaSummary."""
     size, n = e[0].size, e.shape[-1]
     # Variances may differ by orders of magnitude between times: each time is scaled to size 1.
     scale = np.repeat(np.sqrt(np.diagonal(covariance).reshape(-1, size).max(axis=1)), size)
@@ -353,7 +352,6 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
 
 
 def _compare_pooled(joint: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference of pooled squares from their freedom."""
     total, freedom = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
     if not freedom > 0.0:
         return Interval(math.nan, 0.0, math.inf)
@@ -472,7 +470,6 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
 
 
 def _pooled_expected_nees(quadratic: FloatArray, level: float) -> Interval:
-    """Return an interval for the relative difference of the pooled NEES from its mean."""
     finite = quadratic[np.isfinite(quadratic).all(axis=1)]
     ratio = quadratic_interval(float(finite[:, 0].sum()), finite[:, 1:].ravel(), level)
     return deviation_interval(1.0, ratio) if len(finite) else ratio

@@ -240,7 +240,6 @@ def _walks_bound(samples: GossipSamples, level: float) -> Finding:
 
 
 def _tokens_move(samples: GossipSamples, level: float) -> Finding:
-    """Compare how often j hands its pair to i with binomial numbers of Abar_ij."""
     i, j = _pairs_to_count(samples.scenario)
     trials, totals = int(np.sum(samples.runs.slots)), samples.runs.moves.sum(axis=0)
     nodes = samples.scenario.nodes
@@ -294,7 +293,6 @@ def _share_from(values: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _check_tokens(samples: GossipSamples, level: float) -> Finding:
-    """Compare the law at the end of the covariance of each token with the stationary one."""
     last, pairs = len(check_slots(samples.scenario)) - 1, []
     chain, origin = samples.reference.P[last], samples.reference.positions[:, 0]
     for i, node in enumerate(samples.nodes):

@@ -77,7 +77,6 @@ class HybridSamples(RunSamples):
 
 
 def _variance_exists(scenario: Scenario) -> Assumption:
-    """Return the assumption that P, which is random since links tick at random, has a variance."""
     name, source = "the covariance has a variance", "derived"
     # Nodes whose own readings leave a mode that does not decay unseen: their P may grow for long.
     unobserved = [
@@ -199,7 +198,6 @@ def _constant_gains_are_worse(samples: HybridSamples, level: float) -> Finding:
 
 
 def _mixing_factor(scenario: Scenario) -> float:
-    """Return a factor on the rates with which estimates agree 100 times faster than they change."""
     S, slowest = limit_covariance(scenario), _slowest_mixing(coupling(scenario))
     models = {id(model): model for model in scenario.models}.values()  # nodes share them
     speeds = [

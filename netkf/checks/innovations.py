@@ -1,24 +1,37 @@
 """Innovations of a run: readings minus their predictions by the nodes, and their autocorrelations.
 
 Traces do not contain readings. A replay in the SimPy engine, with the same events and states as the
-run, passes every reading to the filter again, and the filter records it.
+run, passes every reading to the filter again, inside a filter that records it.
+
+Over ``[a, b]`` of length g a node with ``dy = H x ds + dv``, cov(dv) = R ds, reads y = int dy. From
+its estimate at a it predicts ``H z``, where z is the integral of the predicted state over the
+interval. The innovation ``y - H z`` has the covariance ``S = H Z H' + R g``, where Z is the
+covariance of the integral of the prediction error e: de = A e ds + dw with cov(e(a)) = P(a).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Filter, Reading
-from netkf.checks.increments import WhitenedInnovation, record_increments
+from netkf.algorithms.filter import (
+    Filter,
+    NodeInfo,
+    Reading,
+    interval_rule,
+    may_be_silent,
+)
+from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.errors import NetkfError
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, square_root
+from netkf.plants.transitions import Transitions
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
-from netkf.trace.schema import CODES
 
 MAX_EVENTS = 400_000
 """Largest number of events of a run that is replayed: that takes about half a minute."""
@@ -26,14 +39,6 @@ MAX_LAG = 20
 """Largest lag of autocorrelations, in readings."""
 MIN_READINGS = 30
 """Smallest number of readings of a node for which autocorrelations are computed."""
-
-
-class RecordedSample(NamedTuple):
-    """A sample, with the estimate (n,) and P (n, n), or None, of its node just before it."""
-
-    reading: Reading
-    xhat: FloatArray
-    P: FloatArray | None
 
 
 class Innovations(NamedTuple):
@@ -58,27 +63,186 @@ class Innovations(NamedTuple):
     increments: int = 0
 
 
+class Recorded(NamedTuple):
+    """The innovation (p,) of a reading in units of its covariance, nan without a finite P."""
+
+    time: float
+    node: int
+    whitened: FloatArray
+    of_increments: bool
+
+
+class TimedState(NamedTuple):
+    """The state of a filter, ``inner``, with what an innovation needs besides.
+
+    node  : node of the state; -1 for a pooled filter, which reads all sensors
+    time  : present time of the state, seconds
+    start : estimate (n,) and P (n, n), or None, before the last prediction
+    """
+
+    inner: Any
+    node: int
+    time: float
+    start: tuple[FloatArray, FloatArray | None]
+
+
+class ExpectedIncrements:
+    """Predictions of increments under one ``model`` with A, Q, H and R, for intervals of any
+    length.
+    """
+
+    def __init__(self, model: Any) -> None:
+        """Take A and Q (n, n), H (p, n) and R (p, p) of ``model``."""
+        n = len(model.A)
+        self._n, self._H, self._R = n, model.H, model.R
+        # The joint equation of (x, z): dx = A x ds + dw and dz = x ds.
+        A = np.block([[model.A, np.zeros((n, n))], [np.eye(n), np.zeros((n, n))]])
+        B = np.concatenate([square_root(model.Q), np.zeros((n, n))])
+        self._equation = Transitions(A, B)
+
+    def whitened_innovation(
+        self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
+    ) -> FloatArray:
+        """Return the innovation y - H E[z] (p,) of increments y = int dy (p,) over ``gap`` seconds,
+        times the inverse Cholesky factor of its covariance S; z is the integral of the state.
+
+        ``xhat`` (n,) and ``P`` (n, n) are the estimate at the start of the interval.
+        """
+        n, H = self._n, self._H
+        # Transition of (x, z) over the gap, and a square root of its noise covariance.
+        F, root = (law[0] for law in self._equation.laws(np.array([gap])))
+        J = F[n:, :n]  # integral of exp(A s) over the gap, so that E[z] = J xhat
+        S = H @ (J @ P @ J.T + root[n:] @ root[n:].T) @ H.T + self._R * gap
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(S), y - H @ J @ xhat))
+
+
+@dataclass(frozen=True, eq=False)
+class Recorder(Filter):
+    """The filter ``inner``, whose innovations are appended to ``recorded``; ``expected`` are the
+    predictions of increments under each of its models, by id.
+    """
+
+    inner: Filter
+    recorded: list[Recorded]
+    expected: dict[int, ExpectedIncrements]
+
+    @property
+    def timing(self) -> Timing:
+        """That of the filter, whose states are inside."""
+        rule, silent = interval_rule(self.inner), may_be_silent(self.inner)
+        return replace(self.inner.timing, interval=lambda state: rule(state.inner), decides=silent)
+
+    @property
+    def needs(self) -> Needs:
+        """Those of the filter."""
+        return self.inner.needs
+
+    @property
+    def link_weights(self) -> Weights:
+        """Those of the filter."""
+        return self.inner.link_weights
+
+    @property
+    def analysis(self) -> Analysis:
+        """That of the filter, whose states are inside."""
+        given = self.inner.analysis
+        return replace(
+            given,
+            wrapped=self.inner,
+            conserved=lambda state: given.conserved(state.inner),
+            stopped=lambda state: given.stopped(state.inner),
+        )
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> TimedState:
+        """Return the state at time 0 with the estimate ``mean`` (n,), ``cov`` (n, n)."""
+        inner = self.inner.init(model, mean, cov, node)
+        return TimedState(inner, -1 if self.timing.pooled else node.node, 0.0, (mean, None))
+
+    def predict(self, state: TimedState, gap: float) -> TimedState:
+        """Return the state predicted over ``gap`` seconds, with the estimate before it."""
+        inner, start = self.inner.predict(state.inner, gap), self.inner.estimate(state.inner)
+        return TimedState(inner, state.node, state.time + gap, start)
+
+    def update(self, state: TimedState, reading: Any) -> TimedState:
+        """Update as the filter does; append the innovation first."""
+        sampled = isinstance(reading, Reading)
+        innovation = (self._of_sample if sampled else self._of_increments)(state, reading)
+        if innovation is not None:
+            time = reading.time if sampled else state.time
+            self.recorded.append(Recorded(time, state.node, innovation, not sampled))
+        return state._replace(inner=self.inner.update(state.inner, reading))
+
+    def _of_sample(self, state: TimedState, reading: Any) -> FloatArray | None:
+        xhat, P = self.inner.estimate(state.inner)
+        if not len(reading.y):
+            return None
+        if P is None or not np.isfinite(P).all():
+            return np.full(len(reading.y), np.nan)
+        S = reading.H @ P @ reading.H.T + reading.R
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(S), reading.y - reading.H @ xhat))
+
+    def _of_increments(self, state: TimedState, reading: Any) -> FloatArray | None:
+        (xhat, P), model = state.start, state.inner.model
+        if P is None or not np.isfinite(P).all():
+            return None
+        if id(model) not in self.expected:
+            self.expected[id(model)] = ExpectedIncrements(model)
+        # The first half of the moments is the integral of dy.
+        y = reading.moments[: len(reading.moments) // 2]
+        return self.expected[id(model)].whitened_innovation(xhat, P, y, reading.gap)
+
+    def emit(self, state: TimedState, exchange: Any) -> tuple[TimedState, Any]:
+        """Return the state and the payload of its message, as the filter does."""
+        inner, payload = self.inner.emit(state.inner, exchange)
+        return state._replace(inner=inner), payload
+
+    def absorb(self, state: TimedState, messages: Sequence[Any], exchange: Any) -> TimedState:
+        """Return the state after ``messages``, as the filter does."""
+        return state._replace(inner=self.inner.absorb(state.inner, messages, exchange))
+
+    def estimate(self, state: TimedState) -> tuple[FloatArray, FloatArray | None]:
+        """Return xhat (n,) and P (n, n) or None, as the filter does."""
+        return self.inner.estimate(state.inner)
+
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """Return a state or a payload with the estimate moved by ``offset`` (n,)."""
+        if not isinstance(state, TimedState):
+            return self.inner.shift(state, offset)
+        return state._replace(inner=self.inner.shift(state.inner, offset))
+
+
 def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     """Return the innovations of the samples and increments of a run, which is replayed for them.
 
     Raises NetkfError with the reason if there are none: the filter gives no covariance, there are
-    no readings, the run has more than ``max_events``
-    events, or the events of the replay differ, as they may if another version made the run.
+    no readings, the run has more than ``max_events`` events, or the events of the replay differ, as
+    they may if another version made the run.
     """
     scenario: Scenario = run.scenario
     if len(run.log) > max_events:
         raise NetkfError(f"a run of more than {max_events:,} events is not replayed")
-    algorithm: Filter = scenario.filter.algorithm
-    samples: list[RecordedSample] = []
-    intervals: list[WhitenedInnovation] = []
-    if not scenario.slotted and scenario.increment_sensors:
-        algorithm = record_increments(algorithm, intervals)
-    filtering = dataclasses.replace(scenario.filter, algorithm=_record_samples(algorithm, samples))
+    recorder = Recorder(scenario.filter.algorithm, [], {})
+    filtering = dataclasses.replace(scenario.filter, algorithm=recorder)
     replay = simulate(with_filter(scenario, filtering), run.seed, run.replica, "simpy")
     # Without a trace there are no events to compare.
     if len(run.log) and first_difference(run, replay) is not None:
         raise NetkfError("a replay makes other events than the run: it is of another version")
-    return _collect_innovations(replay, samples, intervals)
+    # In slots the last readings come after the last state sample, when events are not recorded.
+    recorded = [one for one in recorder.recorded if one.time < scenario.horizon]
+    recorded.sort(key=lambda one: one.time)
+    nis = np.array([float(one.whitened @ one.whitened) for one in recorded])
+    if not np.isfinite(nis).any():
+        raise NetkfError(
+            "there are no readings, or the filter gives no covariance to judge them by"
+        )
+    return Innovations(
+        times=np.array([one.time for one in recorded]),
+        nodes=np.array([one.node for one in recorded], dtype=np.int64),
+        rows=np.array([len(one.whitened) for one in recorded]),
+        nis=nis,
+        whitened=[one.whitened for one in recorded],
+        increments=sum(one.of_increments for one in recorded),
+    )
 
 
 def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
@@ -91,84 +255,6 @@ def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
         if name in scenario.__dict__:
             copy.__dict__[name] = scenario.__dict__[name]
     return copy
-
-
-def _record_samples(algorithm: Filter, samples: list[RecordedSample]) -> Filter:
-    """Return the filter ``algorithm`` that also appends what it is updated with to ``samples``."""
-    base: Any = type(algorithm)
-
-    def update(self: Any, state: Any, reading: Any) -> Any:
-        """Append the sample with the estimate before it, then update as the filter does."""
-        if isinstance(reading, Reading):
-            samples.append(RecordedSample(reading, *self.estimate(state)))
-        return base.update(self, state, reading)
-
-    def shift(self: Any, state: Any, offset: FloatArray) -> Any:
-        """Move the ``state`` by ``offset`` (n,) as the filter does."""
-        return base.shift(self, state, offset)
-
-    # Engines do not move the origin of the states for a class that defines ``update`` without
-    # ``shift`` (``commutes``); then the replay would round differently from the run.
-    methods = {"update": update, "shift": shift, "__module__": base.__module__}
-    # Copied instead of constructed: its parameters have been checked already.
-    recording: Any = object.__new__(type(base.__name__, (base,), methods))
-    recording.__dict__.update(algorithm.__dict__)
-    return recording  # type: ignore[no-any-return]
-
-
-def _collect_innovations(
-    run: Run, samples: list[RecordedSample], intervals: list[WhitenedInnovation]
-) -> Innovations:
-    """Return the innovations of a replay in order of time; raises NetkfError."""
-    nodes, samples = _match_nodes(run, [sample for sample in samples if len(sample.reading.y)])
-    whitened = [_whiten(sample) for sample in samples]
-    whitened += [interval.whitened for interval in intervals]
-    nis = np.array([float(v @ v) for v in whitened])
-    if not np.isfinite(nis).any():
-        raise NetkfError(
-            "there are no readings, or the filter gives no covariance to judge them by"
-        )
-    ends = [interval.end for interval in intervals]
-    times = np.array([sample.reading.time for sample in samples] + ends)
-    interval_nodes = np.array([interval.node for interval in intervals], dtype=np.int64)
-    nodes = np.concatenate([nodes, interval_nodes])
-    order = np.argsort(times, kind="stable")
-    rows = np.array([len(values) for values in whitened])
-    ordered = [whitened[k] for k in order.tolist()]
-    return Innovations(
-        times=times[order],
-        nodes=nodes[order],
-        rows=rows[order],
-        nis=nis[order],
-        whitened=ordered,
-        increments=len(intervals),
-    )
-
-
-def _match_nodes(
-    run: Run, samples: list[RecordedSample]
-) -> tuple[np.ndarray, list[RecordedSample]]:
-    """Return the node of each sample (M,), by its ``sense`` event; -1 if a pooled filter reads."""
-    senses = run.log[run.log["kind"] == CODES["sense"]][["t", "node"]]
-    # A node with several sensors uses them together, and may have an event for each.
-    first = np.ones(len(senses), dtype=bool)
-    first[1:] = senses[1:] != senses[:-1]
-    senses = senses[first]
-    times = np.array([sample.reading.time for sample in samples])
-    # In slots the last readings come after the last state sample, when events are not recorded.
-    if len(senses) <= len(samples) and np.array_equal(senses["t"], times[: len(senses)]):
-        return senses["node"], samples[: len(senses)]
-    return np.full(len(samples), -1), samples
-
-
-def _whiten(sample: RecordedSample) -> FloatArray:
-    """Return the innovation (p,) in units of its covariance; nan without a finite P."""
-    reading, xhat, P = sample
-    if P is None or not np.isfinite(P).all():
-        return np.full(len(reading.y), np.nan)
-    S = reading.H @ P @ reading.H.T + reading.R
-    v = reading.y - reading.H @ xhat
-    return np.asarray(np.linalg.solve(np.linalg.cholesky(S), v))
 
 
 def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:

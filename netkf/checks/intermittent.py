@@ -213,7 +213,6 @@ class IntermittentSamples(SwitchedSamples):
     def _draw_node(
         self, purpose: str, k: int, slots: list[int], samples: int, paths: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the fields of ArrivalSamples for the k-th node of the scenario."""
         scenario = self.scenario
         node = scenario.nodes[k]
         senders = sensing_neighbours(scenario)[node]
@@ -240,7 +239,6 @@ class IntermittentSamples(SwitchedSamples):
 
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
-    """Return the probability that a reading on a direction arrives within its slot."""
     channel = scenario.network.channel
     if not channel.loss.independent:
         raise TheoryError("losses come in bursts or recorded")
@@ -252,7 +250,6 @@ def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
 
 
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:
-    """Check that no P is below that of a filter without losses from the same start."""
     slots = list(check_slots(samples.scenario))
     table, sequences, _ = find_arrivals(samples.scenario, None, slots[-1])
     starts = initial_roots(samples.scenario)[sampled_indices(samples.scenario)]
@@ -318,7 +315,6 @@ def _check_arrival_counts(samples: IntermittentSamples, level: float) -> Finding
 
 
 def _averages_of_paths(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare averages over the slots of one run with those of simulated arrivals."""
     averages, expected = samples.runs.averages, samples.reference.averages
     intervals = [
         (law_distance(averages[:, i], expected[i], level / len(samples.nodes)), f"at node {node}")
@@ -375,7 +371,6 @@ def _mean_diverges(samples: IntermittentSamples, level: float) -> Finding:
 
 
 def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
-    """Return the exact invariant laws of a scalar P, by index of the sampled node."""
     laws, neighbours = {}, sensing_neighbours(scenario)
     if not fixed_readings(scenario).holds:
         return {}
@@ -394,7 +389,6 @@ def _scalar_laws(scenario: Scenario) -> dict[int, ScalarLaw]:
 
 
 def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare how often P falls between the holes of its support with exact probabilities."""
     laws, intervals, tests = _scalar_laws(samples.scenario), [], []
     single_level = level / (len(laws) * (CELLS + 1))
     for k, law in laws.items():
@@ -417,7 +411,6 @@ def _outage_counts(samples: IntermittentSamples, level: float) -> Finding:
 def _law_at_end(
     samples: IntermittentSamples, k: int, law: ScalarLaw
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the exact distribution function of P at the k-th node in the last slot."""
     node = int(sampled_indices(samples.scenario)[k])
     start = float(samples.first_covariances[node, 0, 0])
     return partial(law.cdf_after, slots=check_slots(samples.scenario)[-1], start=start)
@@ -435,7 +428,6 @@ def _outage_edges(law: ScalarLaw) -> FloatArray:
 
 
 def _scalar_law_exact(samples: IntermittentSamples, level: float) -> Finding:
-    """Compare the distribution of a scalar P at the end with its exact law."""
     laws = _scalar_laws(samples.scenario)
     intervals = []
     for k, law in laws.items():

@@ -117,7 +117,6 @@ class PushSumSamples(RunSamples):
 
 
 def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
-    """Check that exchanges conserve mass."""
     drift = np.abs(samples.runs.drift)
     message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
     # Size of the compared values, of the terms whose rounding errors they inherit, and relative
@@ -130,7 +129,6 @@ def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
-    """Compare P of every node at the end with that of the filter with all readings."""
     limit = push_sum_limits(with_promised_filter(samples.scenario)).P
     was_replayed = ~np.isnan(samples.runs.replayed[:, -1, 0, 0, 0])
     P, replayed = samples.runs.P[was_replayed, -1], samples.runs.replayed[was_replayed, -1]
@@ -159,7 +157,6 @@ def _horizon_factor(samples: PushSumSamples, limit: FloatArray) -> float:
 
 @error_test
 def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
-    """Test the null hypothesis that errors at the end have mean 0, in all directions at once."""
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", BIAS_TOLERANCE)
     if not np.isfinite(samples.standardised).all():
@@ -181,7 +178,6 @@ def _check_unbiased(samples: PushSumSamples, level: float) -> Finding:
 @error_test
 @gaussian_test
 def _mean_square(samples: PushSumSamples, level: float) -> Finding:
-    """Test the null hypothesis that mean-square errors at the end are the exact steady ones."""
     if not len(samples.followed):
         return find_unknown("no run has errors that were followed exactly", SQUARE_TOLERANCE)
     squares, weights = samples.ratios
@@ -219,7 +215,6 @@ def _gamma_certified(samples: PushSumSamples, level: float) -> Finding:
 
 
 def _many_steps(samples: PushSumSamples, level: float) -> Finding:
-    """Check that steady covariances and the noise of averaging come to their limits."""
     scenario = with_promised_filter(samples.scenario)
     limits, gamma, distance = large_gamma_limits(scenario), 1, np.inf
     noise_scale = float(np.abs(limits.noise).max())
@@ -367,7 +362,6 @@ def _promises(scenario: Scenario) -> tuple[Promise, ...]:
 
 
 def _every_slot(scenario: Scenario) -> Assumption:
-    """Return the assumption that every node averages and gains in every slot."""
     algorithm: Any = with_promised_filter(scenario).filter.algorithm
     holds = algorithm.stop == "never" and not algorithm.asymptotic
     evidence = "exchanged for ever" if holds else "gains are frozen or taken from the limit"

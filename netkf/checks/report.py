@@ -58,7 +58,6 @@ def _computed_lines(rows: list[Evidence]) -> list[str]:
 
 
 def _summary_lines(verdict: Verdict) -> list[str]:
-    """Return the lines below the table."""
     counts = Counter(row.verdict for row in verdict.rows)
     counted_verdicts = ", ".join(f"{counts[v]} {v}" for v in VERDICTS if counts[v])
     looks = f" at all of {verdict.looks} looks" if verdict.looks > 1 else ""
@@ -85,7 +84,6 @@ def _broken_again(broken: list[Evidence], command: str) -> list[str]:
 
 
 def _describe_row(row: Evidence) -> str:
-    """Return the text below a promise."""
     if row.verdict == NOT_PROMISED:
         return row.assumptions
     parts = [f"needs about {row.needed:,} runs"] if row.needed is not None else []
@@ -100,7 +98,6 @@ def _describe_row(row: Evidence) -> str:
 
 
 def _summarise_row(row: Evidence) -> str:
-    """Return what a row says in short."""
     if row.verdict == NOT_PROMISED or not row.low < row.high:
         return _describe_row(row)
     needed = f"needs about {row.needed:,} runs; " if row.needed is not None else ""
@@ -109,7 +106,6 @@ def _summarise_row(row: Evidence) -> str:
 
 
 def _describe_limits(row: Evidence) -> str:
-    """Return the tolerance and the detectable error of a row in brackets, or an empty text."""
     limits = [f"{row.tolerance:g} is tolerated"] if row.tolerance else []
     if row.detectable > 0.0:
         limits.append(f"an error of {row.detectable:.2g} is detectable")

@@ -61,7 +61,6 @@ def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: st
 
 
 def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str) -> None:
-    """Write the files of a verdict, the JSON with their digests last."""
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
     results = io.BytesIO()
@@ -90,7 +89,6 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
 
 
 def _require_same(path: Path, columns: dict[str, Any]) -> None:
-    """Raise ScenarioError unless the results read back are those that were written."""
     again = _result_columns(tuple(_read_results(path)))
     for name in sorted(columns.keys() | again.keys()):
         one, other = (np.asarray(part.get(name, ())) for part in (columns, again))
@@ -171,7 +169,6 @@ def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
 
 
 def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
-    """Return the results of all replicas as arrays, by name, for a file without pickles."""
     columns = {
         "difference": np.array([result.difference for result in results]),
         "expected": np.array([result.expected for result in results]),

@@ -20,16 +20,11 @@ from netkf.scenario.model import Filtering
 from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, riccati_step
 from netkf.theory.errors import error_squares
-from netkf.theory.hybrid.path_moments import expected_squares
-from netkf.trace.run import Run
 from netkf.trace.schema import KINDS
 
 MAX_ERRORS = 24
-"""Largest number of errors of all nodes whose exact covariance costs about as much as a few runs,
-in slots.
+"""Largest number of errors of all nodes whose exact covariance costs about as much as a few runs.
 """
-MAX_COUPLED = 40
-"""The same number in continuous time, where compiled code integrates the covariance."""
 
 
 class RunMetrics(NamedTuple):
@@ -81,7 +76,8 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
     run = simulate(scenario, seed, replica, engine)
     if run.status != "complete":
         return block_metrics(scenario, seed, range(replica, replica + 1), engine)
-    square = time_average(scenario, _expected_squares(scenario, run))[None]
+    squares = np.trace(error_squares(scenario, run), axis1=2, axis2=3)
+    square = time_average(scenario, squares)[None]
     trace = time_average(scenario, np.trace(run.P, axis1=2, axis2=3))[None]
     counts = np.array([[run.count(kind) for kind in KINDS]])
     return RunMetrics(
@@ -93,24 +89,17 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
     )
 
 
-def _expected_squares(scenario: Scenario, run: Run) -> FloatArray:
-    """Return E|x - xhat_i|^2 (T, N) given the events of a run; raises TheoryError if unknown."""
-    if not scenario.slotted:
-        return expected_squares(scenario, run)
-    return np.asarray(np.trace(error_squares(scenario, run), axis1=2, axis2=3))
-
-
 def expected_errors_known(scenario: Scenario) -> bool:
     """Return True if ``expected_metrics`` take about as long as a few runs."""
     errors = len(scenario.nodes) * scenario.plant.n
-    if not scenario.is_random or errors > (MAX_ERRORS if scenario.slotted else MAX_COUPLED):
+    if not scenario.is_random or errors > MAX_ERRORS:
         return False
     short = scenario
     if not scenario.slotted and isinstance(scenario.probe, float):
         # Whether it is known does not depend on the horizon.
         short = scenario.replace({"horizon": scenario.probe})
     try:
-        _expected_squares(short, simulate(short))
+        error_squares(short, simulate(short))
     except TheoryError:
         return False
     return True

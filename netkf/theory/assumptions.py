@@ -85,7 +85,6 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on the graph and on the filter's weights."""
     topology = scenario.topology
     components = len(topology.components)
     rows: list[AssumptionRow] = [
@@ -108,7 +107,6 @@ def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _reach_row(scenario: Scenario) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that what a node knows can reach all others."""
     import networkx
 
     topology = scenario.topology
@@ -124,7 +122,6 @@ def _reach_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on controllability, observability and the filters' model."""
     plant = scenario.diffusion
     # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
     idle = unobservable_mode(plant.A.T, plant.Q)
@@ -170,7 +167,6 @@ def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
 
 
 def _entries(scenario: Scenario, node: int) -> tuple[int, ...]:
-    """Return the numbers of the [[sensors]] entries of a node."""
     return tuple(placed_sensor.entry for placed_sensor in scenario.placed_sensors.get(node, ()))
 
 
@@ -198,7 +194,6 @@ def _information(scenario: Scenario, entries: tuple[int, ...]) -> np.ndarray:
 
 
 def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on rates and laws of the clocks at which nodes transmit."""
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     if transmits_at_samples(scenario):
@@ -242,7 +237,6 @@ def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on losses, delays and the symmetry of arrivals."""
     channel = scenario.network.channel
     # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
     # fixed delay only shifts it; a random delay or dependent losses do neither.

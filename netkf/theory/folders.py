@@ -6,27 +6,29 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from netkf.algorithms.belief_propagation import is_forest
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.belief_propagation import assumptions as beliefs
 from netkf.theory.common.columns import ErrorColumns
 from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
-from netkf.theory.consensus_innovations import assumptions as pseudo_states
+from netkf.theory.common.plant_assumptions import model_and_start_rows
+from netkf.theory.common.random_links import all_messages_arrive
 from netkf.theory.constant_gain import linear_errors as constant_gains
 from netkf.theory.diffusion import assumptions as diffusion
-from netkf.theory.event_triggered import assumptions as event_triggers
 from netkf.theory.gossip import assumptions as gossip
-from netkf.theory.hybrid import assumptions as hybrid
 from netkf.theory.information_consensus import assumptions as information_consensus
 from netkf.theory.intermittent import assumptions as intermittent
 from netkf.theory.kalman_consensus import linear_errors as kalman_consensus
 from netkf.theory.push_sum import assumptions as push_sum
 from netkf.theory.push_sum.promises import slot_lines, slot_promises
-from netkf.theory.stochastic_trigger import assumptions as stochastic_triggers
-from netkf.theory.stochastic_trigger.errors import error_columns
-from netkf.theory.track_fusion import assumptions as tracks
+from netkf.theory.stochastic_trigger.errors import (
+    UNHEARD,
+    all_hear_all,
+    error_columns,
+    start_alike,
+)
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 from netkf.trace.run import Run
 
@@ -58,22 +60,85 @@ class PaperTheory:
     slot_lines: Callable[[dict[str, Any], Callable[[Any], str]], list[str]] | None = None
 
 
+def _no_loss(scenario: Scenario, source: str, arrives: str, otherwise: str) -> AssumptionRow:
+    """Return the row that no message is lost, with what follows from that and else."""
+    lossless = all_messages_arrive(scenario)
+    return "no message is lost", source, lossless, arrives if lossless else otherwise
+
+
+def _tree_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the row under which P of belief propagation is the covariance of the error."""
+    tree = is_forest(scenario)
+    evidence = "every reading arrives on one way" if tree else "readings return and count again"
+    return [("the graph has no loops", "Weiss and Freeman 2001", tree, evidence)]
+
+
+def _belief_rows(scenario: Scenario) -> list[AssumptionRow]:
+    return model_and_start_rows(scenario, "Weiss and Freeman 2001", *_tree_rows(scenario))
+
+
+def _pseudo_state_rows(scenario: Scenario) -> list[AssumptionRow]:
+    source, otherwise = "Das and Moura 2017", "gains are those without losses"
+    row = _no_loss(scenario, source, "every message arrives in its slot", otherwise)
+    return model_and_start_rows(scenario, source, row)
+
+
+def _event_rows(scenario: Scenario) -> list[AssumptionRow]:
+    source, otherwise = "Battistelli et al. 2018", "a sender does not notice a loss"
+    row = _no_loss(scenario, source, "neighbours have what was sent", otherwise)
+    return model_and_start_rows(scenario, source, row)
+
+
+def _track_rows(scenario: Scenario) -> list[AssumptionRow]:
+    analysis = scenario.node_filter.analysis
+    source, rows = analysis.source, model_and_start_rows(scenario, analysis.source)
+    if analysis.P_by_design[0] != "equal":
+        return rows
+    arrives = "every message arrives in its slot"
+    return [*rows, _no_loss(scenario, source, arrives, "P depends on who is heard")]
+
+
+def _silence_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the rows under which errors under the stochastic trigger are as large as P says."""
+    source, heard, alike = "Han et al. 2015", all_hear_all(scenario), start_alike(scenario)
+    evidence = "silence is a decision" if heard else UNHEARD
+    start = "with the same mean and covariance"
+    if not alike:
+        start = "silence is about the sender's prediction, which is not the hearer's"
+    return model_and_start_rows(
+        scenario,
+        source,
+        ("every node hears every other, without losses", source, heard, evidence),
+        ("all filters have one estimate from the start", source, alike, start),
+    )
+
+
+def _reset_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the row that Pi = I - epsilon L is doubly stochastic, paper H (5)."""
+    algorithm: Any = scenario.filter.algorithm
+    epsilon, degree = algorithm.epsilon, max(scenario.topology.degrees.values())
+    diagonal = 1.0 - epsilon * degree
+    evidence = f"epsilon {epsilon:g}, largest degree {degree}, least diagonal entry {diagonal:.3g}"
+    name = "Pi is doubly stochastic, 0 < epsilon <= 1/max degree"
+    return [(name, "H (5)", diagonal >= -1e-12, evidence)]
+
+
 OF_PAPERS = {
-    "belief_propagation": PaperTheory(beliefs.slot_rows, beliefs.weight_rows),
-    "consensus_innovations": PaperTheory(pseudo_states.slot_rows),
+    "belief_propagation": PaperTheory(_belief_rows, _tree_rows),
+    "consensus_innovations": PaperTheory(_pseudo_state_rows),
     "constant_gain": PaperTheory(
         slot_jumps=constant_gains.slot_jumps, clock_jumps=constant_gains.clock_jumps
     ),
     "diffusion": PaperTheory(diffusion.slot_rows),
-    "event_triggered": PaperTheory(event_triggers.slot_rows),
+    "event_triggered": PaperTheory(_event_rows),
     "gossip": PaperTheory(gossip.slot_rows),
-    "hybrid": PaperTheory(weight_rows=hybrid.weight_rows),
+    "hybrid": PaperTheory(weight_rows=_reset_rows),
     "information_consensus": PaperTheory(information_consensus.slot_rows),
     "intermittent": PaperTheory(intermittent.slot_rows),
     "kalman_consensus": PaperTheory(slot_jumps=kalman_consensus.slot_jumps),
     "push_sum": PaperTheory(push_sum.slot_rows, slot_promises=slot_promises, slot_lines=slot_lines),
-    "stochastic_trigger": PaperTheory(stochastic_triggers.slot_rows, error_columns=error_columns),
-    "track_fusion": PaperTheory(tracks.slot_rows, steady_slots=tracks_in_slots),
+    "stochastic_trigger": PaperTheory(_silence_rows, error_columns=error_columns),
+    "track_fusion": PaperTheory(_track_rows, steady_slots=tracks_in_slots),
 }
 
 

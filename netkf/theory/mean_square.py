@@ -14,15 +14,15 @@ import numpy as np
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.records import Kernels
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.linalg.spectra import contracts, growth_rate
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.alone import silent_jumps
 from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.jumps import ClockJumps, LyapunovInverse, SlotJumps
 from netkf.theory.errors import diagonal_blocks, require_known_filter
 from netkf.theory.folders import LinearErrors, theory_of
+from netkf.theory.intermittent.riccati import steady_covariance
 from netkf.theory.numerics.positive_maps import (
     PositiveMap,
     fixed_point,
@@ -174,7 +174,6 @@ def _choose_solver(
 
 
 def _system_maker(scenario: Scenario) -> Callable[[Scenario], LinearErrors] | None:
-    """Return the function that makes the linear system of a scenario, if there is one."""
     node_filter, paper = scenario.node_filter, theory_of(scenario)
     if not scenario.slotted:
         return paper.clock_jumps
@@ -214,3 +213,32 @@ def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
         lambda X: inverse(system.inflow(X)),
         inverse(stationary[:, None, None] * system.noise),
     )
+
+
+def silent_jumps(scenario: Scenario) -> SlotJumps:
+    """Return the errors of filters in slots that exchange nothing, at their steady gains K (n, p),
+    as a linear system: a matrix I - K H (n, n) for each filter, and the noise of all.
+
+    One block of n errors for each node, or a single block if all nodes share one pooled filter.
+    Gains follow from the R that filters assume, the noise of the readings from the true one.
+    """
+    F, Q = scenario.slot_belief
+    if scenario.node_filter.timing.pooled:
+        model = scenario.pooled_slot_model
+        sensors = [(model.H, model.R)]
+        true = [block_diagonal([scenario.observation_matrices(node)[1] for node in scenario.nodes])]
+    else:
+        sensors = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]
+        true = [scenario.observation_matrices(node)[1] for node in scenario.nodes]
+    gains = [_steady_gain(F, Q, *sensor) for sensor in sensors]
+    closed = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in zip(gains, sensors, strict=True)])
+    noise = block_diagonal([K @ R @ K.T for K, R in zip(gains, true, strict=True)])
+    return SlotJumps(scenario.slot_plant.F, scenario.slot_plant.Q, closed, noise, directions=None)
+
+
+def _steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the gain (n, p) for predictions ``x+ = F x + w``, cov(w) = Q."""
+    if not len(H):
+        return np.zeros((len(F), 0))
+    P = steady_covariance(F, Q, H, R)
+    return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P).T)

@@ -97,7 +97,6 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
 
 
 def _sufficient_link_rate(scenario: Scenario) -> dict[str, Any]:
-    """Return the link rate from which on the steady bound is close to S, or a reason."""
     try:
         if len(scenario.nodes) > MAX_RATE_NODES:
             raise TheoryError(
@@ -217,7 +216,6 @@ def _assumption_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _bound_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
-    """Return the lines on the bounds at the horizon and in the steady state."""
     lines = ["", "trace of the bound on E[P_i]"]
     columns = {
         f"at {scenario.horizon:g} s": promises["bound_at_horizon"],
@@ -251,7 +249,6 @@ def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
 
 
 def _link_rate_line(link_rate: dict[str, Any]) -> str:
-    """Return the line on the link rate from which on the steady bound is close to its limit S."""
     rates = f"{format_number(link_rate['factor'])} times the rates given"
     if link_rate["value"] is not None:
         rates = f"links from {format_number(link_rate['value'])} per second on"
@@ -259,7 +256,6 @@ def _link_rate_line(link_rate: dict[str, Any]) -> str:
 
 
 def _bound_table(scenario: Scenario, columns: list[dict[str, Any]]) -> str:
-    """Return a table of the traces of the bounds on the mean of P, with a row per node."""
     rows = []
     for k, node in enumerate(scenario.nodes):
         traces = [column["trace"][k] if column["trace"] else None for column in columns]

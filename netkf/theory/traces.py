@@ -71,7 +71,6 @@ def _require_small_bound(scenario: Scenario, samples: int) -> None:
 
 
 def _steady_note(scenario: Scenario) -> str:
-    """Return a note for users if the bound on P has no steady state, or if this is not known."""
     if scenario.slotted or reason_without_bound(scenario):
         return ""
     if len(scenario.nodes) * scenario.plant.n**2 > MAX_STEADY_ENTRIES:

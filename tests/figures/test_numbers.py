@@ -8,8 +8,7 @@ import scipy.stats
 
 import netkf
 from netkf.algorithms.models import FlowModel
-from netkf.checks.increments import ExpectedIncrements
-from netkf.checks.innovations import autocorrelation, compute_innovations
+from netkf.checks.innovations import ExpectedIncrements, autocorrelation, compute_innovations
 from netkf.figures.traffic import age_of_information, messages_by_direction, wilson_interval
 from netkf.studies.consistency import run_consistency
 from tests.conftest import SCENARIOS

@@ -68,7 +68,6 @@ def event_fault(scenario: Scenario, run: Run) -> str:
 
 
 def _describe(log: IntArray, row: int) -> str:
-    """Return a text about a row of the log, with its kind, time, node and peer."""
     event = log[row]
     names = [f"node {event['node']}"] if event["node"] >= 0 else []
     names += [f"peer {event['peer']}"] if event["peer"] >= 0 else []
@@ -81,7 +80,6 @@ def _first(wrong: np.ndarray) -> int | None:
 
 
 def _ordered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault if times decrease, or events of one instant are not in order."""
     if (row := _first(~np.isfinite(log["t"]) | (log["t"] < 0.0))) is not None:
         yield f"{_describe(log, row)} has no time of the run"
     if (row := _first(np.diff(log["t"]) < 0.0)) is not None:
@@ -107,7 +105,6 @@ def _ordered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _ordered_steps(log: Any) -> Iterator[str]:
-    """Yield a fault if a step of an exchange in slots has events out of their order."""
     # A message that takes time may arrive in a later exchange, where it is late.
     rows = np.flatnonzero((log["phase"] >= 0) & (log["kind"] != LATE))
     steps = np.cumsum(log["kind"][rows] == ROUND)
@@ -127,7 +124,6 @@ def _keys(log: Any, senders: np.ndarray, receivers: np.ndarray) -> IntArray:
 
 
 def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless messages and transmissions are numbered from 0 in order."""
     links = set(scenario.topology.directions)
     for kind in (SEND, TRANSMIT):
         rows = np.flatnonzero(log["kind"] == kind)
@@ -146,7 +142,6 @@ def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each message is lost at once, or arrives once when its age says."""
     send_rows = np.flatnonzero(log["kind"] == SEND)
     sends = log[send_rows]
     ends = np.flatnonzero(np.isin(log["kind"], (DELIVER, LOST, LATE)))
@@ -190,7 +185,6 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each node that messages reach at one instant (in slots."""
     kinds = log["kind"]
     if scenario.slotted and isinstance(scenario.network.activation, Matching):
         swaps, arrivals = (np.flatnonzero(kinds == kind) for kind in (SWAP, DELIVER))
@@ -233,7 +227,6 @@ def _compare_times(
 
 
 def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless nodes sense on their grid and at samples drawn again."""
     if run.status != "complete":
         return
     sampled = scenario.sample_times(Streams(run.seed, run.replica))
@@ -251,7 +244,6 @@ def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless clocks tick at the times drawn again, in order of clocks."""
     clock = scenario.network.activation
     silent = not scenario.node_filter.timing.talks or run.status != "complete"
     if silent or not isinstance(clock, LinkClock) or isinstance(clock, OnReadings):
@@ -277,7 +269,6 @@ def _ticked(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _caused(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each message follows its cause, which sends to all receivers."""
     kinds = log["kind"]
     clock: Any = scenario.network.activation
     by_link = getattr(clock, "at", "links") in ("links", "directions")
@@ -312,12 +303,10 @@ def _caused(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _slots(scenario: Scenario) -> int:
-    """Return the number of slots that begin before the horizon."""
     return math.ceil(scenario.horizon / scenario.slot_plant.period * (1.0 - 1e-12) - 1e-9)
 
 
 def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless each node with sensors senses once in every slot."""
     if run.status != "complete" or "sense" not in (scenario.node_filter.timing.schedule or ()):
         return
     first = 0 if scenario.node_filter.timing.predicts else 1
@@ -331,7 +320,6 @@ def _read_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
 
 
 def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
-    """Yield a fault unless all nodes, or drawn pairs, send in every step."""
     algorithm, activation = scenario.node_filter, scenario.network.activation
     if run.status != "complete" or not algorithm.timing.talks or may_be_silent(algorithm):
         return

@@ -136,7 +136,6 @@ def _summary_fault(run: Run, stored: StoredRun) -> str:
 
 
 def _transmissions(run: Run) -> dict[int, int]:
-    """Return the number of transmissions of each node."""
     rows = run.log[np.isin(run.log["kind"], (CODES["send"], CODES["transmit"], CODES["round"]))]
     sends = rows["kind"] == CODES["send"]
     broadcasts = rows["node"][rows["kind"] == CODES["transmit"]]
@@ -150,7 +149,6 @@ def _transmissions(run: Run) -> dict[int, int]:
 
 
 def _averages_fault(run: Run, summary: dict[str, Any], rows: dict[int, Any]) -> str:
-    """Return a fault of the averages over time."""
     after = run.times > 0.0
     after = after if after.any() else np.ones(len(run.times), dtype=bool)
     blurred_from = summary.get("rounding_from")

@@ -114,7 +114,6 @@ def record_promises(audits: Sequence[Audit]) -> tuple[Promise, ...]:
 
 
 def _find_fault(audits: Sequence[Audit], name: str, looked: int, what: str) -> Finding:
-    """Return the finding on one entry of the audits: broken if it names a fault in any run."""
     entries = [(k, getattr(audit, name)) for k, audit in enumerate(audits) if audit.looked[looked]]
     known = [(k, entry) for k, entry in entries if not entry.startswith(UNKNOWN)]
     if not known:
@@ -136,22 +135,18 @@ def _events(audits: Sequence[Audit], level: float) -> Finding:
 
 
 def _samples(audits: Sequence[Audit], level: float) -> Finding:
-    """Check true states and errors, see :func:`_events`."""
     return _find_fault(audits, "samples", 0, "status, times, x drawn again, and x - xhat")
 
 
 def _start(audits: Sequence[Audit], level: float) -> Finding:
-    """Check the samples at time 0, see :func:`_events`."""
     return _find_fault(audits, "start", 1, "xhat and P at time 0, and weights,")
 
 
 def _engines(audits: Sequence[Audit], level: float) -> Finding:
-    """Compare both engines, see :func:`_events`."""
     return _find_fault(audits, "engines", 1, "events to the bit, xhat and P to rounding,")
 
 
 def _files(audits: Sequence[Audit], level: float) -> Finding:
-    """Compare files with the run in memory, see :func:`_events`."""
     return _find_fault(audits, "files", 1, "tables, manifest, counts and averages")
 
 

@@ -46,7 +46,6 @@ def sample_fault(scenario: Scenario, run: Run, seed: int, replica: int) -> str:
 
 
 def _status_fault(scenario: Scenario, run: Run) -> str:
-    """Return a fault of the status, the fingerprint or the sample times of a run."""
     diverged = run.log[run.log["kind"] == CODES["diverged"]]
     if (run.status == "diverged") != bool(len(diverged)):
         return f"status {run.status} with {len(diverged)} events that say diverged"
@@ -61,7 +60,6 @@ def _status_fault(scenario: Scenario, run: Run) -> str:
 
 
 def _truth_fault(scenario: Scenario, run: Run) -> str:
-    """Return a fault if true states are not those that the plant draws from the run's streams."""
     expected, allowed = drawn_states(scenario, run.seed, run.replica, run.times)
     gap = np.nan_to_num(np.abs(run.x - expected).max(axis=1, initial=0.0), nan=np.inf)
     if not (gap > allowed).any():
@@ -104,7 +102,6 @@ def drawn_states(
 
 
 def _error_fault(run: Run) -> str:
-    """Return a fault if errors are not x - xhat up to the rounding of these."""
     with np.errstate(over="ignore", invalid="ignore"):
         gap = np.abs(run.x[:, None] - run.xhat - run.error)
         size = np.abs(run.x).max(axis=1)[:, None] + np.abs(run.xhat).max(axis=2)

@@ -21,8 +21,7 @@ from netkf.theory.common.columns import ErrorColumns
 from netkf.theory.common.forms import MEAN, Forms
 from netkf.theory.common.increments import IncrementFlows, increment_flows
 from netkf.theory.common.linear_verbs import LinearVerbs
-from netkf.theory.common.observations import timed_observations
-from netkf.theory.numerics.observations import Observation
+from netkf.theory.common.observations import Observation, timed_observations
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -96,7 +95,6 @@ class ClockColumns(ErrorColumns):
         }
 
     def _laws_of_gaps(self) -> dict[float, tuple[FloatArray, FloatArray]]:
-        """Return F and the root of the noise of the plant, by gap between readings or samples."""
         times = np.unique([0.0, *self._samples, *self._run.times.tolist()])
         gaps = np.unique(np.diff(times))
         return dict(
@@ -120,7 +118,6 @@ class ClockColumns(ErrorColumns):
             yield
 
     def _apply(self, time: float, kind: int, node: int, peer: int, message: int) -> None:
-        """Repeat one row of the log."""
         if kind == SENSE:
             self._sense(0 if self._scenario.node_filter.timing.pooled else self._index[node], time)
         elif kind == TRANSMIT and self._shared:
@@ -163,7 +160,6 @@ class ClockColumns(ErrorColumns):
             self._move_origin()
 
     def _move_origin(self) -> None:
-        """Make the true state the origin of all estimates."""
         forms, scenario = self._forms_of_all, self._scenario
         offset = -forms.table[self._x, : forms.used]
         for h in range(self.estimators):
@@ -192,7 +188,6 @@ class ClockColumns(ErrorColumns):
         return gap
 
     def _sense(self, h: int, time: float) -> None:
-        """Update node h with all its samples of this instant, once."""
         observation: Observation | None = self._samples.get(time, {}).pop(h, None)
         if observation is None or not len(observation.H):
             return
@@ -224,7 +219,6 @@ class ClockColumns(ErrorColumns):
         return self._whitened[key][1:]
 
     def _send(self, key: tuple[int, int, int], time: float) -> None:
-        """Send one message, if it will arrive."""
         node, peer, number = key
         h, filters, forms = self._index[node], self._filters, self._forms_of_all
         arrives = key in self._delivered
@@ -267,7 +261,6 @@ class ClockColumns(ErrorColumns):
             self._free.append(m)
 
     def _absorb(self, node: int, time: float) -> None:
-        """Let a node absorb all messages of this instant."""
         h, filters, scenario = self._index[node], self._filters, self._scenario
         run, forms, grid = filters.run, self._forms_of_all, scenario.time_grid
         gap = self._gap(h, time)
@@ -314,12 +307,10 @@ def has_clock_columns(scenario: Scenario) -> bool:
 
 
 def _columns_of(run: Run) -> list[list[Any]]:
-    """Return the columns of the log that are used."""
     return [run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message")]
 
 
 def _delivered(log: list[list[Any]]) -> set[tuple[int, int, int]]:
-    """Return the messages that arrive: sender, receiver and number of each."""
     return {
         (peer, node, message)
         for _, kind, node, peer, message in zip(*log, strict=True)

@@ -206,7 +206,6 @@ class DelayedJumps:
 
     @cached_property
     def _lyapunov(self) -> LyapunovInverse:
-        """Inverse of the Lyapunov map of the mean drift."""
         return LyapunovInverse(self._mean[0][None])
 
     def _solve_without_messages(self, right: FloatArray) -> FloatArray:
@@ -217,7 +216,6 @@ class DelayedJumps:
 
     @cached_property
     def _factors(self) -> dict[bool, Any]:
-        """Cache of the LU factors of a small problem, by whether it has jumps."""
         return {}
 
     def _by_elimination(self, right: FloatArray, jumps: bool) -> FloatArray:

@@ -28,7 +28,8 @@ class IncrementFlows(NamedTuple):
              propagated together
     reading : the estimators in them, which read increments
     plant : the flow of the true state
-    follows : whether errors depend on the state, because the filters' A is not the plant's
+    follows : whether errors depend on the state, because the filters' A is not the plant's: flows
+              are then those of the state and the error together, of which only the error has a P
     """
 
     groups: list[tuple[ErrorFlow, IntArray]]
@@ -58,22 +59,23 @@ class IncrementFlows(NamedTuple):
         # The plant's noise at the 8 nodes of the quadrature enters all errors; the noises of the
         # increments take n inputs for each estimate.
         n, common = len(state), self.plant.inputs
-        first = forms.inputs(common + n * len(self.reading))
+        size = 2 * n if self.follows else n
+        first = forms.inputs(common + size * len(self.reading))
         used, noise = forms.used, first + common
         x = forms.table[state, :used]
         F, response = self.plant(gap)
         moved = F @ x
         moved[:, first:noise] += response
         for flow, members in self.groups:
-            errors = x - forms.table[estimates[members].reshape(-1), :used].reshape(-1, n, used)
-            own = np.ascontiguousarray(roots[members])
-            if self.follows:
-                flow.follow(errors, own, x, gap, (first, noise))
-            else:
-                flow.move(errors, own, gap, (first, noise))
-            roots[members] = own
-            forms.table[estimates[members].reshape(-1), :used] = (moved - errors).reshape(-1, used)
-            noise += n * len(members)
+            rows, own = estimates[members].reshape(-1), np.zeros((len(members), size, size))
+            errors = np.empty((len(members), size, used))
+            errors[:, :n] = x
+            errors[:, -n:] = x - forms.table[rows, :used].reshape(-1, n, used)
+            own[:, -n:, -n:] = roots[members]
+            flow.move(errors, own, gap, (first, noise))
+            roots[members] = own[:, -n:, -n:]
+            forms.table[rows, :used] = (moved - errors[:, -n:]).reshape(-1, used)
+            noise += size * len(members)
         forms.table[state, :used] = moved
 
 
@@ -99,7 +101,13 @@ def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | Non
         raise TheoryError("the exact errors of this filter are known for sampled sensors")
     A, Q = scenario.belief
     plant = (scenario.diffusion.A, scenario.diffusion.B)
-    B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
+    B, noise = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q), plant[1]
+    follows = not np.array_equal(A, plant[0])
+    if follows:
+        # d(x, e) = (A x, (A - A_f) x + (A_f - L H) e) dt + (B, B) dw, less the noise of L dv in e.
+        zero, noise = np.zeros_like(A), np.concatenate([plant[1], plant[1]])
+        B = np.concatenate([np.zeros_like(B), B])
+        A = np.block([[plant[0], zero], [plant[0] - A, A]])
     members: dict[bytes, list[int]] = {}
     flows: dict[bytes, ErrorFlow] = {}
     for h, observation in enumerate(observations[:estimators]):
@@ -109,7 +117,10 @@ def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | Non
         key = b"|".join(part.tobytes() for part in observation)
         members.setdefault(key, []).append(h)
         if key not in flows:
-            flows[key] = ErrorFlow(A, B, observation.H, observation.R, observation.root, plant)
+            H = observation.H
+            if follows:
+                H = np.concatenate([np.zeros_like(H), H], axis=1)
+            flows[key] = ErrorFlow(A, B, H, observation.R, observation.root, noise)
     groups = [(flows[key], np.array(members[key])) for key in flows]
     reading = [h for indices in members.values() for h in indices]
-    return IncrementFlows(groups, reading, StateFlow(*plant), not np.array_equal(A, plant[0]))
+    return IncrementFlows(groups, reading, StateFlow(*plant), follows)

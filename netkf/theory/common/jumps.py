@@ -133,7 +133,6 @@ class ClockJumps:
 
     @cached_property
     def _chains(self) -> list[IntArray]:
-        """The indices, by clock, of the bursty chains that make a step at its ticks."""
         assert self.directions is not None
         return [
             np.unique(self.directions.source[tick_directions]) for _, tick_directions in self.ticks

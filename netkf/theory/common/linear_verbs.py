@@ -153,7 +153,6 @@ def prober(kernels: Kernels, moves: bool) -> Any:
 
     @kernel
     def run_verb(record: Any, run: Any, verb: int, h: int, m: int) -> None:
-        """Run a verb."""
         if verb == UPDATE:
             update(record, h, run)
         elif verb == EMIT:
@@ -163,7 +162,6 @@ def prober(kernels: Kernels, moves: bool) -> Any:
 
     @kernel
     def move(record: Any, run: Any, verb: int, h: int, m: int) -> None:
-        """Move a node or a message with the origin."""
         if verb == SHIFT:
             shift(record, h, run)
         else:
@@ -265,13 +263,11 @@ class LinearVerbs:
         self._fit_blocks(8)
 
     def _view(self, name: str) -> np.ndarray:
-        """Return the view of an array in the store."""
         shape, begin = self._shapes[name], self._begin[name]
         words = self._stored[begin : begin + math.prod(shape)]
         return words.view(self._dtypes[name]).reshape(shape)
 
     def _set_means(self, arrays: dict[str, np.ndarray]) -> None:
-        """Give the forms the means of what filters start with."""
         for name, array in arrays.items():
             difference = (array[0] - self._view(name)).reshape(-1)
             words = self._begin[name] + np.flatnonzero(difference)
@@ -341,11 +337,9 @@ class LinearVerbs:
 
     @property
     def _record_room(self) -> int:
-        """Past events for which there is room."""
         return int(self._shapes[self._past[0]][1])
 
     def _double_past(self) -> None:
-        """Make room for twice as many past events."""
         arrays = {name: self._view(name).copy() for name in self._begin}
         rows = {
             name: self._row[begin : begin + math.prod(self._shapes[name])].reshape(

@@ -7,20 +7,41 @@ run.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, as_kernel_array
+from netkf.linalg.arrays import FloatArray, as_kernel_array, block_diagonal
 from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
-from netkf.scenario.sampling import (
-    sample_path,
-    sample_times,
-)
+from netkf.scenario.sampling import sample_path, sample_times
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.observations import Observation, stack_observations
 from netkf.trace.run import Run
+
+
+class Observation(NamedTuple):
+    """Readings at one instant.
+
+    H    : (p, n)
+    R    : (p, p) noise covariance that the filter assumes
+    root : (p, p) a square root of the true noise covariance
+    """
+
+    H: FloatArray
+    R: FloatArray
+    root: FloatArray
+
+
+def stack_observations(observations: list[Observation], n: int) -> Observation:
+    """Join ``observations`` of a state (n,) with independent noises into one: H (p, n) stacked, R
+    and root (p, p) block diagonal, for p readings together.
+    """
+    if len(observations) == 1:
+        return observations[0]
+    H = np.concatenate([np.zeros((0, n)), *(observation.H for observation in observations)])
+    R, root = (block_diagonal([observation[k] for observation in observations]) for k in (1, 2))
+    return Observation(H, R, root)
+
 
 EstimatorObservations = dict[int, Observation]
 """Observations by the index of the estimator that uses them."""
@@ -75,7 +96,6 @@ def increment_observations(scenario: Scenario) -> list[Observation]:
 
 
 def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
-    """Return True if all observations are of the same arrays."""
     return len(some) == len(others) and all(
         a is b
         for one, other in zip(some, others, strict=True)

@@ -274,12 +274,10 @@ def _source_of(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
 
 
 def _all_sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the links with draws (and channel states) of their own, in order."""
     return list(dict.fromkeys(_source_of(scenario, link) for link in links))
 
 
 def _fail_together(scenario: Scenario) -> bool:
-    """Return True if both directions of a link are activated, and lost, together."""
     at = getattr(scenario.network.activation, "at", "links")
     return scenario.network.channel.symmetric and at == "links"
 

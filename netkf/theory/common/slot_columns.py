@@ -24,8 +24,7 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.lanes import LANES, blocks_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns, padded
-from netkf.theory.common.observations import slot_observations
-from netkf.theory.numerics.observations import Observation
+from netkf.theory.common.observations import Observation, slot_observations
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -69,7 +68,6 @@ class SlotColumns(ErrorColumns):
         self._filters = self._begin()
 
     def _begin(self) -> SlotFilters:
-        """Return the filters at time 0: those of the column of means have theirs."""
         setup = self._setup
         columns = self._x.shape[1]
         filters = SlotFilters(setup, self._kernels, blocks_of(columns), with_means=False)
@@ -102,7 +100,6 @@ class SlotColumns(ErrorColumns):
             yield
 
     def _move_truth(self) -> None:
-        """Move the true state by one slot, with a column for each noise of the plant."""
         self._x = np.column_stack([self._F @ self._x, self._noise])
         self._fit(self._x.shape[1])
 

@@ -130,7 +130,6 @@ def _error_flow(scenario: Scenario) -> JointErrorFlow:
 
 
 def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
-    """Return the sensors that take samples, node by node."""
     gains, sampled_nodes = _node_gains(scenario), []
     for k, node in enumerate(scenario.nodes):
         for placed_sensor in scenario.sampled_sensors.get(node, ()):

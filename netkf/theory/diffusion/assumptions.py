@@ -52,7 +52,6 @@ def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
 
 
 def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, on balanced weights and strong connection."""
     W = sparse_weights(scenario)
     W.eliminate_zeros()
     unbalanced = float(np.abs(W.sum(axis=1) - 1.0).max())
@@ -97,7 +96,6 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows that the parameter is a random walk, and on Q and r of the filters."""
     plant = scenario.slot_plant
     F, Q = scenario.slot_belief
     smallest = float(np.linalg.eigvalsh(Q)[0])
@@ -153,7 +151,6 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row that every message arrives in time, so that weights are fixed."""
     if is_recorded(scenario.network.channel):
         return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
     all_arrive = all_messages_arrive(scenario)

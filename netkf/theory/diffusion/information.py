@@ -230,7 +230,6 @@ def _levels(sources: list[_Source], past: list[FloatArray], window: int) -> Floa
 
 
 def _group_by_kind(sources: list[_Source]) -> list[list[int]]:
-    """Return the indices of the sources with the same A, C and drive."""
     groups: dict[tuple[bytes, ...], list[int]] = {}
     for k, source in enumerate(sources):
         key = tuple(part.tobytes() for part in (source.A, source.C, source.drive))

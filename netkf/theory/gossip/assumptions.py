@@ -32,7 +32,6 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _matching_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row that the mean matching is irreducible and aperiodic, G C.1."""
     name = "the mean matching is irreducible and aperiodic"
     try:
         mean = _mean_swaps(scenario)
@@ -61,7 +60,6 @@ def _mean_swaps(scenario: Scenario) -> FloatArray:
 
 
 def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row of weak detectability, G D.1: readings along some walk suffice."""
     name = "some walk on the network detects the state (weak detectability)"
     try:
         walk = detecting_walk(scenario)
@@ -82,7 +80,6 @@ def _walk_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _swap_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the row that every exchange is a swap, also where messages are lost."""
     channel = scenario.network.channel
     # A swap needs both messages: if one is lost, its pair exists twice and the other is gone.
     # The exact class: one that derives from it may lose messages.

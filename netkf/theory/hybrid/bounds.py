@@ -20,10 +20,10 @@ from netkf.algorithms.kernels.riccati import RiccatiTable, propagate_riccati, ri
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.observations import Observation
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.taylor import StiffError, solve_by_taylor_series
-from netkf.theory.numerics.observations import Observation
 
 TOLERANCE = 1e-10  # relative, of the solver
 DEFECT_TOLERANCE = 1e-7  # relative, of the finished solution

@@ -22,7 +22,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import sample_path, sample_times
 from netkf.scenario.scenario import Scenario
-from netkf.theory.numerics.observations import Observation, stack_observations
+from netkf.theory.common.observations import Observation, stack_observations
 
 
 class PoissonSamples(NamedTuple):

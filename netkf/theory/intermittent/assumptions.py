@@ -65,7 +65,6 @@ def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows that readings arrive independently, and often enough."""
     channel = scenario.network.channel
     loss = channel.loss
     # R (12) needs independent arrivals of positive probability.

@@ -139,7 +139,6 @@ def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:
 
 
 def _triangle_indices(shape: Shape) -> tuple[IntArray, IntArray, IntArray]:
-    """Return matrices, rows and columns of the entries in S upper triangles."""
     rows, columns = np.triu_indices(shape[-1])
     matrices = np.repeat(np.arange(shape[0]), len(rows))
     return matrices, np.tile(rows, shape[0]), np.tile(columns, shape[0])

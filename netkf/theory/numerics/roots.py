@@ -7,14 +7,12 @@ updated by orthogonal triangularisation (Kailath, Sayed and Hassibi 2000, Linear
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.small import copy_matrix, solve_inplace
+from netkf.linalg.small import solve_inplace
 
 
 @kernel
@@ -31,18 +29,6 @@ def triangularise(factor: FloatArray, n: int, columns: int) -> None:
         # Exact zeros right of the diagonal, and in columns that are not part of the product.
         for c in range(min(i + 1, columns), max(n, columns)):
             factor[i, c] = 0.0
-
-
-@kernel(allocates=True)
-def triangular(factor: FloatArray) -> FloatArray:
-    """Return the lower triangular S (n, n) with ``S S' = factor factor'`` for ``factor``
-    (n, at least n).
-    """
-    n, scratch = factor.shape[0], factor.copy()
-    triangularise(scratch, n, factor.shape[1])
-    root = np.empty((n, n))
-    _keep_root(root, scratch)
-    return root
 
 
 @kernel
@@ -114,49 +100,6 @@ def exponential(series: FloatArray, share: float) -> FloatArray:
                 total = total * share + series[term, i, j]
             E[i, j] = total
     return E
-
-
-@kernel(allocates=True)
-def discretise(
-    series: FloatArray,
-    unit: float,
-    B: FloatArray,
-    gap: float,
-    quadrature: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A gap)`` (d, d) and the root (d, d) of the covariance that B dw adds over
-    ``gap`` seconds.
-
-    ``series`` (T, d, d) are the terms of exp(A s) in s / ``unit``, which hold for s up to ``unit``
-    seconds; B is (d, m); ``quadrature`` the nodes and weights (K,) on [0, 1].
-    """
-    # The series holds up to one unit: discretise a short step, then double it.
-    short, doublings = gap, 0
-    while short > unit:
-        short, doublings = 0.5 * short, doublings + 1
-    nodes, weights = quadrature
-    d, m = B.shape
-    columns = max(len(nodes) * m, 2 * d)
-    factor = np.zeros((d, columns))
-    for k in range(len(nodes)):
-        # The noise covariance is the integral of exp(A s) B B' exp(A s)': its root has a block for
-        # each node of the quadrature.
-        E = exponential(series, (1.0 - nodes[k]) * short / unit)
-        _add_product(factor, k * m, E, B, math.sqrt(weights[k] * short))
-    F, root, square = exponential(series, short / unit), np.empty((d, d)), np.empty((d, d))
-    triangularise(factor, d, columns)
-    _keep_root(root, factor)
-    for _ in range(doublings):
-        # Q(2 s) = F Q(s) F' + Q(s)
-        _multiply_into(factor, F, root)
-        for i in range(d):
-            for j in range(d):
-                factor[i, d + j] = root[i, j]
-        triangularise(factor, d, 2 * d)
-        _keep_root(root, factor)
-        _multiply_into(square, F, F)
-        copy_matrix(F, square)
-    return F, root
 
 
 @kernel(allocates=True)
@@ -302,7 +245,7 @@ def flow_estimates(
     errors: FloatArray,
     roots: FloatArray,
     columns: tuple[int, int],
-    flow: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
+    flow: tuple[FloatArray, ...],
     exponential: tuple[FloatArray, float, float],
     gap: float,
     quadrature: tuple[FloatArray, FloatArray],

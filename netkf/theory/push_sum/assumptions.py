@@ -37,7 +37,6 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on controllability, observability and the filters' model."""
     F, Q = scenario.slot_belief
     # (F, Q^1/2) is controllable if and only if (F', Q) is observable.
     idle = unobservable_mode(F.T, Q)
@@ -58,7 +57,6 @@ def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _observability_row(scenario: Scenario) -> AssumptionRow:
-    """Return the row that all sensors together observe every mode of the plant."""
     F, _ = scenario.slot_belief
     informations = [model.information for model in scenario.slot_models]
     hidden = unobservable_mode(F, np.sum(informations, axis=0))
@@ -72,7 +70,6 @@ def _observability_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, about the graph and the losses of links."""
     law: Averaging | None  # with which probabilities links are up; None if there is no such law
     try:
         law, reason = averaging_law(scenario), ""
@@ -87,7 +84,6 @@ def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _graph_row(scenario: Scenario) -> AssumptionRow:
-    """Return the assumption, as a row of the table, that the graph is undirected and connected."""
     topology = scenario.topology
     components = len(topology.components)
     return (
@@ -115,7 +111,6 @@ def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> 
 
 
 def _joint_failure_row(scenario: Scenario, law: Averaging | None) -> AssumptionRow:
-    """Return the row that both directions of a link fail together."""
     joint = scenario.network.channel.symmetric
     if law is not None:
         # Both directions have one probability, and each is up exactly if both are.
@@ -143,7 +138,6 @@ def _connection_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on the consensus gain delta of z <- (I - L / delta) z."""
     # One step multiplies disagreement by I - L / delta, of norm below 1 for delta > rho(L) / 2.
     delta, bound = push_sum_filter(scenario).delta, consensus_gain_bound(scenario)
     local = f"nodes can tell from degrees that rho(L) <= {min(bound.local, bound.nodes)}"
@@ -186,7 +180,6 @@ def _stop_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _moment_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows on bounded means and mean squares: exact, and as certified."""
     return [
         _exact_row(
             ("the estimates become unbiased", "P (30), derived"),

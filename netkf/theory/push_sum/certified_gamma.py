@@ -59,7 +59,6 @@ def gamma_constants(scenario: Scenario) -> GammaConstants:
 
 @lru_cache(maxsize=8)
 def _bound_constants(scenario: Scenario) -> GammaConstants:
-    """Return the constants of :func:`gamma_constants`, cached for both theorems."""
     steps = estimation_steps(scenario)
     law, P, N = steps.averaging, steps.limits.P, steps.limits.N
     _require_conditions(scenario, law, P)
@@ -100,7 +99,6 @@ def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> No
 
 
 def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
-    """Return p_d, or the upper end of its interval where it is only estimated."""
     links, nodes = law.links, scenario.nodes
     up = {(nodes[i], nodes[j]): float(p) for (i, j), p in zip(links, law.both, strict=True)}
     return disconnection_probability(scenario.topology, up).high
@@ -126,7 +124,6 @@ def minimum_gamma(scenario: Scenario, moment: Moment = "mean", sharp: bool = Fal
     test = {"mean": theorem_5, "mean-square": theorem_6}[_check_moment(moment)]
 
     def certified(gamma: int) -> bool:
-        """Return True if the theorem's bound on the error dynamics contracts with this gamma."""
         return test(constants, bound, gamma) < 1.0
 
     return _least_certified(certified, constants)
@@ -224,7 +221,6 @@ def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
 
 
 def _spectral_radius(matrix: list[list[float]]) -> float:
-    """Return the spectral radius of a small matrix."""
     return float(np.abs(np.linalg.eigvals(np.array(matrix))).max())
 
 

@@ -91,7 +91,6 @@ def disconnection_probability(
 
 @lru_cache(maxsize=8)
 def _scenario_probability(scenario: Scenario, seed: int, samples: int | None) -> Probability:
-    """Return p_d of a scenario, cached: assumptions and promises both use it."""
     return _probability(*_link_probabilities(scenario, None), seed, samples)
 
 
@@ -147,7 +146,6 @@ def _nodes_and_links(graph: Any) -> tuple[list[Any], list[Edge]]:
 
 
 def _read_graph(graph: Any) -> tuple[list[Any], list[Edge], bool]:
-    """Return nodes and links of a networkx graph or of pairs of nodes, and if it is directed."""
     import networkx
 
     if isinstance(graph, networkx.Graph):
@@ -192,7 +190,6 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
 
 
 def _is_connected(neighbours: list[dict[int, float]]) -> bool:
-    """Return True if the links connect all nodes."""
     reached, waiting = {0}, [0]
     while waiting:
         for node in neighbours[waiting.pop()].keys() - reached:

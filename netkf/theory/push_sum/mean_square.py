@@ -43,7 +43,6 @@ def push_sum_radius(scenario: Scenario) -> float:
 
 @lru_cache(maxsize=8)
 def _cached_radius(scenario: Scenario) -> float:
-    """Return :func:`push_sum_radius`, cached for tables and covariance."""
     return radius(estimation_steps(scenario))
 
 

@@ -35,20 +35,16 @@ def slot_promises(scenario: Scenario) -> dict[str, Any]:
     """
 
     def limit() -> float:
-        """Return the trace of P_inf, to which P of every node tends."""
         return float(np.trace(push_sum_limits(scenario).P))
 
     def central() -> float:
-        """Return the trace of the steady covariance of the Kalman filter with all readings."""
         return float(np.trace(central_covariance(scenario)))
 
     def by_node() -> list[float]:
-        """Return the trace of the error covariance of each node."""
         covariance = push_sum_error_covariance(scenario)
         return [float(trace) for trace in np.trace(covariance, axis1=1, axis2=2)]
 
     def cut() -> list[float]:
-        """Return the interval of the probability that failing links disconnect the network."""
         probability = disconnection_probability(scenario)
         return [probability.low, probability.high]
 
@@ -92,7 +88,6 @@ def _leader_slots(scenario: Scenario) -> int:
 
 
 def _value_or_reason(function: Callable[[], Any]) -> dict[str, Any]:
-    """Return the value of a function, or the reason why there is none."""
     try:
         return {"value": function(), "reason": None}
     except TheoryError as error:
@@ -110,19 +105,16 @@ def slot_lines(results: dict[str, Any], number: Callable[[Any], str]) -> list[st
         return value["reason"] or make(value["value"])
 
     def errors(traces: list[float]) -> str:
-        """Return mean and range of traces as text."""
         # The central trace is None where the central filter has no steady covariance.
         mean, central = float(np.mean(traces)), results["central_trace"]["value"]
         ratio = f", {mean / central:.4g} times the central one" if central else ""
         return f"mean {number(mean)}, from {number(min(traces))} to {number(max(traces))}{ratio}"
 
     def interval(ends: list[float]) -> str:
-        """Return an interval as text, one number if both ends are equal."""
         low, high = ends
         return number(low) if low == high else f"{number(low)} .. {number(high)} (simulated)"
 
     def corollary(results: dict[str, float]) -> str:
-        """Return the verdict on gamma as text."""
         verdict = "too few" if results["gamma"] < results["needed"] else "enough"
         return f"{results['gamma']}, where rho(A_R) is {number(results['radius'])}: {verdict}"
 

@@ -19,10 +19,8 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns
 from netkf.theory.common.forms import MEAN, Forms
-from netkf.theory.common.observations import slot_observations
+from netkf.theory.common.observations import Observation, slot_observations
 from netkf.theory.common.random_links import all_messages_arrive
-from netkf.theory.numerics.observations import Observation
-from netkf.theory.numerics.prediction import triangular_root
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -102,7 +100,6 @@ class ScheduleColumns(ErrorColumns):
         self._add(noise)
 
     def _use(self, observation: Observation) -> None:
-        """Update the error and the root of P by a reading."""
         if not len(observation.H):
             return
         gain, self._root = measurement_update(self._root, observation)
@@ -120,6 +117,14 @@ class ScheduleColumns(ErrorColumns):
         """Store the present errors for ``law``."""
         error = self._table.freeze(self._table.table[self._e, : self._table.used])
         self._kept.append(np.tile(error, (self.estimators, 1)))
+
+
+def triangular_root(factor: FloatArray) -> FloatArray:
+    """Return the lower triangular S (n, n) with ``S S' = factor factor'``, of a ``factor`` (n, k)
+    with k >= n columns.
+    """
+    # factor' = Z U, so factor factor' = U' U.
+    return cast(FloatArray, np.linalg.qr(factor.T, mode="r")).T
 
 
 def measurement_update(root: FloatArray, observation: Observation) -> tuple[FloatArray, FloatArray]:

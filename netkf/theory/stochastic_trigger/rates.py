@@ -9,9 +9,9 @@ import numpy as np
 from netkf.algorithms.stochastic_trigger import trigger_matrix
 from netkf.linalg.arrays import ArrayLike, square_root
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.observations import Observation
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
 from netkf.theory.numerics.matrices import as_covariance
-from netkf.theory.numerics.observations import Observation
 from netkf.theory.stochastic_trigger.errors import decisions, measurement_update, silence
 from netkf.trace.run import Run
 

@@ -92,7 +92,6 @@ def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> 
 
 
 def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
-    """Return the probability with which a node hears each other, by their indices."""
     topology, delay = scenario.topology, scenario.network.channel.delay.fixed
     if delay is None:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")

@@ -1,1 +1,0 @@
-"""Theory of belief propagation: exact errors, and the assumptions under which P is right."""

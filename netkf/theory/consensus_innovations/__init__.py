@@ -1,1 +1,0 @@
-"""Theory of consensus plus innovations: exact errors and assumptions."""

@@ -1,1 +1,0 @@
-"""Theory of the diffusion Kalman filter: exact errors."""

@@ -1,1 +1,0 @@
-"""Theory of event-triggered consensus on information: its assumptions."""
