@@ -175,11 +175,9 @@ class ReplicaResult(NamedTuple):
 def run_replica(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> ReplicaResult:
-    """Simulate and summarise one ``replica`` of the runs of ``seed`` of a scenario whose samples
-    are at the times that promises are checked at (:func:`with_check_times`).
-
-    A user's filter class is also run as its built-in base (the twin), for the first TWIN_RUNS
-    replicas and where it diverged, to see whether the two compute the same.
+    """Simulate and summarise one ``replica`` of the runs of ``seed`` of a scenario with samples at
+    the times of :func:`with_check_times`. A user's filter class is also run as its built-in base,
+    the twin, for the first TWIN_RUNS replicas and where it diverged.
     """
     chosen = choose_engine(engine, scenario, announce=False)
     run, promised = simulate(scenario, seed, replica, chosen), with_promised_filter(scenario)
@@ -264,12 +262,9 @@ def judge_replicas(
     scenario: Scenario, results: Iterable[ReplicaResult], seed: int, confidence: float
 ) -> Verdict:
     """Return the verdict on a scenario from the ``results`` of its replicas of ``seed``, in their
-    order: one row (holds, broken, undecided, not promised) for each promise of its filter's paper,
-    each test of its clocks, channels, plant and sensors against the laws that they state, and each
-    test of what is recorded of its runs.
-
+    order: a row for each promise of its filter's paper, of its parts and of the record of its runs.
     All intervals hold together with probability ``confidence``. Raises TheoryError if there are no
-    covariances with which promises could be compared.
+    covariances to judge.
     """
     checks, replicas = find_checks(scenario), list(results)
     audits = [result.audit for result in replicas]

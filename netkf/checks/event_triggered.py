@@ -15,11 +15,8 @@ from netkf.laws.intervals import student_interval
 
 @error_test
 def check_nees_bound(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that the mean of NEES / n is at most 1 at every time and node, as it
-    is if P is at least the second moment of the error.
-
-    Decisions to send depend on the data, so that errors given the events are not Gaussian. Hence
-    Student's interval for the mean over the runs is used, with the level shared by all points.
+    """Test that the mean of NEES / n is at most 1 at every time and node. Decisions to send depend
+    on data, so that errors given the events are not Gaussian: by Student's interval over the runs.
     """
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
     finite = np.flatnonzero(np.isfinite(nees).all(axis=0))

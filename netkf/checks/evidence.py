@@ -173,11 +173,9 @@ def judge(
     runs: int,
     level: float,
 ) -> list[Evidence]:
-    """Return the evidence for each promise (a statement of a paper or of a part of the scenario,
-    with its test), from the ``samples`` of ``runs`` runs that the tests take.
-
-    With probability 1 - ``level`` at least, all intervals contain the truth: tests that are not
-    exact share the level equally (Bonferroni). A promise with a failing assumption is not tested.
+    """Return the evidence for each promise from the ``samples`` of ``runs`` runs that the tests
+    take. With probability 1 - ``level`` all intervals contain the truth: tests that are not exact
+    share it equally (Bonferroni). A promise with a failing assumption is not tested.
     """
     failing = [
         [row for row in assumptions if _is_needed(promise, row) and not row.holds]
@@ -199,10 +197,9 @@ def judge(
 
 
 def fold_followers(rows: Sequence[Evidence]) -> list[Evidence]:
-    """Return the ``rows`` of a verdict with one broken row for each mistake.
-
-    The first broken row of a group is its root, unless the group relies on another one with a
-    broken row (FOLLOWS). Other broken rows are not promised: they say from which row they follow.
+    """Return the ``rows`` of a verdict with one broken row for each mistake: the first of its
+    group, unless that relies on another with a broken row (FOLLOWS). Others say from which row they
+    follow.
     """
     first: dict[str, Evidence] = {}
     for row in rows:
@@ -332,10 +329,8 @@ def _unpromised_row(promise: Promise, reason: str) -> Evidence:
 
 
 def find_identity(deviation: float, allowed: float, message: str) -> Finding:
-    """Return the finding of a test that compares two computations of the same values, which should
-    be equal up to rounding: broken if ``deviation`` exceeds ``allowed``.
-
-    ``deviation`` is their largest relative deviation, ``allowed`` the bound on that from rounding.
+    """Return the finding on two computations of the same values: broken if their largest relative
+    ``deviation`` exceeds what rounding has ``allowed``.
     """
     margin = allowed - deviation
     text = f"largest relative deviation {deviation:.1e}, rounding explains {allowed:.0e}; {message}"

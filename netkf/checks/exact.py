@@ -67,12 +67,9 @@ SINGULAR = 1e-12
 
 
 def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run at its K checked times and N sampled nodes: P (K, N, n, n),
-    errors (K, N, n), NEES (K, N), and the exact law of the errors.
-
-    The errors are Gaussian given the events of the run (ticks, losses, delays), from which theory
-    computes their covariance. This is left out (nan) for later replicas, if the nodes have too many
-    errors together, and if the equations of the filter are not known.
+    """Return the summary of a run: P, errors and NEES, and the exact law of the errors given its
+    events. That is nan for later replicas, for too many errors together, and without known
+    equations.
     """
     times, nodes, n = run.xhat.shape
     at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
@@ -128,11 +125,8 @@ def _exact_statistics(
 
 
 def max_replayed(scenario: Scenario) -> int:
-    """Return the number of replicas, the first ones, whose exact error covariances are computed
-    from their events (replayed), which takes far longer than a summary.
-
-    They have enough errors to reveal a wrong covariance (ENOUGH_ERRORS, and in slots ENOUGH_RUNS),
-    within the limits of MAX_REPLAYED, MIN_REPLAYED and the time that MAX_REPLAYED_STEPS allow.
+    """Return the number of replicas, the first ones, whose exact covariances are computed: enough
+    to reveal a wrong one (ENOUGH_ERRORS, ENOUGH_RUNS), within MAX_REPLAYED and the time for it.
     """
     per_run = len(probe_times(scenario)) * errors_at_once(scenario)
     steps, min_replicas = integration_steps(scenario), 0
@@ -182,10 +176,8 @@ def _pool_nees(e: FloatArray, P: FloatArray, law: ErrorLaw) -> FloatArray:
 
 def nees_shares(whitened: FloatArray) -> FloatArray:
     """Return the factors (K,) that scale each of K NEES to the expected value n, so that none
-    outweighs the others in a sum.
-
-    The expected NEES is the trace of ``whitened`` (K, n, n), L Sigma L' with L' L = P^-1; the scale
-    is 0 where that is 0.
+    outweighs the others: ``whitened`` (K, n, n) is L Sigma L' with L' L = P^-1, its trace the
+    expected NEES.
     """
     expected = np.trace(whitened, axis1=-2, axis2=-1)
     return np.asarray(
@@ -219,13 +211,9 @@ def few_errors(scenario: Scenario) -> Assumption:
 def whiten_errors(
     e: FloatArray, stacked: FloatArray, min_variance: float, floor: FloatArray | float = 0.0
 ) -> FloatArray:
-    """Return ``e' Sigma^-1 e`` of the errors of all nodes and its degrees of freedom, (K, 2), at K
-    times: chi-square if Sigma is their covariance.
-
-    ``e`` (K, N, n) are errors less their mean, ``stacked`` (K, N n, N n) joint covariances Sigma.
-    Eigenvectors count if their variance is above ``min_variance`` times the largest one and above
-    ``floor`` (K,), the variance of rounding errors. Small variances matter: they are those of the
-    differences between nodes.
+    """Return ``e' Sigma^-1 e`` and its degrees of freedom, (K, 2), of errors less their mean ``e``
+    (K, N, n) with joint covariances ``stacked`` (K, N n, N n). Directions count if their variance
+    is above ``min_variance`` times the largest one and above ``floor`` (K,).
     """
     finite = np.asarray(np.isfinite(stacked).all(axis=(-1, -2)))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], stacked, 0.0))
@@ -254,14 +242,9 @@ def with_base_filter(scenario: Scenario) -> Scenario:
 
 
 def promised_filter(algorithm: Any) -> Any:
-    """Return the filter whose promises (statements of its paper) are checked for ``algorithm``.
-
-    It is the given one if its class is built in or overrides only weights of links; otherwise one
-    of the built-in class that it derives from, with the same parameters.
-
-    Raises TheoryError for a class that derives from no built-in one, and for one that declares
-    ``talks = False`` (sends no messages) although its base sends some, since promises about the
-    base are about messages.
+    """Return the filter whose promises are checked for ``algorithm``: itself if it is built in or
+    overrides only weights of links, else that of its built-in base. Raises TheoryError without a
+    base, and for ``talks = False`` where the base sends messages.
     """
     built_in, name = built_in_class(algorithm), type(algorithm).__name__
     if built_in is None:
@@ -322,12 +305,9 @@ def _compare_with_exact(
 @error_test
 @gaussian_test
 def check_error_covariance(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that errors have their exact mean and covariance Sigma, computed
-    from the events of each run, in the runs that were replayed (the first ``max_replayed``).
-
-    Under it the sum of e' Sigma^-1 e over the runs is chi-square, at every node and time and for
-    all nodes at a time (``runs.whole``), which together err with at most half the probability
-    ``level``, and for all errors of all times (``runs.joint``), which has the other half.
+    """Test that errors have their exact mean and covariance given the events of each replayed run:
+    e' Sigma^-1 e is chi-square at every node and time and for all nodes (``runs.whole``), with half
+    of the ``level``, and for all errors of all times (``runs.joint``).
     """
     runs, scenario = samples.runs, samples.scenario
     n, max_runs = scenario.plant.n, max_replayed(scenario)
@@ -360,14 +340,9 @@ def _compare_pooled(joint: FloatArray, level: float) -> Interval:
 
 @error_test
 def check_bias(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that errors less their exact mean have no constant bias, the same at
-    all nodes and times.
-
-    The bias is estimated by generalised least squares from ``runs.bias`` (R, n, n + 1), which has
-    the information matrix and vector of each replayed run. Its length is in standard deviations of
-    an error: it is whitened by the mean covariance of all nodes and times.
-
-    The interval of the finding misses the truth with at most the probability ``level``.
+    """Test that errors less their exact mean have no constant bias, by generalised least squares
+    from ``runs.bias`` (R, n, n + 1). Its length is in standard deviations of an error. The interval
+    misses with at most the probability ``level``.
     """
     # Only these runs have exact covariances.
     max_runs = max_replayed(samples.scenario)
@@ -421,14 +396,9 @@ def _length_interval(spread: FloatArray, z: FloatArray, level: float) -> Interva
 @error_test
 @gaussian_test
 def check_expected_nees(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that NEES has its expected value given the events of each run, which
-    is not n where P is not the covariance Sigma of the errors.
-
-    Given the events NEES is a quadratic form of Gaussian errors (less their exact mean): a sum of
-    squares of standard normal numbers weighted by the eigenvalues of P^-1 Sigma. So is its sum over
-    runs, and no variance has to be estimated. Each NEES is scaled to the expected value n, since
-    expected values may differ widely between runs. The interval of the finding misses the truth
-    with at most the probability ``level``.
+    """Test that NEES has its expected value given the events of each run. Given them it is a sum of
+    squares of standard normal numbers weighted by the eigenvalues of P^-1 Sigma, scaled to n; so is
+    its sum over runs. The interval misses with at most the probability ``level``.
     """
     runs, n = samples.runs, samples.scenario.plant.n
     max_runs = max_replayed(samples.scenario)
@@ -478,12 +448,9 @@ def _pooled_expected_nees(quadratic: FloatArray, level: float) -> Interval:
 @error_test
 @gaussian_test
 def check_nees(samples: RunSamples, level: float) -> Finding:
-    """Test the null hypothesis that errors are Gaussian with covariance P of the filter, given the
-    messages that were exchanged.
-
-    Under it NEES is chi-square with n degrees of freedom at every node and time, and its sum over R
-    runs with R n degrees. The interval of the finding misses the truth with at most the probability
-    ``level``.
+    """Test that errors are Gaussian with covariance P given the messages: the sum of NEES over R
+    runs is chi-square with R n degrees of freedom at every node and time, with at most the
+    probability ``level`` of a miss.
     """
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
     if np.isnan(samples.runs.e).all():
@@ -505,13 +472,8 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
 
 def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: float) -> Interval:
     """Return an interval for the relative difference between the sum of all NEES (R, K) and that of
-    their exact means.
-
-    ``nees``, ``mean`` and ``square`` are (R, K), for K points (time, node) of R runs; ``square`` is
-    half of the variances. Runs are independent. For the K points of a run, which are correlated in
-    an unknown way, the standard deviation of their sum is at most the sum of their standard
-    deviations. The chi-square law with the mean and this variance gives the limits. The interval
-    misses the truth with at most the probability ``level``.
+    their exact means (R, K); ``square`` (R, K) is half of the variances. Runs are independent;
+    points of a run add at most their deviations. It misses with at most the probability ``level``.
     """
     spread = np.sqrt(2.0 * square).sum(axis=1)
     expected = float(mean.sum())

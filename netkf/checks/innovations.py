@@ -103,10 +103,9 @@ class ExpectedIncrements:
     def whitened_innovation(
         self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
     ) -> FloatArray:
-        """Return the innovation y - H E[z] (p,) of increments y = int dy (p,) over ``gap`` seconds,
-        times the inverse Cholesky factor of its covariance S; z is the integral of the state.
-
-        ``xhat`` (n,) and ``P`` (n, n) are the estimate at the start of the interval.
+        """Return y - H E[z] (p,) of increments y (p,) over ``gap`` seconds times the inverse
+        Cholesky factor of its covariance; ``xhat`` (n,) and ``P`` (n, n) are the estimate before
+        them.
         """
         n, H = self._n, self._H
         # Transition of (x, z) over the gap, and a square root of its noise covariance.
@@ -212,11 +211,9 @@ class Recorder(Filter):
 
 
 def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
-    """Return the innovations of the samples and increments of a run, which is replayed for them.
-
-    Raises NetkfError with the reason if there are none: the filter gives no covariance, there are
-    no readings, the run has more than ``max_events`` events, or the events of the replay differ, as
-    they may if another version made the run.
+    """Return the innovations of a run, which is replayed for them. Raises NetkfError without
+    readings or covariances, for more than ``max_events`` events, and if the replay has other
+    events.
     """
     scenario: Scenario = run.scenario
     if len(run.log) > max_events:
@@ -280,10 +277,7 @@ def autocorrelation(values: FloatArray, lags: int) -> FloatArray:
 
 def autocorrelations(recorded: Innovations) -> tuple[dict[int, FloatArray], dict[int, int]]:
     """Return, by node with at least MIN_READINGS readings, the autocorrelations (L,) of its
-    innovations at lags 1 .. L, and the number of its readings.
-
-    The L lags are the same for all nodes: MAX_LAG, or fewer if a node has few readings. One lag is
-    one reading of the node.
+    innovations at lags 1 .. L in readings, the same for all nodes, and the number of its readings.
     """
     series = innovation_series(recorded)
     counts = {node: len(values) for node, values in series.items()}

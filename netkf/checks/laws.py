@@ -40,12 +40,9 @@ class Pair(NamedTuple):
 def find_largest(
     distances: Sequence[tuple[Interval, str]], tolerance: float, message: str
 ) -> Finding:
-    """Return the finding on pairs (interval of a distance, label), where all distances should be 0,
-    up to ``tolerance``; ``message`` begins its text.
-
-    It reports the distance with the largest lower limit. The caller makes each interval at a share
-    of the level, so that all of them together miss with at most its probability. Distances that are
-    nan are left out, with a word in the text; undecided if all are.
+    """Return the finding on pairs (interval of a distance, label) of distances that should be 0 up
+    to ``tolerance``: the one with the largest lower limit. The caller shares the level among them.
+    Those that are nan are left out; undecided if all are.
     """
     known = [item for item in distances if not np.isnan(item[0][:3]).any()]
     if not known:
@@ -72,10 +69,8 @@ def find_largest(
 
 
 def find(comparison: Comparison, tolerance: float) -> Finding:
-    """Return the finding of a ``comparison`` of draws with the law that a part states.
-
-    If any distance is significant it is the most significant one; otherwise that of all values
-    together, which is more precise, and the message adds the largest distance of a part.
+    """Return the finding of a ``comparison`` of draws with the law that a part states: the most
+    significant distance, or else that of all values together with the largest one of a part.
     """
     distances, text, overall = comparison
     if not distances:
@@ -101,12 +96,9 @@ POOLED_TOLERANCE = 0.1
 def pool(
     single: Finding, pooled: Interval, what: str, tolerance: float = POOLED_TOLERANCE
 ) -> Finding:
-    """Return the finding of one promise from that of its comparisons one by one (at each node and
-    time), ``single``, and the interval ``pooled`` of one comparison of all values together.
-
-    The caller gives each a part of the error probability. If only a single comparison is
-    significant, it is the finding; otherwise the pooled one is, whose interval is far narrower,
-    with its own ``tolerance``. ``what`` describes the pooled values.
+    """Return the finding of comparisons one by one, ``single``, and of all values together,
+    ``pooled``, which are ``what``. The caller gives each a part of the level. The pooled one, with
+    its own ``tolerance``, is far narrower and decides unless only a single one is significant.
     """
     # The upper end of a margin below 0: the single comparison breaks the promise. A pooled value of
     # nan (nothing could be pooled) leaves the single comparisons too.
@@ -128,13 +120,10 @@ def pool(
 
 
 def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Finding:
-    """Test the null hypothesis that both samples of covariances of each pair have the same
-    probability distribution (law), within LAW_TOLERANCE.
-
-    Diagonal entries are compared one by one by a Kolmogorov-Smirnov distance
-    (:func:`law_distance`), which needs no moments; all comparisons together err with at most the
-    probability ``level``. ``start`` is the largest trace at time 0, whose rounding errors remain in
-    P. The finding is ``early`` if a limit distribution is not reached by then.
+    """Test that both samples of each pair have the same law within LAW_TOLERANCE, by a
+    Kolmogorov-Smirnov distance for each diagonal entry; all together err with at most the
+    probability ``level``. ``start`` is the largest trace at 0, whose rounding remains in P. It is
+    ``early`` if a limit law is not reached.
     """
     single_level, early = level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
@@ -174,11 +163,8 @@ def diagonal_distances(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def growth_intervals(earlier: FloatArray, later: FloatArray, level: float) -> list[Interval]:
-    """Return an interval for the growth between two samples of covariances, ``earlier`` (S, n, n)
-    and ``later`` (S', n, n), for each of the n diagonal entries.
-
-    The growth is the largest P(later > GROWTH x) - P(earlier > x) over all x: 0 if the later entry
-    is stochastically at most GROWTH times the earlier one. Each interval misses the truth with at
+    """Return an interval for the growth between samples ``earlier`` (S, n, n) and ``later`` (S', n,
+    n) of each diagonal entry: the largest P(later > GROWTH x) - P(earlier > x). Each misses with at
     most the probability ``level``.
     """
     return [
@@ -190,14 +176,10 @@ def growth_intervals(earlier: FloatArray, later: FloatArray, level: float) -> li
 def compare_growth(
     pairs: Sequence[Pair], expected: Sequence[tuple[FloatArray, FloatArray] | None], level: float
 ) -> Finding:
-    """Test the null hypothesis that covariances stay stochastically bounded, by samples at half of
-    the horizon and at its end.
-
-    Under it the later sample of each pair, ``second``, is stochastically at most GROWTH times the
-    earlier one, ``first``. In a short horizon laws may still grow, so that ``expected`` has for
-    each pair two samples (S, n, n) of the laws that both should have: only faster growth than
-    theirs breaks the promise. Where it is None, growth leaves the row undecided. All comparisons
-    together err with at most the probability ``level``.
+    """Test that covariances stay stochastically bounded: the sample at the end of each pair,
+    ``second``, is at most GROWTH times that at half of the horizon. ``expected`` has samples of the
+    laws that both should have: only faster growth breaks the promise; without them growth leaves it
+    undecided. All err with at most the probability ``level``.
     """
     single_level, early = 0.5 * level / sum(pair.first.shape[-1] for pair in pairs), False
     intervals = []
@@ -222,13 +204,10 @@ def compare_growth(
 def compare_chi_square(
     ratios: FloatArray, freedom: Sequence[float], labels: Sequence[str], level: float, name: str
 ) -> Finding:
-    """Test the null hypothesis that squares over their degrees of freedom, ``ratios`` (R, K), have
-    mean 1, such as NEES / n at K points of R runs.
-
-    Under it the sum of the squares of column k over all R runs is chi-square with ``freedom[k]``
-    degrees of freedom. Columns that are not finite are left out; the tests of the others together
-    err with at most the probability ``level``. ``labels`` (K) say what the columns are, ``name``
-    what the squares are called in the message.
+    """Test that squares over their degrees of freedom, ``ratios`` (R, K), have mean 1: the sum of
+    column k is chi-square with ``freedom[k]`` degrees. Columns that are not finite are left out;
+    the others err with at most the probability ``level``. ``labels`` (K) name columns, ``name`` the
+    squares.
     """
     finite = np.flatnonzero(np.isfinite(ratios).all(axis=0))
     if not len(finite):

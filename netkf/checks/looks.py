@@ -30,10 +30,8 @@ def is_decided(rows: Sequence[Evidence]) -> bool:
 
 
 def next_runs(rows: Sequence[Evidence], runs: int, max_runs: int) -> int:
-    """Return the number of runs after which the promises are judged again, up to ``max_runs``.
-
-    It is the largest number that an undecided promise is forecast to need (``row.needed``), but
-    between MIN_GROWTH and MAX_GROWTH times the ``runs`` done so far.
+    """Return the number of runs after which promises are judged again, up to ``max_runs``: the most
+    that a row is forecast to need, between MIN_GROWTH and MAX_GROWTH times the ``runs`` so far.
     """
     needed = [row.needed for row in rows if row.verdict == UNDECIDED and row.needed is not None]
     forecast = MARGIN * max(needed, default=runs)
@@ -42,11 +40,8 @@ def next_runs(rows: Sequence[Evidence], runs: int, max_runs: int) -> int:
 
 
 def keep_decisions(earlier: Sequence[Evidence], rows: Sequence[Evidence]) -> tuple[Evidence, ...]:
-    """Return the ``rows`` (one for each promise) of a new judgement, in which undecided rows are
-    replaced by the decision of an ``earlier`` judgement with fewer runs.
-
-    The intervals of all judgements hold jointly, so that an earlier decision is as valid as a new
-    one. A promise that was broken at any of them stays broken.
+    """Return the ``rows`` of a new judgement, in which undecided rows keep the decision of an
+    ``earlier`` one: the intervals of all judgements hold jointly. A broken promise stays broken.
     """
     earlier_rows = {(row.promise, row.source): row for row in earlier}
     decisions = []

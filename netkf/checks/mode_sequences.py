@@ -54,10 +54,7 @@ class ModeTable(NamedTuple):
         self, roots: FloatArray, sequences: np.ndarray, lengths: list[int]
     ) -> FloatArray:
         """Return the covariances (L, K, n, n) of K filters after each of L increasing numbers of
-        slots, ``lengths``, from the roots of their start covariances, ``roots`` (K, n, n).
-
-        A row of ``sequences`` (K, T) has the index of the mode (set of readings) that updates one
-        filter in each slot.
+        slots, ``lengths``, from ``roots`` (K, n, n), by the modes ``sequences`` (K, T).
         """
         results, applied = [], 0
         for length in lengths:
@@ -68,10 +65,7 @@ class ModeTable(NamedTuple):
 
 
 def reference_count(scenario: Scenario, laws: int) -> int:
-    """Return the number of simulated covariances by which each of ``laws`` probability
-    distributions is represented when those of the runs are compared with it: fewer for more
-    distributions, larger plants and networks.
-    """
+    """Return the number of covariances by which each of ``laws`` laws is represented."""
     step = (3 * scenario.plant.n) ** 3  # operations for one update of one covariance
     budget = MAX_OPERATIONS if len(scenario.nodes) <= MAX_NODES else 0.1 * MAX_OPERATIONS
     affordable = budget / (laws * check_slots(scenario)[-1] * step)
@@ -179,11 +173,8 @@ def growth_of(earlier: FloatArray, later: FloatArray) -> float:
 
 
 def slots_until(distance: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:
-    """Return a number of slots after which ``distance``, a function of such a number, is at most
-    half of ``tolerance``.
-
-    The number is doubled from ``slots`` on. Each call of ``distance`` simulates about MIN_CHAINS /
-    4 covariances (n, n) for so many slots; nan if that would take too long.
+    """Return a number of slots, doubled from ``slots`` on, after which ``distance`` of it is at
+    most half of ``tolerance``; nan if simulating that would take too long.
     """
     operations, count = 0.0, slots
     while True:
@@ -213,9 +204,8 @@ class TokenHistory(NamedTuple):
 
 
 def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
-    """Return the index (slots, N) of the node whose pair (estimate, covariance) each of the N nodes
-    used in each of the first ``slots`` slots, from the swaps in the log of a run of a gossip
-    filter; a node that swapped with nobody used its own.
+    """Return the index (slots, N) of the node whose pair (estimate, covariance) each node used in
+    each slot of a run of a gossip filter; its own without a swap.
     """
     index = scenario.topology.index  # index of each node id
     sources = np.tile(np.arange(len(index)), (slots, 1))
@@ -229,12 +219,8 @@ def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
 
 
 def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
-    """Return the history of the pairs (estimate, covariance) that the N nodes of a gossip filter
-    hold at the start of a ``slot``: the node where each started (N,), and the node that held it in
-    each slot before (N, slot).
-
-    ``sources`` (slots, N) is the index of the node whose pair each node used in each slot, from
-    :func:`pair_sources`.
+    """Return where the pairs that the N nodes hold at the start of a ``slot`` began (N,), and where
+    they were in each slot before (N, slot), from the ``sources`` of :func:`pair_sources`.
     """
     path = np.empty((sources.shape[1], slot), dtype=int)
     # Backwards in time: the node that held, in slot t, the pair that node k holds at the end.
@@ -246,11 +232,8 @@ def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
 
 
 def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
-    """Return the index (N,) of the node where each token took its last reading, in slot - 1: token
-    n is the pair (estimate, covariance) that started at node n, p_n(slot - 1) of paper G (13).
-
-    ``sources`` (slots, N) is the index of the node whose pair each node used in each slot. None if
-    pairs were copied, so that the tokens at the nodes are no permutation of those at the start.
+    """Return the index (N,) of the node where each token, the pair that started at node n, took its
+    last reading, p_n(slot - 1) of paper G (13). None if pairs were copied.
     """
     origin = trace_tokens(sources, slot).origin
     if len(set(origin.tolist())) < len(origin):
@@ -261,9 +244,7 @@ def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
 
 
 def gossip_modes(scenario: Scenario) -> ModeTable:
-    """Return the table of the readings that can update a covariance of a gossip filter in one slot:
-    mode k is the reading of the k-th node, paper G (11).
-    """
+    """Return the table in which mode k is the reading of the k-th node, paper G (11)."""
     F, Q = scenario.slot_belief
     readings = [(model.H, model.R) for model in scenario.slot_models]
     return ModeTable(F, square_root(Q), reading_modes(readings, len(F)))
@@ -289,9 +270,8 @@ def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:
-    """Return the table of the sets of readings that can update a covariance in one slot under
-    intermittent observations: mode m is all readings of the nodes (ids) ``sets[m]``, with their
-    stacked H (p, n) and block diagonal noise covariance (p, p), equation 17 of that paper.
+    """Return the table in which mode m is all readings of the nodes (ids) ``sets[m]`` together, R
+    (17).
     """
     F, Q = scenario.slot_belief
     index = scenario.topology.index
@@ -304,11 +284,8 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
 
 
 def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> Arrivals:
-    """Return the readings that W sampled nodes used in the first ``slots`` slots of a run: in each
-    slot a node's own and those that the trace says were delivered to it; without a run those that
-    they would use if none were lost, which gives the smallest covariances. Each set of readings
-    that occurs is one mode, and ``sequences`` (W, slots) has the index of the mode of each node and
-    slot.
+    """Return the readings that W sampled nodes used in the first ``slots`` slots of a run, their
+    own and those delivered; without a run those that they would use if none were lost.
     """
     arrived: dict[tuple[int, int], list[int]] = {}
     if run is not None:

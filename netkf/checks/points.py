@@ -24,11 +24,8 @@ MAX_ENTRIES = 6400
 
 
 def check_slots(scenario: Scenario) -> tuple[int, ...]:
-    """Return the slots (numbers of sampling periods) at which promises are checked: 2, 5, half of
-    the horizon and its last slot.
-
-    For filters whose estimate is filtered (not predicted) the last slot is one earlier, because the
-    estimate at the horizon includes exchanges that the trace does not record.
+    """Return the slots at which promises are checked: 2, 5, half of the horizon and its last one,
+    which is one earlier for filtered estimates, whose last exchanges are not in the trace.
     """
     period = scenario.slot_plant.period
     # 1e-9: a horizon of a whole number of periods keeps its last slot despite rounding.
@@ -54,11 +51,9 @@ def errors_at_once(scenario: Scenario) -> int:
 
 
 def probe_times(scenario: Scenario) -> list[float]:
-    """Return the times in seconds at which runs are sampled.
-
-    They are those at which single covariances are compared (:func:`check_times`), and further ones
-    spread evenly over the horizon, used only by tests that pool the errors of all times. The more
-    errors one time has, the fewer further ones (POOLED_ERRORS, MAX_POOLED).
+    """Return the times in seconds at which runs are sampled: those of :func:`check_times`, and
+    further ones, evenly spread, for tests that pool the errors of all times: the fewer, the more
+    errors one time has (POOLED_ERRORS, MAX_POOLED).
     """
     checked = check_times(scenario)
     count = min(MAX_POOLED, POOLED_ERRORS // errors_at_once(scenario))
@@ -82,10 +77,8 @@ def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
 
 
 def sampled_indices(scenario: Scenario) -> IntArray:
-    """Return the indices (W,) of the nodes whose samples are kept.
-
-    These are all nodes of a network of up to MAX_NODES nodes; of a larger one between MIN_SAMPLED
-    and MAX_SAMPLED evenly spaced indices, fewer the larger the covariances are.
+    """Return the indices (W,) of the nodes whose samples are kept: all of up to MAX_NODES, else
+    MIN_SAMPLED to MAX_SAMPLED evenly spaced ones, fewer the larger covariances are.
     """
     nodes, n = len(scenario.nodes), scenario.plant.n
     if nodes <= MAX_NODES:

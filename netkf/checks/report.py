@@ -18,12 +18,9 @@ WIDTH = 87  # with the indent 100 columns
 
 
 def verdict_text(verdict: Verdict, claim: str = "", command: str = "", full: bool = True) -> str:
-    """Return the text of ``netkf check``.
-
-    Broken rows come first; then all others, the counts of the verdicts, and the broken rows once
-    more in short. ``command`` followed by the number of a run replays that run. Unless ``full``,
-    rows that are not broken have one line below their promise, and those that hold or follow from
-    others without looking at a run are one line together.
+    """Return the text of ``netkf check``: broken rows first and once more in short at the end, with
+    the ``command`` that replays their run. Unless ``full``, other rows have one line below their
+    promise.
     """
     lines = [f"{verdict.scenario}: {claim}" if claim else verdict.scenario, ""]
     broken = [row for row in verdict.rows if row.verdict == BROKEN]

@@ -100,13 +100,8 @@ class RunSamples:
 
 
 def check_replay(samples: RunSamples, level: float) -> Finding:
-    """Compare every covariance of the runs, ``runs.P`` (R, K, N, n, n), with ``runs.replayed``: the
-    same computed by the equations of the filter from the events of the run (ticks, losses, delays)
-    without the engine.
-
-    Only some runs are replayed, the entries of the others are nan; so are covariances that the
-    equations cannot give, which are left out. The finding is undecided if there are no others. No
-    interval is estimated, so that ``level`` is not used.
+    """Compare the covariances of the runs (R, K, N, n, n) with ``runs.replayed``, by the equations
+    of the filter from the events of the run; those that are not known are left out.
     """
     replayed = np.isfinite(samples.runs.replayed).any(axis=(1, 2, 3, 4))
     P, expected = samples.runs.P[replayed], samples.runs.replayed[replayed]
@@ -138,12 +133,9 @@ def compare_points(
     message: str,
     replicas: IntArray | None = None,
 ) -> Finding:
-    """Return the finding on covariances that should equal others up to rounding. It names the run,
-    time and node at which the first deviation is too large, so that this run can be replayed.
-
-    ``gap`` (R, K', N) are absolute deviations at the last K' checked times; ``limits`` the sizes of
-    the values, those of the terms whose rounding errors they inherit, and a relative tolerance
-    (:func:`allowed_deviation`); ``replicas`` (R,) the numbers of the runs, 0 to R - 1 by default.
+    """Return the finding on covariances that should equal others up to rounding, with the first
+    run, time and node that depart: absolute deviations ``gap`` (R, K', N) at the last K' times,
+    ``limits`` of :func:`allowed_deviation`, and ``replicas`` (R,), the numbers of the runs.
     """
     finding = compare_identities(gap, *limits, message)
     wrong = ~(gap <= allowed_deviation(*limits))
@@ -161,8 +153,6 @@ def compare_points(
 def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
     """Return |P - expected| over the largest entry of each expected matrix, in the shape of ``P``
     (..., n, n); inf where that is not finite.
-
-    ``expected`` has the same shape, or is one matrix (n, n) for all.
     """
     size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -172,11 +162,8 @@ def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
 
 
 def check_growth(samples: RunSamples, level: float) -> Finding:
-    """Test that the distribution of P over the runs is bounded: compare its growth in the second
-    half of the horizon with that of P replayed by the filter's equations from the events of the
-    runs (:func:`compare_growth`).
-
-    The interval of the finding misses the truth with at most the probability ``level``.
+    """Test that P is stochastically bounded by its growth in the second half of the horizon and
+    that of P replayed from the events (:func:`compare_growth`).
     """
     P, replayed = samples.runs.P, samples.runs.replayed
     # Only some runs are replayed, the entries of the others are nan.

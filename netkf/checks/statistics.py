@@ -33,9 +33,8 @@ def affine(interval: Interval, scale: float, shift: float) -> Interval:
 
 
 def band_width(samples: int, level: float) -> float:
-    """Return the half width of a band around the empirical distribution function of ``samples``
-    values that contains the true one with probability 1 - ``level`` (Dvoretzky, Kiefer and
-    Wolfowitz; Massart's constant).
+    """Return the half width of the band around the distribution function of ``samples`` values that
+    misses with probability ``level`` (Dvoretzky, Kiefer and Wolfowitz; Massart's constant).
     """
     return math.sqrt(math.log(2.0 / level) / (2.0 * samples))
 
@@ -52,13 +51,10 @@ def round_digits(values: FloatArray) -> FloatArray:
 def law_distance(
     first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
-    """Return an interval for sup |F - G| of the distribution functions F and G of two samples
-    ``first`` (S,) and ``second`` (S',): the two-sample Kolmogorov-Smirnov statistic, with a band
-    around each sample.
-
-    The samples may depend on each other, since each band holds on its own. Further runs add to the
-    first sample only. Values that differ by less than ``rounding``, or in the last of DIGITS
-    digits, count as equal. The interval misses the truth with at most the probability ``level``.
+    """Return an interval for sup |F - G| of the laws of two samples (S,) and (S',), which may
+    depend on each other: Kolmogorov-Smirnov with a band around each. Values that differ by less
+    than ``rounding`` are equal. Further runs add to the first. It misses with at most the
+    probability ``level``.
     """
     gaps = np.abs(_ecdf_gaps(first, second, rounding))
     return _band_interval(gaps, len(first), len(second), level, grow=False)
@@ -67,11 +63,9 @@ def law_distance(
 def law_excess(
     first: FloatArray, second: FloatArray, level: float, rounding: float = 0.0
 ) -> Interval:
-    """Return an interval for the largest ``P(second > x) - P(first > x)`` over all x, from two
-    samples ``first`` (S,) and ``second`` (S',).
-
-    Values that differ by less than ``rounding`` count as equal. Further runs add to both samples.
-    The interval misses the truth with at most the probability ``level``.
+    """Return an interval for the largest ``P(second > x) - P(first > x)`` over x of two samples
+    (S,) and (S',), to both of which further runs add; it misses with at most the probability
+    ``level``.
     """
     gaps = _ecdf_gaps(first, second, rounding)
     return _band_interval(gaps, len(first), len(second), level, grow=True)
@@ -111,8 +105,7 @@ def distance_to_law(
     cdf: Callable[[FloatArray], FloatArray], values: FloatArray, level: float
 ) -> Interval:
     """Return an interval for the largest difference between the exact distribution function ``cdf``
-    and that of the sample ``values`` (S,): the one-sample Kolmogorov-Smirnov statistic with its DKW
-    band, which misses with probability ``level``.
+    and that of ``values`` (S,), with its DKW band, which misses with probability ``level``.
     """
     points = np.unique(round_digits(values))
     slack = 10.0 ** (1 - DIGITS) * np.maximum(np.abs(points), 1e-300)
@@ -129,11 +122,8 @@ def distance_to_law(
 
 
 def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
-    """Return the interval ``value`` +- ``width``, clipped to [0, 1], for a distance between two
-    distribution functions; in forecasts for more runs the width shrinks as 1 / sqrt(runs).
-
-    ``width`` is the half width at the level of the interval. ``detectable`` is the true distance at
-    which the interval would exclude 0 with probability POWER, nan if unknown.
+    """Return the interval ``value`` +- ``width``, clipped to [0, 1], of a distance between laws,
+    whose width shrinks as 1 / sqrt(runs); ``detectable`` is found with probability POWER.
     """
 
     def limits(value: float, factor: float) -> tuple[float, float]:
@@ -145,13 +135,9 @@ def band_around(value: float, width: float, detectable: float = math.nan) -> Int
 
 
 def quadratic_interval(total: float, weights: FloatArray, level: float) -> Interval:
-    """Return the interval for c if ``total`` is c times sum_k weights_k z_k^2 with independent
-    standard normal z_k; ``weights`` (K,) are at least 0.
-
-    Its ends are quantiles of that sum by the saddle-point formula of Lugannani and Rice (1980),
-    whose relative error in the tails is a few per cent for any weights. For equal weights the sum
-    is a multiple of a chi-square variable, whose exact quantiles are used. The interval misses the
-    truth with at most the probability ``level``.
+    """Return the interval for c if ``total`` is c times sum_k weights_k z_k^2 with standard normal
+    z_k and ``weights`` (K,) >= 0: quantiles by Lugannani and Rice (1980), to a few per cent in the
+    tails, exact for equal weights. It misses with at most the probability ``level``.
     """
     weights = weights[weights > 1e-12 * weights.max(initial=0.0)]
     if not len(weights):
@@ -209,12 +195,9 @@ def _log_tail(weights: FloatArray, s: float) -> float:
 
 
 def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
-    """Return an interval for the largest eigenvalue of the mean of R symmetric ``samples``
-    (R, n, n).
-
-    Scheffe's method covers all directions at once: Hotelling's T^2 bounds the mean of the n (n + 1)
-    / 2 distinct entries, estimated from R samples, which must have a variance. The interval misses
-    the truth with at most the probability ``level``.
+    """Return an interval for the largest eigenvalue of the mean of R symmetric ``samples`` (R, n,
+    n): Scheffe's method with Hotelling's T^2 for their n (n + 1) / 2 entries, which must have a
+    variance. It misses with at most the probability ``level``.
     """
     count, n = len(samples), samples.shape[-1]
     mean = samples.mean(axis=0)
@@ -241,11 +224,8 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
 
 
 def pearson_test(counts: np.ndarray, probabilities: FloatArray) -> tuple[float, int]:
-    """Return the p-value of Pearson's chi-square test and its number of cells.
-
-    ``counts`` (C,) and ``probabilities`` (C,) are those of C cells in decreasing order of
-    probability; the last cells, with expected counts below MIN_EXPECTED, are pooled with the last
-    frequent one.
+    """Return the p-value of Pearson's test of ``counts`` (C,) with ``probabilities`` (C,) in
+    decreasing order, and its number of cells: the last, rarer than MIN_EXPECTED, are pooled.
     """
     expected = probabilities * counts.sum()
     frequent = max(1, int((expected >= MIN_EXPECTED).sum()))

@@ -23,12 +23,9 @@ RATE_TOLERANCE = 0.05  # of the share of slots with a message
 
 
 def check_rate(samples: RunSamples, level: float) -> Finding:
-    """Return the interval of the ratio of the messages sent to those expected, a test that nodes
-    send with their stated probability given the past.
-
-    If they do, the number of messages of a run less the sum of the probabilities is a martingale
-    with mean 0; Student's interval is over the independent runs. The interval of the finding misses
-    the truth with at most the probability ``level``.
+    """Test that nodes send with their stated probability given the past: messages less the sum of
+    the probabilities are a martingale. Student's interval over the runs misses with at most the
+    probability ``level``.
     """
     sent, expected = samples.runs.sends.T
     total = float(expected.mean())

@@ -51,10 +51,8 @@ NUMBERS = ("margin", "low", "high", "tolerance", "seen", "expected", "off", "det
 
 
 def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str = "") -> None:
-    """Write scenario.toml, verdict.json, verdict.csv, verdict.txt and results.npz into
-    ``directory``.
-
-    ``text`` is that of verdict.txt; by default it is made from the verdict.
+    """Write scenario.toml, verdict.json, verdict.csv, verdict.txt, with ``text``, and results.npz
+    into ``directory``.
     """
     with defer_signals():  # an interrupt must not leave a verdict that does not match its results
         _save_verdict(directory, scenario, verdict, text or verdict_text(verdict, scenario.claim))
@@ -99,10 +97,8 @@ def _require_same(path: Path, columns: dict[str, Any]) -> None:
 
 
 def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
-    """Remove the files of a check that was stopped while it wrote its first verdict; return True if
-    the directory holds no verdict.
-
-    Raises ScenarioError if the files are of a check of another scenario.
+    """Remove the files of a check that was stopped during its first verdict; return True if the
+    directory holds no verdict. Raises ScenarioError for files of another scenario.
     """
     if not directory.is_dir() or not any(directory.iterdir()):
         return True
@@ -117,9 +113,8 @@ def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
 
 
 def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
-    """Return the verdict in a directory, to which runs can be added.
-
-    Raises ScenarioError if there is none, or one of another scenario, seed or version.
+    """Return the verdict in a directory, to which runs can be added. Raises ScenarioError if there
+    is none, or one of another scenario, seed or version.
     """
     remedy = "give a directory that netkf check --out has written"
     try:

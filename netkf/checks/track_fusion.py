@@ -31,11 +31,8 @@ below which P counts as steady.
 
 
 def check_steady(samples: RunSamples, level: float) -> Finding:
-    """Compare P at the end of the runs with that of steady tracks: the Kalman filters of the nodes
-    (tracks) in their steady state, fused by their exact cross-covariances.
-
-    While the initial P may still matter, the finding is ``early`` (undecided) and has the horizon
-    that suffices. No interval is estimated, so that ``level`` is not used.
+    """Compare P at the end with that of steady tracks fused by their exact cross-covariances;
+    ``early``, with the horizon that suffices, while the initial P may still matter.
     """
     radius, steady = tracks_in_slots(samples.scenario)
     expected = steady[sampled_indices(samples.scenario)]

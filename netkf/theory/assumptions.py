@@ -47,10 +47,8 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 
 
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return a row for each assumption on a scenario: text, equation, whether it holds, and why.
-
-    In continuous time they are those of H if it is about the filter, else those of any filter; in
-    slots those of the filter's paper or, without one, of any filter in slots.
+    """Return a row for each assumption: text, equation, whether it holds, and why. Under clocks
+    those of H if it is about the filter, in slots those of its paper, else those of any filter.
     """
     rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
     if not scenario.is_linear:

@@ -216,11 +216,8 @@ def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
 
 
 def silent_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of filters in slots that exchange nothing, at their steady gains K (n, p),
-    as a linear system: a matrix I - K H (n, n) for each filter, and the noise of all.
-
-    One block of n errors for each node, or a single block if all nodes share one pooled filter.
-    Gains follow from the R that filters assume, the noise of the readings from the true one.
+    """Return the errors of Kalman filters in slots at their steady gains as a linear system, one
+    block of n errors for each node, or one if they share a pooled filter.
     """
     F, Q = scenario.slot_belief
     if scenario.node_filter.timing.pooled:

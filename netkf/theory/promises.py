@@ -51,14 +51,9 @@ LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
 
 
 def compute_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return what theory states about a scenario without simulation, its promises, as plain JSON
-    (`netkf theory --json`).
-
-    The assumptions; in continuous time the bound on the mean of P at the horizon and in the steady
-    state, link rates and limits; in slots what the filter's paper promises, or the centralised
-    covariance; the exact steady error covariance of linear filters with constant gains. Matrices
-    are dictionaries with ``value`` and ``trace``; if one does not exist these are None and
-    ``reason`` says why.
+    """Return what theory states about a scenario without simulation as plain JSON (`netkf theory
+    --json`): assumptions, bounds, link rates and limits, results of the paper, exact steady errors.
+    Matrices have ``value`` and ``trace``, None with a ``reason`` if there is none.
     """
     promises: dict[str, Any] = {
         "scenario": scenario.name,

@@ -32,10 +32,8 @@ MAX_STEADY_ENTRIES = 100_000
 
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
-    """Return the traces that theory gives to compare those of P with: the bound on the mean of P at
-    the sample ``times`` (T,), its limit for ever faster links, and a centralised filter.
-
-    If theory does not apply or takes too much memory, the reason is given instead.
+    """Return the bound on the mean of P at ``times`` (T,), its limit for fast links, and a
+    centralised filter's trace, or the reason why theory does not apply.
     """
     bound, reason = None, ""
     try:

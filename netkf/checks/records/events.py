@@ -53,10 +53,8 @@ TIME_TOLERANCE = 1e-9
 
 
 def event_fault(scenario: Scenario, run: Run) -> str:
-    """Return one line about the first fault of the record of a run's events; empty without one.
-
-    Looked at are the order of events, the numbers of messages, what becomes of each message,
-    readings, ticks with the messages that they send, and absorptions.
+    """Return one line about the first fault of the record of a run's events: their order, numbers,
+    ends of messages, readings, ticks and absorptions; empty without one.
     """
     log = run.log
     rules = [_ordered, _numbered, _decided, _absorbed]

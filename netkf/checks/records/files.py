@@ -30,10 +30,7 @@ class FilesUnknownError(Exception):
 
 def files_fault(scenario: Scenario, run: Run, engine: Engine) -> str:
     """Return one line about the first difference between a ``run`` in memory and the files that
-    ``netkf run`` and ``netkf.save`` write of it: tables, manifest, counts and averages of the
-    summary; empty without one. The run is simulated again, by ``engine``; the directories are
-    removed.
-
+    ``netkf run`` and ``netkf.save`` write of it, simulated again by ``engine``; empty without one.
     Raises FilesUnknownError if files cannot be written.
     """
     seeded = dataclasses.replace(scenario, seed=run.seed)

@@ -32,9 +32,8 @@ SUM_ROUNDINGS = 64.0
 
 
 def sample_fault(scenario: Scenario, run: Run, seed: int, replica: int) -> str:
-    """Return one line about the first fault of the record of a run, number ``replica`` of the runs
-    of ``seed``: of its number, status, fingerprint, sample times, true states and errors; empty
-    without one.
+    """Return one line about the first fault of the samples of run number ``replica`` of ``seed``:
+    number, status, fingerprint, times, true states and errors; empty without one.
     """
     if (run.seed, run.replica, run.nodes) != (seed, replica, scenario.nodes):
         return f"run {run.replica} of seed {run.seed} stands for run {replica} of seed {seed}"
@@ -113,10 +112,8 @@ def _error_fault(run: Run) -> str:
 
 
 def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None) -> Scenario:
-    """Return the scenario with a sample at time 0 besides the others, cut at ``horizon`` (s).
-
-    In continuous time samples are also taken at the instants of some events of the ``log`` of a
-    run, which come before them: absorptions, ticks and readings.
+    """Return the scenario cut at ``horizon`` (s), with a sample at time 0 and, in continuous time,
+    at the instants of some events of the ``log`` of a run, which come before them.
     """
     times = [np.zeros(1), scenario.times]
     if not scenario.slotted and log is not None:
@@ -129,9 +126,7 @@ def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None
 
 def weight_fault(scenario: Scenario) -> str:
     """Return one line about the first link whose weight is not that of [filter]: entry [l, i] of a
-    matrix is the weight that node i gives to what node l sends, a Metropolis weight is one over one
-    plus the larger number of nodes that either end hears. Empty without a fault, and for weights of
-    other kinds.
+    matrix, or Metropolis'. Empty without a fault, and for weights of other kinds.
     """
     weights, nodes = getattr(scenario.filter.algorithm, "weights", None), scenario.nodes
     heard = {node: {j for j, i in scenario.topology.directions if i == node} for node in nodes}

@@ -11,11 +11,8 @@ from netkf.trace.run import Run
 
 
 def with_last_exchanges(scenario: Scenario, run: Run) -> Run:
-    """Return the run with the exchanges of the slot at the horizon, if its state there is that
-    after them, as samples of filtered estimates are: the trace ends before that slot. They are
-    those of the same run over a longer horizon.
-
-    Raises TheoryError if there is no such run.
+    """Return the run with the exchanges of the slot at the horizon, on which filtered estimates
+    there depend: those of the same run over a longer horizon. Raises TheoryError without one.
     """
     algorithm, plant, horizon = scenario.node_filter, scenario.slot_plant, scenario.horizon
     slots = plant.slots_of(run.times).tolist()

@@ -283,9 +283,8 @@ class DelayedJumps:
 
     @cached_property
     def is_bounded(self) -> bool:
-        """True if it is proved that mean squares of the errors are bounded: the spectral radius of
-        ``apply_jumps``, the map T from white noise to the noise that jumps cause under it, is below
-        1, because some positive definite Phi (M, M) solves ``Phi = T(Phi) + I``.
+        """True if mean squares are proved to be bounded: the radius of ``apply_jumps``, T, is below
+        1, because a positive definite Phi (M, M) solves ``Phi = T(Phi) + I``.
         """
         unit = self._driven_by(np.eye(len(self.instant.drift)))
         try:
@@ -302,9 +301,8 @@ class DelayedJumps:
 
     @cached_property
     def mean_is_stable(self) -> bool:
-        """True if the mean of the errors dies out: the spectral radius of the map from the errors
-        of d seconds to those of the next d is below 1 (Breda, Maset and Vermiglio 2015, Stability
-        of Linear Delay Differential Equations, chapter 6).
+        """True if the mean of the errors dies out, by the map of errors over d seconds (Breda,
+        Maset and Vermiglio 2015, Stability of Linear Delay Differential Equations, chapter 6).
         """
         K, M = self.points + 1, len(self.instant.drift)
 

@@ -24,10 +24,8 @@ def is_recorded(channel: Channel) -> bool:
 
 
 def true_model_row(scenario: Scenario, source: str, matrices: str) -> AssumptionRow:
-    """Return the row that says if the filters' model is the true one.
-
-    ``source`` is the equation of the paper, ``matrices`` a text on what is the same, such as "same
-    F, Q and R". The verdict is None for recorded states or readings, which have no known model.
+    """Return the row that says if the filters' model is the true one, in which ``matrices`` are the
+    same, by ``source``; None for records.
     """
     if not scenario.is_random:
         return TRUE_MODEL, source, None, UNKNOWN_LAW
@@ -36,10 +34,8 @@ def true_model_row(scenario: Scenario, source: str, matrices: str) -> Assumption
 
 
 def judge_plant(scenario: Scenario, holds: bool, evidence: str) -> tuple[bool | None, str]:
-    """Return the verdict ``holds`` and the ``evidence`` for a statement about the plant's own
-    matrices.
-
-    Where the state is recorded these matrices are an assumption, and the verdict is None.
+    """Return the verdict ``holds`` and the ``evidence`` for a statement about the plant's matrices;
+    None where the state is recorded, so that they are assumed.
     """
     if scenario.plant.is_random:
         return holds, evidence

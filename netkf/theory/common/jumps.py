@@ -68,12 +68,9 @@ class SlotJumps:
         return self.directions.mean(self.nodes, self._all)
 
     def step(self, X: FloatArray, noise: bool = False) -> FloatArray:
-        """Return the second moments (S, M, M) one slot later, from those X (S, M, M) of the M = N n
-        stacked errors in each of S modes.
-
-        A mode is a joint state of the links with bursty losses (S = 1 without such). Each moment is
-        weighted by the probability of its mode, so that their sum is the second moment. ``noise``
-        adds the noises of plant and readings; without it the map is linear.
+        """Return the second moments (S, M, M) one slot after X (S, M, M) of the M = N n stacked
+        errors, by mode of the links, each weighted by its probability; with the ``noise`` of plant
+        and readings, or linear.
         """
         N = self.nodes
         weight = self.directions.stationary if self.directions else np.ones(1)
@@ -140,10 +137,7 @@ class ClockJumps:
 
     @cached_property
     def flows(self) -> FloatArray:
-        """Mean drift B (S, M, M) of the M = N n errors, per second, in each of S modes (joint
-        states of links with bursty losses), while the mode stays; it is the linear part of the
-        equation of second moments, of which ``inflow`` is the rest.
-        """
+        """Mean drift B (S, M, M) of the errors, per second, while the mode of the links stays."""
         drifts, eye = np.tile(self.drift, (self.shape[0], 1, 1)), np.eye(len(self.drift))
         for node, rate, lost in self.samples:
             _block_slice(drifts, self.nodes, node)[...] -= rate * lost
@@ -196,9 +190,7 @@ class ClockJumps:
 
     def inflow(self, X: FloatArray) -> FloatArray:
         """Return the rate (S, M, M) per second at which jumps increase second moments X (S, M, M)
-        beyond the mean drift B of ``flows``: ``dX/dt = B X + X B' + inflow(X) + noise``.
-
-        It is a positive map; S counts modes of the channels, M = N n stacked errors.
+        beyond ``flows``, ``dX/dt = B X + X B' + inflow(X) + noise``: a positive map.
         """
         total = self.sampled(X)
         if self.directions is None or not self.ticks:

@@ -76,10 +76,8 @@ def _noise(
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
-    """Return the continuous readings of each estimator, H (p, n), the assumed R (p, p) and a root
-    of the true one; p is 0 for estimators without any.
-
-    Estimators with sensors of the same ``[[sensors]]`` entries share one object.
+    """Return the continuous readings of each estimator; p is 0 without any. Estimators with sensors
+    of the same entries share one object.
     """
     placed, n = scenario.increment_sensors, scenario.plant.n
     entries_in_use = {sensor.entry for sensors in placed.values() for sensor in sensors}
@@ -104,11 +102,8 @@ def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
 
 
 def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
-    """Return a function from a slot (0-based) to the readings of that slot (H, the assumed R and a
-    root of the true R), by index of the estimator (the filter of a node, or one pooled filter);
-    call it with increasing slots.
-
-    Estimators without sensors are missing; p is the number of readings of the slot.
+    """Return a function from a slot, increasing from call to call, to its readings by index of the
+    estimator; those without sensors are missing.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     noises = _noises(scenario)
@@ -147,11 +142,8 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
 
 
 def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObservations]:
-    """Return the readings of a run's sampled sensors in continuous time as H, the assumed R and a
-    root of the true R, by which errors are replayed: by time (seconds) and index of the estimator
-    that uses them (the filter of a node, or one pooled filter). The values read are not needed.
-
-    Samples that one filter gets at one instant are one observation. Equal ones are one object.
+    """Return the readings of a run's sampled sensors by time (seconds) and index of the estimator.
+    Samples of one instant are one observation; equal ones are one object.
     """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     by_node, noises = scenario.sampled_sensors, _noises(scenario)

@@ -11,9 +11,8 @@ from netkf.theory.intermittent.riccati import undetectable_slot_mode
 
 
 def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions on the plant that the papers about slots share, as rows (assumption,
-    source, whether it holds, evidence) of the table: (F, Q^1/2) is stabilisable, Q is definite, and
-    the filters know the true model.
+    """Return the assumptions on the plant that papers about slots share: (F, Q^1/2) is
+    stabilisable, Q definite, and the filters know the model.
     """
     plant = scenario.slot_plant
     smallest = float(np.linalg.eigvalsh(plant.Q)[0])
@@ -64,10 +63,8 @@ def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
 def model_and_start_rows(
     scenario: Scenario, source: str, *between: AssumptionRow
 ) -> list[AssumptionRow]:
-    """Return the rows of a filter in slots of which little is assumed: that it knows the model,
-    those about its network, ``between``, and its first covariances.
-
-    ``source`` is the equation or section of the paper that the rows name.
+    """Return the rows, by ``source``, of a filter in slots of which little is assumed: it knows the
+    model, those ``between``, and its first covariances.
     """
     return [
         true_model_row(scenario, source, "same F, Q and R"),

@@ -66,9 +66,8 @@ class Directions(NamedTuple):
         return probabilities
 
     def advance(self, X: FloatArray, chains: IntArray) -> FloatArray:
-        """Return second moments (S, M, M) by mode after a step of the given ``chains`` (indices of
-        two-state chains of bursty losses, whose joint state is the mode), from those X (S, M, M)
-        before it; each is weighted by the probability of its mode.
+        """Return second moments (S, M, M) by mode after a step of the given bursty ``chains``, from
+        those X (S, M, M) before it, each weighted by the probability of its mode.
         """
         if self.steps is None:
             return X
@@ -94,8 +93,7 @@ class Directions(NamedTuple):
 
     def mean(self, nodes: int, directions: IntArray) -> FloatArray:
         """Return E[D] (S, N n, N n), the mean change of the stacked errors of N = ``nodes`` nodes
-        by one exchange over the given ``directions`` (indices of directed links), for each mode: a
-        joint state of the links with bursty losses.
+        by one exchange over the given ``directions``, by mode.
         """
         n = self.weight.shape[-1]
         blocks = np.zeros((self.modes, nodes, nodes, n, n))
@@ -108,11 +106,9 @@ class Directions(NamedTuple):
     def products(
         self, first: IntArray, second: IntArray, factor: FloatArray, Z: FloatArray
     ) -> FloatArray:
-        """Return ``sum_p c_p D_a Z D_b'`` (S, N n, N n) over P pairs (a, b) of directions, where
-        D_a (N n, N n) is the change of the stacked errors by a message on direction a.
-
-        ``first`` and ``second`` (P,) are the indices a and b, ``factor`` (S, P) holds c by mode,
-        and Z (S, N n, N n) the second moments of the stacked errors.
+        """Return ``sum_p c_p D_a Z D_b'`` (S, N n, N n) over P pairs of directions ``first``,
+        ``second`` (P,), D_a being the change of errors by a message on a; ``factor`` (S, P) is c by
+        mode, Z (S, N n, N n).
         """
         n = self.weight.shape[-1]
         S, N = len(Z), Z.shape[1] // n
@@ -152,11 +148,9 @@ def _join_blocks(blocks: FloatArray) -> FloatArray:
 def directions_of(
     scenario: Scenario, weights: dict[tuple[int, int], FloatArray], wait: float
 ) -> Directions:
-    """Return the directed links of a scenario, with the law of their losses and the ``weights``
-    (n, n) that receivers give to messages, for each (sender, receiver).
-
-    Messages that take more than ``wait`` seconds count as lost. Raises TheoryError if losses or
-    delays have no law that is known here. The order is that of ``weights``.
+    """Return the directed links of a scenario in the order of ``weights`` (n, n) by (sender,
+    receiver), with the law of their losses; messages that take more than ``wait`` seconds are lost.
+    Raises TheoryError without a known law.
     """
     _require_law(scenario)
     loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
@@ -178,9 +172,7 @@ def directions_of(
 
 
 def nothing_is_lost(scenario: Scenario) -> bool:
-    """Return True if no message of a scenario in slots is lost: its losses say so, and no record
-    decides which links are up.
-    """
+    """Return True if no message of a scenario in slots is lost, by its losses and its records."""
     loss = scenario.network.channel.loss
     return not has_recorded_broadcasts(scenario) and all(
         loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
@@ -189,9 +181,7 @@ def nothing_is_lost(scenario: Scenario) -> bool:
 
 
 def has_recorded_broadcasts(scenario: Scenario) -> bool:
-    """Return True if a table lists the links that are up in each step of a broadcast: messages on
-    the others are lost, whatever the loss model says.
-    """
+    """Return True if a table lists the links that are up in each step of a broadcast."""
     activation = scenario.network.activation
     return isinstance(activation, RecordedSlots) and not activation.matching
 
@@ -203,9 +193,8 @@ def all_messages_arrive(scenario: Scenario) -> bool:
 
 
 def delivery_of(scenario: Scenario, direction: tuple[int, int]) -> float:
-    """Return the probability with which each message on a directed link (sender, receiver) arrives.
-
-    Raises TheoryError if it is unknown before a run, or not the same for all messages.
+    """Return the probability with which each message on a link (sender, receiver) arrives. Raises
+    TheoryError if it is unknown before a run, or not the same for all messages.
     """
     loss, table = scenario.network.channel.loss, scenario.table_probability(direction)
     mean = loss.mean_delivery(direction, table)
@@ -286,9 +275,8 @@ def poisson_ticks(
     scenario: Scenario, links: list[tuple[int, int]]
 ) -> tuple[tuple[float, IntArray], ...]:
     """Return for each clock at which nodes transmit its rate (1/s) and the indices (K,), in
-    ``links``, of the K directions that transmit when it ticks.
-
-    ``links`` are pairs (sender, receiver). Raises TheoryError unless clocks are Poisson processes.
+    ``links``, of the directions that transmit then. Raises TheoryError for other than Poisson
+    clocks.
     """
     clock = scenario.network.activation
     assert isinstance(clock, LinkClock)

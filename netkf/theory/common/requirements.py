@@ -12,11 +12,8 @@ from netkf.scenario.scenario import Scenario
 
 
 def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
-    """Wrap each function whose first parameter is a Scenario, so that it refuses anything else.
-
-    ``functions`` are the public objects of ``netkf.theory`` by name. Returns the wrapped functions
-    by name, and leaves out classes and functions of other arguments. A wrapped function raises
-    ScenarioError, which says how to load a scenario, since a path is the usual mistake.
+    """Return the public ``functions`` of ``netkf.theory`` whose first parameter is a Scenario, by
+    name, each refusing anything else by a ScenarioError that says how to load one.
     """
     wrapped = {}
     for name, function in functions.items():

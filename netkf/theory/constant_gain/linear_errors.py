@@ -27,11 +27,8 @@ def link_weights(scenario: Scenario) -> dict[tuple[int, int], FloatArray]:
 
 
 def slot_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of all nodes in slots as a linear system with jumps: they are predicted,
-    corrected to ``e - L (H e + v)`` by the gain L (n, p) of each node, and averaged in the
-    exchange.
-
-    Raises TheoryError for recorded exchanges.
+    """Return the errors of all nodes in slots as a linear system: predicted, corrected by the gain
+    of each node, averaged in the exchange. Raises TheoryError for recorded exchanges.
     """
     gains, n = _node_gains(scenario), scenario.plant.n
     sensors = [scenario.observation_matrices(node) for node in scenario.nodes]
@@ -78,12 +75,9 @@ class SampledNode(NamedTuple):
 
 
 def clock_jumps(scenario: Scenario) -> ClockJumps | DelayedJumps | SlotJumps:
-    """Return the errors of all nodes in continuous time as a linear system with jumps at readings
-    and messages, of which exact steady mean squares are computed.
-
-    Clocks are Poisson processes of links, directions or nodes, or periodic and all tick together;
-    then the system is that from tick to tick. Raises TheoryError for other clocks, random delays,
-    and delays together with bursts under Poisson clocks.
+    """Return the errors of all nodes in continuous time as a linear system with jumps, for Poisson
+    clocks, or periodic ones that tick together: then from tick to tick. Raises TheoryError for
+    others, random delays, and delays beside bursts under Poisson clocks.
     """
     flow, samples, weights = _error_flow(scenario), _sampled_nodes(scenario), link_weights(scenario)
     clock = scenario.network.activation
@@ -114,9 +108,8 @@ def _node_slice(k: int, n: int) -> slice:
 
 
 def _error_flow(scenario: Scenario) -> JointErrorFlow:
-    """Return the dynamics of the errors of N nodes between events, with the correction by
-    increments: the drift A - L H (N, n, n) per second, and the covariance (N n, N n) of the noise
-    per second.
+    """Return the drift A - L H (N, n, n) of errors between events and the covariance (N n, N n) of
+    their noise, per second.
     """
     gains, truth = _node_gains(scenario), scenario.diffusion
     N, n = len(gains), len(truth.A)
@@ -143,9 +136,8 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
 def _poisson_samples(
     scenario: Scenario, samples: list[SampledNode]
 ) -> tuple[tuple[tuple[int, float, FloatArray], ...], FloatArray]:
-    """Return (node, rate in 1/s, correction L H) of each sensor that samples, and the covariance
-    per second (N n, N n) that all samples add to the stacked errors. Raises TheoryError for clocks
-    that are not Poisson processes.
+    """Return (node, rate in 1/s, L H) of each sensor that samples, and the covariance per second (N
+    n, N n) that samples add. Raises TheoryError for other than Poisson clocks.
     """
     N, n = len(scenario.nodes), scenario.plant.n
     noise, sampled_nodes = np.zeros((N * n, N * n)), []
@@ -168,13 +160,8 @@ def _from_tick_to_tick(
     delay: float,
 ) -> SlotJumps:
     """Return the system from one exchange to the next, for periodic clocks that tick together.
-
-    ``clock`` is that of the messages, ``flow`` the dynamics between events, ``samples`` those of
-    the nodes that sample at ticks. Messages over ``directions`` take ``delay`` seconds and are
-    predicted over them. If no node has increments, a predicted message has the error that the
-    sender has at the arrival, as if it had been sent then. Raises TheoryError if clocks differ,
-    sensors do not sample at the ticks, the delay is not below the period, or nodes have increments
-    beside a delay.
+    Without increments a predicted message has the error that the sender has at the arrival. Raises
+    TheoryError if clocks differ, or nodes have increments beside a delay.
     """
     _require_one_clock(clock, samples)
     N, n, _ = flow.drift.shape

@@ -24,9 +24,7 @@ MAX_NODES = 2000  # of a network whose diameter is computed, from the distances 
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions of the diffusion paper, as rows (assumption, source, whether it holds,
-    evidence) of the table: on weights, plant, information, arrivals and first covariances.
-    """
+    """Return the assumptions of the diffusion paper as rows of the table."""
     return [
         *_weight_rows(scenario),
         *_plant_rows(scenario),

@@ -249,11 +249,8 @@ def _window_excitation(source: _Source, states: FloatArray, window: int) -> Floa
 
 
 def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return ``E[phi phi' / (1 + |phi|^2)]`` (K, n, n), the mean excitation by a Gaussian regressor
-    phi in a slot.
-
-    phi has K means ``mean`` (K, n) and one covariance ``cov`` (n, n). 1 / (1 + r) is the integral
-    of exp(-u (1 + r)) over u > 0, so that only Gaussian integrals remain.
+    """Return ``E[phi phi' / (1 + |phi|^2)]`` (K, n, n) of a Gaussian phi with means ``mean`` (K, n)
+    and one ``cov`` (n, n), by 1 / (1 + r) = int exp(-u (1 + r)) du.
     """
     spread, axes = np.linalg.eigh(cov)
     spread = np.maximum(spread, 0.0)

@@ -19,9 +19,7 @@ MAX_LISTED = 12  # matchings that a row names
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions of the gossip paper, as rows (assumption, source, whether it holds,
-    evidence) of the table: on matching, plant, walk, swaps and first covariances.
-    """
+    """Return the assumptions of the gossip paper as rows of the table."""
     return [
         *_matching_rows(scenario),
         *slot_plant_rows(scenario),

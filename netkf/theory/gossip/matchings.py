@@ -35,10 +35,8 @@ def mean_matching(scenario: Scenario) -> FloatArray:
 
 
 def effective_matching(scenario: Scenario) -> FloatArray:
-    """Return the mean (N, N) of the swaps that succeed: Abar with the losses of the channel.
-
-    Raises TheoryError if slots depend on each other, if a swap can become a copy, or if messages
-    can be late.
+    """Return the mean (N, N) of the swaps that succeed: Abar with the losses of the channel. Raises
+    TheoryError if slots depend on each other, swaps can become copies, or messages be late.
     """
     activation, channel = scenario.network.activation, scenario.network.channel
     if not isinstance(activation, Matching):
@@ -77,10 +75,8 @@ def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
 
 
 def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
-    """Return (is irreducible, is also aperiodic, period) of a nonnegative ``matrix`` (N, N).
-
-    The period is the greatest common divisor of the lengths of the cycles in the graph of positive
-    entries; 0 if the matrix is reducible.
+    """Return (is irreducible, is also aperiodic, period) of a nonnegative ``matrix`` (N, N); the
+    period is the gcd of the lengths of its cycles, 0 if it is reducible.
     """
     import networkx
 

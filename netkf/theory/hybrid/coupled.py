@@ -151,9 +151,8 @@ def require_bound(scenario: Scenario) -> None:
 
 
 def increment_informations(scenario: Scenario) -> FloatArray:
-    """Return ``G_i = H_i' R_i^-1 H_i`` (N, n, n) of the increments, with the R that filters assume.
-
-    A pooled filter has the same G, of all sensors, at every node.
+    """Return ``G_i = H_i' R_i^-1 H_i`` (N, n, n) of the increments, with the R that filters assume;
+    a pooled filter has all at every node.
     """
     observations, n = increment_observations(scenario), scenario.plant.n
     distinct = {
@@ -173,10 +172,8 @@ def increment_informations(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=4)
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return the coefficients c (N, N), sparse, by which messages couple the nodes' covariances:
-    rate (per second) of arrivals from j at i, times the weight that i gives them.
-
-    Calls with one scenario return the same array, which must not be modified.
+    """Return the coefficients c (N, N), sparse: the rate (1/s) of arrivals from j at i times their
+    weight. Calls with one scenario share the array.
     """
     index, size = scenario.topology.index, len(scenario.nodes)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
@@ -191,12 +188,7 @@ def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
 
 
 def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
-    """Return the coupled Riccati equations H(12) of a scenario with N nodes, whose solution bounds
-    the mean of each filter's P: coefficients (n, n), information (N, n, n), rates of arrivals
-    (N, N) and P(0) (N, n, n).
-
-    Raises TheoryError if H(12) does not apply.
-    """
+    """Return the equations H(12) of a scenario; raises TheoryError if they do not apply."""
     require_bound(scenario)
     A, Q = scenario.belief
     n = scenario.plant.n
@@ -228,10 +220,8 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
 
 
 def has_balanced_rates(scenario: Scenario) -> bool | None:
-    """Return True if both directions of each link have one rate: then the bound tends to S as links
-    become faster, the steady covariance with the mean information of all nodes (H equation 13).
-
-    None if the rates are not known beforehand.
+    """Return True if both directions of each link have one rate, so that S is the limit, H (13);
+    None if rates are not known beforehand.
     """
     if not np.isfinite(list(scenario.effective_rates().values())).all():
         return None
@@ -245,11 +235,9 @@ def _is_symmetric(c: scipy.sparse.csr_array) -> bool:
 
 
 def left_weights(scenario: Scenario) -> FloatArray:
-    """Return the weights (N,) of the nodes' information in the limit of ever faster links.
-
-    They are the left null vector of ``D - c``, c the coupling and D its row sums, scaled to sum 1:
-    1/N if both directions of each link have one rate. Raises TheoryError if messages do not connect
-    all nodes.
+    """Return the weights (N,) of the nodes' information for ever faster links: the left null vector
+    of ``D - c``, D the row sums of the coupling. Raises TheoryError if messages do not connect all
+    nodes.
     """
     algorithm = scenario.filter.algorithm
     if len(scenario.nodes) == 1:

@@ -34,13 +34,8 @@ def solve_linearised(
     right: FloatArray,
     tolerance: float = RESIDUAL_TOLERANCE,
 ) -> FloatArray:
-    """Return the solution X (N, m) of ``op_P(X) = -right``, where op_P is the linearisation at P
-    (N, n, n) of the coupled Riccati equations H(12), which bound the mean of N filters' P.
-
-    m = n (n + 1) / 2 entries of the upper triangle for each of N nodes, as in ``right`` (N, m); nan
-    if the map is singular. The norm of the residual is at most ``tolerance`` times that of
-    ``right``, or as small as rounding lets it be. Raises TheoryError if there are too many
-    unknowns.
+    """Return X (N, m) with ``op_P(X) = -right``, op_P the linearisation of H(12) at P (N, n, n),
+    see :func:`solve_map`.
     """
     return solve_map(packed.linear(P), right, tolerance)
 
@@ -48,11 +43,8 @@ def solve_linearised(
 def solve_map(
     linear: LinearisedRiccati, right: FloatArray, tolerance: float = RESIDUAL_TOLERANCE
 ) -> FloatArray:
-    """Return the solution X (N, m) of ``linear(X) = -right``; nan if the map is singular.
-
-    X and ``right`` (N, m) hold the m = n (n + 1) / 2 entries of the upper triangle for each of N
-    nodes. The norm of the residual is at most ``tolerance`` times that of ``right``, or as small as
-    rounding lets it be. Raises TheoryError if neither elimination nor GMRES can solve for so many
+    """Return X (N, m) with ``linear(X) = -right``; nan if the map is singular. The residual is at
+    most ``tolerance`` times ``right`` (N, m), or rounding. Raises TheoryError for too many
     unknowns.
     """
     eliminates = right.size <= FEW_UNKNOWNS or linear.packed.eliminates_cheaply
@@ -67,12 +59,9 @@ def solve_map(
 
 
 def is_stable(linear: LinearisedRiccati) -> bool:
-    """Return True if all solutions of ``dX/dt = linear(X)``, an (n, n) matrix for each of N nodes,
-    vanish with time.
-
-    The map generates positive maps, so that it is stable if and only if a positive definite X has a
-    negative definite image at every node: the solution X for -I, with a residual that nowhere
-    reaches I. Raises TheoryError if there are too many unknowns to solve for.
+    """Return True if all solutions of ``dX/dt = linear(X)`` vanish with time: as for any generator
+    of positive maps, if and only if the solution X for -I is positive definite. Raises TheoryError
+    for too many unknowns.
     """
     packed = linear.packed
     P = packed.equations.start

@@ -62,10 +62,7 @@ class PackedRiccati:
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
         """Return the equations with another drift A (n, n) and noise Q (n, n) or (N, n, n), per
-        second.
-
-        Arrays that depend on the network alone are shared with the present object, which is
-        unchanged.
+        second; arrays of the network are shared.
         """
         shifted = copy.copy(self)
         shifted.equations = self.equations._replace(A=A, Q=Q)
@@ -98,9 +95,7 @@ class PackedRiccati:
         return scipy.sparse.csr_array(matrix)
 
     def pack(self, P: FloatArray) -> FloatArray:
-        """Return the upper triangles (..., m) of symmetric P (..., n, n), row by row; m = n (n + 1)
-        / 2.
-        """
+        """Return the upper triangles (..., m) of symmetric P (..., n, n), row by row."""
         return np.ascontiguousarray(P[..., self._i, self._j])
 
     def unpack(self, Y: FloatArray) -> FloatArray:
@@ -109,9 +104,7 @@ class PackedRiccati:
         return np.asarray(Y[..., self._indices].reshape(*Y.shape[:-1], n, n))
 
     def predict(self, Y: FloatArray) -> FloatArray:
-        """Return the rows (N, m) of ``T P T' + q``: the covariances in rows Y (N, m) predicted over
-        the delay.
-        """
+        """Return the rows (N, m) of ``T P T' + q``: those of Y (N, m) predicted over the delay."""
         return np.asarray(Y @ self._predicted + self._q)
 
     def slope(self, Y: FloatArray, sent: FloatArray | None = None) -> FloatArray:
@@ -149,11 +142,8 @@ class PackedRiccati:
         change += group.heard @ arriving
 
     def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
-        """Return the Taylor coefficients (order + 1, N, m) of the solution of the coupled Riccati
-        equations through ``Y`` (N, m), rows of m entries for the symmetric matrix of each node.
-
-        Without delay, in powers of seconds / ``span``. The right-hand side is quadratic, so that
-        each coefficient follows from those before it.
+        """Return the Taylor coefficients (order + 1, N, m), in powers of seconds / ``span``, of the
+        solution through ``Y`` (N, m), without delay.
         """
         series = np.empty((order + 1, *Y.shape))
         series[0] = Y
@@ -184,10 +174,8 @@ class PackedRiccati:
         return series
 
     def linear(self, P: FloatArray) -> LinearisedRiccati:
-        """Return the coupled Riccati equations H(12), which bound the mean of each node's P,
-        linearised at ``P`` (N, n, n), that is with the gains of P held fixed.
-
-        P minimises the right-hand side over gains, so that their change has no first-order effect.
+        """Return H(12) linearised at ``P`` (N, n, n), with its gains held fixed: P minimises the
+        right-hand side over gains, so that their change has no first-order effect.
         """
         blocks = self._blocks(self._sensed, P[self._sensed] @ self.equations.G[self._sensed])
         heard = [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
@@ -202,10 +190,8 @@ class PackedRiccati:
         return LinearisedRiccati(np.asarray(blocks), heard, self)
 
     def linear_with_gains(self, corrections: FloatArray) -> LinearisedRiccati:
-        """Return the linear map of P with constant gains, for equations without samples.
-
-        ``corrections`` (N, n, n) has the product ``L_i H_i`` of gain and observation matrix of each
-        node, zeros without a sensor.
+        """Return the linear map of P with constant gains, of which ``corrections`` (N, n, n) are
+        ``L_i H_i``, for equations without samples.
         """
         blocks = self._blocks(np.arange(len(corrections)), corrections)
         heard = [(self.equations.coupling, np.arange(len(corrections)), self._predicted[None])]
@@ -239,9 +225,7 @@ class LinearisedRiccati(NamedTuple):
     packed: PackedRiccati
 
     def arriving(self, X: FloatArray) -> FloatArray:
-        """Return what messages from other nodes add per second at each node, (N, m), for rows X
-        (N, m) of all nodes, the upper triangles of their covariances.
-        """
+        """Return what messages add per second at each node, (N, m), for rows X (N, m)."""
         total = np.zeros_like(X)
         for rates, nodes, maps in self.heard:
             sent = X[nodes]
@@ -260,9 +244,7 @@ class LinearisedRiccati(NamedTuple):
         return np.asarray(total)
 
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
-        """Return the linear map as a sparse matrix (N m, N m), with the arrivals from other nodes
-        or, without ``arriving``, block diagonal.
-        """
+        """Return the map as a sparse matrix (N m, N m), with the arrivals or block diagonal."""
         size, m, _ = self.blocks.shape
         shape = (size * m, size * m)
         transposed = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))

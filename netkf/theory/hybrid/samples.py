@@ -42,18 +42,14 @@ class PoissonSamples(NamedTuple):
     heard: scipy.sparse.csr_array
 
     def update_gains(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the Kalman gains K (S, n, p) and ``I - K H`` (S, n, n) of the S sensors, at the
-        covariances P (N, n, n) of the N nodes.
-        """
+        """Return the gains K (S, n, p) and ``I - K H`` (S, n, n) of the S sensors at P (N, n, n)."""
         # C = P H' and K = C (H C + R)^-1
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         K = np.swapaxes(np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)), 1, 2)
         return K, np.eye(P.shape[-1]) - K @ self.H
 
     def sample_decrease(self, P: FloatArray) -> FloatArray:
-        """Return the decrease ``P H' (H P H' + R)^-1 H P`` (S, n, n) of the covariance of each
-        sensor's node by one sample, at the covariances P (N, n, n) of the N nodes.
-        """
+        """Return ``P H' (H P H' + R)^-1 H P`` (S, n, n) of the node of each sensor, at P (N, n, n)."""
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         return np.asarray(C @ np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)))
 
@@ -111,10 +107,8 @@ def transmits_at_samples(scenario: Scenario) -> bool:
 
 
 def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
-    """Return the mean effect of messages that nodes send when they sample: for each link the
-    delivery probability times the weight that the receiver gives to a message.
-
-    Keys are the indices (receiver, sender); empty if the nodes do not transmit at samples.
+    """Return, by the indices (receiver, sender), the delivery probability times the weight of
+    messages that nodes send when they sample; empty if they do not.
     """
     if not scenario.filter.algorithm.timing.talks or not transmits_at_samples(scenario):
         return {}
@@ -127,9 +121,7 @@ def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
 
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
-    """Return all sensors with Poisson clocks, in groups of equal numbers p of rows: each has the H
-    (S, p, n), R (S, p, p) and rates (S,) of its S sensors.
-    """
+    """Return all sensors with Poisson clocks, in groups of equal numbers p of rows."""
     index, size = scenario.topology.index, len(scenario.nodes)
     pooled = scenario.filter.algorithm.timing.pooled
     entries_by_rows: dict[int, list[tuple[int, FloatArray, FloatArray, float, int]]] = {}
@@ -166,9 +158,7 @@ def _arrival_rates(
 
 
 def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
-    """Return the samples at known times below the horizon, in the order of time: the readings of
-    each node, and the mean weights (N, N) of the messages that are sent then.
-    """
+    """Return the samples at known times below the horizon, in the order of time."""
     placed_sensors = {
         (node, placed_sensor.ordinal): placed_sensor
         for node, sensors_of_node in scenario.sampled_sensors.items()

@@ -22,12 +22,9 @@ MAX_ENTRIES = 200  # entries of all covariances together
 
 
 def second_moment_rate(scenario: Scenario) -> float:
-    """Return the growth rate (1/s) of second moments of the filters' random covariances P, by an
-    upper bound on P whose mean is the steady bound; they stay finite if it is below 0, and then
-    intervals for the mean of P hold.
-
-    Raises TheoryError except for Poisson clocks of links with independent losses and no delay, if
-    the steady bound does not exist (then the mean grows too), and for very large networks.
+    """Return the growth rate (1/s) of second moments of an upper bound on P; below 0 intervals for
+    the mean of P hold. Raises TheoryError except for Poisson clocks of links with independent
+    losses and no delay, without a steady bound, and for very large networks.
     """
     channel = scenario.network.channel
     if not isinstance(scenario.network.activation, Poisson):

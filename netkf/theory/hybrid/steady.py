@@ -79,10 +79,8 @@ def has_stabilising_gains(scenario: Scenario) -> bool:
 
 
 def steady_by_node(scenario: Scenario) -> FloatArray:
-    """Return the steady covariance (N, n, n) that each node's filter has by itself, in a network
-    without messages; nan if it has none.
-
-    Raises TheoryError if nodes communicate.
+    """Return the steady covariance (N, n, n) that each node has without messages; nan if it has
+    none. Raises TheoryError if nodes communicate.
     """
     equations = coupled_riccati(scenario)
     if equations.talks:
@@ -93,11 +91,8 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
 
 
 def steady_state(equations: CoupledRiccati) -> FloatArray | None:
-    """Return the steady state (N, n, n) of the coupled Riccati ``equations`` that bound the mean of
-    each of N filters' P, or None if there is none.
-
-    Raises TheoryError for samples at known times, which lead to a cycle, and if the residual of the
-    computed state is too large.
+    """Return the steady state (N, n, n) of H(12), or None. Raises TheoryError for samples at known
+    times, which lead to a cycle, and for too large a residual.
     """
     packed = PackedRiccati(equations)
     P = _stabilising_covariances(packed)
@@ -215,11 +210,8 @@ def _no_steady_state(scenario: Scenario, equations: CoupledRiccati) -> str:
 
 
 def threshold_factor(equations: CoupledRiccati) -> float | None:
-    """Return the least factor on all link rates for which H(12), the coupled Riccati ``equations``
-    of the bounds on the covariances of all nodes, has a steady state.
-
-    By bisection and extrapolation to the relative accuracy 1e-6, or 1e-3 for large networks; None
-    if no factor up to 1e6 suffices.
+    """Return the least factor on all link rates for which H(12) has a steady state, to 1e-6, or
+    1e-3 for large networks; None if 1e6 does not suffice.
     """
     low = _necessary_factor(equations)
     if low is None:

@@ -27,14 +27,10 @@ class StiffError(Exception):
 def solve_by_taylor_series(
     packed: PackedRiccati, times: FloatArray, scale: float, max_orders: int, limit: float
 ) -> FloatArray:
-    """Return the solution (T, N, m) at ``times`` (seconds, increasing) of the coupled Riccati
-    equations that bound the mean of P at N nodes (H equation 12), from ``packed.start`` at 0.
-
-    Each covariance is packed into its m = n (n + 1) / 2 distinct entries. A step is accepted if its
-    last terms are negligible and its polynomial satisfies the equation at its end; entries far
-    below ``scale`` need not be accurate. Raises StiffError after
-    ``max_orders`` coefficients or if steps shrink to nothing, and TheoryError if an entry exceeds
-    ``limit``.
+    """Return the solution (T, N, m) of H(12) at ``times`` (s, increasing) from ``packed.start``.
+    Steps are accepted if the polynomial satisfies the equation at their end; entries far below
+    ``scale`` need not be accurate. Raises StiffError after ``max_orders`` coefficients, and
+    TheoryError beyond ``limit``.
     """
     Y, now = packed.start, 0.0
     out = np.empty((len(times), *Y.shape))

@@ -26,9 +26,7 @@ TOLERANCE = 1e-12  # of a count: rounding of products of weights
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions, as rows of the table, about the model, the weights of readings and
-    the first covariances.
-    """
+    """Return the assumptions about model, weights of readings and first covariances as rows."""
     once: AssumptionRow = (ONCE, "derived", *_judge_counts(scenario))
     return model_and_start_rows(scenario, SOURCE, once)
 
@@ -62,11 +60,8 @@ def step_weights(scenario: Scenario) -> FloatArray:
 def effective_weights(
     scenario: Scenario, weights: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the weights (N, N) of the predictions and those of the readings (N, N) in the
-    estimates after an exchange, in which nodes average pairs (information vector and matrix).
-
-    Entry (i, j) is the number of times that node i counts the information of node j. ``weights``
-    (N, N) of each step are those of the messages that arrived in it, 0 for others.
+    """Return how often node i counts the prediction and the reading of node j after an exchange,
+    (N, N) each; ``weights`` (N, N) of each step are those of the messages that arrived.
     """
     algorithm: Any = scenario.node_filter
     N = len(scenario.nodes)

@@ -24,10 +24,7 @@ BOUNDED_MEAN = "readings arrive often enough for a bounded mean (sufficient)"
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions of the paper on intermittent observations, as rows (assumption,
-    source, whether it holds, evidence) of the table: on plant, detectability, arrivals and first
-    covariances.
-    """
+    """Return the assumptions of the paper on intermittent observations as rows of the table."""
     return [
         *slot_plant_rows(scenario),
         *_detectability_rows(scenario),

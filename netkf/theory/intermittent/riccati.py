@@ -146,10 +146,8 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
 
 
 def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the steady covariance (n, n) after a reading, paper P (12); P* is that before it.
-
-    F and Q are (n, n), H (p, n), R (p, p). Raises TheoryError if (F, H) is not detectable or P*
-    cannot be computed precisely.
+    """Return the steady covariance (n, n) after a reading, paper P (12). Raises TheoryError if (F,
+    H) is not detectable or P* cannot be computed precisely.
     """
     P = steady_covariance(F, Q, H, R)
     information = H.T @ np.linalg.solve(R, H)
@@ -163,9 +161,7 @@ def _optimal_gain(P: FloatArray, F: FloatArray, H: FloatArray, R: FloatArray) ->
 
 
 def undetectable_slot_mode(F: FloatArray, H: FloatArray) -> complex | None:
-    """Return an eigenvalue of F (n, n) on or outside the unit circle that H (p, n) does not
-    observe, or None.
-    """
+    """Return an eigenvalue of F on or outside the unit circle that H does not observe, or None."""
     return hidden_mode(F, H, FACTOR)
 
 
@@ -251,11 +247,9 @@ def _critical_bounds(F: FloatArray, H: FloatArray, search: _GainSearch) -> tuple
 
 
 def contraction_radius(F: FloatArray, arrivals: Sequence[tuple[float, FloatArray]]) -> float:
-    """Return the least spectral radius over gains of the mean-square dynamics.
-
-    ``X -> sum_s p_s (F + K_s H_s) X (F + K_s H_s)'`` with F (n, n), over sets s of readings, with
-    stacked ``H_s`` (p, n), that arrive with probability p_s: ``arrivals`` are the pairs (p_s, H_s).
-    Below 1 the mean of the covariance stays bounded (R (32), derived for several links).
+    """Return the least spectral radius over gains of ``X -> sum_s p_s (F + K_s H_s) X (F + K_s
+    H_s)'``, with ``arrivals`` (p_s, H_s) of sets of readings. Below 1 the mean of P stays bounded
+    (R (32), derived).
     """
     return _GainSearch(F, [H for _, H in arrivals]).best([p for p, _ in arrivals])[0]
 
@@ -433,14 +427,10 @@ def couple_from_the_past(
     empty: np.ndarray,
 ) -> tuple[FloatArray, np.ndarray]:
     """Return K exact draws (K, n, n) from the invariant law of a switched Riccati recursion, and
-    the last mode (K,) of each, by coupling from the past (Propp and Wilson 1996). A mode says which
-    readings update a covariance in a slot.
-
-    ``draw(following, T)`` returns the T modes before those in ``following`` (K, S);
-    ``propagate(roots, modes)`` applies modes (K, T) to roots (K, n, n); ``empty`` is an array
-    (K, 0) of modes, which fixes K and the type. Chains from both ``starts`` (2, n, n), between
-    which all others lie, run through ever longer pasts until they meet. Raises TheoryError if they
-    do not within MAX_PAST slots.
+    their last modes (K,) (Propp and Wilson 1996). ``draw(following, T)`` returns T modes before
+    ``following`` (K, S), ``propagate(roots, modes)`` applies modes (K, T); ``empty`` (K, 0) fixes K
+    and type. Chains from both ``starts`` (2, n, n) run until they meet; TheoryError after MAX_PAST
+    slots.
     """
     out = np.empty((len(empty), *starts.shape[1:]))
     last = np.empty(len(empty), dtype=empty.dtype)

@@ -61,9 +61,8 @@ class ScalarLaw:
         return self.F**2 * self.R / self.H**2 + self.Q, float(self.without(np.array(self.least)))
 
     def cdf(self, x: ArrayLike) -> FloatArray:
-        """Return P(X <= x) for a covariance X with the invariant law, exact to about 1e-15,
-        elementwise: an array of the shape of ``x``. It goes back slot by slot: from x one learns if
-        the last slot had a reading, and the point before it that has the same probability.
+        """Return P(X <= x) of the invariant law, exact to about 1e-15, in the shape of ``x``: slot
+        by slot backwards, since x tells whether the last slot had a reading.
         """
         point = np.array(x, dtype=np.float64)
         total, weight = np.zeros_like(point), np.ones_like(point)
@@ -82,14 +81,9 @@ class ScalarLaw:
         return total
 
     def cdf_after(self, x: ArrayLike, slots: int, start: float) -> FloatArray:
-        """Return P(P_t <= x) after t = ``slots`` slots from P_0 = ``start``, exact, an array of the
-        shape of ``x``.
-
-        P_t is f_0(P_{t-1}) (a slot without a reading) with probability 1 - g and f_1(P_{t-1}) (one
-        with a reading) with probability g, so that the
-        distribution function obeys ``P(P_t <= x) = (1 - g) P(P_{t-1} <= f_0^-1(x)) + g P(P_{t-1} <=
-        f_1^-1(x))``. At or above P* one of the two terms is 0 or 1; below P*, which only a smaller
-        start reaches, both count.
+        """Return P(P_t <= x) after t = ``slots`` slots from P_0 = ``start``, exact, in the shape of
+        ``x``: ``P(P_t <= x) = (1 - g) P(P_{t-1} <= f_0^-1(x)) + g P(P_{t-1} <= f_1^-1(x))``. At or
+        above P* one of the terms is 0 or 1; below it both count.
         """
         x = np.asarray(x, dtype=np.float64)
         point, owner = x.reshape(-1), np.arange(x.size)
@@ -117,10 +111,8 @@ class ScalarLaw:
         return total.reshape(x.shape)
 
     def quantile(self, u: ArrayLike) -> FloatArray:
-        """Return the least x with P(X <= x) >= u for a covariance X with the invariant law, an
-        array of the shape of ``u``.
-
-        ``u`` must lie in [0, 1), otherwise it raises TheoryError.
+        """Return the least x with P(X <= x) >= u, in the shape of ``u``, which must lie in [0, 1),
+        else it raises TheoryError.
         """
         level = np.array(u, dtype=np.float64)
         if ((level < 0.0) | (level >= 1.0)).any():
@@ -144,12 +136,9 @@ class ScalarLaw:
         return P
 
     def mean(self) -> float:
-        """Return the mean E of a covariance X with the invariant law to about 1e-9 relative,
-        infinite if (1-g) F^2 >= 1; f_0 is a slot without a reading, f_1 one with it.
-
-        E = g E[f_1(X)] + (1-g)(F^2 E + Q), and E[f_1(X)] lies between two sums over all
-        compositions of 18 maps, applied to P* and to infinity. Raises TheoryError if these differ
-        by more than 1e-6.
+        """Return the mean E of the invariant law to about 1e-9, infinite if (1-g) F^2 >= 1: E = g
+        E[f_1(X)] + (1-g)(F^2 E + Q), with E[f_1(X)] between two sums over compositions of 18 maps.
+        Raises TheoryError if these differ by more than 1e-6.
         """
         growth = (1.0 - self.delivery) * self.F**2
         if not contracts(growth):

@@ -21,11 +21,9 @@ from netkf.theory.intermittent.riccati import steady_covariance
 
 
 def slot_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of all nodes' Kalman-consensus filters in slots, at steady gains, as a
-    linear system with jumps, of which exact mean squares are computed: the exchange adds to each
-    error consensus terms, multiples of the differences of predictions.
-
-    Raises TheoryError for recorded exchanges, and if nodes share readings and messages can be lost.
+    """Return the errors of Kalman-consensus filters in slots at steady gains as a linear system:
+    the exchange adds multiples of the differences of predictions. Raises TheoryError for recorded
+    exchanges, and if nodes share readings and messages can be lost.
     """
     algorithm: Any = scenario.filter.algorithm
     nodes = scenario.nodes

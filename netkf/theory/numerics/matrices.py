@@ -14,10 +14,7 @@ RESIDUAL = 1e-9  # of an equation, relative to its terms: larger ones mean a fai
 
 
 def as_numbers(name: str, value: ArrayLike) -> FloatArray:
-    """Return ``value`` as a float array of its own shape, a single number as (1, 1).
-
-    ``name`` is how the message of the TheoryError calls the value if it is not real numbers.
-    """
+    """Return ``value`` as a float array, a number as (1, 1); a TheoryError calls it ``name``."""
     try:
         if np.iscomplexobj(value):
             raise TypeError
@@ -29,9 +26,7 @@ def as_numbers(name: str, value: ArrayLike) -> FloatArray:
 
 
 def as_integer(name: str, value: object, min_value: int, max_value: float = np.inf) -> int:
-    """Return ``value``, an int in ``min_value`` .. ``max_value``; otherwise raises TheoryError,
-    whose message calls it ``name``.
-    """
+    """Return ``value``, an int in ``min_value`` .. ``max_value``; else raises TheoryError."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise TheoryError(f"{name} must be an integer, got {value!r}")
     if not min_value <= value <= max_value:
@@ -45,10 +40,7 @@ def as_integer(name: str, value: object, min_value: int, max_value: float = np.i
 
 
 def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
-    """Return ``value`` as a finite (n, n) array, a number as 1 x 1; any n if it is None.
-
-    Raises TheoryError otherwise, whose message calls the value ``name``.
-    """
+    """Return ``value`` as a finite (n, n) array, any n if it is None; else raises TheoryError."""
     array = as_numbers(name, value)
     shape_text = "square" if n is None else f"{n} x {n}"
     if array.ndim != 2 or array.shape[0] != array.shape[1] or n not in (None, len(array)):
@@ -59,10 +51,7 @@ def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
 
 
 def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
-    """Return ``value`` as a symmetric positive semidefinite (n, n) array.
-
-    Raises TheoryError otherwise, whose message calls the value ``name``.
-    """
+    """Return ``value`` as a symmetric positive semidefinite (n, n) array; else raises TheoryError."""
     array = as_square(name, value, n)
     if n == 0:
         return array
@@ -99,11 +88,8 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
 
 
 def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
-    """Return the stabilising solution S (n, n) of ``0 = A S + S A' + Q - S G S``.
-
-    A, Q and G are (n, n), ``G = H' R^-1 H`` the information per second of continuous readings.
-    Raises TheoryError with the reason if there is none, or if the computed S fails the check of its
-    residual or does not stabilise A - S G.
+    """Return the stabilising solution S (n, n) of ``0 = A S + S A' + Q - S G S``, all (n, n).
+    Raises TheoryError if there is none, or the computed one fails the check of its residual.
     """
     hidden = undetectable_mode(A, G)
     if hidden is not None:

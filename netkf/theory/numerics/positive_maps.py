@@ -36,9 +36,8 @@ RESIDUAL, MAX_ROUNDS = 1e-10, 20
 
 
 def spectral_radius(T: PositiveMap, shape: Shape) -> float:
-    """Return the spectral radius of a positive map ``T`` on stacks of a ``shape`` (S, M, M).
-
-    Raises TheoryError if it is neither proved nor found by two different searches.
+    """Return the spectral radius of a positive map ``T`` on stacks of a ``shape`` (S, M, M). Raises
+    TheoryError if it is neither proved nor found by two different searches.
     """
     if _count_numbers(shape) > MAX_DENSE:
         value, X = _extreme_eigenvalue(T, np.broadcast_to(np.eye(shape[-1]), shape), "LR")
@@ -50,13 +49,9 @@ def spectral_radius(T: PositiveMap, shape: Shape) -> float:
 
 
 def fixed_point(T: PositiveMap, Q: FloatArray, radius: float) -> FloatArray:
-    """Return the solution (S, M, M) of ``X = T(X) + Q`` by iterative refinement of elimination or,
-    for large stacks, of GMRES.
-
-    T is a positive map on stacks of S symmetric matrices, of spectral ``radius`` below 1, and Q
-    (S, M, M) such a stack. The residual is below RESIDUAL max(1 - radius, 1e-3), relative to the
-    standard deviations of row and column. If GMRES does not reach that, elimination is tried for
-    stacks of up to MAX_DENSE_FALLBACK numbers. Raises TheoryError if neither does.
+    """Return the solution (S, M, M) of ``X = T(X) + Q``, T of ``radius`` below 1, by refined
+    elimination or GMRES, to a residual of RESIDUAL max(1 - radius, 1e-3) relative to the standard
+    deviations of row and column; else raises TheoryError.
     """
     # The error of the solution is up to 1 / (1 - radius) times the residual.
     tolerance = RESIDUAL * max(1.0 - radius, 1e-3)

@@ -77,11 +77,9 @@ class ErrorFlow:
     def move(
         self, errors: FloatArray, roots: FloatArray, gap: float, columns: tuple[int, int]
     ) -> None:
-        """Propagate the forms of K ``errors`` (K, n, C), and the ``roots`` (K, n, n) of their P,
-        over ``gap`` seconds, at most ``unit``.
-
-        Changes both. ``columns``: the first of the plant's 8 m inputs, and the first of n inputs of
-        each error.
+        """Propagate the forms of K ``errors`` (K, n, C) and the ``roots`` (K, n, n) of their P in
+        place over ``gap`` seconds, at most ``unit``; ``columns``: the first of the plant's 8 m
+        inputs, and the first of n inputs of each error.
         """
         quadrature = (NODES, WEIGHTS)
         flow_estimates(errors, roots, columns, self._tables, self._exponential, gap, quadrature)
@@ -99,11 +97,8 @@ class StateFlow:
         self.inputs = len(NODES) * B.shape[1]
 
     def __call__(self, gap: float) -> tuple[FloatArray, FloatArray]:
-        """Return the state's transition (n, n) and its response (n, 8 m) to the plant's inputs,
-        over a ``gap`` in seconds, at most MAX_NORM / |A|.
-
-        The inputs are independent with variance 1, those of one instant side by side, so that
-        response times its transpose is the covariance of the noise over the gap.
+        """Return the state's transition (n, n) and its response (n, 8 m) to the plant's independent
+        inputs over a ``gap`` in seconds, at most MAX_NORM / |A|.
         """
         E = self._exp(np.append((1.0 - NODES) * gap, gap))
         root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]

@@ -17,11 +17,8 @@ from netkf.linalg.small import solve_inplace
 
 @kernel
 def triangularise(factor: FloatArray, n: int, columns: int) -> None:
-    """Overwrite the first n columns of ``factor`` (n, at least n) by the lower triangular S (n, n)
-    with ``S S' = factor factor'``, the product being over the first ``columns`` columns: S is a
-    root of the covariance of which ``factor`` is one with more columns.
-
-    Columns from n on are overwritten with intermediate values.
+    """Overwrite the first n columns of ``factor`` by the lower triangular S (n, n) with ``S S' =
+    factor factor'`` of its first ``columns`` columns; the others are scratch.
     """
     # Householder reflections from the right leave factor factor' unchanged.
     for i in range(n):
@@ -33,10 +30,7 @@ def triangularise(factor: FloatArray, n: int, columns: int) -> None:
 
 @kernel
 def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> None:
-    """Replace ``rows`` (count, n) by ``rows L^-T`` in place, for a lower triangular L (n, n).
-
-    By forward substitution, row by row.
-    """
+    """Replace ``rows`` (count, n) by ``rows L^-T`` in place, for a lower triangular L (n, n)."""
     for r in range(count):
         for j in range(n):
             total = rows[r, j]
@@ -47,9 +41,8 @@ def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> 
 
 @kernel
 def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: FloatArray) -> None:
-    """Multiply an error by a ``matrix`` (n, n) in place: replace the first ``used`` columns of its
-    ``form`` (n, width), which has the coefficients of the error as a linear function of random
-    inputs, by ``matrix form``; ``scratch`` (n, used) is overwritten.
+    """Replace the first ``used`` columns of a ``form`` (n, width) by ``matrix form``; ``scratch``
+    (n, used).
     """
     n = matrix.shape[0]
     for i in range(n):
@@ -106,12 +99,9 @@ def exponential(series: FloatArray, share: float) -> FloatArray:
 def flow_blocks(
     series: FloatArray, unit: float, scale: float, gap: float, nodes: FloatArray
 ) -> FloatArray:
-    """Return the transposes (K + 1, 4, n, n) of the four blocks of exp(M s), row by row, at the
-    ``nodes`` (K,) of a gap and at its end; M is the Hamiltonian of the Riccati equation of P.
-
-    ``series`` (T, 2 n, 2 n) are the terms of the power series of exp(M s) in s / unit for
-    covariances in units of ``scale``, which is removed from the result. ``nodes`` are fractions of
-    the ``gap``, and ``gap`` and ``unit`` are seconds.
+    """Return the transposes (K + 1, 4, n, n) of the blocks of exp(M s) at the ``nodes`` (K,) of a
+    gap and at its end; ``series`` (T, 2 n, 2 n) are the terms of exp(M s) in s / unit for
+    covariances in units of ``scale``.
     """
     n, count = series.shape[1] // 2, len(nodes)
     out = np.empty((count + 1, 4, n, n))
@@ -130,13 +120,9 @@ def flow_blocks(
 def flow_gramian(
     blocks: FloatArray, whitened: FloatArray, root_weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return F (n, n) and Gamma (K p, n) of a gap with continuous readings, from which the
-    covariance at its end follows for any covariance P at its start.
-
-    F is the error's transition ``X(g)^-T`` for P = 0 at the start, Gamma' Gamma the information
-    that the readings of the gap give about the state at its start. ``blocks`` (K + 1, 4, n, n) are
-    those of ``flow_blocks``, ``whitened`` (p, n) is R^-1/2 H, and ``root_weights`` (K,) are the
-    square roots of the quadrature weights in seconds.
+    """Return F = ``X(g)^-T`` (n, n) for P = 0 at the start of a gap, and Gamma (K p, n), with
+    Gamma' Gamma the information of its readings about the state at its start, for ``whitened``
+    R^-1/2 H (p, n).
     """
     count = len(root_weights)
     p, n = whitened.shape
@@ -165,10 +151,8 @@ def flow_gramian(
 def flow_start(
     F: FloatArray, blocks: FloatArray, B: FloatArray, gain: FloatArray, root_weights: FloatArray
 ) -> FloatArray:
-    """Return the root (n, n) of P at the end of a gap from P = 0 at its start.
-
-    ``B`` (n, m) is the filters' noise factor, ``gain`` (n, p) is ``H' R^-1/2``; ``F``, ``blocks``
-    and ``root_weights`` as in flow_gramian().
+    """Return the root (n, n) of P at the end of a gap from P = 0; ``B`` (n, m) is the filters'
+    noise factor, ``gain`` (n, p) is ``H' R^-1/2``.
     """
     count, n, m, p = len(root_weights), B.shape[0], B.shape[1], gain.shape[1]
     factor, response = np.zeros((n, max(n, count * (m + p)))), np.empty((n, n))
@@ -199,11 +183,8 @@ def _add_product(out: FloatArray, first: int, a: FloatArray, b: FloatArray, scal
 def flow_over_gap(
     F: FloatArray, Gamma: FloatArray, start: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ``F J``, ``F J P`` and the root of P at the end of a gap, (n, n) each.
-
-    ``J = (I + P G)^-1`` with P = root root' at the start of the gap and ``G = Gamma' Gamma``; F
-    (n, n) and Gamma (K p, n) are those of flow_gramian(), and ``start`` (n, n) is the root at the
-    end of the solution from P = 0, see flow_start().
+    """Return ``F J``, ``F J P`` and the root of P at the end of a gap, (n, n) each, with ``J = (I +
+    P Gamma' Gamma)^-1`` and P = root root' at its start; ``start`` is that of ``flow_start``.
     """
     n, rows = F.shape[0], Gamma.shape[0]
     GS, SL = np.empty((rows, n)), root.copy()

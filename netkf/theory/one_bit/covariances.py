@@ -33,11 +33,8 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
 
 
 def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
-    """Return P (T, N, n, n) of the sign-of-innovations filters of N nodes at the T times of a run
-    in slots, computed by their equations from which nodes' bits arrived.
-
-    Raises TheoryError if a node with a sensor has no hearer, since the log then does not show when
-    it uses its own bits, and if H differs from slot to slot.
+    """Return P (T, N, n, n) of the sign-of-innovations filters at the times of a run in slots, from
+    the bits that arrived. Raises TheoryError if nobody hears a node with a sensor, or H varies.
     """
     unheard = [node for node in scenario.sensing_nodes if not scenario.topology.receivers(node)]
     if unheard:

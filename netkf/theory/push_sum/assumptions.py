@@ -24,9 +24,7 @@ HEAVY_TAIL_RADIUS = 0.885  # above it mean squares over runs have no useful inte
 
 
 def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions of the push-sum paper as rows (assumption, source, whether it holds,
-    evidence) of the table: on plant, links, consensus gain, freezing of gains and moments.
-    """
+    """Return the assumptions of the push-sum paper as rows of the table."""
     return [
         *_plant_rows(scenario),
         *_link_rows(scenario),

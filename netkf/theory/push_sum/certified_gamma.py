@@ -192,9 +192,8 @@ def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
-    """Return the spectral radius of the matrix A_S(gamma) of paper P (45), with c_B = ``bound``:
-    below 1 it certifies, by paper P Theorem 6, that mean-square errors stay bounded with gamma
-    averaging steps.
+    """Return the spectral radius of A_S(gamma) of paper P (45), with c_B = ``bound``; below 1 it
+    certifies gamma for mean squares.
     """
     root_lambda, bound_square = constants.contraction**0.5, bound * bound
     mean_factor, square_factor = constants.mean**gamma, constants.mean_square**gamma

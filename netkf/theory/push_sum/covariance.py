@@ -25,10 +25,8 @@ def push_sum_error_covariance(scenario: Scenario) -> FloatArray:
 
 
 def covariance_of_steps(steps: EstimationSteps) -> FloatArray:
-    """Return the steady covariance (N, n, n) of the nodes' errors for given estimation ``steps``:
-    the linear system of updates by readings and averaging steps (steps 4 and 5 of the paper).
-
-    Raises TheoryError if there is none: the mean-square radius of the steps is not below 1.
+    """Return the steady covariance (N, n, n) of errors under estimation ``steps``. Raises
+    TheoryError if their mean-square radius is not below 1.
     """
     return _covariance(steps, radius(steps))
 

@@ -72,13 +72,9 @@ class EstimationSteps:
 
 
 def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> EstimationSteps:
-    """Return how the push-sum filter's errors change in a slot once its gains have converged, as a
-    linear system: the closed loops (I - K_i H_i) F and noise factors (N, n, n) of the nodes (step
-    4), and the law of averaging over links that may fail (step 5): the scenario's own links or the
-    given ``averaging``.
-
-    The filters' Q and R may differ from the truth, their F may not. Raises TheoryError if
-    asymptotic gains do not exist or the links are not drawn independently.
+    """Return how the push-sum filter's errors change in a slot at its asymptotic gains, with the
+    scenario's links or the given ``averaging``. Raises TheoryError without such gains, for another
+    F than the plant's, and for links that are not drawn independently.
     """
     limits = push_sum_limits(scenario)
     F, _ = scenario.slot_belief
@@ -95,12 +91,9 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
 
 
 def averaging_law(scenario: Scenario, delivery: float | None = None) -> Averaging:
-    """Return the law of the push-sum filter's averaging steps (step 5): the probabilities with
-    which the links of the scenario's channel are up, or one ``delivery`` probability for all links,
-    and the consensus gain.
-
-    Raises TheoryError for recorded links, for losses that depend on the past, and for delays by
-    which messages can be late.
+    """Return the law of the averaging steps with the links of the channel, or one ``delivery``
+    probability. Raises TheoryError for recorded links, losses that depend on the past, and delays
+    by which messages can be late.
     """
     algorithm, topology = push_sum_filter(scenario), scenario.topology
     channel = scenario.network.channel

@@ -64,11 +64,8 @@ def push_sum_stability(
 
 
 def radius(steps: EstimationSteps) -> float:
-    """Return the mean-square radius, by which second moments of the errors grow in a slot in the
-    long run: the spectral radius of their linear map T, the largest over groups of states that do
-    not mix.
-
-    Raises TheoryError for networks with more than MAX_ROWS states in a group.
+    """Return the spectral radius of the map of second moments over a slot, the largest over groups
+    of states that do not mix. Raises TheoryError for more than MAX_ROWS states in a group.
     """
     return max(_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 

@@ -28,10 +28,8 @@ MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election; probability tha
 
 
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return what theory says about a scenario's push-sum filter, by name, for ``netkf theory``:
-    each result is ``{"value", "reason"}`` with JSON values.
-
-    One of the two is None; the reason says why there is no value.
+    """Return the results of the push-sum paper by name, for ``netkf theory``, each ``{"value",
+    "reason"}`` with JSON values, one of them None.
     """
 
     def limit() -> float:

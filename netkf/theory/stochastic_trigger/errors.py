@@ -142,11 +142,8 @@ def measurement_update(root: FloatArray, observation: Observation) -> tuple[Floa
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:
-    """Return the observation to which a node's silence is equivalent for the others, who do not get
-    its ``reading``: the same H (p, n), with noise R + Y^-1 (p, p).
-
-    ``Y`` (p, p), or a number times I, is the matrix of the stochastic trigger: a node is silent
-    with probability exp(-z' Y z / 2), z being the innovation of its reading.
+    """Return the observation to which a node's silence is equivalent for the others: the H of its
+    ``reading`` with noise R + Y^-1 (p, p), Y the matrix of the trigger, or a number times I.
     """
     R = silence_noise(reading.R, Y)
     # The true noise, whose root the reading has, may differ from the believed R.

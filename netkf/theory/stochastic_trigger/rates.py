@@ -31,11 +31,8 @@ def trigger_rate(P: ArrayLike, H: ArrayLike, R: ArrayLike, Y: ArrayLike) -> floa
 
 
 def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
-    """Return the number of transmissions in a run and its expectation.
-
-    The expectation is the sum over slots and nodes of the probability of a transmission given all
-    earlier ones. All nodes must hear each other. The first slot, in which every node with a sensor
-    sends, is left out.
+    """Return the number of transmissions in a run and the sum of their probabilities given the
+    past, without the first slot; all nodes must hear each other.
     """
     algorithm: Any = scenario.filter.algorithm
     sent = decisions(scenario, run)

@@ -27,12 +27,9 @@ MAX_NEIGHBOURS = 10
 
 
 def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
-    """Return the exact steady errors of track fusion in slots, in which each node shows the
-    estimate of its own Kalman filter (its track) combined with those that it hears: the largest
-    spectral radius of ``C F (x) C F`` of a track, with C = I - K H, and the covariances (N, n, n)
-    of the errors of what nodes show, over noises and losses.
-
-    Raises TheoryError where a track has no steady state or losses have no law.
+    """Return the largest spectral radius of ``C F (x) C F`` of a track, C = I - K H, and the exact
+    steady covariances (N, n, n) of what nodes show, over noises and losses. Raises TheoryError
+    where a track has no steady state or losses have no law.
     """
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
@@ -46,9 +43,8 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
 
 
 def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
-    """Return the covariances (N, N, n, n) of the errors of all nodes' steady Kalman filters
-    (tracks), block (i, j) being that of nodes i and j, and the largest spectral radius of ``C F (x)
-    C F`` of a track, with C = I - K H.
+    """Return the joint covariances (N, N, n, n) of the errors of all steady tracks, and the radius
+    above.
     """
     (F, Q), n = scenario.slot_belief, scenario.plant.n
     closed, noises = [], []
