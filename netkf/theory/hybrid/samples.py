@@ -42,14 +42,14 @@ class PoissonSamples(NamedTuple):
     heard: scipy.sparse.csr_array
 
     def update_gains(self, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the gains K (S, n, p) and ``I - K H`` (S, n, n) of the S sensors at P (N, n, n)."""
+        """Return the gains K (S, n, p) and ``I - K H`` (S, n, n) of the sensors at P (N, n, n)."""
         # C = P H' and K = C (H C + R)^-1
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         K = np.swapaxes(np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)), 1, 2)
         return K, np.eye(P.shape[-1]) - K @ self.H
 
     def sample_decrease(self, P: FloatArray) -> FloatArray:
-        """Return ``P H' (H P H' + R)^-1 H P`` (S, n, n) of the node of each sensor, at P (N, n, n)."""
+        """Return ``P H' (H P H' + R)^-1 H P`` (S, n, n) of the node of each sensor at P."""
         C = P[self.nodes] @ np.swapaxes(self.H, 1, 2)
         return np.asarray(C @ np.linalg.solve(self.H @ C + self.R, np.swapaxes(C, 1, 2)))
 

@@ -51,7 +51,7 @@ def as_square(name: str, value: ArrayLike, n: int | None = None) -> FloatArray:
 
 
 def as_covariance(name: str, value: ArrayLike, n: int) -> FloatArray:
-    """Return ``value`` as a symmetric positive semidefinite (n, n) array; else raises TheoryError."""
+    """Return ``value`` as a symmetric semidefinite (n, n) array; else raises TheoryError."""
     array = as_square(name, value, n)
     if n == 0:
         return array
