@@ -51,13 +51,6 @@ DRAWS = 20
 """Number of errors drawn from each exact covariance."""
 
 
-def _without_cooperation(scenario: Scenario) -> Scenario:
-    promised: Any = with_promised_filter(scenario).filter.algorithm
-    algorithm = dataclasses.replace(promised, weights=np.eye(len(scenario.nodes)))
-    chosen = dataclasses.replace(scenario.filter, algorithm=algorithm)
-    return dataclasses.replace(scenario, filter=chosen, probe=scenario.times[-1:])
-
-
 def _sensors_excite(samples: RunSamples, level: float) -> Finding:
     levels = information_level(samples.scenario, PASTS, samples.seed)
     network = levels[levels["node"] == -1].iloc[0]  # the row of all sensors together
@@ -175,7 +168,11 @@ def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
     summary, sampled = summarise_exactly(scenario, run), sampled_indices(scenario)
     summary.alone = np.full(summary.P[0].shape, np.nan)
     if run.replica < ALONE and few_errors(scenario).holds:
-        silent = _without_cooperation(scenario)
+        # Without weights for others, sampled at the last time only.
+        promised: Any = with_promised_filter(scenario).filter.algorithm
+        algorithm = dataclasses.replace(promised, weights=np.eye(len(scenario.nodes)))
+        chosen = dataclasses.replace(scenario.filter, algorithm=algorithm)
+        silent = dataclasses.replace(scenario, filter=chosen, probe=scenario.times[-1:])
         last = error_covariance(silent, simulate(silent, run.seed, run.replica))[-1]
         summary.alone = last[sampled]
     return summary

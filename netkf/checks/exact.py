@@ -432,17 +432,14 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
         f"mean NEES {nees[:, tested].mean():.4g}, exact errors say "
         f"{mean[tested].mean() / len(P):.4g}, n is {n}; largest relative difference"
     )
-    pooled = _pooled_expected_nees(runs.quadratic[:max_runs], 0.5 * level)
+    quadratic = runs.quadratic[:max_runs]
+    quadratic = quadratic[np.isfinite(quadratic).all(axis=1)]
+    pooled = quadratic_interval(float(quadratic[:, 0].sum()), quadratic[:, 1:].ravel(), 0.5 * level)
+    pooled = deviation_interval(1.0, pooled) if len(quadratic) else pooled
     finding = pool(
         find_largest(intervals, NEES_TOLERANCE, message), pooled, EVERYTHING, NEES_TOLERANCE
     )
     return finding._replace(message=finding.message + samples.blurred_note, most_runs=max_runs)
-
-
-def _pooled_expected_nees(quadratic: FloatArray, level: float) -> Interval:
-    finite = quadratic[np.isfinite(quadratic).all(axis=1)]
-    ratio = quadratic_interval(float(finite[:, 0].sum()), finite[:, 1:].ravel(), level)
-    return deviation_interval(1.0, ratio) if len(finite) else ratio
 
 
 @error_test

@@ -39,16 +39,17 @@ from netkf.theory.push_sum.certified_gamma import (
     gamma_constants,
     minimum_gamma,
 )
-from netkf.theory.push_sum.covariance import push_sum_error_covariance
 from netkf.theory.push_sum.disconnection import Probability, disconnection_probability
-from netkf.theory.push_sum.large_gamma import (
+from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
+from netkf.theory.push_sum.mean_square import (
     LargeGamma,
     large_gamma_limits,
     push_sum_covariances,
+    push_sum_error_covariance,
     push_sum_noise,
+    push_sum_radius,
+    push_sum_stability,
 )
-from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
-from netkf.theory.push_sum.mean_square import push_sum_radius, push_sum_stability
 from netkf.theory.stochastic_trigger.rates import trigger_rate
 
 __all__ = [

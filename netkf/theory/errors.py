@@ -16,10 +16,10 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
-from netkf.theory.common.clock_columns import ClockColumns, has_clock_columns
-from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.clock_columns import ClockColumns
+from netkf.theory.common.columns import ErrorColumns, has_columns
 from netkf.theory.common.evidence import NONLINEAR
-from netkf.theory.common.slot_columns import SlotColumns, has_columns
+from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.folders import theory_of
 from netkf.trace.run import Run
 
@@ -104,10 +104,8 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         raise TheoryError(NONLINEAR)
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
-        if has_columns(scenario):
-            return SlotColumns(scenario, run)
-    elif has_clock_columns(scenario):
-        return ClockColumns(scenario, run)
+    if has_columns(scenario):
+        return (SlotColumns if scenario.slotted else ClockColumns)(scenario, run)
     require_known_filter(scenario)
     make = theory_of(scenario).error_columns
     if make is None:

@@ -15,16 +15,15 @@ from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.records import Kernels
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal
-from netkf.linalg.spectra import contracts, growth_rate
+from netkf.linalg.spectra import contracts
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.delayed_jumps import DelayedJumps
-from netkf.theory.common.jumps import ClockJumps, LyapunovInverse, SlotJumps
+from netkf.theory.common.jumps import SlotJumps
 from netkf.theory.errors import diagonal_blocks, require_known_filter
 from netkf.theory.folders import LinearErrors, theory_of
-from netkf.theory.intermittent.riccati import steady_covariance
+from netkf.theory.intermittent.riccati import steady_gain
 from netkf.theory.numerics.positive_maps import (
-    PositiveMap,
     fixed_point,
     spectral_radius,
 )
@@ -99,7 +98,7 @@ def _solve(scenario: Scenario) -> tuple[float, FloatArray | None]:
             return radius, None
         X = system.covariance
     else:
-        T, Q = _slot_map(system) if isinstance(system, SlotJumps) else _clock_map(system)
+        T, Q = system.maps()
         radius = spectral_radius(T, system.shape) if Q is not None else np.inf
         if Q is None or not contracts(radius):
             return float(radius), None
@@ -198,23 +197,6 @@ def _require_size(shape: tuple[int, int, int]) -> None:
         )
 
 
-def _slot_map(system: SlotJumps) -> tuple[PositiveMap, FloatArray]:
-    """Return the map of second moments (S, M, M) over a slot, and the noise that it adds."""
-    return system.step, system.step(np.zeros(system.shape), noise=True)
-
-
-def _clock_map(system: ClockJumps) -> tuple[PositiveMap, FloatArray | None]:
-    """Return X -> L^-1(inflow(X)) and L^-1(noise) (S, M, M), L X = -(B X + X B')."""
-    if max(map(growth_rate, system.flows)) >= 0.0:
-        return system.inflow, None
-    inverse = LyapunovInverse(system.flows)
-    stationary = system.directions.stationary if system.directions else np.ones(1)
-    return (
-        lambda X: inverse(system.inflow(X)),
-        inverse(stationary[:, None, None] * system.noise),
-    )
-
-
 def silent_jumps(scenario: Scenario) -> SlotJumps:
     """Return the errors of Kalman filters in slots at their steady gains as a linear system, one
     block of n errors for each node, or one if they share a pooled filter.
@@ -227,15 +209,7 @@ def silent_jumps(scenario: Scenario) -> SlotJumps:
     else:
         sensors = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]
         true = [scenario.observation_matrices(node)[1] for node in scenario.nodes]
-    gains = [_steady_gain(F, Q, *sensor) for sensor in sensors]
+    gains = [steady_gain(F, Q, *sensor) for sensor in sensors]
     closed = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in zip(gains, sensors, strict=True)])
     noise = block_diagonal([K @ R @ K.T for K, R in zip(gains, true, strict=True)])
     return SlotJumps(scenario.slot_plant.F, scenario.slot_plant.Q, closed, noise, directions=None)
-
-
-def _steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the gain (n, p) for predictions ``x+ = F x + w``, cov(w) = Q."""
-    if not len(H):
-        return np.zeros((len(F), 0))
-    P = steady_covariance(F, Q, H, R)
-    return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P).T)

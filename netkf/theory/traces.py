@@ -24,9 +24,8 @@ from netkf.theory.hybrid.coupled import (
 from netkf.theory.hybrid.limits import central_covariance, limit_covariance
 from netkf.theory.hybrid.steady import has_steady_state
 
-MAX_BOUND_BYTES, SERIES_TERMS = 1.5 * 2**30, 30
-"""Largest memory of a bound that is computed, and the terms of the series that computing it stores.
-"""
+MAX_BOUND_BYTES, STAGES = 1.5 * 2**30, 30
+"""Largest memory of a bound that is computed, and the stages that a step of its solver stores."""
 MAX_STEADY_ENTRIES = 100_000
 """Largest number of entries of all covariances for which a run computes the steady state."""
 
@@ -58,8 +57,8 @@ def _require_small_bound(scenario: Scenario, samples: int) -> None:
     if reason_without_bound(scenario):
         return
     n = scenario.plant.n
-    # Numbers that computing it stores: at each sample, and for the terms of a series.
-    entries = (samples * (1.5 * n * n + n) + SERIES_TERMS * n * (n + 1)) * len(scenario.nodes)
+    # Numbers that computing it stores: at each sample, and for the stages of a step.
+    entries = (samples * (1.5 * n * n + n) + STAGES * n * (n + 1)) * len(scenario.nodes)
     if 8.0 * entries > MAX_BOUND_BYTES:
         raise TheoryError(
             f"not computed: Tanwani's H(12) of {len(scenario.nodes):,} nodes, {samples:,} samples, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -110,10 +111,13 @@ def record_promises(audits: Sequence[Audit]) -> tuple[Promise, ...]:
     if not any(audit.looked[0] for audit in audits):
         return ()
     one_engine = any(audit.engines == ONE_ENGINE for audit in audits)
-    return tuple(row for row in PROMISES if row.test is not _engines or not one_engine)
+    return tuple(row for row in PROMISES if row.group != ENGINES or not one_engine)
 
 
-def _find_fault(audits: Sequence[Audit], name: str, looked: int, what: str) -> Finding:
+def _find_fault(
+    name: str, looked: int, what: str, audits: Sequence[Audit], level: float
+) -> Finding:
+    """Return the finding on one entry of the audits: broken if it names a fault in any run."""
     entries = [(k, getattr(audit, name)) for k, audit in enumerate(audits) if audit.looked[looked]]
     known = [(k, entry) for k, entry in entries if not entry.startswith(UNKNOWN)]
     if not known:
@@ -129,35 +133,34 @@ def _find_fault(audits: Sequence[Audit], name: str, looked: int, what: str) -> F
     return finding._replace(message=text, replica=replica, off=-margin)
 
 
-def _events(audits: Sequence[Audit], level: float) -> Finding:
-    """Check that events are recorded once, in order; no interval is estimated from a ``level``."""
-    return _find_fault(audits, "events", 0, "order, numbers, readings, ticks and ends of messages")
-
-
-def _samples(audits: Sequence[Audit], level: float) -> Finding:
-    return _find_fault(audits, "samples", 0, "status, times, x drawn again, and x - xhat")
-
-
-def _start(audits: Sequence[Audit], level: float) -> Finding:
-    return _find_fault(audits, "start", 1, "xhat and P at time 0, and weights,")
-
-
-def _engines(audits: Sequence[Audit], level: float) -> Finding:
-    return _find_fault(audits, "engines", 1, "events to the bit, xhat and P to rounding,")
-
-
-def _files(audits: Sequence[Audit], level: float) -> Finding:
-    return _find_fault(audits, "files", 1, "tables, manifest, counts and averages")
-
-
 PROMISES = tuple(
-    Promise(statement, "the record", (), test, exact=True, group=group)
-    for statement, test, group in (
-        ("events are recorded once, in order, with their numbers", _events, EVENTS),
-        ("states are those that the plant draws, errors are x - xhat", _samples, STATES),
-        ("estimates, covariances and weights begin as [filter] says", _start, STARTS),
-        ("both engines make the same events and states", _engines, ENGINES),
-        ("files hold the run, and the summary counts it", _files, FILES),
+    Promise(statement, "the record", (), partial(_find_fault, *entry), exact=True, group=group)
+    for statement, entry, group in (
+        (
+            "events are recorded once, in order, with their numbers",
+            ("events", 0, "order, numbers, readings, ticks and ends of messages"),
+            EVENTS,
+        ),
+        (
+            "states are those that the plant draws, errors are x - xhat",
+            ("samples", 0, "status, times, x drawn again, and x - xhat"),
+            STATES,
+        ),
+        (
+            "estimates, covariances and weights begin as [filter] says",
+            ("start", 1, "xhat and P at time 0, and weights,"),
+            STARTS,
+        ),
+        (
+            "both engines make the same events and states",
+            ("engines", 1, "events to the bit, xhat and P to rounding,"),
+            ENGINES,
+        ),
+        (
+            "files hold the run, and the summary counts it",
+            ("files", 1, "tables, manifest, counts and averages"),
+            FILES,
+        ),
     )
 )
 

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from netkf.algorithms.filter import commutes, compiled_kernels
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.plants.transitions import Transitions
 from netkf.scenario.scenario import Scenario
@@ -51,7 +50,11 @@ class ClockColumns(ErrorColumns):
     """The errors of M estimators under clocks; the first n rows of the forms are the true state."""
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
-        self._scenario, self._run, self._log = scenario, run, _columns_of(run)
+        self._scenario, self._run, self._log = (
+            scenario,
+            run,
+            [run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message")],
+        )
         self._forms_of_all = forms = Forms(scenario.plant.n * (len(scenario.nodes) + 1))
         plant = cast(Any, scenario.plant)
         self.n = plant.n
@@ -80,7 +83,10 @@ class ClockColumns(ErrorColumns):
         rate = max(np.abs(plant.A).sum(axis=0).max(), CHECKS / scenario.horizon)
         movable = np.array_equal(scenario.belief[0], plant.A)
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
-        self._laws = self._laws_of_gaps()
+        gaps = np.unique(np.diff(np.unique([0.0, *self._samples, *run.times.tolist()])))
+        laws = zip(*self._transitions.laws(gaps), strict=True)
+        # F and the root of the noise of the plant, by gap between readings or samples.
+        self._laws = dict(zip(gaps.tolist(), laws, strict=True))
         self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators)
         index = scenario.topology.index
         self._index = index
@@ -93,13 +99,6 @@ class ClockColumns(ErrorColumns):
             for h in range(len(links.first) - 1)
             for w in range(links.first[h], links.first[h + 1])
         }
-
-    def _laws_of_gaps(self) -> dict[float, tuple[FloatArray, FloatArray]]:
-        times = np.unique([0.0, *self._samples, *self._run.times.tolist()])
-        gaps = np.unique(np.diff(times))
-        return dict(
-            zip(gaps.tolist(), zip(*self._transitions.laws(gaps), strict=True), strict=True)
-        )
 
     def replay(self) -> Iterator[None]:
         """Repeat the log of the run; yield at each of ``run.times``."""
@@ -298,16 +297,6 @@ class ClockColumns(ErrorColumns):
     def keep(self) -> None:
         """Store the present errors for ``law``."""
         self._kept.append(self._forms_of_all.freeze(self._forms()))
-
-
-def has_clock_columns(scenario: Scenario) -> bool:
-    """Return True if the errors of a scenario under clocks follow from the verbs of its filter."""
-    kernels = compiled_kernels(scenario.node_filter, clocked=True)
-    return kernels is not None and kernels.affine and commutes(scenario.node_filter)
-
-
-def _columns_of(run: Run) -> list[list[Any]]:
-    return [run.log[name].tolist() for name in ("t", "kind", "node", "peer", "message")]
 
 
 def _delivered(log: list[list[Any]]) -> set[tuple[int, int, int]]:

@@ -10,7 +10,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from netkf.algorithms.filter import commutes, compiled_kernels
 from netkf.linalg.arrays import FloatArray
+from netkf.scenario.scenario import Scenario
+
+
+def has_columns(scenario: Scenario) -> bool:
+    """Return True if the filter of a scenario is affine and its verbs are kernels: then its errors
+    follow from the verbs. A filter that commutes with a shift of the truth says that it is affine.
+    """
+    kernels = compiled_kernels(scenario.node_filter, clocked=not scenario.slotted)
+    return kernels is not None and kernels.affine and commutes(scenario.node_filter)
 
 
 class ErrorColumns:

@@ -15,7 +15,9 @@ import numpy as np
 import scipy.linalg
 
 from netkf.linalg.arrays import FloatArray, IntArray, block_diagonal, symmetric
+from netkf.linalg.spectra import growth_rate
 from netkf.theory.common.random_links import Directions
+from netkf.theory.numerics.positive_maps import PositiveMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +51,6 @@ class SlotJumps:
         return (self.directions.modes if self.directions else 1, M, M)
 
     @cached_property
-    def _all(self) -> IntArray:
-        """Indices (K,) of all K directions; empty if nothing is sent."""
-        return np.arange(len(self.directions.sender) if self.directions else 0)
-
-    @cached_property
     def _pairs(self) -> tuple[IntArray, IntArray]:
         """Pairs (P,) of directions that share a draw; each is also paired with itself."""
         assert self.directions is not None
@@ -65,7 +62,7 @@ class SlotJumps:
     def _mean(self) -> FloatArray:
         """E[D] (S, M, M), the mean change of errors in one exchange, by mode of bursty links."""
         assert self.directions is not None
-        return self.directions.mean(self.nodes, self._all)
+        return self.directions.mean(self.nodes, np.arange(len(self.directions.sender)))
 
     def step(self, X: FloatArray, noise: bool = False) -> FloatArray:
         """Return the second moments (S, M, M) one slot after X (S, M, M) of the M = N n stacked
@@ -80,6 +77,10 @@ class SlotJumps:
             predicted = self.directions.advance(predicted, np.unique(self.directions.source))
         updated = _multiply_blocks(self.closed, predicted, N) + share * self.noise
         return updated if self.directions is None else self._exchange(predicted, updated)
+
+    def maps(self) -> tuple[PositiveMap, FloatArray | None]:
+        """Return the map of second moments (S, M, M) over a slot, and the noise that it adds."""
+        return self.step, self.step(np.zeros(self.shape), noise=True)
 
     def _exchange(self, predicted: FloatArray, updated: FloatArray) -> FloatArray:
         """Return the second moments (S, M, M) after the exchange, by mode."""
@@ -205,6 +206,17 @@ class ClockJumps:
             total += change + 2.0 * symmetric(self._means[k] @ change)
             total += self.directions.products(first, second, rates, stepped)
         return total
+
+    def maps(self) -> tuple[PositiveMap, FloatArray | None]:
+        """Return X -> L^-1(inflow(X)) and L^-1(noise) (S, M, M), L X = -(B X + X B'); None for the
+        noise where B is not stable.
+        """
+        if max(map(growth_rate, self.flows)) >= 0.0:
+            return self.inflow, None
+        inverse = LyapunovInverse(self.flows)
+        stationary = self.directions.stationary if self.directions else np.ones(1)
+        noise = inverse(stationary[:, None, None] * self.noise)
+        return lambda X: inverse(self.inflow(X)), noise
 
 
 def _block_slice(X: FloatArray, nodes: int, i: int) -> FloatArray:

@@ -325,7 +325,7 @@ class LinearVerbs:
         if not self._past:
             return words
         last, parts = int(self._view("kept")[h, 0]) + events, [words]
-        if last > self._record_room:
+        if last > self._shapes[self._past[0]][1]:
             self._double_past()
             return self.node_words(h, events)
         for name in self._past:
@@ -334,10 +334,6 @@ class LinearVerbs:
             begin = self._begin[name] + h * room * size
             parts.append(np.arange(begin, begin + last * size))
         return np.concatenate(parts)
-
-    @property
-    def _record_room(self) -> int:
-        return int(self._shapes[self._past[0]][1])
 
     def _double_past(self) -> None:
         arrays = {name: self._view(name).copy() for name in self._begin}

@@ -152,14 +152,24 @@ def directions_of(
     receiver), with the law of their losses; messages that take more than ``wait`` seconds are lost.
     Raises TheoryError without a known law.
     """
-    _require_law(scenario)
-    loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
-    links, index = list(weights), scenario.topology.index
-    at = {link: k for k, link in enumerate(_all_sources(scenario, links))}
-    source = np.array([at[_source_of(scenario, link)] for link in links], dtype=np.int64)
+    channel = scenario.network.channel
+    loss, delay = channel.loss, channel.delay.fixed
+    if is_recorded(channel) or has_recorded_broadcasts(scenario):
+        raise TheoryError("losses or delays are recorded: their law is not known")
+    if delay is None:
+        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
     chained = isinstance(loss, GilbertElliott) and not loss.independent
+    if not (chained or loss.independent):
+        raise TheoryError("losses depend on earlier ones in a way that is not known here")
+    links, index = list(weights), scenario.topology.index
+    clock: Any = scenario.network.activation
+    # One draw decides about both directions of a link that are activated and lost together.
+    together = channel.symmetric and (not isinstance(clock, LinkClock) or clock.at == "links")
+    owners = [min(link, link[::-1]) if together else link for link in links]
+    at = {owner: k for k, owner in enumerate(dict.fromkeys(owners))}
+    source = np.array([at[owner] for owner in owners], dtype=np.int64)
     delivery = _deliveries(scenario, links, source, len(at))
-    if delay is not None and delay > wait:
+    if delay > wait:
         delivery = np.zeros_like(delivery)
     return Directions(
         np.array([index[i] for i, _ in links], dtype=np.int64),
@@ -222,17 +232,6 @@ def has_constant_losses(scenario: Scenario) -> bool:
     return True
 
 
-def _require_law(scenario: Scenario) -> None:
-    """Raise TheoryError if losses or delays have no law that is known here."""
-    channel = scenario.network.channel
-    if is_recorded(channel) or has_recorded_broadcasts(scenario):
-        raise TheoryError("losses or delays are recorded: their law is not known")
-    if channel.delay.fixed is None:
-        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
-    if not (isinstance(channel.loss, GilbertElliott) or channel.loss.independent):
-        raise TheoryError("losses depend on earlier ones in a way that is not known here")
-
-
 def _deliveries(
     scenario: Scenario, links: list[tuple[int, int]], source: IntArray, chains: int
 ) -> FloatArray:
@@ -255,20 +254,6 @@ def _deliveries(
         )
     modes = np.arange(1 << chains)
     return np.where(modes[:, None] >> source & 1, probabilities(True), probabilities(False))
-
-
-def _source_of(scenario: Scenario, link: tuple[int, int]) -> tuple[int, int]:
-    """Return the link whose draw decides about ``link``: one for both directions, or its own."""
-    return min(link, link[::-1]) if _fail_together(scenario) else link
-
-
-def _all_sources(scenario: Scenario, links: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    return list(dict.fromkeys(_source_of(scenario, link) for link in links))
-
-
-def _fail_together(scenario: Scenario) -> bool:
-    at = getattr(scenario.network.activation, "at", "links")
-    return scenario.network.channel.symmetric and at == "links"
 
 
 def poisson_ticks(

@@ -15,7 +15,7 @@ from typing import cast
 
 import numpy as np
 
-from netkf.algorithms.filter import commutes, compiled_kernels
+from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.records import make_records
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
@@ -35,14 +35,6 @@ means; from NOISE on the noises.
 
 FEW = 64
 """Columns that cost no more time than fewer do."""
-
-
-def has_columns(scenario: Scenario) -> bool:
-    """Return True if the filter of a scenario is affine and its verbs are kernels: then its errors
-    follow from the verbs. A filter that commutes with a shift of the truth says that it is affine.
-    """
-    kernels = compiled_kernels(scenario.node_filter, clocked=False)
-    return kernels is not None and kernels.affine and commutes(scenario.node_filter)
 
 
 class SlotColumns(ErrorColumns):

@@ -6,13 +6,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from netkf.core.clock import Clock
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
+from netkf.linalg.arrays import FloatArray, block_diagonal, square_root, symmetric
 from netkf.network.clocks import LinkClock, Periodic
 from netkf.network.matchings import Broadcast
+from netkf.plants.transitions import Transitions
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.delayed_jumps import DelayedJumps
 from netkf.theory.common.jumps import ClockJumps, SlotJumps
@@ -206,14 +206,11 @@ def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
 
 def _move_errors(flow: JointErrorFlow, gap: float) -> tuple[FloatArray, FloatArray]:
     """Return the transition (N n, N n) of errors over ``gap`` seconds, and the covariance of the
-    noise over it, by Van Loan's formula (1978).
+    noise over it.
     """
-    drift = block_diagonal(list(flow.drift))
-    M = len(drift)
-    # exp [[-D, N], [0, D']] g has the blocks e^{-D g} N_g and e^{D' g} on the right, Van Loan 1978.
-    E = scipy.linalg.expm(gap * np.block([[-drift, flow.noise], [np.zeros_like(drift), drift.T]]))
-    transition = E[M:, M:].T
-    return transition, symmetric(transition @ E[:M, M:])
+    transitions = Transitions(block_diagonal(list(flow.drift)), square_root(flow.noise))
+    F, root = (law[0] for law in transitions.laws(np.array([gap])))
+    return F, root @ root.T
 
 
 def _node_gains(scenario: Scenario) -> list[FloatArray]:

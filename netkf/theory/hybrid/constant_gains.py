@@ -42,7 +42,9 @@ def constant_gain_bound(
     linear, constant = _linear_equation(scenario, gains)
     packed = linear.packed
     if times is None:
-        return _steady(linear, constant)
+        if not is_stable(linear):
+            raise TheoryError("constant gains do not stabilise the filters: no steady state")
+        return packed.unpack(solve_map(linear, constant))
     moments = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if not np.isfinite(moments).all() or (np.diff(moments, prepend=0.0) < 0.0).any():
         raise TheoryError("times must be finite, increasing and not negative")
@@ -81,10 +83,3 @@ def _linear_equation(
     packed = PackedRiccati(equations)
     constant = packed.pack(np.array([L @ R @ L.T for L, (_, R) in pairs]) + equations.Q)
     return packed.linear_with_gains(corrections), constant
-
-
-def _steady(linear: LinearisedRiccati, constant: FloatArray) -> FloatArray:
-    """Return the steady state (N, n, n) of map and constant; raises TheoryError if unstable."""
-    if not is_stable(linear):
-        raise TheoryError("constant gains do not stabilise the filters: there is no steady state")
-    return linear.packed.unpack(solve_map(linear, constant))

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.limits import limit_covariance
@@ -68,9 +67,10 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
 
     def excess(log_factor: float) -> float:
         """Return log(distance / delta) with all link rates times exp(``log_factor``)."""
-        distance = _distance(equations, S, math.exp(log_factor))
-        if distance is None:
+        P = steady_state(equations.scale_rates(math.exp(log_factor)))
+        if P is None:
             return NO_STEADY_STATE
+        distance = float(np.linalg.norm(P - S, axis=(1, 2)).max())
         return math.log(max(distance, 1e-300) / delta)
 
     # An interval low .. high of the logarithm with the root in it: upwards, then downwards.
@@ -96,12 +96,6 @@ def _require_talk(scenario: Scenario) -> CoupledRiccati:
     if not equations.coupling.nnz:
         raise TheoryError("no message ever arrives, so that rates of links change nothing")
     return equations
-
-
-def _distance(equations: CoupledRiccati, S: FloatArray, factor: float) -> float | None:
-    """Return ``max_i |calP_i - S|_F`` with link rates times ``factor``; None if unbounded."""
-    P = steady_state(equations.scale_rates(factor))
-    return None if P is None else float(np.linalg.norm(P - S, axis=(1, 2)).max())
 
 
 def _with_rate(scenario: Scenario, factor: float) -> LinkRate:

@@ -57,8 +57,6 @@ class PackedRiccati:
         self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
         self._C = _low_rank_factors(equations.G[self._sensed])
-        # The same C with the nodes last, (n, r, S), for ``series``.
-        self._across = np.ascontiguousarray(self._C.transpose(1, 2, 0))
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
         """Return the equations with another drift A (n, n) and noise Q (n, n) or (N, n, n), per
@@ -140,38 +138,6 @@ class PackedRiccati:
             updated = self.pack(sent)[group.nodes] - self.pack(group.sample_decrease(sent))
             arriving = self.predict(updated)
         change += group.heard @ arriving
-
-    def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
-        """Return the Taylor coefficients (order + 1, N, m), in powers of seconds / ``span``, of the
-        solution through ``Y`` (N, m), without delay.
-        """
-        series = np.empty((order + 1, *Y.shape))
-        series[0] = Y
-        # With G = C C' at nodes with a sensor, coefficient k of P G P is the sum of M_i M_j' over
-        # i + j = k with M = P C. Nodes come last, so that numpy runs along them. The terms with
-        # i < j are computed, those with i > j are their transposes, and i = j adds one for even k.
-        n, r, sensed = self._across.shape
-        products = np.empty((order, n, r, sensed))
-        for k in range(order):
-            change = self._exchange @ series[k]
-            change += series[k] @ self._drift_map
-            if k == 0:
-                change += self._Q
-            if sensed:
-                rows = np.ascontiguousarray(series[k, self._sensed].T)
-                P = rows[self._indices].reshape(n, n, sensed)
-                np.einsum("ijs,jrs->irs", P, self._across, out=products[k])
-                half_count = (k + 1) // 2
-                half = np.einsum(
-                    "kirs,kjrs->ijs", products[:half_count], products[k : k - half_count : -1]
-                )
-                square = half[self._i, self._j] + half[self._j, self._i]
-                if k % 2 == 0:
-                    middle = products[k // 2]
-                    square += np.einsum("irs,jrs->ijs", middle, middle)[self._i, self._j]
-                change[self._sensed] -= square.T
-            np.multiply(change, span / (k + 1), out=series[k + 1])
-        return series
 
     def linear(self, P: FloatArray) -> LinearisedRiccati:
         """Return H(12) linearised at ``P`` (N, n, n), with its gains held fixed: P minimises the

@@ -145,6 +145,16 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
     return P
 
 
+def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the steady Kalman gain (n, p) by which a reading corrects the prediction. Raises
+    TheoryError if P* does not exist.
+    """
+    if not len(H):
+        return np.zeros((len(F), 0))
+    P = steady_covariance(F, Q, H, R)
+    return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P).T)
+
+
 def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
     """Return the steady covariance (n, n) after a reading, paper P (12). Raises TheoryError if (F,
     H) is not detectable or P* cannot be computed precisely.

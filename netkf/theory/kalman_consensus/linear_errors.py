@@ -32,7 +32,11 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     (F, Q), index = scenario.slot_belief, scenario.topology.index
     heard: list[list[int]] = [[k] for k in range(len(nodes))]
     if algorithm.share_readings:
-        _require_lossless(scenario)
+        if not all_messages_arrive(scenario):
+            raise TheoryError(
+                "gains follow the readings that arrive; exact steady mean squares of kcf are known "
+                "with share_readings = false, or where nothing is lost"
+            )
         for sender, receiver in scenario.topology.directions:
             heard[index[receiver]].append(index[sender])
     sensors = [scenario.observation_matrices(node, believed=True) for node in nodes]
@@ -58,12 +62,3 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     stacked_gains = gains.reshape(-1, rows[-1])
     plant, noise = scenario.slot_plant, stacked_gains @ true @ stacked_gains.T
     return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, directions, on_predictions=True)
-
-
-def _require_lossless(scenario: Scenario) -> None:
-    """Raise TheoryError unless every message arrives in its slot."""
-    if not all_messages_arrive(scenario):
-        raise TheoryError(
-            "gains follow the readings that arrive; exact steady mean squares of kcf are known "
-            "with share_readings = false, or where nothing is lost"
-        )

@@ -114,14 +114,10 @@ def _least_factor(T: PositiveMap, X: FloatArray) -> float:
         roots = np.linalg.cholesky(X)
     except np.linalg.LinAlgError:
         return np.inf
-    return max(_largest_ratio(image, L) for image, L in zip(T(X), roots, strict=True))
-
-
-def _largest_ratio(image: FloatArray, L: FloatArray) -> float:
-    """Return the least c with ``image <= c L L'`` for triangular L (M, M)."""
-    half = scipy.linalg.solve_triangular(L, image, lower=True)
-    scaled = scipy.linalg.solve_triangular(L, half.T, lower=True)
-    return float(np.linalg.eigvalsh(symmetric(scaled))[-1])
+    # L^-1 image L^-T, for X = L L'.
+    half = np.linalg.solve(roots, T(X))
+    scaled = np.linalg.solve(roots, np.swapaxes(half, 1, 2))
+    return float(np.linalg.eigvalsh(symmetric(scaled))[:, -1].max())
 
 
 def _is_small(residual: FloatArray, X: FloatArray, tolerance: float) -> bool:

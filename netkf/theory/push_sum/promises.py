@@ -18,10 +18,9 @@ from netkf.theory.push_sum.certified_gamma import (
     minimum_gamma,
     searches_gamma,
 )
-from netkf.theory.push_sum.covariance import push_sum_error_covariance
 from netkf.theory.push_sum.disconnection import disconnection_probability
 from netkf.theory.push_sum.limits import consensus_gain_bound, push_sum_limits
-from netkf.theory.push_sum.mean_square import push_sum_radius
+from netkf.theory.push_sum.mean_square import push_sum_error_covariance, push_sum_radius
 
 MAX_STEPS = 20  # largest gamma in the search for the exact smallest one
 MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election; probability that it is over

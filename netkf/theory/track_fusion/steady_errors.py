@@ -20,7 +20,7 @@ from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, is_recorded
 from netkf.theory.common.random_links import delivery_of
-from netkf.theory.intermittent.riccati import steady_covariance
+from netkf.theory.intermittent.riccati import steady_gain
 
 MAX_NEIGHBOURS = 10
 """Neighbours whose messages may be lost, all sets of which are looked at."""
@@ -50,8 +50,7 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
     closed, noises = [], []
     for node in scenario.nodes:
         H, R = scenario.observation_matrices(node)
-        M = steady_covariance(F, Q, H, R)
-        K = np.linalg.solve(H @ M @ H.T + R, H @ M).T if len(H) else np.zeros((n, 0))
+        K = steady_gain(F, Q, H, R)
         closed.append(np.eye(n) - K @ H)
         noises.append(K @ R @ K.T)
     joint = np.zeros((len(closed), len(closed), n, n))
@@ -83,7 +82,11 @@ def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> 
             probabilities[j] if is_heard else 1.0 - probabilities[j] for j, is_heard in outcomes
         )
         order = [i, *certain, *(j for j, is_heard in outcomes if is_heard)]
-        total += probability * _fuse_tracks(joint, order)
+        own: FloatArray = joint[i, i]
+        if len(order) > 1:
+            root = best_combination(joint, order, square_root(own))[1]
+            own = np.asarray(root @ root.T)
+        total += probability * own
     return total
 
 
@@ -94,12 +97,3 @@ def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
     if delay > scenario.phase_length:
         return {}
     return {topology.index[j]: delivery_of(scenario, (j, node)) for j in topology.senders(node)}
-
-
-def _fuse_tracks(joint: FloatArray, order: list[int]) -> FloatArray:
-    """Return the covariance (n, n) of the best combination of the tracks ``order``."""
-    P: FloatArray = joint[order[0], order[0]]
-    if len(order) == 1:
-        return P
-    root = best_combination(joint, order, square_root(P))[1]
-    return np.asarray(root @ root.T)
