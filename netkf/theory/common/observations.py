@@ -43,6 +43,16 @@ def stack_observations(observations: list[Observation], n: int) -> Observation:
     return Observation(H, R, root)
 
 
+def joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
+    """Return ``(I - K H) P (I - K H)' + K R K'`` (n, n), the covariance after a reading in the form
+    of Joseph, for ``P`` (n, n) before it.
+    """
+    H, R = observation.H, observation.R
+    K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+    closed = np.eye(len(P)) - K @ H
+    return np.asarray(closed @ P @ closed.T + K @ R @ K.T)
+
+
 EstimatorObservations = dict[int, Observation]
 """Observations by the index of the estimator that uses them."""
 

@@ -54,10 +54,15 @@ class SlotColumns(ErrorColumns):
         self._kernels = replace(kernels, decides=False)
         self._kept = []
         self._fewest = 0
+        self._all_observations = slot_observations(scenario, run)
         self._whitened: dict[int, tuple[Observation, FloatArray]] = {}
         # The true state (n, columns).
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._filters = self._begin()
+
+    def _observe(self, slot: int) -> dict[int, Observation]:
+        """Return the readings of a slot by estimator."""
+        return self._all_observations(slot)
 
     def _begin(self) -> SlotFilters:
         setup = self._setup
@@ -74,17 +79,17 @@ class SlotColumns(ErrorColumns):
     def replay(self) -> Iterator[None]:
         """Replay the events of the run; yield at each of ``run.times``."""
         scenario, run, setup = self._scenario, self._run, self._setup
-        observe, arrivals = slot_observations(scenario, run), _arrivals(scenario, run, setup)
+        arrivals = _arrivals(scenario, run, setup) if scenario.node_filter.timing.talks else {}
         predicts, processed = scenario.node_filter.timing.predicts, 0
         for until in scenario.slot_plant.slots_of(run.times).tolist():
             while processed < until:
                 slot = processed if predicts else processed + 1
                 if predicts:
-                    self._simulate(slot, observe(slot), arrivals)
+                    self._simulate(slot, self._observe(slot), arrivals)
                     self._move_truth()
                 else:
                     self._move_truth()
-                    self._simulate(slot, observe(slot), arrivals)
+                    self._simulate(slot, self._observe(slot), arrivals)
                 if self._x.shape[1] > max(FEW, 2 * self._fewest):
                     self._compress()
                     self._fewest = self._x.shape[1]

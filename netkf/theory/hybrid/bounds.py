@@ -20,7 +20,7 @@ from netkf.algorithms.kernels.riccati import RiccatiTable, propagate_riccati, ri
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observations import Observation
+from netkf.theory.common.observations import joseph_update
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.packed import PackedRiccati
 
@@ -383,7 +383,7 @@ class _SampleJumps:
         if jump is not None:
             P = packed.unpack(Y)
             for node, observation in jump.observations.items():
-                P[node] = _joseph_update(P[node], observation)
+                P[node] = joseph_update(P[node], observation)
             Y = packed.pack(P)
             if jump.weights is not None:
                 self._arrivals[time + equations.delay] = jump.weights, Y
@@ -396,14 +396,6 @@ class _SampleJumps:
         # H (9) in the mean: P_i <- (1 - sum_j w_ij) P_i + sum_j w_ij P_j.
         own_weight = 1.0 - weights.sum(axis=1)
         return np.asarray(own_weight[:, None] * Y + weights @ sent)
-
-
-def _joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
-    """Return ``(I - K H) P (I - K H)' + K R K'`` (n, n), the Joseph form of an update."""
-    H, R = observation.H, observation.R
-    K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-    closed = np.eye(len(P)) - K @ H
-    return np.asarray(closed @ P @ closed.T + K @ R @ K.T)
 
 
 def _limit_evaluations(slope: Slope) -> Slope:

@@ -12,7 +12,7 @@ import numpy as np
 from netkf.algorithms.kernels.square_root import reflect
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.small import solve_inplace
+from netkf.linalg.small import add_matmul, copy_matrix, matmul, solve
 
 
 @kernel
@@ -39,44 +39,25 @@ def divide_by_transpose(rows: FloatArray, L: FloatArray, count: int, n: int) -> 
             rows[r, j] = total / L[j, j]
 
 
-@kernel
-def multiply_form(form: FloatArray, matrix: FloatArray, used: int, scratch: FloatArray) -> None:
-    """Replace the first ``used`` columns of a ``form`` (n, width) by ``matrix form``; ``scratch``
-    (n, used).
-    """
-    n = matrix.shape[0]
+@kernel(allocates=True)
+def root_of(factor: FloatArray, columns: int) -> FloatArray:
+    """Return the lower triangular S (n, n) of ``triangularise``, which overwrites ``factor``."""
+    n = factor.shape[0]
+    triangularise(factor, n, columns)
+    root = np.zeros((n, n))
     for i in range(n):
-        for c in range(used):
-            scratch[i, c] = 0.0
-        for j in range(n):
-            factor = matrix[i, j]
-            if factor == 0.0:
-                continue
-            for c in range(used):
-                scratch[i, c] += factor * form[j, c]
+        for j in range(i + 1):
+            root[i, j] = factor[i, j]
+    return root
+
+
+@kernel(allocates=True)
+def identity(n: int) -> FloatArray:
+    """Return the unit matrix (n, n)."""
+    unit = np.zeros((n, n))
     for i in range(n):
-        for c in range(used):
-            form[i, c] = scratch[i, c]
-
-
-@kernel
-def _multiply_into(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
-    """Write ``a b`` (r, c) over the first c columns of ``out``, for a (r, k) and b (k, c)."""
-    for i in range(a.shape[0]):
-        for j in range(b.shape[1]):
-            total = 0.0
-            for k in range(a.shape[1]):
-                total += a[i, k] * b[k, j]
-            out[i, j] = total
-
-
-@kernel
-def _keep_root(root: FloatArray, factor: FloatArray) -> None:
-    """Write the lower triangle of the first n columns of ``factor`` into ``root`` (n, n)."""
-    n = root.shape[0]
-    for i in range(n):
-        for j in range(n):
-            root[i, j] = factor[i, j] if j <= i else 0.0
+        unit[i, i] = 1.0
+    return unit
 
 
 @kernel(allocates=True)
@@ -124,27 +105,15 @@ def flow_gramian(
     Gamma' Gamma the information of its readings about the state at its start, for ``whitened``
     R^-1/2 H (p, n).
     """
-    count = len(root_weights)
-    p, n = whitened.shape
-    F = np.zeros((n, n))
+    count, (p, n) = len(root_weights), whitened.shape
     Gamma = np.empty((count * p, n))
-    inverse = np.empty((n, n))
-    # F = X(g)^-T, and block 0 is X^T.
-    for i in range(n):
-        F[i, i] = 1.0
-    solve_inplace(blocks[count, 0].copy(), F, n)
     for k in range(count):
-        for i in range(n):
-            for j in range(n):
-                inverse[i, j] = 1.0 if i == j else 0.0
-        solve_inplace(blocks[k, 0].copy(), inverse, n)
+        rows = matmul(whitened, solve(blocks[k, 0], identity(n)))
         for i in range(p):
             for j in range(n):
-                total = 0.0
-                for m in range(n):
-                    total += whitened[i, m] * inverse[m, j]
-                Gamma[k * p + i, j] = root_weights[k] * total
-    return F, Gamma
+                Gamma[k * p + i, j] = root_weights[k] * rows[i, j]
+    # F = X(g)^-T, and block 0 is X^T.
+    return solve(blocks[count, 0], identity(n)), Gamma
 
 
 @kernel(allocates=True)
@@ -155,17 +124,12 @@ def flow_start(
     noise factor, ``gain`` (n, p) is ``H' R^-1/2``.
     """
     count, n, m, p = len(root_weights), B.shape[0], B.shape[1], gain.shape[1]
-    factor, response = np.zeros((n, max(n, count * (m + p)))), np.empty((n, n))
+    factor = np.zeros((n, max(n, count * (m + p))))
     for k in range(count):
         first = k * (m + p)
-        _multiply_into(response, F, blocks[k, 0])
-        _add_product(factor, first, response, B, root_weights[k])
-        _multiply_into(response, F, blocks[k, 2])
-        _add_product(factor, first + m, response, gain, root_weights[k])
-    triangularise(factor, n, count * (m + p))
-    root = np.empty((n, n))
-    _keep_root(root, factor)
-    return root
+        _add_product(factor, first, matmul(F, blocks[k, 0]), B, root_weights[k])
+        _add_product(factor, first + m, matmul(F, blocks[k, 2]), gain, root_weights[k])
+    return root_of(factor, count * (m + p))
 
 
 @kernel
@@ -187,8 +151,7 @@ def flow_over_gap(
     P Gamma' Gamma)^-1`` and P = root root' at its start; ``start`` is that of ``flow_start``.
     """
     n, rows = F.shape[0], Gamma.shape[0]
-    GS, SL = np.empty((rows, n)), root.copy()
-    _multiply_into(GS, Gamma, root)
+    GS, SL = matmul(Gamma, root), root.copy()
     triangle = np.zeros((n, n + rows))
     for i in range(n):
         triangle[i, i] = 1.0
@@ -198,27 +161,13 @@ def flow_over_gap(
     triangularise(triangle, n, n + rows)
     divide_by_transpose(SL, triangle, n, n)
     divide_by_transpose(GS, triangle, rows, n)
-    J, half, FJ = np.zeros((n, n)), np.zeros((n, n)), np.empty((n, n))
-    for i in range(n):
-        J[i, i] = 1.0
-        for j in range(n):
-            for k in range(rows):
-                half[i, j] += GS[k, i] * Gamma[k, j]
-    for i in range(n):
-        for j in range(n):
-            for k in range(n):
-                J[i, j] -= SL[i, k] * half[k, j]
-    _multiply_into(FJ, F, J)
-    factor, FSZ, FC = np.empty((n, 2 * n)), np.empty((n, n)), np.empty((n, n))
-    _multiply_into(FSZ, F, SL)
-    _multiply_into(FC, FSZ, SL.T)
+    J = identity(n)
+    _add_product(J, 0, matmul(SL, GS.T), Gamma, -1.0)
+    FSZ, factor = matmul(F, SL), np.empty((n, 2 * n))
     for i in range(n):
         for j in range(n):
             factor[i, j], factor[i, n + j] = FSZ[i, j], start[i, j]
-    triangularise(factor, n, 2 * n)
-    end_root = np.empty((n, n))
-    _keep_root(end_root, factor)
-    return FJ, FC, end_root
+    return matmul(F, J), matmul(FSZ, SL.T), root_of(factor, 2 * n)
 
 
 @kernel(allocates=True)
@@ -243,7 +192,6 @@ def flow_estimates(
     columns     : the first of the K m inputs of the plant, and the first of the n inputs of each
                   error's own noise, which are there if p > 0
     """
-    used = errors.shape[2]
     whitened, gain, noise, B, plant = flow
     nodes, weights = quadrature
     root_weights = np.sqrt(weights * gap)
@@ -251,26 +199,20 @@ def flow_estimates(
     F, Gamma = flow_gramian(blocks, whitened, root_weights)
     start = flow_start(F, blocks, B, gain, root_weights)
     count, n, p = len(nodes), F.shape[0], whitened.shape[0]
-    scratch, phi = np.empty((n, used)), np.empty((n, n))
-    reading_noise = np.zeros((n, max(n, count * p)))
     for e in range(len(errors)):
         form = errors[e]
         FJ, FC, root = flow_over_gap(F, Gamma, start, roots[e])
-        multiply_form(form, FJ, used, scratch)
-        for i in range(n):
-            for j in range(reading_noise.shape[1]):
-                reading_noise[i, j] = 0.0
+        copy_matrix(form, matmul(FJ, form))
+        reading_noise = np.zeros((n, max(n, count * p)))
         for k in range(count):
             # Phi(g, s) = X(g)^-T X(s)^T, and Phi(g, s) L(s) with the gain L of the filter at s.
-            _multiply_into(phi, FJ, blocks[k, 0])
-            _add_product(phi, 0, FC, blocks[k, 1], 1.0)
+            phi = add_matmul(matmul(FJ, blocks[k, 0]), FC, blocks[k, 1])
             _add_product(form, columns[0] + k * plant.shape[1], phi, plant, root_weights[k])
-            _multiply_into(phi, FJ, blocks[k, 2])
-            _add_product(phi, 0, FC, blocks[k, 3], 1.0)
+            phi = add_matmul(matmul(FJ, blocks[k, 2]), FC, blocks[k, 3])
             _add_product(reading_noise, k * p, phi, noise, root_weights[k])
         if p > 0:
-            triangularise(reading_noise, n, max(n, count * p))
+            own = root_of(reading_noise, max(n, count * p))
             for i in range(n):
                 for j in range(i + 1):
-                    form[i, columns[1] + e * n + j] += reading_noise[i, j]
-        _keep_root(roots[e], root)
+                    form[i, columns[1] + e * n + j] += own[i, j]
+        copy_matrix(roots[e], root)

@@ -8,19 +8,25 @@ reading: neither depends on what was read (Han et al. 2015, Theorem 2).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, cast
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.registry import built_in_filters
 from netkf.algorithms.stochastic_trigger import silence_noise
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray, square_root
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns
-from netkf.theory.common.forms import MEAN, Forms
-from netkf.theory.common.observations import Observation, slot_observations
+from netkf.theory.common.observations import (
+    Observation,
+    slot_observations,
+    stack_observations,
+)
 from netkf.theory.common.random_links import all_messages_arrive
+from netkf.theory.common.slot_columns import SlotColumns
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -55,90 +61,30 @@ def decisions(scenario: Scenario, run: Run) -> Decisions:
     return {(slot, index[node]) for slot, node in zip(slots, rows["node"].tolist(), strict=True)}
 
 
-class ScheduleColumns(ErrorColumns):
-    """The error of the one estimate that all nodes have, as a form of the noises."""
-
-    # Who sends depends on readings, so that the filter is not affine: it has equations of its own.
+class ScheduleColumns(SlotColumns):
+    """The error of the one estimate that all nodes have: that of a filter with all readings, for
+    which silence is a reading that equals its prediction, with the noise R + Y^-1.
+    """
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
-        self._scenario, self._run, self._kept = scenario, run, []
-        self.estimators, self.n = len(scenario.nodes), scenario.plant.n
-        mean, cov = scenario.initial_estimate(scenario.nodes[0])
-        plant: Any = scenario.plant
-        self._table = Forms(self.n)
-        self._e, self._root = self._table.take(self.n), square_root(np.asarray(cov))
-        first = square_root(np.asarray(plant.start_cov))
-        self._add(first)
-        self._table.table[self._e, MEAN] = plant.start_mean - mean
+        algorithm: Any = scenario.filter.algorithm
+        self._Y, self._sent = algorithm.Y, decisions(scenario, run)
+        self._each = slot_observations(scenario, run)
+        super().__init__(_with_one_filter(scenario), run)
 
-    def _add(self, noise: FloatArray) -> None:
-        """Add ``noise`` (n, k) times k new inputs to the error."""
-        column, width = self._table.inputs(noise.shape[1]), noise.shape[1]
-        self._table.table[self._e, column : column + width] += noise
-
-    def replay(self) -> Iterator[None]:
-        """Replay the decisions of the run; yield at each of ``run.times``."""
-        scenario, slot = self._scenario, 0
-        sent, observe = decisions(scenario, self._run), slot_observations(scenario, self._run)
-        (F, Q), Y = scenario.slot_belief, cast(Any, scenario.filter.algorithm).Y
-        noise = square_root(Q)
-        for until in scenario.slot_plant.slots_of(self._run.times).tolist():
-            while slot < until:
-                slot += 1
-                self._change(F, noise)
-                self._root = triangular_root(np.column_stack([F @ self._root, noise]))
-                for h, observation in observe(slot).items():
-                    # Silence counts as a reading that equals its prediction, with the noise
-                    # R + Y^-1.
-                    self._use(observation if (slot, h) in sent else silence(observation, Y))
-            yield
-
-    def _change(self, matrix: FloatArray, noise: FloatArray) -> None:
-        """Multiply the error by a ``matrix`` (n, n) and add ``noise`` (n, k) times new inputs."""
-        table, used = self._table.table, self._table.used
-        table[self._e, :used] = matrix @ table[self._e, :used]
-        self._add(noise)
-
-    def _use(self, observation: Observation) -> None:
-        if not len(observation.H):
-            return
-        gain, self._root = measurement_update(self._root, observation)
-        self._change(np.eye(self.n) - gain @ observation.H, -gain @ observation.root)
-
-    def _forms(self) -> FloatArray:
-        """Return the errors (N n, C): the means, and the columns of inputs."""
-        return np.tile(self._table.table[self._e, : self._table.used], (self.estimators, 1))
-
-    def covariances(self) -> FloatArray:
-        """Return P (N, n, n) of the estimators."""
-        return np.tile(self._root @ self._root.T, (self.estimators, 1, 1))
-
-    def keep(self) -> None:
-        """Store the present errors for ``law``."""
-        error = self._table.freeze(self._table.table[self._e, : self._table.used])
-        self._kept.append(np.tile(error, (self.estimators, 1)))
+    def _observe(self, slot: int) -> dict[int, Observation]:
+        used = [
+            observation if (slot, h) in self._sent else silence(observation, self._Y)
+            for h, observation in self._each(slot).items()
+            if len(observation.H)
+        ]
+        return {0: stack_observations(used, self.n)}
 
 
-def triangular_root(factor: FloatArray) -> FloatArray:
-    """Return the lower triangular S (n, n) with ``S S' = factor factor'``, of a ``factor`` (n, k)
-    with k >= n columns.
-    """
-    # factor' = Z U, so factor factor' = U' U.
-    return cast(FloatArray, np.linalg.qr(factor.T, mode="r")).T
-
-
-def measurement_update(root: FloatArray, observation: Observation) -> tuple[FloatArray, FloatArray]:
-    """Return the Kalman gain (n, p) and the root (n, n) of P after a reading, for the ``root``
-    before it, by one orthogonal triangularisation, in which no subtraction loses digits.
-    """
-    p, n = observation.H.shape
-    # [[R^1/2, H S], [0, S]] times an orthogonal matrix is [[C, 0], [K C, S+]], C C' = H P H' + R.
-    rows = np.block(
-        [[np.linalg.cholesky(observation.R), observation.H @ root], [np.zeros((n, p)), root]]
-    )
-    lower = triangular_root(rows)
-    gain = np.linalg.solve(lower[:p, :p].T, lower[p:, :p].T).T
-    return np.asarray(gain), lower[p:, p:]
+@lru_cache(maxsize=8)
+def _with_one_filter(scenario: Scenario) -> Scenario:
+    filtering = replace(scenario.filter, algorithm=built_in_filters()["central"]())
+    return replace(scenario, filter=filtering)
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:

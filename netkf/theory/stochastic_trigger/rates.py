@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.stochastic_trigger import trigger_matrix
-from netkf.linalg.arrays import ArrayLike, square_root
+from netkf.linalg.arrays import ArrayLike
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.observations import Observation
+from netkf.theory.common.observations import Observation, joseph_update
 from netkf.theory.intermittent.riccati import check_system, lyapunov_step
 from netkf.theory.numerics.matrices import as_covariance
-from netkf.theory.stochastic_trigger.errors import decisions, measurement_update, silence
+from netkf.theory.stochastic_trigger.errors import decisions, silence
 from netkf.trace.run import Run
 
 
@@ -51,9 +51,8 @@ def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
             for k, (H, R, _) in sensors.items():
                 count += (slot, k) in sent
                 expected += trigger_rate(P, H, R, trigger_matrix(Y, len(R)))
-        root = square_root(P)
         for k, observation in sensors.items():
             used = observation if (slot, k) in sent else silence(observation, Y)
-            root = measurement_update(root, used)[1]
-        P, slot = root @ root.T, slot + 1
+            P = joseph_update(P, used)
+        slot += 1
     return count, expected

@@ -1,43 +1,12 @@
-"""Square roots of covariances, and forms of noises."""
+"""Forms of noises."""
 
 import numpy as np
-import pytest
 
 from netkf.theory.common.forms import Forms
-from netkf.theory.common.observations import Observation
-from netkf.theory.stochastic_trigger.errors import measurement_update, triangular_root
-
-SIZES = (1, 2, 3, 5)
-
-
-def roots(n, count, seed=0):
-    return list(np.random.default_rng(seed + n).standard_normal((count, n, n)))
 
 
 def square(root):
     return root @ root.T
-
-
-@pytest.mark.parametrize("shape", [(3, 3), (2, 7), (1, 4)])
-def test_triangular_roots_have_the_square_of_their_parts(shape):
-    parts = np.random.default_rng(2).standard_normal(shape)
-    parts[:, -1:] *= 1e9  # columns of any size
-    root = triangular_root(parts)
-    assert np.array_equal(root, np.tril(root))
-    assert np.allclose(square(root), square(parts), rtol=1e-14, atol=0.0)
-
-
-@pytest.mark.parametrize("n", SIZES)
-def test_updates_are_those_of_a_kalman_filter(n):
-    random = np.random.default_rng(n)
-    (root,), H = roots(n, 1), random.standard_normal((2, n))
-    R = square(random.standard_normal((2, 2))) + np.eye(2)
-    R.flags.writeable = False  # as those of a scenario
-    K, after = measurement_update(root, Observation(H, R, np.eye(2)))
-    P = square(root)
-    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-    assert np.allclose(K, gain, atol=1e-12)
-    assert np.allclose(square(after), P - gain @ H @ P, atol=1e-12)
 
 
 def test_settled_forms_stay_valid_while_inputs_are_reduced():
