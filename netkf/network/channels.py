@@ -89,10 +89,7 @@ class Loss(Component):
 class NoLoss(Loss):
     """Every message arrives."""
 
-    @property
-    def deterministic(self) -> bool:
-        """True: every delivery probability is 1."""
-        return True
+    deterministic = True
 
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
@@ -144,6 +141,8 @@ class GilbertElliott(Loss):
     its bad state.
     """
 
+    stateful = True
+
     to_bad: float | None = field(probability, default=None)
     to_good: float | None = field(number(above=0.0, high=1.0), default=None)
     deliver_good: float | None = field(probability, default=None)
@@ -193,11 +192,6 @@ class GilbertElliott(Loss):
         assert self.to_bad is not None
         assert self.to_good is not None
         return self.to_bad, self.to_good
-
-    @property
-    def stateful(self) -> bool:
-        """True: each activation draws the next state of the chain."""
-        return True
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Return True if the chain is in its bad state after a step from ``bad``."""
@@ -283,13 +277,10 @@ class Delay(Component):
 class NoDelay(Delay):
     """A message arrives when it is sent."""
 
+    fixed = 0.0
+
     def draw(self, random: np.random.Generator) -> float:
         """Return 0."""
-        return 0.0
-
-    @property
-    def fixed(self) -> float | None:
-        """0 seconds."""
         return 0.0
 
 

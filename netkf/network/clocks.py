@@ -118,6 +118,8 @@ class Poisson(LinkClock):
     ``[[i, rate], ...]`` of single nodes.
     """
 
+    memoryless = True
+
     rate: float | None = field(_rate, default=None)
     rates: tuple[tuple[float, ...], ...] = field(
         list_of(_entity_rate, "triples [i, j, rate]", min_length=0), default=()
@@ -148,11 +150,6 @@ class Poisson(LinkClock):
         """Return the rate of the process of ``entity``, in ticks per second; nan if it has none."""
         rate = self._entity_rates.get(entity, self.rate)
         return math.nan if rate is None else rate
-
-    @property
-    def memoryless(self) -> bool:
-        """True: the gaps are exponential."""
-        return True
 
     def ticks(
         self,

@@ -43,6 +43,8 @@ class DeliveringLoss(Loss):
     All but the chosen messages have the same draws and outcomes as in the run.
     """
 
+    independent = False
+
     given: Loss = field(instance_of(Loss))
     # A mutable object, set before each replay: one scenario with its cached tables serves all.
     deliveries: Deliveries = field(instance_of(Deliveries))
@@ -73,11 +75,6 @@ class DeliveringLoss(Loss):
     def mean_delivery(self, link: Link, table_probability: float) -> float:
         """Return nan: this is one outcome, not a law."""
         return math.nan
-
-    @property
-    def independent(self) -> bool:
-        """Return False: this is one outcome, not a law."""
-        return False
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError if the model ``given`` does not fit the graph."""

@@ -109,6 +109,10 @@ class RecordedLoss(Loss):
     not listed.
     """
 
+    independent = False
+
+    deterministic = True
+
     path: SourceFile = field(source_file)
     after: str = field(_after, default="deliver")
 
@@ -123,11 +127,6 @@ class RecordedLoss(Loss):
         rule = "delivered must be 0 or 1, one value a message"
         return read_messages(self.path, "delivered", rule, lambda value: value in (0.0, 1.0))
 
-    @property
-    def deterministic(self) -> bool:
-        """True: the table decides."""
-        return True
-
     def delivery_probability(
         self, link: Link, message: int, bad: bool, table_probability: float
     ) -> float:
@@ -141,11 +140,6 @@ class RecordedLoss(Loss):
         """Return nan: the fraction is unknown before a run."""
         return math.nan
 
-    @property
-    def independent(self) -> bool:
-        """False: a record is one outcome, not a law."""
-        return False
-
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless every recorded pair is a link."""
         demand_links(self.path, self.table.lines, topology)
@@ -158,6 +152,8 @@ class RecordedDelay(Delay):
     Messages of a directed link are counted from 0; ``after`` is the treatment of a message that is
     not listed. If it is delivered, it takes no time.
     """
+
+    is_random = False
 
     path: SourceFile = field(source_file)
     after: str = field(_after, default="deliver")
@@ -176,11 +172,6 @@ class RecordedDelay(Delay):
     def draw(self, random: np.random.Generator) -> float:
         """Return 0; nothing is drawn."""
         return 0.0
-
-    @property
-    def is_random(self) -> bool:
-        """False: the table decides."""
-        return False
 
     @property
     def longest(self) -> float:
