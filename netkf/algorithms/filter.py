@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -202,6 +203,7 @@ class Filter(Component):
     """
 
     kernels: ClassVar[Kernels | None] = None
+    _called_if = MappingProxyType({"emit": "timing.talks", "absorb": "timing.talks"})
 
     @property
     def timing(self) -> Timing:

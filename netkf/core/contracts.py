@@ -17,7 +17,8 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
@@ -134,6 +135,26 @@ def _require_same_kind(cls: type, name: str, own: Any, contract: Any) -> None:
     is_data = not callable(own) and not hasattr(own, "__get__")
     if isinstance(contract, FunctionType) and is_data and not isinstance(own, dataclasses.Field):
         raise ContractError(f"{cls.__name__}.{name} must be a method, not {quote(own)}")
+
+
+def hold_to_flags(part: Any, called_if: Mapping[str, str]) -> None:
+    """Raise ContractError if the class of a user's ``part`` overrides a method that is never
+    called: the flag that ``called_if`` names for it is False, and inherited.
+    """
+    order = type(part).__mro__
+
+    def owner(name: str) -> type:
+        return next(cls for cls in order if name in _own_names(cls))
+
+    for method, flag in called_if.items():
+        cls, contract = owner(method), _member_of_netkf(type(part), method)
+        if is_netkf_class(cls) or not is_netkf_class(owner(flag.partition(".")[0])):
+            continue
+        if not getattr(contract, "__isabstractmethod__", False) and not attrgetter(flag)(part):
+            where = describe_method(type(part), inspect.unwrap(vars(cls)[method]))
+            raise ContractError(
+                f"{where} is never called where {flag} is False; state that it is True"
+            )
 
 
 SIMILAR = 0.8

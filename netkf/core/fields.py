@@ -15,11 +15,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from netkf.core.contracts import hold_to_contract, is_netkf_class
+from netkf.core.contracts import hold_to_contract, hold_to_flags, is_netkf_class
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.instants import as_written
 from netkf.core.printable import MAX_NAME
@@ -91,6 +91,9 @@ class Component:
     Components are equal if they have the same class and equal fields.
     """
 
+    _called_if: ClassVar[Mapping[str, str]] = {}
+    """Methods of a contract that are called only where another member is True."""
+
     def __new__(cls, *values: Any, **named: Any) -> Self:
         """Return a new object; raises ScenarioError for settings without a name that must have one,
         and for names that are none.
@@ -116,6 +119,8 @@ class Component:
             value, rule = getattr(self, field.name), field.metadata.get("rule")
             if rule is not None and not (value is None and field.default is None):
                 object.__setattr__(self, field.name, rule(field.name, value))
+        if self._called_if and not is_netkf_class(type(self)):
+            hold_to_flags(self, self._called_if)
 
     def __eq__(self, other: object) -> bool:
         """Return True if both components have the same class and equal fields."""

@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,8 @@ class Loss(Component):
     below its ``delivery_probability``. Both directions share the number when the channel is
     symmetric.
     """
+
+    _called_if = MappingProxyType({"next_state": "stateful"})
 
     @abstractmethod
     def delivery_probability(
@@ -234,6 +237,8 @@ class GilbertElliott(Loss):
 @dataclass(frozen=True, eq=False)
 class Delay(Component):
     """The contract of a delay model."""
+
+    _called_if = MappingProxyType({"draw": "is_random"})
 
     @abstractmethod
     def draw(self, random: np.random.Generator) -> float:

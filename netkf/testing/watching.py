@@ -17,6 +17,7 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 
+from netkf.core.contracts import ContractError
 from netkf.core.errors import NetkfError, quote
 from netkf.core.fields import Component
 from netkf.linalg.arrays import FloatArray
@@ -78,6 +79,8 @@ def make_part(
         return part
     try:
         return cls(**settings)
+    except ContractError as error:
+        raise AssertionError(str(error)) from None
     except Exception as error:
         text = f"could not be made with the settings {dict(settings)!r}"
         remedy = "hand over an object, or the class with its settings as keywords"

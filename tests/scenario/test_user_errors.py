@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import textwrap
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -155,6 +156,9 @@ MISTAKES = {
                                         r"F\.independant is never read: did you mean independent\?"),
     "a law's number outside the law": ("DELAY", "def cdf(self, t): return t\ndef draw(self, random): return 1.0",
                                        r"F\.cdf \(FILE, line 6\) is never called: state it in law, as WaitingLaw\(cdf"),
+    "a state that is never asked for": (
+        "LOSS", "def next_state(self, bad, random): return random.random() < 0.5",
+        r"F\.next_state \(FILE, line 6\) is never called where stateful is False"),
     "a misspelled start": ("PLANT", "def start_meen(self): return np.zeros(1)",
                            r"F\.start_meen \(FILE, line 6\) is never called: did you mean start_mean\?"),
 }  # fmt: skip
@@ -319,3 +323,32 @@ def test_members_of_their_own_are_no_mistakes(name):
     base, body = HEALTHY[name]
     source = f"{HEAD}@dataclass(frozen=True, eq=False)\nclass F({base}):\n"
     exec(source + textwrap.indent(body, "    "), {"__name__": __name__})  # raises no ContractError
+
+
+def test_overrides_that_no_engine_calls_are_told_and_settings_may_decide():
+    @dataclass(frozen=True, eq=False)
+    class Timid(parts.ConstantDelay):
+        def draw(self, random):
+            return 2.0
+
+    @dataclass(frozen=True, eq=False)
+    class Talks(parts.Local):
+        def absorb(self, state, messages, exchange):
+            return state
+
+    @dataclass(frozen=True, eq=False)
+    class Sometimes(parts.Bernoulli):
+        bursts: bool = parts.setting(parts.boolean, default=False)
+
+        @property
+        def stateful(self):
+            return self.bursts
+
+        def next_state(self, bad, random):
+            return random.random() < 0.5
+
+    with pytest.raises(TypeError, match=r"Timid.draw \(.*\) is never called where is_random is F"):
+        Timid(1.0)
+    with pytest.raises(TypeError, match=r"Talks.absorb \(.*\) is never called where timing.talks"):
+        Talks()
+    assert not Sometimes(0.5).stateful

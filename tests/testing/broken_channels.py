@@ -61,8 +61,16 @@ class HalfSure(Bernoulli):
         return True
 
 
-@says(CHANNELS, "Fickle.next_state: must draw nothing where stateful is False", delivery=0.5)
+@says(CHANNELS, "Fickle.next_state (tests/testing/broken_channels.py", delivery=0.5)
 class Fickle(Bernoulli):
+    def next_state(self, bad, random):
+        return random.random() < 0.5
+
+
+@says(CHANNELS, "Denies.next_state: must draw nothing where stateful is False", delivery=0.5)
+class Denies(Bernoulli):
+    stateful = False
+
     def next_state(self, bad, random):
         return random.random() < 0.5
 
