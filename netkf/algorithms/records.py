@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -202,13 +203,17 @@ class Records:
     @property
     def memories(self) -> np.ndarray:
         """(B, words) int64: the struct of each block, for ``struct_like``."""
-        first = self.struct
-        blocks = len(self.arrays["xhat"])
-        memories = np.tile(first.memory, (blocks, 1))
+        # Numbers of the struct may have changed, addresses have not.
+        return np.asarray(self.struct.memory + self._steps)
+
+    @cached_property
+    def _steps(self) -> np.ndarray:
+        """What is added to the words of the first block for those of each block (B, words)."""
+        blocks = np.arange(len(self.arrays["xhat"]), dtype=np.int64)
+        steps = np.zeros((len(blocks), len(self.struct.memory)), dtype=np.int64)
         for name, array in self.arrays.items():
-            steps = np.arange(blocks, dtype=np.int64) * array.strides[0]
-            memories[:, first.struct_offsets[name]] += steps
-        return memories
+            steps[:, self.struct.struct_offsets[name]] = blocks * array.strides[0]
+        return steps
 
 
 def make_records(

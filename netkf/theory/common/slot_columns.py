@@ -66,7 +66,9 @@ class SlotColumns(ErrorColumns):
 
     def _begin(self) -> SlotFilters:
         setup = self._setup
-        columns = self._x.shape[1]
+        # Making filters takes longer than some slots: there is room for all columns that few are.
+        in_slot = self.n + int(setup.rows.sum())
+        columns = self._x.shape[1] + min(FEW, in_slot * (setup.slots + 1))
         filters = SlotFilters(setup, self._kernels, blocks_of(columns), with_means=False)
         starts = list(zip(setup.xhat, setup.root, strict=True))
         means = make_records(
@@ -129,7 +131,7 @@ class SlotColumns(ErrorColumns):
         # The origin follows the true state, so that errors on unstable plants keep their digits.
         framed = self._scenario.filters_know_the_truth
         state = padded(self._x, width - columns).reshape(n, 1, blocks, LANES)
-        local = np.ascontiguousarray(np.moveaxis(state, 2, 0).swapaxes(1, 2))
+        local = np.ascontiguousarray(state.transpose(2, 1, 0, 3))
         if framed and setup.algorithm.timing.predicts:
             self._x[:] = 0.0
         y = np.zeros((setup.estimators, setup.p, width))
@@ -141,7 +143,7 @@ class SlotColumns(ErrorColumns):
             y[h, :rows, first : first + noises] += whitened[:, n:]
             H[0, 0, h, :rows] = whitened[:, :n, None]
             first += noises
-        y = np.moveaxis(y.reshape(*y.shape[:2], blocks, LANES), 2, 0)[:, None]
+        y = y.reshape(*y.shape[:2], blocks, LANES).transpose(2, 0, 1, 3)[:, None]
         algorithm, steps = setup.algorithm, len(setup.fresh)
         up = arrivals.get(slot, np.zeros((steps, len(setup.directions)), dtype=np.uint8))
         shape = (blocks, 1, *up.shape, LANES)
@@ -179,7 +181,10 @@ class SlotColumns(ErrorColumns):
         """Turn the columns of noises into as few as their rank allows."""
         columns = self._x.shape[1]
         linear = {}
-        for name, matrix in self._matrices().items():
+        for name, array in self._filters.records.arrays.items():
+            if array.dtype != np.float64:
+                continue
+            matrix = self._matrix(name)
             rows = (matrix[:, NOISE:] != matrix[:, ZERO : ZERO + 1]).any(axis=1)
             if rows.any():
                 linear[name] = matrix, rows
@@ -210,24 +215,20 @@ class SlotColumns(ErrorColumns):
 
     def _forms(self) -> FloatArray:
         """Return the errors (M n, C - 1): the means, and the columns of noises."""
-        estimates = self._matrices()["xhat"]
+        estimates = self._matrix("xhat")
         return np.asarray(np.tile(self._x, (self.estimators, 1)) - estimates)[:, MEAN:]
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n) of the estimators."""
-        roots = self._matrices()["root"][:, ZERO]
+        roots = self._matrix("root")[:, ZERO]
         S = np.tril(roots.reshape(self.estimators, self.n, self.n))
         return np.asarray(S @ np.swapaxes(S, 1, 2))
 
-    def _matrices(self) -> dict[str, FloatArray]:
-        """Return all arrays of the filters as matrices (entries, C), by name."""
-        arrays, columns = self._filters.records.arrays, self._x.shape[1]
-        width = len(arrays["xhat"]) * LANES
-        return {
-            name: np.moveaxis(array, 0, -2).reshape(-1, width)[:, :columns]
-            for name, array in arrays.items()
-            if array.dtype == np.float64
-        }
+    def _matrix(self, name: str) -> FloatArray:
+        """Return an array of the filters as a matrix (entries, C)."""
+        array = self._filters.records.arrays[name]
+        entries = array.transpose(*range(1, array.ndim - 1), 0, array.ndim - 1)
+        return entries.reshape(-1, len(array) * LANES)[:, : self._x.shape[1]]
 
     def _write(self, values: dict[str, FloatArray], columns: int) -> None:
         """Give the filters so many columns, with these matrices (entries, columns)."""
