@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from functools import cache
 
 import pytest
 
@@ -44,10 +45,10 @@ LETTER = re.compile(rf"\b([HGRPD]){PLACE}")
 AUTHORS = {"H": "Tanwani", "G": "Moura", "R": "Sinopoli", "P": "Battilotti", "D": "Xie"}
 
 
+@cache
 def texts():
-    for file in TEXTS:
-        if file.suffix in SUFFIXES and file.is_file():
-            yield file, file.read_text(encoding="utf-8")
+    files = [file for file in TEXTS if file.suffix in SUFFIXES and file.is_file()]
+    return [(file, file.read_text(encoding="utf-8")) for file in files]
 
 
 def test_the_readme_is_one_screen_and_the_changes_are_few():

@@ -8,6 +8,13 @@ from netkf.theory import error_covariance
 
 from .linearity import engine_covariance
 
+
+@pytest.fixture
+def ring(ring):
+    """A ring of four nodes is enough: a run for each noise takes half the time."""
+    return ring.replace({"network.graph.nodes": 4, "sensors.0.nodes": [0, 2]})
+
+
 STATED = 1e-3  # the docs promise this much at the default sensing period
 
 
@@ -79,13 +86,13 @@ def test_baselines(ring, kind):
 
 def test_several_sensors_on_a_node_and_rows_of_zeros(ring):
     more = [
-        {"nodes": [0, 3], "H": [[1.0, 0.0]], "R": [[0.25]]},
+        {"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.25]]},
         {"nodes": [0, 1], "H": [[0.0, 1.0], [0.0, 0.0]], "R": [[0.5, 0.1], [0.1, 0.3]]},
     ]
     assert deviation(ring.replace({"horizon": 1.0, "sensors": more})) < STATED / 20
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_random_systems_with_large_first_covariances(build, seed):
     random = np.random.default_rng(seed)
     n = int(random.integers(2, 4))
