@@ -17,6 +17,7 @@ from netkf.engines.compiled.agenda import is_immediate, simulate_agenda
 from netkf.engines.compiled.batches import flow_batches, quick_runs
 from netkf.engines.compiled.clock_loop import clock_loop
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
+from netkf.engines.compiled.own_sensors import is_own, reads_in_python
 from netkf.engines.compiled.slot_loop import slot_loop
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
@@ -27,29 +28,26 @@ from netkf.plants.linear import LinearPlant
 from netkf.plants.recorded import (
     RecordedDiffusion,
     RecordedPlant,
-    RecordedSensor,
     UnknownDiffusion,
     UnknownPlant,
 )
-from netkf.plants.regressors import RegressorSensor
-from netkf.plants.sensors import LinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import RunBatch
 from netkf.trace.recorder import Recorder
 
-BUILT_IN_PARTS = (
+PLANTS = (
     *(Diffusion, RecordedDiffusion, UnknownDiffusion),
     *(LinearPlant, RecordedPlant, UnknownPlant),
-    *(LinearSensor, RegressorSensor, RecordedSensor),
 )
 
 
 @dataclass(frozen=True)
 class CompiledEngine(Engine):
-    """Runs all built-in plants, sensors and filters; clocks and channels may be a user's own, since
-    schedules are drawn in Python.
+    """Runs all built-in plants, linear sensors and filters. Clocks, losses, delays and sensors that
+    take samples or read in slots may be a user's own, since Python can draw what they do; filters
+    if they are kernels.
     """
 
     name = "compiled"
@@ -59,14 +57,17 @@ class CompiledEngine(Engine):
         remedy = 'use engine="simpy", or "auto", which chooses'
         if not has_numba():
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
-        parts: list[tuple[str, Component]] = [("plant", scenario.plant)]
-        parts += [("sensor", sensor) for sensor in scenario.sensors]
-        for family, part in parts:
-            # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
-            if type(part) not in BUILT_IN_PARTS:
-                return (
-                    f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
-                )
+        # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
+        unknown: list[tuple[str, Component]] = []
+        if type(scenario.plant) not in PLANTS:
+            unknown.append(("plant", scenario.plant))
+        unknown += [
+            ("sensor", sensor)
+            for sensor in scenario.sensors
+            if is_own(sensor) and not reads_in_python(sensor, scenario.slotted)
+        ]
+        for family, part in unknown:
+            return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)
             return (

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.engines.compiled.own_sensors import is_own, read_many
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import Instants
 from netkf.linalg.arrays import FloatArray
-from netkf.plants.readings import RecordedSamples
 from netkf.plants.sampling import Samples
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
@@ -59,13 +59,15 @@ class SampleTables:
                 times[node, placed_sensor.ordinal],
                 scenario.sample_path(streams, node, placed_sensor),
                 indices,
-                scenario.sensors[placed_sensor.entry].varying,
+                bool(varies),
             )
-            for (node, placed_sensor), indices in zip(placed, parts, strict=True)
+            for (node, placed_sensor), indices, varies in zip(
+                placed, parts, _sensor_tables(scenario).varying, strict=True
+            )
         ]
         self.instants = _make_instants(scenario, t[order], sensor[order])
         for (_, placed_sensor), sampled in zip(placed, self._sensors, strict=True):
-            if isinstance(sampled.samples, RecordedSamples) and sampled.varying:
+            if sampled.varying and hasattr(sampled.samples, "covariance"):
                 R = scenario.noise_covariance(placed_sensor.entry, believed=True)
                 _add_noises(self.instants, sampled.samples, sampled.indices, R)
 
@@ -83,17 +85,15 @@ class SampleTables:
             sample_times = sensor.times[first:last]
             # The state at each sample; ``times`` contains all of them.
             x = states[np.searchsorted(times, sample_times)]
-            y, H = sensor.samples.several(range(first, last), x)
+            y, H = read_many(sensor.samples, range(first, last), x)
             indices, p = sensor.indices[first:last], y.shape[1]
             instants.y[indices, :p] = y
             if sensor.varying:
                 instants.H[instants.matrix[indices], :p] = H
 
 
-def _add_noises(
-    instants: Instants, samples: RecordedSamples, indices: np.ndarray, R: FloatArray
-) -> None:
-    """Set rows and noise of each sample of a recorded sensor: values may be missing."""
+def _add_noises(instants: Instants, samples: Any, indices: np.ndarray, R: FloatArray) -> None:
+    """Set rows and noise of each sample of a sensor that has its own: values may be missing."""
     p, first = instants.root.shape[1], len(instants.rows)
     root = np.zeros((len(indices), p, p))
     rows = np.zeros(len(indices), dtype=np.int64)
@@ -146,12 +146,12 @@ def _sensor_tables(scenario: Scenario) -> SensorTables:
     max_rows = int(rows.max(initial=1))
     root, H = np.zeros((len(parts), max_rows, max_rows)), np.zeros((len(parts), max_rows, n))
     for k, (part, R) in enumerate(parts):
-        root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.H
+        root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.matrix_of(n)
     return SensorTables(
         node=np.array([node for node, _ in placed], dtype=np.int64),
         filter=np.array([0 if pooled else index[node] for node, _ in placed], dtype=np.int64),
         rows=rows,
-        varying=np.array([part.varying for part, _ in parts], dtype=bool),
+        varying=np.array([part.varying or is_own(part) for part, _ in parts], dtype=bool),
         root=root,
         H=H,
     )

@@ -18,6 +18,7 @@ import numpy as np
 from netkf.algorithms.filter import compiled_kernels
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
+from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_filters import SlotFilters
@@ -167,6 +168,11 @@ class SlotRuns:
         scenario, first = self._scenario, self._first
         self._recorded: list[tuple[AssignedSensor, Any]] = [
             (s, scenario.slot_path(first, s.node, s.placed_sensor)) for s in setup.recorded_sensors
+        ]
+        # One path for each run.
+        self._own: list[tuple[AssignedSensor, list[Any]]] = [
+            (s, [scenario.slot_path(r, s.node, s.placed_sensor) for r in streams.per_replica])
+            for s in setup.own_sensors
         ]
 
     def _begin_messages(self) -> None:
@@ -470,9 +476,17 @@ class SlotRuns:
         draw_readings(
             MANY, setup.sensors, noise, normal_ziggurat(), x, regressor_states, scratch, y, H
         )
-        if not self._recorded or not times.sensed.any():
+        if not (self._recorded or self._own) or not times.sensed.any():
             return ReadingBlock(y, H, rebased)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
+        for s, paths in self._own:
+            rows = slice(s.row, s.row + s.rows)
+            y[:, times.sensed, s.estimator, rows] = 0.0  # in lanes without a run
+            for run, path in enumerate(paths):
+                b, lane = divmod(run, LANES)
+                own = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R)
+                for out, values in zip((y, H), own, strict=True):
+                    out[b, times.sensed, s.estimator, rows, ..., lane] = values
         for s, path in self._recorded:
             rows = slice(s.row, s.row + s.rows)
             # L^-1 y and L^-1 H, with the R = L L' that filters believe; all runs read the same.

@@ -13,6 +13,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel
+from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.slot_messages import (
     INDEPENDENT,
     NODE_WAKEUP,
@@ -171,19 +172,23 @@ class SlotSetup:
                 )
                 rows[estimator] += count
         self.rows, self.p = rows, int(rows.max(initial=1))
-        kinds = [type(scenario.sensors[s.placed_sensor.entry]) for s in self.assigned]
-        self.recorded_sensors = [
-            s for s, k in zip(self.assigned, kinds, strict=True) if k is RecordedSensor
-        ]
-        # Python reads recorded sensors, kernels read the others; some of these have regressors as
-        # H.
-        self.kernel_sensors = [
-            s for s, k in zip(self.assigned, kinds, strict=True) if k is not RecordedSensor
-        ]
-        self.regressor_sensors = [
-            s for s, k in zip(self.assigned, kinds, strict=True) if k is RegressorSensor
-        ]
-        self.varies = bool(self.recorded_sensors or self.regressor_sensors)
+        # Python reads recorded sensors and those of users, kernels read the others; some of these
+        # have regressors as H.
+        self.recorded_sensors: list[AssignedSensor] = []
+        self.own_sensors: list[AssignedSensor] = []
+        self.kernel_sensors: list[AssignedSensor] = []
+        self.regressor_sensors: list[AssignedSensor] = []
+        for assigned in self.assigned:
+            sensor = scenario.sensors[assigned.placed_sensor.entry]
+            if is_own(sensor):
+                self.own_sensors.append(assigned)
+            elif isinstance(sensor, RecordedSensor):
+                self.recorded_sensors.append(assigned)
+            else:
+                self.kernel_sensors.append(assigned)
+                if isinstance(sensor, RegressorSensor):
+                    self.regressor_sensors.append(assigned)
+        self.varies = len(self.kernel_sensors) < len(self.assigned) or bool(self.regressor_sensors)
         # The same in all blocks of runs and all slots, hence 1, 1.
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
         self._set_kernel_sensors(scenario)
@@ -332,7 +337,7 @@ class SlotSetup:
             sensor: Any = scenario.sensors[s.placed_sensor.entry]
             recorded_slots = sensor.record.slots(s.node, scenario.slot_plant.period)
             slots.setdefault(scenario.topology.index[s.node], set()).update(recorded_slots)
-        for s in self.kernel_sensors:
+        for s in self.kernel_sensors + self.own_sensors:
             slots.pop(scenario.topology.index[s.node], None)
         return slots
 

@@ -1,0 +1,65 @@
+"""Sensors of users in the compiled engine: Python reads them, many readings at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import cholesky, solve_lower
+from netkf.plants.readings import covariance_of
+from netkf.plants.recorded import RecordedSensor
+from netkf.plants.regressors import RegressorSensor
+from netkf.plants.sensors import LinearSensor, Sensor
+
+BUILT_IN = (LinearSensor, RegressorSensor, RecordedSensor)
+METHODS = ("path", "slot_path", "samples", "matrix_of", "varying")
+"""What says how a sensor reads."""
+
+
+def is_own(sensor: Sensor) -> bool:
+    """Return True if a sensor reads in a way of its own: kernels do not know it."""
+    return not any(
+        isinstance(sensor, base)
+        and all(getattr(type(sensor), m, None) is getattr(base, m, None) for m in METHODS)
+        for base in BUILT_IN
+    )
+
+
+def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
+    """Return True if Python can read a user's sensor for the engine: in slots, or by samples. Its
+    increments would be drawn by kernels.
+    """
+    return sensor.linear and (slotted or getattr(sensor, "sampling", None) is not None)
+
+
+def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return readings (S, p) and H (S, p, n) of S increasing ``numbers`` of samples or slots of a
+    ``path``, whose states are x (S, n).
+    """
+    if hasattr(path, "several"):
+        y, H = path.several(numbers, x)
+        return y, H
+    # What a user's class must have: ``reading`` of a sample gives y and H, in a slot y alone.
+    pairs = [(path.reading(k, state), k) for k, state in zip(numbers, x, strict=True)]
+    if hasattr(path, "matrix"):
+        return np.array([y for y, _ in pairs]), np.array([path.matrix(k) for _, k in pairs])
+    return np.array([y for (y, _), _ in pairs]), np.array([H for (_, H), _ in pairs])
+
+
+def read_whitened(
+    path: Any, slots: Sequence[int], x: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return readings (S, p) and H (S, p, n) of S increasing ``slots``, whose states are x (S, n),
+    multiplied by the inverse Cholesky factor of the R (p, p) that filters believe.
+    """
+    y, H = read_many(path, slots, x)
+    roots = [cholesky(covariance_of(path, slot, R)) for slot in slots]
+    both = [
+        solve_lower(root, np.column_stack([values, matrix]))
+        for root, values, matrix in zip(roots, y, H, strict=True)
+    ]
+    whitened = np.array(both)
+    return whitened[:, :, 0], whitened[:, :, 1:]

@@ -1,0 +1,144 @@
+"""Sensors that users write run in both engines alike, wherever Python can read them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.network.clocks import Periodic
+from netkf.plants.sampling import DrawnSamples
+from netkf.plants.sensors import LinearSensor, Sensor
+from tests.engines.agreement import assert_agree
+from tests.testing.sound_parts import Bearing, LaplaceSensor
+
+
+class Skewed:
+    """Readings with noise that has no kernel, of an H that turns; the least that is asked for."""
+
+    def __init__(self, random, R):
+        self.random, self.R = random, R
+
+    def matrix(self, k):
+        return np.array([[np.cos(0.1 * k), np.sin(0.1 * k), 0.0, 0.0]])
+
+    def draw(self, k, x):
+        noise = np.sqrt(self.R[0]) * (self.random.exponential() - 1.0)
+        return self.matrix(k) @ x + noise
+
+
+class SkewedInSlots(Skewed):
+    def reading(self, slot, x):
+        return self.draw(slot, x)
+
+    def covariance(self, slot, R):
+        return R * (1.0 + slot % 2)
+
+
+class SkewedSamples:
+    def __init__(self, random, R):
+        self.readings = Skewed(random, R)
+
+    def reading(self, k, x):
+        return self.readings.draw(k, x), self.readings.matrix(k)
+
+
+@dataclass(frozen=True, eq=False)
+class Turning(LinearSensor):
+    def slot_path(self, node, period, generator):
+        return SkewedInSlots(generator("noise"), self.R)
+
+    def samples(self, node, generator, horizon):
+        return SkewedSamples(generator("noise"), self.R)
+
+
+@dataclass(frozen=True, eq=False)
+class Biased(LinearSensor):
+    def samples(self, node, generator, horizon):
+        return DrawnSamples(1.01 * self.H, self.R, generator("noise"))
+
+
+@dataclass(frozen=True, eq=False)
+class Empty(LinearSensor):
+    pass
+
+
+@dataclass(frozen=True, eq=False)
+class Increments(LinearSensor):
+    def path(self, random, cutting):
+        return super().path(random, cutting)
+
+
+ONE = {"H": [[1.0, 0.0, 0.0, 0.0]], "R": [[0.5]]}
+TWO = {"H": np.eye(2, 4), "R": [[0.5, 0.2], [0.2, 0.3]]}
+IN_SLOTS = {
+    "laplace": LaplaceSensor(nodes=(0, 2), **TWO),
+    "from the contract": Bearing(nodes=(1, 3), direction=[3.0, 4.0, 0.0, 0.0], sigma=0.5),
+    "turning": Turning(nodes=(0, 4), **ONE),
+    "empty": Empty(nodes=(0, 4), **ONE),
+}
+
+
+@pytest.fixture(scope="module")
+def slots():
+    return netkf.load("scenarios/gossip_ring.toml").replace({"horizon": 20.0})
+
+
+@pytest.fixture(scope="module")
+def clocks():
+    return netkf.load("scenarios/intel_lab_radio.toml").replace({"horizon": 6.0})
+
+
+def in_clocks(scenario, cls):
+    old = scenario.sensors[0]
+    own = cls(nodes=old.nodes, H=old.H, R=old.R, sampling=Periodic(period=0.5, jitter=0.1))
+    return scenario.replace({"sensors": [own]})
+
+
+@pytest.mark.parametrize("kind", IN_SLOTS)
+def test_in_slots(slots, kind):
+    built_in = LinearSensor(nodes=(1,), H=[[0.0, 1.0, 0.0, 0.0]], R=[[2.0]])
+    scenario = slots.replace({"sensors": [IN_SLOTS[kind], built_in]})
+    run = assert_agree(scenario)
+    assert netkf.simulate(scenario).engine == "compiled"
+    # Runs side by side are what they are alone.
+    ensemble = netkf.monte_carlo(scenario, 11, workers=1)
+    errors = [netkf.simulate(scenario, replica=r).error for r in range(11)]
+    mean = np.mean([e[:, :, :, None] * e[:, :, None, :] for e in errors], axis=0)
+    np.testing.assert_allclose(ensemble.mean_error, mean, rtol=1e-9, atol=1e-9)
+    assert run.status == "complete"
+
+
+@pytest.mark.parametrize("cls", [Turning, Biased, Empty])
+def test_samples(clocks, cls):
+    scenario = in_clocks(clocks, cls)
+    run = assert_agree(scenario)
+    assert (run.events["kind"] == "sense").any()
+
+
+def test_increments_of_a_sensor_that_overrides_nothing_are_compiled():
+    ring = netkf.load("scenarios/poisson_ring.toml").replace({"horizon": 3.0})
+    old = ring.sensors[0]
+    same, own = (
+        ring.replace({"sensors": [cls(nodes=old.nodes, H=old.H, R=old.R)]})
+        for cls in (Empty, Increments)
+    )
+    assert netkf.simulate(same).engine == "compiled"
+    assert_agree(same)
+    assert netkf.simulate(own).engine == "simpy"
+    with pytest.raises(netkf.NetkfError, match="cannot run the sensor .*Increments"):
+        netkf.simulate(own, engine="compiled")
+
+
+def test_what_nobody_reads_in_bulk_is_refused(slots):
+    @dataclass(frozen=True, eq=False)
+    class Curved(Sensor):
+        linear = False
+        H = np.eye(2)
+        R = np.eye(2)
+
+        def slot_path(self, node, period, generator):
+            raise AssertionError
+
+    with pytest.raises(netkf.NetkfError):
+        netkf.simulate(slots.replace({"sensors": [Curved(nodes=(0,))]}), engine="compiled")
