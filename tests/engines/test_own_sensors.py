@@ -126,7 +126,7 @@ def test_increments_of_a_sensor_that_overrides_nothing_are_compiled():
     assert netkf.simulate(same).engine == "compiled"
     assert_agree(same)
     assert netkf.simulate(own).engine == "simpy"
-    with pytest.raises(netkf.NetkfError, match="cannot run the sensor .*Increments"):
+    with pytest.raises(netkf.NetkfError, match=r"cannot run the sensor .*Increments"):
         netkf.simulate(own, engine="compiled")
 
 
