@@ -105,7 +105,6 @@ def end_later(status: int, seconds: float, message: str = "") -> None:
     """Start a thread that prints ``message`` and ends the process after ``seconds``."""
 
     def end() -> None:
-        """Wait, write the message and end the process."""
         time.sleep(seconds)
         if message:
             with contextlib.suppress(Exception):

@@ -48,7 +48,6 @@ class ProgressLine:
         last_percent = -1
 
         def update(seconds: float) -> None:
-            """Show the percentage of the horizon that has been simulated, if it has changed."""
             # Engines call this far more often than the percentage changes.
             nonlocal last_percent
             percent = int(100.0 * seconds / horizon)
@@ -65,7 +64,6 @@ class ProgressLine:
         first_update: tuple[float, int] | None = None
 
         def update(done: int, wanted: int) -> None:
-            """Show the numbers and the estimated time left."""
             nonlocal first_update
             now = time.monotonic()
             # The rate counts from the first update: a resumed ensemble does not begin at 0.

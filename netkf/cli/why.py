@@ -14,7 +14,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 
 if TYPE_CHECKING:
-    from netkf.studies.why import Why
+    from netkf.studies.explanation import Why
     from netkf.trace.run import Run
 
 

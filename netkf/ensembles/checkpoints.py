@@ -69,7 +69,6 @@ class BlockCheckpoints:
     """Statistics of the finished blocks, one file each, written atomically."""
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
-        """Serve the blocks of runs of ``scenario`` in a run ``directory``; nothing is read yet."""
         self._folder, self._scenario = directory / BLOCKS_FOLDER, scenario
         self._numbers: set[int] = set()
 
@@ -332,7 +331,6 @@ def _restore_statistics(arrays: Any) -> RunStatistics:
     """Return the statistics of a block, without its traces, from the arrays of its file."""
 
     def moments(name: str) -> Moments:
-        """Return the moments of one quantity."""
         return Moments(*(arrays[f"{name}_{field}"] for field in Moments._fields))
 
     texts = _read_texts(arrays)

@@ -191,9 +191,6 @@ class _DirectoryWriter:
     """
 
     def __init__(self, scenario: Scenario, directory: Path, plan: RunIdentity) -> None:
-        """Prepare to write the blocks (parts of the replicas) of the runs that ``plan`` describes
-        to an existing ``directory``; nothing is written yet.
-        """
         self.scenario, self.directory, self.plan = scenario, directory, plan
         self.blocks = BlockCheckpoints(directory, scenario)
         self._manifest = Manifest(

@@ -205,7 +205,6 @@ def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:
     i, j = np.triu_indices(n)
 
     def upper(values: FloatArray) -> list[FloatArray]:
-        """Return the upper triangles (T N,) of the matrices ``values`` (T, N, n, n), row by row."""
         return list(values[:, :, i, j].reshape(rows, -1).T)
 
     columns = [

@@ -59,7 +59,6 @@ class RemotePool(Pool):
     """A pool outside this process, to which each scenario is sent pickled, packed once."""
 
     def __init__(self) -> None:
-        """Make a pool that has packed no scenario yet."""
         # The last scenario and its packed form, to be reused for its other blocks.
         self._packed: tuple[object, PackedScenario] | None = None
 

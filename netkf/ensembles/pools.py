@@ -41,7 +41,6 @@ class LocalPool(Pool):
     ahead = 1
 
     def __init__(self) -> None:
-        """Make a pool whose first block has one run; see ``_note_duration`` for the next ones."""
         self._size = 1
 
     def submit(self, job: Job) -> Future[Any]:
@@ -77,7 +76,6 @@ class AdaptivePool(LocalPool):
     """
 
     def __init__(self, workers: int, open_ended: bool = False) -> None:
-        """Make a pool of this process, which may grow to so many ``workers`` processes."""
         super().__init__()
         self.width, self._open_ended = workers, open_ended
         self._processes: ProcessPool | None = None
@@ -136,7 +134,6 @@ class ExecutorPool(RemotePool):
     """A user's concurrent.futures executor, which is not shut down."""
 
     def __init__(self, executor: Executor) -> None:
-        """Make a pool that submits its blocks to ``executor``."""
         super().__init__()
         self._executor = executor
         # Executors do not tell their number of workers; those of the standard library have it here.
@@ -154,7 +151,6 @@ class DaskPool(RemotePool):
     """
 
     def __init__(self, address: str) -> None:
-        """Connect to the scheduler at ``address``, such as "tcp://HOST:PORT"."""
         super().__init__()
         _check_address(address)
         try:

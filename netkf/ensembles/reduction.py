@@ -158,7 +158,6 @@ def reduction_scratch(filters: int, n: int, largest: int) -> ReductionScratch:
     nodes, rows = (depth, wide, columns), (LANES, wide, columns)
 
     def in_lanes(numbers: int) -> FloatArray:
-        """Return aligned scratch (wide ``numbers`` + L, L) for ``wide`` sample times."""
         return np.asarray(aligned((wide * numbers + LANES, LANES)))
 
     return ReductionScratch(

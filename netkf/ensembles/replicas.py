@@ -93,7 +93,6 @@ def replicate_blocks(
     job = Job(scenario, task, seed, first, start=0, stop=runs, size=blocks.size)
 
     def take(block: Job, result: Any) -> None:
-        """Add the result of a block to the tree and report progress."""
         nonlocal runs_done
         # A block of 2^level replicas, the k-th of this size, is the node (level, k) of the tree.
         tree.add(block.start // block.size, result, block.size.bit_length() - 1)

@@ -124,7 +124,6 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
     """Return means (N + 1, 3) of square error, trace of P and NEES over time and runs."""
 
     def column(name: str) -> FloatArray:
-        """Return one quantity (N + 1,) of all nodes and, last, of all together, or nan."""
         return np.array([row.get(name) for row in rows], dtype=np.float64)
 
     # The summary has the root of the mean square error; the standard error of its square is 2 rms

@@ -51,9 +51,6 @@ class _Worker:
     """A worker process with its two pipes, and the task it works on (None if idle)."""
 
     def __init__(self, hide_main: bool) -> None:
-        """Start the process and its two pipes, for jobs and for results; with ``hide_main`` it does
-        not import the user's script, which would run it again.
-        """
         receiver, self._jobs = multiprocessing.Pipe(duplex=False)
         self.results, sender = multiprocessing.Pipe(duplex=False)
         self.task: _Task | None = None
@@ -127,7 +124,6 @@ class ProcessPool(RemotePool):
     """
 
     def __init__(self, workers: int) -> None:
-        """Make a pool of at most ``workers`` processes."""
         super().__init__()
         self.width = workers
         self._workers: list[_Worker] = []

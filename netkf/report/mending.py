@@ -19,9 +19,8 @@ from netkf.report.markup import bullets, paragraph, table_box
 from netkf.report.worst import WorstSample
 from netkf.runs.simulate import simulate
 from netkf.runs.tables import format_number
-from netkf.studies.explanation import Explanation
+from netkf.studies.explanation import Why, relative_change
 from netkf.studies.why import why
-from netkf.studies.why_text import relative_change, write_sentences
 
 SAME_NUMBERS = 1e-4
 """Relative difference below which numbers of four digits look the same."""
@@ -31,7 +30,7 @@ REPLAYED_EVENTS, MIN_REPLAYS, MAX_REPLAYS = 300_000, 5, 60
 """Events that the replays of a page may have together, and the limits of the number of replays."""
 
 
-def explain_worst(source: ReportSource) -> Explanation | str | None:
+def explain_worst(source: ReportSource) -> Why | str | None:
     """Explain the worst sample after the start-up, or return the reason for none, or None."""
     run = source.run
     if source.worst is None or run is None or source.kind != "run":
@@ -55,7 +54,7 @@ def _why_command(source: ReportSource, worst: WorstSample) -> str:
     return f"netkf why {source.label} --node {worst.node} --at {worst.time:.10g}"
 
 
-def describe_mending(explanation: Explanation) -> str:
+def describe_mending(explanation: Why) -> str:
     """Return a sentence on the worst sample had no message been missing, by replays."""
     # The first replay is the run as it was, the last one has no message missing.
     actual, best = explanation.what_ifs[0], explanation.what_ifs[-1]
@@ -107,7 +106,7 @@ def central_sample(source: ReportSource) -> CentralSample | None:
     return CentralSample(float(np.trace(central_run.P[row, 0])), error)
 
 
-def describe_central(source: ReportSource, explanation: Explanation, central: CentralSample) -> str:
+def describe_central(source: ReportSource, explanation: Why, central: CentralSample) -> str:
     """Return sentences on the price of the network: the worst sample beside the central one."""
     best = explanation.what_ifs[-1]
     numbers = [f"trace P {format_number(central.trace)}"] if math.isfinite(central.trace) else []
@@ -134,7 +133,7 @@ def _describe_change(name: str, before: float, after: float) -> str:
     return f"{change} ({relative_change(after, before)})" if before > 0.0 else change
 
 
-def _describe_smallest_set(explanation: Explanation) -> str:
+def _describe_smallest_set(explanation: Why) -> str:
     smallest = explanation.smallest
     if smallest is None or smallest.messages == ():
         return ""
@@ -149,7 +148,7 @@ def _describe_smallest_set(explanation: Explanation) -> str:
     )
 
 
-def mending_section(source: ReportSource, explanation: Explanation | str) -> str:
+def mending_section(source: ReportSource, explanation: Why | str) -> str:
     """Return the replays of the worst sample as HTML, or the reason why there are none."""
     if isinstance(explanation, str) or source.worst is None:
         return paragraph(f"The worst sample is not explained here: {explanation}", "note")
@@ -170,4 +169,4 @@ def mending_section(source: ReportSource, explanation: Explanation | str) -> str
     replays = table_box(caption, ("replayed with", "messages", "trace P", "change", "error"), rows)
     command = _why_command(source, source.worst.explained)
     note = f"All numbers are from replays of the run, none is estimated. For more: {command}"
-    return bullets(write_sentences(explanation)) + replays + paragraph(note, "note")
+    return bullets(explanation.sentences()) + replays + paragraph(note, "note")

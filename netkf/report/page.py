@@ -37,7 +37,7 @@ from netkf.runs.files import require_own, write_text
 from netkf.runs.stored import StoredRun
 from netkf.scenario.writing import toml_text
 from netkf.studies.compare import Comparison, compare, damage_named
-from netkf.studies.explanation import Explanation
+from netkf.studies.explanation import Why
 from netkf.studies.stored import StoredComparison
 from netkf.trace.messages import MESSAGE, join_messages
 from netkf.trace.schema import KINDS
@@ -79,7 +79,7 @@ class _AnalysedSource(NamedTuple):
 
     source: ReportSource
     messages: np.ndarray
-    worst: Explanation | str | None = None
+    worst: Why | str | None = None
     readings: Innovations | str | None = None
     layout: list[list[float]] | None = None
 
@@ -284,7 +284,7 @@ def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | 
 def _source_sentences(entry: _AnalysedSource) -> list[str]:
     """Return the sentences about a directory: its data, and after "Why" the replays."""
     sentences = describe_source(entry.source, entry.messages, entry.readings)
-    if isinstance(entry.worst, Explanation):
+    if isinstance(entry.worst, Why):
         after_why = (k for k, line in enumerate(sentences, 1) if line.startswith("Why: "))
         index = next(after_why, len(sentences))
         sentences.insert(index, describe_mending(entry.worst))

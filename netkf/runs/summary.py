@@ -45,7 +45,6 @@ class SummarySink(Sink):
     thread_safe: ClassVar[bool] = True
 
     def __init__(self) -> None:
-        """Begin without samples and events."""
         self.times: list[float] = []
         self.sq_error: list[FloatArray] = []
         self.trace: list[FloatArray] = []

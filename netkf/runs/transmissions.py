@@ -27,7 +27,6 @@ class Transmissions:
     """
 
     def __init__(self) -> None:
-        """Begin with counts of 0."""
         self.sent: Counter[int] = Counter()
         self._broadcasts: Counter[int] = Counter()
         self._slot_transmissions: Counter[int] = Counter()

@@ -1,11 +1,24 @@
-"""The explanation of the estimate of a node at an instant, as plain values."""
+"""The explanation of the estimate of a node at an instant: values, words, tables, a document."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from netkf.core.printable import shorten
 from netkf.network.deliveries import MessageKey
+from netkf.runs.files import to_json_value
+from netkf.runs.tables import format_number, format_table, shorten_rows
 from netkf.studies.message_sets import SmallestSet
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_ROWS, MAX_LISTED = 20, 4
+COUNT_WORDS = ("no", "one", "two", "three")
 
 GOOD_ENOUGH = 0.05
 """By default a set of messages suffices if it brings the trace of P to at most 1 + GOOD_ENOUGH
@@ -13,20 +26,27 @@ times that of the run with every message delivered.
 """
 
 
-@dataclass(frozen=True)
-class Missing:
-    """A message that was sent but not used: its ``outcome`` (of OUTCOMES), and when it was ``sent``
-    and ``arrived`` (seconds, nan if it did not).
+class Missing(NamedTuple):
+    """A message, number ``message`` from ``sender`` to ``receiver`` (ids), that was sent but not
+    used: its ``outcome`` (of OUTCOMES), and when it was ``sent`` and ``arrived`` (seconds, nan if
+    it did not).
     """
 
-    key: MessageKey
+    sender: int
+    receiver: int
+    message: int
     outcome: str
     sent: float
     arrived: float
 
+    @property
+    def key(self) -> MessageKey:
+        """The identity of the message."""
+        return MessageKey(self.sender, self.receiver, self.message)
+
     def __str__(self) -> str:
-        sender, receiver, count = self.key
-        return f"{sender} -> {receiver} number {count} ({self.outcome}, sent at {self.sent:.6g} s)"
+        link = f"{self.sender} -> {self.receiver} number {self.message}"
+        return f"{link} ({self.outcome}, sent at {self.sent:.6g} s)"
 
 
 @dataclass(frozen=True)
@@ -74,7 +94,7 @@ class WhatIf:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Explanation:
+class Why:
     """The explanation of the estimate of ``node`` at ``at`` seconds in one run of a scenario.
 
     ``trace`` is that of its covariance P and ``error`` the length of its error. ``sources`` has the
@@ -104,3 +124,291 @@ class Explanation:
     def error(self) -> float:
         """The length of x - xhat at the node, nan without a known truth."""
         return self.what_ifs[0].error
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """A row for each other node, and the node itself if it has a sensor: ages in seconds."""
+        import pandas as pd
+
+        # Ages are also known for 1, 2, ... ``budget`` more messages delivered.
+        budget = len(self.sources[0].with_more) if self.sources else 0
+        rows = [
+            {
+                "node": s.node,
+                "sensor": s.sensor,
+                "neighbour": s.neighbour,
+                "heard": s.heard,
+                "arrived": s.arrived,
+                "unheard": s.unheard,
+                "known_age": self._age_at_sample(s.known),
+                "reading": s.reading,
+                "reading_age": self._age_at_sample(s.reading),
+                "route": " -> ".join(map(str, s.route)),
+                **{
+                    f"age_with_{k}_more": self.at - s.with_more[k - 1] for k in range(1, budget + 1)
+                },
+                "age_without_losses": self.at - s.without_losses,
+                "missing": "; ".join(map(str, s.missing)),
+            }
+            for s in self.sources
+        ]
+        return pd.DataFrame(rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain JSON values; what is unknown is None."""
+        document: dict[str, Any] = {
+            **{name: getattr(self, name) for name in ("scenario", "node", "at", "seed", "replica")},
+            "trace": self.trace,
+            "error": self.error,
+            "sentences": self.sentences(),
+            "sources": [
+                {**vars(s), "missing": [m._asdict() for m in s.missing]} for s in self.sources
+            ],
+            "what_ifs": [{**vars(w), "messages": self._entries(w.messages)} for w in self.what_ifs],
+            "smallest": None,
+            "notes": self.notes,
+        }
+        if self.smallest is not None:
+            document["smallest"] = {
+                **vars(self.smallest),
+                "messages": self._entries(self.smallest.messages),
+                "best": self._entries(self.smallest.best),
+                "proven": self.smallest.proven,
+            }
+        plain: dict[str, Any] = to_json_value(document)
+        return plain
+
+    def _entries(self, keys: Sequence[MessageKey] | None) -> list[dict[str, Any]] | None:
+        return None if keys is None else [self.missing[key]._asdict() for key in keys]
+
+    def __repr__(self) -> str:
+        return (
+            f"<netkf why: node {self.node} at {self.at:g} s of {self.scenario!r}, trace P "
+            f"{self.trace:.4g}>"
+        )
+
+    def __str__(self) -> str:
+        notes = [f"note: {note}" for note in self.notes]
+        tables = ["", self._source_table(), "", self._replay_table()]
+        return "\n".join([*self.sentences(), *tables, *notes])
+
+    def sentences(self) -> list[str]:
+        """Return the explanation in sentences, one line each."""
+        return [
+            *self._state_sentences(),
+            *self._heard_sentences(),
+            *self._reading_sentences(),
+            *self._smallest_sentences(),
+        ]
+
+    def _state_sentences(self) -> Iterator[str]:
+        run = f"seed {self.seed}, replica {self.replica}"
+        scenario = shorten(self.scenario, 60)
+        sentence = f"Node {self.node} at {self.at:g} s ({scenario}, {run})"
+        if math.isfinite(self.trace):
+            rms = math.sqrt(max(self.trace, 0.0))
+            sentence += f": trace P is {self.trace:.4g}, which claims an RMS error of {rms:.3g}"
+        else:
+            sentence += ": the filter gives no covariance"
+        error = f"; its error is {self.error:.3g}" if math.isfinite(self.error) else ""
+        yield f"{sentence}{error}."
+
+    def _heard_sentences(self) -> Iterator[str]:
+        neighbours = [s for s in self.sources if s.neighbour]
+        if not neighbours:
+            yield f"No other node sends to node {self.node}."
+            return
+        heard = sorted((s for s in neighbours if not math.isnan(s.heard)), key=lambda s: -s.heard)
+        silent = [s.node for s in neighbours if math.isnan(s.heard)]
+        parts = [f"node {s.node} {self._format_time_before(s.heard)}" for s in heard[:MAX_LISTED]]
+        if parts:
+            others = (
+                f" and {len(heard) - MAX_LISTED} others before" if len(heard) > MAX_LISTED else ""
+            )
+            yield f"It last heard {_join_with_and(parts)}{others} (times of sending)."
+        if silent:
+            yield f"It had never heard node {_list_items(silent)}."
+        unheard = sum(s.unheard for s in neighbours)
+        if unheard:
+            counts = [f"{s.unheard} of node {s.node}" for s in neighbours if s.unheard]
+            verb = "message sent to it since then was"
+            verb = verb if unheard == 1 else "messages sent to it since then were"
+            listed = _list_items(counts, "other nodes")
+            yield f"{unheard} {verb} lost, late or not used: {listed}."
+
+    def _reading_sentences(self) -> Iterator[str]:
+        sensors = [s for s in self.sources if s.sensor and s.node != self.node]
+        with_reading = sorted(
+            (s for s in sensors if not math.isnan(s.reading)), key=lambda s: s.reading
+        )
+        without_reading = [s for s in sensors if math.isnan(s.reading)]
+        if with_reading:
+            oldest = with_reading[:MAX_LISTED]
+            parts = [
+                f"{self.at - s.reading:.4g} s old from node {s.node} ({_format_route(s)})"
+                for s in oldest
+            ]
+            prefix = "The oldest of its" if len(with_reading) > MAX_LISTED else "Its"
+            yield f"{prefix} newest readings are {_join_with_and(parts)}."
+        if without_reading:
+            nodes = _list_items([s.node for s in without_reading])
+            yield f"No reading of node {nodes} can have reached it."
+        yield from self._missed_reading_sentences(with_reading + without_reading)
+
+    def _missed_reading_sentences(self, sensors: list[InformationSource]) -> Iterator[str]:
+        kept_from_newer = [s for s in sensors if s.missing]
+        for source in kept_from_newer[:MAX_LISTED]:
+            # with_more[k - 1]: time of the newest reading with k more messages.
+            newest = source.with_more[len(source.missing) - 1]
+            messages = _join_with_and([str(m) for m in source.missing])
+            age = f"{self.at - newest:.4g} s old"
+            yield f"A newer reading of node {source.node}, {age}, would have come with {messages}."
+        if len(kept_from_newer) > MAX_LISTED:
+            others = len(kept_from_newer) - MAX_LISTED
+            yield (
+                f"Newer readings of {others} other nodes would have come too, with these or others."
+            )
+        if sensors and not kept_from_newer:
+            count = len(sensors[0].with_more)
+            messages = "one message" if count == 1 else f"up to {COUNT_WORDS[count]} messages"
+            yield f"No newer reading was kept away by {messages} that did not come."
+
+    def _smallest_sentences(self) -> Iterator[str]:
+        """Yield the sentences on the smallest set of missing messages; none without P."""
+        # The last replay is the one in which no message is missing.
+        smallest, no_losses = self.smallest, self.what_ifs[-1]
+        if smallest is None:
+            return
+        change = relative_change(no_losses.trace, self.trace)
+        error = "" if math.isnan(no_losses.error) else f" and the error {no_losses.error:.4g}"
+        trace = f"{no_losses.trace:.4g} ({change})"
+        yield f"Had no message been missing, trace P would be {trace}{error}."
+        tried, limit = _describe_search(smallest), self._format_limit(smallest)
+        if smallest.messages:
+            named = _join_with_and([str(self.missing[key]) for key in smallest.messages])
+            subject, fewer = "One message", ""
+            if len(smallest.messages) > 1:
+                subject = f"{len(smallest.messages)} messages together"
+                fewer = "; fewer would not" if smallest.proven else "; perhaps fewer would"
+            yield (
+                f"{subject} would have brought trace P to {smallest.trace:.4g} (wanted: at most "
+                f"{limit}): {named}{fewer} ({tried})."
+            )
+        elif smallest.messages is not None:
+            yield f"No message had to come: trace P as it was is at most {limit}."
+        elif smallest.proven:
+            most = f"{smallest.most} messages or fewer"
+            yield f"No {most} would have brought it to {limit} ({tried})."
+        else:
+            yield (
+                f"No set of up to {smallest.most} messages brought it to {limit}, of those that "
+                f"were tried ({tried}; --replays tries more)."
+            )
+        if smallest.messages is None and smallest.best:
+            named = _join_with_and([str(self.missing[key]) for key in smallest.best])
+            change = relative_change(smallest.best_trace, self.trace)
+            trace = f"{smallest.best_trace:.4g} ({change})"
+            yield f"The best that was tried brings it to {trace}: {named}."
+
+    def _format_limit(self, smallest: SmallestSet) -> str:
+        usual = (1.0 + GOOD_ENOUGH) * self.what_ifs[-1].trace
+        where = f", {1.0 + GOOD_ENOUGH:g} times that with no message missing"
+        is_default = math.isclose(smallest.limit, usual, rel_tol=1e-9)
+        return f"{smallest.limit:.4g}{where if is_default else ''}"
+
+    def _source_table(self) -> str:
+        """Return the table of nodes with a sensor or a link to the node; others are counted."""
+        listed = [s for s in self.sources if s.sensor or s.neighbour or s.node == self.node]
+        others = len(self.sources) - len(listed)
+        budget = len(listed[0].with_more) if listed else 0
+        header = ["from", "last heard", "missed since", "newest reading", "age"]
+        header += [f"+{k}" for k in range(1, budget + 1)] + ["none lost", "way"]
+        rows = [
+            [
+                f"{s.node}{'' if s.sensor else ' (no sensor)'}",
+                _format_time(s.heard),
+                str(s.unheard) if s.neighbour else "-",
+                _format_time(s.reading),
+                *(format_number(self.at - t) for t in (s.reading, *s.with_more, s.without_losses)),
+                _format_route(s),
+            ]
+            for s in listed
+        ]
+        text = format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
+        other_text = f"\n{others} other nodes have no sensor and no link to it." if others else ""
+        ages = f"+1 .. +{budget}: age of the newest reading with so many more messages"
+        return f"{text}\ntimes in seconds; {ages}{other_text}"
+
+    def _replay_table(self) -> str:
+        truth = any(math.isfinite(w.error) for w in self.what_ifs)
+        header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
+        rows = [
+            [
+                w.label,
+                "all" if w.messages is None else str(len(w.messages)),
+                format_number(w.trace),
+                # The first row is the run as it was, from which the others are changes.
+                "" if k == 0 else relative_change(w.trace, self.trace),
+                *([format_number(w.error)] if truth else []),
+            ]
+            for k, w in enumerate(self.what_ifs)
+        ]
+        return format_table(header, shorten_rows(rows, MAX_ROWS), left_columns=1)
+
+    def _age_at_sample(self, seconds: float) -> float:
+        """Return the age in seconds of something at the time of the sample."""
+        return seconds if math.isnan(seconds) else max(0.0, self.at - seconds)
+
+    def _format_time_before(self, seconds: float) -> str:
+        """Return a time in seconds as text, with its distance from the sample."""
+        # A filtered sample has the time of the beginning of its slot, before the slot's exchanges.
+        since = "in this slot" if seconds > self.at else f"{self.at - seconds:.4g} s before"
+        return f"at {seconds:.6g} s ({since})"
+
+
+def _describe_search(smallest: SmallestSet) -> str:
+    sentence = f"{smallest.candidates} messages could have mattered"
+    if smallest.considered < smallest.candidates:
+        if not smallest.considered:
+            return f"{sentence}; all of them together change next to nothing"
+        since = f"{smallest.considered} of them sent from {smallest.since:.6g} s on"
+        sentence += f", {since}; all before would have changed next to nothing"
+    return f"{sentence}; {smallest.replays} replays"
+
+
+def relative_change(trace: float, base: float) -> str:
+    """Return the relative difference of a trace from ``base`` in percent, as text."""
+    if not (math.isfinite(trace) and base > 0.0):
+        return "-"
+    percent = round(100.0 * (trace / base - 1.0), 1) + 0.0  # no -0.0
+    return f"{percent:+.1f} %"
+
+
+def _format_time(seconds: float) -> str:
+    """Return seconds as text, "-" for nan."""
+    return "-" if math.isnan(seconds) else f"{seconds:.6g}"
+
+
+def _format_route(source: InformationSource) -> str:
+    if not source.route:
+        return "-"
+    if len(source.route) == 1:
+        return "its own"
+    nodes = (
+        source.route if len(source.route) <= 6 else (*source.route[:3], "..", *source.route[-2:])
+    )
+    return " -> ".join(map(str, nodes))
+
+
+def _list_items(items: Sequence[object], others: str = "others") -> str:
+    """Return the first MAX_LISTED items joined, and the number of the ``others``."""
+    parts = [str(item) for item in items[:MAX_LISTED]]
+    more = len(items) - len(parts)
+    return _join_with_and([*parts, f"{more} {others}"] if more else parts)
+
+
+def _join_with_and(parts: Sequence[str]) -> str:
+    """Return parts joined by commas and "and"."""
+    if len(parts) < 2:
+        return "".join(parts)
+    return f"{', '.join(parts[:-1])} and {parts[-1]}"

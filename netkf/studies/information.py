@@ -222,7 +222,6 @@ def _swap_flow(nodes: IntArray, rows: int, messages: Messages, used: IntArray) -
     keys = indices * length + start
 
     def segment(segment_nodes: IntArray, row: IntArray) -> IntArray:
-        """Return the segments (K,) of nodes (K,) that contain the events at ``row`` (K,)."""
         sought_keys = np.searchsorted(nodes, segment_nodes) * length + row
         return np.asarray(np.searchsorted(keys, sought_keys, side="right") - 1)
 
@@ -318,9 +317,6 @@ class KeptReadings:
     """
 
     def __init__(self, scenario: DerivedScenario, log: IntArray, at: float) -> None:
-        """Find the readings in the EVENT rows ``log`` (E,) that influence the sample at ``at``
-        seconds.
-        """
         self._scenario, self._times, self._at = scenario, log["t"], at
         sensed = np.flatnonzero(log["kind"] == CODES["sense"])
         # Sorted by node: the rows of a node are neighbours, in their order.

@@ -121,7 +121,6 @@ class _Search:
     """Traces of P by replays, and the gains (decreases of the trace) of sets of messages."""
 
     def __init__(self, replayer: Replayer, limit: float) -> None:
-        """Take the replayer of a run, and the ``limit`` that the trace of P is to reach."""
         self._replayer, self._limit = replayer, limit
         self._gains: dict[tuple[MessageKey, ...], float] = {}
 
@@ -141,7 +140,6 @@ class _Search:
         tolerance = NEGLIGIBLE * (base - self._limit)
 
         def are_negligible(count: int) -> bool:
-            """Return True if the first ``count`` candidates change the trace negligibly."""
             keys = [candidate.key for candidate in candidates[:count]]
             return abs(self.trace(keys) - base) <= tolerance
 

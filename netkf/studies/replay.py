@@ -67,9 +67,6 @@ class Replayer:
     """
 
     def __init__(self, scenario: Scenario, seed: int, replica: int, node: int, at: float) -> None:
-        """Take the run by its scenario, ``seed`` and ``replica``; states are those of ``node`` (its
-        id) at ``at`` seconds. Nothing is simulated yet.
-        """
         self.scenario, self._seed, self._replica = scenario, seed, replica
         self._node, self.at, self.count = scenario.nodes.index(node), at, 0
         self._deliveries = Deliveries()

@@ -223,7 +223,6 @@ class Search:
     """A bisection between two values of a key, which keeps all probes."""
 
     def __init__(self, problem: SizingProblem, decide: Callable[[float], Probe]) -> None:
-        """Take the problem, and the function that returns the probe of a value of the key."""
         self._problem, self._decide = problem, decide
         self.probes: list[Probe] = []
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from netkf.ensembles.stored import StoredEnsemble
 from netkf.network.deliveries import MessageKey
 from netkf.network.graphs import Topology
 from netkf.scenario.scenario import Scenario
-from netkf.studies.explanation import GOOD_ENOUGH, Explanation, InformationSource, Missing, WhatIf
+from netkf.studies.explanation import GOOD_ENOUGH, InformationSource, Missing, WhatIf, Why
 from netkf.studies.information import (
     OUTCOMES,
     USED,
@@ -39,40 +37,16 @@ from netkf.studies.information import (
 from netkf.studies.message_sets import Candidate, SmallestSet, find_smallest_set
 from netkf.studies.opening import open as open_directory
 from netkf.studies.replay import Replayer
-from netkf.studies.why_text import format_why, source_table, why_document
 from netkf.trace.run import Run
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 MAX_MISSING = 3  # largest size of a set of missing messages that is searched
 MIN_REPLAYS, MAX_REPLAYS, MAX_EVENTS = 10, 1000, 5_000_000
 """The default number of replays is MAX_EVENTS over the events of one replay, within the two limits.
 It holds for those that search the smallest set, and again for those with newer readings of nodes.
 """
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Why(Explanation):
-    """The answer of ``netkf.why``: an explanation with its texts and tables."""
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """A row for each other node, and the node itself if it has a sensor: ages in seconds."""
-        return source_table(self)
-
-    def __str__(self) -> str:
-        return format_why(self)
-
-    def __repr__(self) -> str:
-        return (
-            f"<netkf why: node {self.node} at {self.at:g} s of {self.scenario!r}, trace P "
-            f"{self.trace:.4g}>"
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return why_document(self)
 
 
 def why(
@@ -208,7 +182,6 @@ class _Evidence:
     """The evidence in the events of a run about one node at one instant."""
 
     def __init__(self, replayer: Replayer, node: int, max_missing: int) -> None:
-        """Search the paths on which information reached, or could have reached, ``node``."""
         self._replayer, self._node, self._max_missing = replayer, node, max_missing
         self.scenario = replayer.scenario
         talks, links = self.scenario.node_filter.timing.talks, self.scenario.topology.directions
@@ -328,7 +301,9 @@ def _is_newer(reading: float, than: float) -> bool:
 def _describe_missing(messages: Messages, m: int, topology: Topology) -> Missing:
     sender, receiver, number = messages.key(m)
     return Missing(
-        MessageKey(topology.named(sender), topology.named(receiver), number),
+        topology.named(sender),
+        topology.named(receiver),
+        number,
         OUTCOMES[int(messages.outcome[m])],
         float(messages.sent[m]),
         float(messages.arrived[m]),

@@ -72,9 +72,6 @@ class BatchSink(Sink):
     thread_safe: ClassVar[bool] = True
 
     def __init__(self, replicas: range, times: FloatArray, shape: tuple[int, int]) -> None:
-        """Allocate the arrays of the R runs ``replicas``, filled with nan: T = len(times) samples
-        each of F filters with n states, ``shape`` = (F, n).
-        """
         (filters, n), count = shape, (len(replicas), len(times))
         self._replicas, self._times, self._filters = replicas, times, filters
         self._x = np.full((*count, n), np.nan)

@@ -82,9 +82,6 @@ class Recorder:
     """
 
     def __init__(self, sinks: Sequence[Sink], counts_only: bool = False) -> None:
-        """Begin without events; ``sinks`` get them, and samples, in blocks, or only samples with
-        ``counts_only``.
-        """
         self._sinks, self.counts_only = tuple(sinks), counts_only
         self._rows: list[tuple[float, int, int, int, int, int, float]] = []
         self._hash = hashlib.sha256()
