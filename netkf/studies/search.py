@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -108,23 +108,6 @@ class Sizing(NotebookTable):
 
 
 @dataclass(frozen=True)
-class SizingProblem:
-    """The key of a scenario to search, an integer or not, and the target; ``by`` is theory or
-    simulation.
-    """
-
-    scenario: Scenario
-    key: str
-    integer: bool
-    target: Target
-    by: str
-
-    def at(self, value: float) -> Scenario:
-        """Return the scenario with a value of the key."""
-        return self.scenario.replace({self.key: value})
-
-
-@dataclass(frozen=True)
 class SimulationPlan:
     """How values are decided by simulation.
 
@@ -140,91 +123,26 @@ class SimulationPlan:
     first: int = FIRST_BATCH
 
 
-def decide_by_theory(problem: SizingProblem, value: float) -> Probe:
-    """Return the probe of a ``value`` by theory: the quantity itself or an upper bound."""
-    scenario, target = problem.at(value), problem.target
-    quantity, _ = quantity_by_theory(scenario, target)
-    reached = quantity <= target.limit
-    if theory_is_exact(scenario, target):
-        state = REACHED if reached else MISSED
-        return Probe(
-            value=value,
-            quantity=quantity,
-            low=quantity,
-            high=quantity,
-            runs=0,
-            target=state,
-            by=EXACT,
-        )
-    # The quantity lies between 0 and the bound.
-    return Probe(
-        value=value,
-        quantity=quantity,
-        low=0.0,
-        high=quantity,
-        runs=0,
-        target=REACHED if reached else NOT_SHOWN,
-        by=BOUND,
-    )
-
-
-def decide_by_both(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the probe of a ``value``: by a bound if that suffices, else by simulation."""
-    bound = decide_by_theory(problem, value)
-    return decide_by_simulation(problem, plan, value) if bound.target == NOT_SHOWN else bound
-
-
-def decide_by_simulation(problem: SizingProblem, plan: SimulationPlan, value: float) -> Probe:
-    """Return the probe of a ``value``: runs are doubled until its interval decides."""
-    scenario, target = problem.at(value), problem.target
-    # This target divides by the trace of P of a filter with all readings.
-    central = central_trace(scenario) if target.quantity == "within_central" else None
-    simulated, metrics = 0, []
-    if plan.progress is not None:
-        plan.progress(f"{problem.key} = {value:g}: simulating")
-    while True:
-        batch = min(max(plan.first, simulated), plan.runs - simulated)
-        metrics.append(
-            replicate_blocks(
-                plan.task, join_metrics, scenario, batch, first=simulated, pool=plan.pool
-            )
-        )
-        simulated += batch
-        interval = quantity_by_simulation(join_metrics(*metrics), target, plan.level, central)
-        state = UNDECIDED
-        if interval.high <= target.limit:
-            state = REACHED
-        elif not interval.low <= target.limit:  # also if it is not a number
-            state = MISSED
-        if plan.progress is not None:
-            plan.progress(
-                f"{problem.key} = {value:g}: {target.quantity} {interval.value:.4g}, between "
-                f"{interval.low:.4g} and {interval.high:.4g} after {simulated:,} of at most "
-                f"{plan.runs:,} runs, {state}"
-            )
-        probe = Probe(value, *interval, simulated, state)
-        is_futile = (
-            simulated >= plan.runs // 4 and _runs_to_decide(probe, target) > FUTILE * plan.runs
-        )
-        if state != UNDECIDED or simulated >= plan.runs or is_futile:
-            return probe
-
-
-def _runs_to_decide(probe: Probe, target: Target) -> float:
-    """Return the forecast of the runs that decide a ``probe``; nan if unknown."""
-    width, distance = 0.5 * (probe.high - probe.low), abs(probe.quantity - target.limit)
-    if not math.isfinite(width):
-        return math.nan
-    # Widths fall with the root of the number of runs; 10 % are added as a margin.
-    return 1.1 * probe.runs * (width / distance) ** 2 if distance > 0.0 else math.inf
-
-
+@dataclass(frozen=True)
 class Search:
-    """A bisection between two values of a key, which keeps all probes."""
+    """A bisection between two values of a ``key`` of a scenario, an ``integer`` or not, for one at
+    which it meets the ``target``; it keeps all ``probes``.
 
-    def __init__(self, problem: SizingProblem, decide: Callable[[float], Probe]) -> None:
-        self._problem, self._decide = problem, decide
-        self.probes: list[Probe] = []
+    Values are decided ``by`` theory, simulation, or both: a bound if that suffices, else
+    simulation, for which there is a ``plan``.
+    """
+
+    scenario: Scenario
+    key: str
+    integer: bool
+    target: Target
+    by: str
+    plan: SimulationPlan | None = None
+    probes: list[Probe] = field(default_factory=list)
+
+    def at(self, value: float) -> Scenario:
+        """Return the scenario with a value of the key."""
+        return self.scenario.replace({self.key: value})
 
     def run(self, low: float, high: float, confidence: float, quantity: str) -> Sizing:
         """Try values of the key between ``low`` and ``high``, by bisection, and return the smallest
@@ -236,7 +154,7 @@ class Search:
         first, last = self._probe(low), self._probe(high)
         ends = [first, last]
         if BOUND in (first.by, last.by) and first.by != last.by:  # compare bounds with bounds
-            ends = [decide_by_theory(self._problem, end.value) for end in ends]
+            ends = [self._decide_by_theory(end.value) for end in ends]
         grows = ends[1].quantity > ends[0].quantity
         # The end at which the quantity is smaller should reach the target, the other may not.
         good, bad = (first, last) if grows else (last, first)
@@ -251,24 +169,23 @@ class Search:
             # One more value shows whether the quantity is monotone at all.
             middle = self._value_between(low, high)
             self._probe(low if middle is None else middle)
-        problem, probes = self._problem, tuple(self.probes)
         return Sizing(
-            key=problem.key,
-            target=problem.target,
-            by=problem.by,
-            value=value,
-            misses=misses,
-            grows=grows,
-            confidence=confidence,
-            probes=probes,
-            quantity=quantity,
-            sure=_describe_certainty(probes, confidence, grows, value is None),
-            advice=advise(problem, probes, value, misses, grows),
+            self.key,
+            self.target,
+            self.by,
+            value,
+            misses,
+            grows,
+            confidence,
+            tuple(self.probes),
+            quantity,
+            sure=self._describe_certainty(confidence, grows, value is None),
+            advice=self._advise(value, misses, grows),
         )
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
         """Return neighbouring values between ``value``, which meets the target, and ``misses``."""
-        while len(self.probes) < MAX_PROBES[self._problem.by]:
+        while len(self.probes) < MAX_PROBES[self.by]:
             middle = self._value_between(*sorted((value, misses)))
             if middle is None:
                 break
@@ -280,115 +197,158 @@ class Search:
                 break
         return value, misses
 
-    def _probe(self, value: float) -> Probe:
-        self.probes.append(self._decide(value))
-        return self.probes[-1]
-
     def _value_between(self, low: float, high: float) -> float | None:
         """Return the value to try between ``low`` and ``high``, to DIGITS, or None."""
-        if self._problem.integer:
+        if self.integer:
             middle = (low + high) // 2
             return int(middle) if low < middle < high else None
         # A range of several octaves is halved on a logarithmic scale.
         wide = low > 0.0 and high > 2.0 * low
         middle = math.sqrt(low * high) if wide else 0.5 * (low + high)
-        middle = float(f"{middle:.{DIGITS[self._problem.by]}g}")
+        middle = float(f"{middle:.{DIGITS[self.by]}g}")
         return middle if low < middle < high else None
 
+    def _probe(self, value: float) -> Probe:
+        probe = None if self.by == "simulation" else self._decide_by_theory(value)
+        if probe is None or (self.by == "both" and probe.target == NOT_SHOWN):
+            probe = self._decide_by_simulation(value)
+        self.probes.append(probe)
+        return probe
 
-def advise(
-    problem: SizingProblem,
-    probes: tuple[Probe, ...],
-    value: float | None,
-    misses: float | None,
-    grows: bool,
-) -> str:
-    """Return a text that advises the user on range and number of runs of a next search; empty if
-    this one, with its ``probes`` (values that were tried), was conclusive.
+    def _decide_by_theory(self, value: float) -> Probe:
+        """Return the probe of a ``value`` by theory: the quantity itself or an upper bound."""
+        scenario = self.at(value)
+        quantity, _ = quantity_by_theory(scenario, self.target)
+        exact, reached = theory_is_exact(scenario, self.target), quantity <= self.target.limit
+        state = REACHED if reached else MISSED if exact else NOT_SHOWN
+        # The quantity lies between 0 and a bound.
+        low = quantity if exact else 0.0
+        return Probe(value, quantity, low, quantity, 0, state, EXACT if exact else BOUND)
 
-    ``value`` is the last value of the key that reaches the target and ``misses`` the first that
-    does not, None if there is none; ``grows`` says that the quantity grows with the key.
-    """
-    by_value = sorted(probes)
-    if value is not None and misses is None:
-        end = by_value[-1] if grows else by_value[0]
-        return _advise_range(problem, end.value, end.value * (10.0 if grows else 0.1))
-    nearest = next((p for p in probes if p.value == misses), None)
-    if nearest is None:
-        return ""
-    runs = _advise_runs(nearest, problem.target)
-    if value is not None:
-        return runs
-    # The nearest end and the next value tried.
-    end, inner = (by_value[0], by_value[1]) if grows else (by_value[-1], by_value[-2])
-    further = _advise_beyond(problem, end, inner, grows)
-    return "; ".join(text for text in (further, runs) if text)
-
-
-def _advise_beyond(problem: SizingProblem, end: Probe, inner: Probe, grows: bool) -> str:
-    """Advise on a range beyond the probe ``end``, extrapolated from it and ``inner``."""
-    # The quantity is taken to be a power of the key.
-    numbers = (end.value, inner.value, end.quantity, inner.quantity)
-    if not all(math.isfinite(x) and x > 0.0 for x in numbers) or end.value == inner.value:
-        return ""
-    # quantity ~ key^power, so that the limit is at end.value exp(needed).
-    power = math.log(end.quantity / inner.quantity) / math.log(end.value / inner.value)
-    needed = math.log(problem.target.limit / end.quantity) / power if power else math.inf
-    # The quantity falls towards smaller keys if it grows with the key.
-    is_outside = (needed < 0.0) if grows else (needed > 0.0)
-    if is_outside and abs(needed) <= math.log(MAX_EXTRAPOLATION):
-        return _advise_range(problem, end.value, end.value * math.exp(MARGIN * needed))
-    return (
-        f"{problem.target.quantity} hardly changes beyond {problem.key} = {end.value:g}, where it "
-        f"is {end.quantity:.4g}: other values may not reach the target either"
-    )
-
-
-def _advise_range(problem: SizingProblem, end: float, next_end: float) -> str:
-    """Advise to search ``end`` .. ``next_end``, or say why that is impossible."""
-    if end == 0.0:
-        return ""
-    next_end = round(next_end) if problem.integer else float(f"{next_end:.2g}")
-    try:
-        problem.at(next_end)
-    except ScenarioError as error:
-        return f"{problem.key} cannot be {next_end:g}: {error.rule}"
-    low, high = sorted((end, next_end))
-    return f"next range: --vary {problem.key}={low:g}:{high:g}" if low < high else ""
-
-
-def _advise_runs(probe: Probe, target: Target) -> str:
-    """Return how many runs would decide the ``probe``; empty if it is decided."""
-    runs = _runs_to_decide(probe, target) if probe.target == UNDECIDED else math.nan
-    if math.isnan(runs):
-        return ""
-    if runs > MAX_RUNS:
-        return f"at {probe.value:g} it is too close to the limit for runs to tell"
-    return f"at {probe.value:g} about --runs {float(f'{max(runs, probe.runs):.2g}'):g} would tell"
-
-
-def _describe_certainty(
-    probes: tuple[Probe, ...], confidence: float, grows: bool, none_reached: bool
-) -> str:
-    if all(probe.runs == 0 for probe in probes):
-        certainty = "computed, no simulation"
-        if any(probe.target == NOT_SHOWN for probe in probes):
-            certainty += "; a bound above the limit proves nothing, --by simulation tells"
-    else:
-        certainty = f"all decisions together are right with probability {confidence:g}"
-        if any(probe.target == UNDECIDED for probe in probes):
-            certainty += (
-                "; values that stayed undecided count as not reaching it (more --runs help)"
+    def _decide_by_simulation(self, value: float) -> Probe:
+        """Return the probe of a ``value``: runs are doubled until its interval decides."""
+        plan, scenario, target = self.plan, self.at(value), self.target
+        assert plan is not None
+        # This target divides by the trace of P of a filter with all readings.
+        central = central_trace(scenario) if target.quantity == "within_central" else None
+        simulated, metrics = 0, []
+        say = plan.progress or (lambda _: None)
+        say(f"{self.key} = {value:g}: simulating")
+        while True:
+            batch = min(max(plan.first, simulated), plan.runs - simulated)
+            metrics.append(
+                replicate_blocks(
+                    plan.task, join_metrics, scenario, batch, first=simulated, pool=plan.pool
+                )
             )
-    # Bounds are compared with bounds, since they lie above what simulation finds.
-    pure = len({probe.by for probe in probes}) == 1 and probes[0].by == BOUND
-    for first, second in pairwise(sorted(probes)):
-        ends = [(p.quantity, p.quantity) if pure else (p.low, p.high) for p in (first, second)]
-        turned = ends[0][0] > ends[1][1] if grows else ends[0][1] < ends[1][0]
-        if turned:
-            return (
-                f"{certainty}; NOT monotone between {first.value:g} and {second.value:g}: "
-                "other values may reach it too, narrow the range"
+            simulated += batch
+            interval = quantity_by_simulation(join_metrics(*metrics), target, plan.level, central)
+            state = UNDECIDED
+            if interval.high <= target.limit:
+                state = REACHED
+            elif not interval.low <= target.limit:  # also if it is not a number
+                state = MISSED
+            say(
+                f"{self.key} = {value:g}: {target.quantity} {interval.value:.4g}, between "
+                f"{interval.low:.4g} and {interval.high:.4g} after {simulated:,} of at most "
+                f"{plan.runs:,} runs, {state}"
             )
-    tried = "at the ends and in the middle" if none_reached else f"at {len(probes)} values"
-    return f"{certainty}; taken to be monotone, as it was {tried}"
+            probe = Probe(value, *interval, simulated, state)
+            is_futile = simulated >= plan.runs // 4 and (
+                self._runs_to_decide(probe) > FUTILE * plan.runs
+            )
+            if state != UNDECIDED or simulated >= plan.runs or is_futile:
+                return probe
+
+    def _runs_to_decide(self, probe: Probe) -> float:
+        """Return the forecast of the runs that decide a ``probe``; nan if unknown."""
+        width, distance = 0.5 * (probe.high - probe.low), abs(probe.quantity - self.target.limit)
+        if not math.isfinite(width):
+            return math.nan
+        # Widths fall with the root of the number of runs; 10 % are added as a margin.
+        return 1.1 * probe.runs * (width / distance) ** 2 if distance > 0.0 else math.inf
+
+    def _advise(self, value: float | None, misses: float | None, grows: bool) -> str:
+        """Return advice on range and number of runs of a next search; empty if this one was
+        conclusive.
+
+        ``value`` is the last value of the key that reaches the target and ``misses`` the first that
+        does not, None if there is none.
+        """
+        by_value = sorted(self.probes)
+        if value is not None and misses is None:
+            end = by_value[-1] if grows else by_value[0]
+            return self._advise_range(end.value, end.value * (10.0 if grows else 0.1))
+        nearest = next(probe for probe in by_value if probe.value == misses)
+        runs = self._advise_runs(nearest)
+        if value is not None:
+            return runs
+        # The nearest end and the next value tried.
+        end, inner = (by_value[0], by_value[1]) if grows else (by_value[-1], by_value[-2])
+        further = self._advise_beyond(end, inner, grows)
+        return "; ".join(text for text in (further, runs) if text)
+
+    def _advise_beyond(self, end: Probe, inner: Probe, grows: bool) -> str:
+        """Advise on a range beyond the probe ``end``, extrapolated from it and ``inner``."""
+        # The quantity is taken to be a power of the key.
+        numbers = (end.value, inner.value, end.quantity, inner.quantity)
+        if not all(math.isfinite(x) and x > 0.0 for x in numbers) or end.value == inner.value:
+            return ""
+        # quantity ~ key^power, so that the limit is at end.value exp(needed).
+        power = math.log(end.quantity / inner.quantity) / math.log(end.value / inner.value)
+        needed = math.log(self.target.limit / end.quantity) / power if power else math.inf
+        # The quantity falls towards smaller keys if it grows with the key.
+        is_outside = (needed < 0.0) if grows else (needed > 0.0)
+        if is_outside and abs(needed) <= math.log(MAX_EXTRAPOLATION):
+            return self._advise_range(end.value, end.value * math.exp(MARGIN * needed))
+        return (
+            f"{self.target.quantity} hardly changes beyond {self.key} = {end.value:g}, where it "
+            f"is {end.quantity:.4g}: other values may not reach the target either"
+        )
+
+    def _advise_range(self, end: float, next_end: float) -> str:
+        """Advise to search ``end`` .. ``next_end``, or say why that is impossible."""
+        if end == 0.0:
+            return ""
+        next_end = round(next_end) if self.integer else float(f"{next_end:.2g}")
+        try:
+            self.at(next_end)
+        except ScenarioError as error:
+            return f"{self.key} cannot be {next_end:g}: {error.rule}"
+        low, high = sorted((end, next_end))
+        return f"next range: --vary {self.key}={low:g}:{high:g}" if low < high else ""
+
+    def _advise_runs(self, probe: Probe) -> str:
+        """Return how many runs would decide the ``probe``; empty if it is decided."""
+        runs = self._runs_to_decide(probe) if probe.target == UNDECIDED else math.nan
+        if math.isnan(runs):
+            return ""
+        if runs > MAX_RUNS:
+            return f"at {probe.value:g} it is too close to the limit for runs to tell"
+        enough = float(f"{max(runs, probe.runs):.2g}")
+        return f"at {probe.value:g} about --runs {enough:g} would tell"
+
+    def _describe_certainty(self, confidence: float, grows: bool, none_reached: bool) -> str:
+        probes = sorted(self.probes)
+        if all(probe.runs == 0 for probe in probes):
+            certainty = "computed, no simulation"
+            if any(probe.target == NOT_SHOWN for probe in probes):
+                certainty += "; a bound above the limit proves nothing, --by simulation tells"
+        else:
+            certainty = f"all decisions together are right with probability {confidence:g}"
+            if any(probe.target == UNDECIDED for probe in probes):
+                certainty += (
+                    "; values that stayed undecided count as not reaching it (more --runs help)"
+                )
+        # Bounds are compared with bounds, since they lie above what simulation finds.
+        pure = {probe.by for probe in probes} == {BOUND}
+        for first, second in pairwise(probes):
+            ends = [(p.quantity, p.quantity) if pure else (p.low, p.high) for p in (first, second)]
+            turned = ends[0][0] > ends[1][1] if grows else ends[0][1] < ends[1][0]
+            if turned:
+                return (
+                    f"{certainty}; NOT monotone between {first.value:g} and {second.value:g}: "
+                    "other values may reach it too, narrow the range"
+                )
+        tried = "at the ends and in the middle" if none_reached else f"at {len(probes)} values"
+        return f"{certainty}; taken to be monotone, as it was {tried}"

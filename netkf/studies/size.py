@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -9,7 +10,6 @@ from functools import partial
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number, one_of
-from netkf.engines.base import Engine
 from netkf.ensembles.blocks import BlockTask, each_replica
 from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.runs.simulate import choose_engine
@@ -28,10 +28,6 @@ from netkf.studies.search import (
     Search,
     SimulationPlan,
     Sizing,
-    SizingProblem,
-    decide_by_both,
-    decide_by_simulation,
-    decide_by_theory,
 )
 from netkf.studies.targets import (
     QUANTITIES,
@@ -81,10 +77,8 @@ def size(
         raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)
     if by is not None:
         one_of("theory", "simulation")("--by", by)
-    parsed, confidence = (
-        parse_target(target),
-        number(above=0.0, below=1.0)("--confidence", confidence),
-    )
+    parsed = parse_target(target)
+    confidence = number(above=0.0, below=1.0)("--confidence", confidence)
     integer(low=FIRST_BATCH)("--runs", runs)
     if parsed.of_errors and not scenario.plant.truth_known:
         rule = "is about errors, and there is no ground truth"
@@ -93,35 +87,26 @@ def size(
     is_integer = _check_range(base, key, low, high)
     engine_used = choose_engine(engine, base.replace({key: low}))
     chosen = by or _choose_method(base, key, (low, high), parsed)
-    problem = SizingProblem(scenario=base, key=key, integer=is_integer, target=parsed, by=chosen)
+    search = Search(base, key, is_integer, parsed, chosen)
     if chosen == "theory":
-        quantity = quantity_by_theory(problem.at(low), parsed)[1]
-        return Search(problem, partial(decide_by_theory, problem)).run(low, high, 1.0, quantity)
-    task, simulated, first = _choose_task(problem, low, engine_used)
-    quantity = simulated
+        return search.run(low, high, 1.0, quantity_by_theory(search.at(low), parsed)[1])
+    quantity = f"{QUANTITIES[parsed.quantity]}, over the runs"
+    task: BlockTask = partial(block_metrics, engine=engine_used)
+    first = FIRST_BATCH
+    # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
+    if parsed.of_errors and expected_errors_known(search.at(low)):
+        expected = partial(expected_metrics, engine=engine_used)
+        task, first = partial(each_replica, expected, join_metrics), FIRST_EXPECTED
+        quantity += ", each with its exact expected squared error given its events"
     if chosen == "both":
-        bound = quantity_by_theory(problem.at(low), parsed)[1]
-        quantity = f"{bound}; where that is above the limit, simulated: {simulated}"
+        bound = quantity_by_theory(search.at(low), parsed)[1]
+        quantity = f"{bound}; where that is above the limit, simulated: {quantity}"
     # Bonferroni over all values and all looks at each of them while its runs are doubled.
     looks = 1 + math.ceil(math.log2(max(1.0, runs / first)))
     level = (1.0 - confidence) / (MAX_PROBES["simulation"] * looks)
     with make_pool(runs, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
-        plan = SimulationPlan(
-            task=task, runs=runs, level=level, pool=pool, progress=progress, first=first
-        )
-        method = decide_by_both if chosen == "both" else decide_by_simulation
-        decide = partial(method, problem, plan)
-        return Search(problem, decide).run(low, high, confidence, quantity)
-
-
-def _choose_task(problem: SizingProblem, low: float, engine: Engine) -> tuple[BlockTask, str, int]:
-    quantity = f"{QUANTITIES[problem.target.quantity]}, over the runs"
-    # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.
-    if problem.target.of_errors and expected_errors_known(problem.at(low)):
-        task = partial(expected_metrics, engine=engine)
-        exact = ", each with its exact expected squared error given its events"
-        return partial(each_replica, task, join_metrics), quantity + exact, FIRST_EXPECTED
-    return partial(block_metrics, engine=engine), quantity, FIRST_BATCH
+        plan = SimulationPlan(task, runs, level, pool, progress, first)
+        return dataclasses.replace(search, plan=plan).run(low, high, confidence, quantity)
 
 
 def _check_range(scenario: Scenario, key: str, low: float, high: float) -> bool:
