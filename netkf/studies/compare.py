@@ -19,22 +19,18 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, number
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import shorten
+from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import name_rows
 from netkf.runs.documents import (
     COUNT,
     FINAL_STATUSES,
     NUMBER,
-    SEAL,
-    TEXT,
     TEXTS,
     DamagedError,
-    add_file_name,
     check_files,
-    check_seal,
-    read_document,
-    require_form,
 )
 from netkf.runs.parquet_files import column_names, read_numbers
+from netkf.runs.stored import AVERAGES_FORM, MANIFEST_FORM, SUMMARY_FORM, read_checked_document
 from netkf.studies.metrics import mean_over_runs
 
 AVERAGES = ("rms_error", "mean_trace", "mean_nees")
@@ -42,22 +38,14 @@ MESSAGES = ("sent", "delivered", "lost")
 TRACES = ("bound", "limit", "central")
 DIAGONAL = re.compile(r"P(\d+)_?\1$")
 """Columns of the diagonal of P: P11, or P1_1 where there are more than ten states."""
-ROW: dict[str, Any] = dict.fromkeys((*AVERAGES, "bound"), NUMBER)
-ROW |= {f"{name}_se?": NUMBER for name in ROW}
-MANIFEST: dict[str, Any] = {
-    "name?": TEXT,
-    "status": TEXT,
-    "seed?": COUNT,
-    "runs": {"done": COUNT},
-}
+ROW: dict[str, Any] = {**AVERAGES_FORM, "bound": NUMBER, "bound_se?": NUMBER}
 SUMMARY: dict[str, Any] = {
+    **SUMMARY_FORM,
     "nodes": [{"node": COUNT, **ROW}],
     "overall": ROW,
     "limit": NUMBER,
     "central": NUMBER,
-    "rounding_from?": NUMBER,
     "notes?": TEXTS,
-    "messages": dict.fromkeys(MESSAGES, NUMBER),
     "messages_se?": {f"{name}?": NUMBER for name in MESSAGES},
 }
 
@@ -169,25 +157,14 @@ def read_directory(directory: Path) -> RunDirectory:
     if not directory.is_dir():
         raise ScenarioError(where, "is not a directory", None, "name run directories")
     with damage_named(directory):
-        manifest = _read(directory, "manifest.json", MANIFEST)
+        manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
         if manifest["status"] not in FINAL_STATUSES:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
-        summary = _read(directory, "summary.json", SUMMARY)
+        summary = read_checked_document(directory, "summary.json", SUMMARY)
         name_rows(summary["nodes"])
-        if SEAL in manifest:  # a digest of the manifest itself; older versions wrote none
-            with add_file_name("manifest.json"):
-                check_seal(manifest)
         check_files(directory, manifest, ["scenario.toml", "summary.json"])
     return RunDirectory(directory, manifest, summary)
-
-
-def _read(directory: Path, name: str, form: dict[str, Any]) -> dict[str, Any]:
-    """Return a JSON document of a run directory that has the ``form``; raises DamagedError."""
-    with add_file_name(name):
-        document = read_document(directory / name)
-        require_form(document, form)
-    return document
 
 
 @contextmanager
@@ -226,12 +203,11 @@ class Comparison(NotebookTable):
         ``differs`` names those directories that differ from the first for certain.
         """
         rows = []
-        for row in self.rows:
-            values = {d: e.value for d, e in zip(self.directories, row.entries, strict=True)}
-            real = [d for d, e in zip(self.directories, row.entries, strict=True) if e.real]
-            rows.append(
-                {"quantity": row.quantity, "node": row.node, **values, "differs": ", ".join(real)}
-            )
+        for quantity, node, entries in self.rows:
+            named = list(zip(self.directories, entries, strict=True))
+            values = {name: entry.value for name, entry in named}
+            real = ", ".join(name for name, entry in named if entry.real)
+            rows.append({"quantity": quantity, "node": node, **values, "differs": real})
         return pd.DataFrame(rows)
 
     def document(self) -> dict[str, Any]:
@@ -240,14 +216,7 @@ class Comparison(NotebookTable):
             {"quantity": q, "node": node, "entries": [entry._asdict() for entry in entries]}
             for q, node, entries in self.rows
         ]
-        return {
-            "directories": list(self.directories),
-            "names": list(self.names),
-            "runs": list(self.runs),
-            "confidence": self.confidence,
-            "rows": rows,
-            "notes": [list(notes) for notes in self.notes],
-        }
+        return {**vars(self), "rows": rows}
 
 
 def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comparison:
@@ -259,7 +228,12 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     ``confidence`` (Bonferroni). A difference from a single run has no interval. Raises
     ScenarioError for a directory that is not that of a finished run.
     """
-    runs = _read_all(directories)
+    if isinstance(directories, (str, Path)) or not isinstance(directories, Sequence):
+        remedy = "give all of them in one list: netkf.compare([one, other])"
+        raise ScenarioError("directories", "must be a list", directories, remedy)
+    if not directories:
+        raise ScenarioError("compare", "needs run directories", None, "name at least one")
+    runs = [read_directory(as_path("directories", directory)) for directory in directories]
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
     first = runs[0]
     quantities = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
@@ -281,97 +255,63 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     )
 
 
-def _read_all(directories: Sequence[str | Path]) -> list[RunDirectory]:
-    if isinstance(directories, (str, Path)) or not isinstance(directories, Sequence):
-        remedy = "give all of them in one list: netkf.compare([one, other])"
-        raise ScenarioError("directories", "must be a list", directories, remedy)
-    if not directories:
-        raise ScenarioError("compare", "needs run directories", None, "name at least one")
-    return [read_directory(as_path("directories", directory)) for directory in directories]
-
-
 def _compare_quantity(
     first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float
 ) -> Entry:
     """Return a ``quantity`` at ``node`` (-1: all) and its difference from the ``first`` one."""
-    value, se = other.value(quantity, node)
-    entry = Entry(value, se)
-    if other is first or value is None:
+    entry, base = Entry(*other.value(quantity, node)), Entry(*first.value(quantity, node))
+    if other is first or entry.value is None:
         return entry
     # Run by run if both had the same truth, which is more accurate, else as independent runs.
-    return _pair_runs(first, other, quantity, node, level, entry) or _welch_difference(
-        first.value(quantity, node), entry, (first.runs, other.runs), level
-    )
+    paired = _paired_differences(first, other, quantity, node)
+    if paired is not None:
+        method = "paired" if quantity != "rms_error" else "paired, mean squares"
+        return _with_interval(entry, *mean_over_runs(paired), len(paired) - 1, level, method)
+    if base.value is None:
+        return entry
+    difference = entry.value - base.value
+    squares = [math.nan if one.se is None else one.se * one.se for one in (base, entry)]
+    if not math.isfinite(sum(squares)) or min(first.runs, other.runs) < 2:
+        return entry._replace(difference=difference, method="one run")
+    # Welch's interval.
+    parts = [s * s / (one.runs - 1) for s, one in zip(squares, (first, other), strict=True)]
+    degrees = min(first.runs, other.runs) - 1.0
+    if sum(parts) > 0.0:
+        degrees = sum(squares) ** 2 / sum(parts)
+    error = math.sqrt(sum(squares))
+    return _with_interval(entry, difference, error, degrees, level, "Welch")
 
 
-def _pair_runs(
-    first: RunDirectory, other: RunDirectory, quantity: str, node: int, level: float, entry: Entry
-) -> Entry | None:
-    """Return ``entry`` with its difference taken run by run; None without states or one truth."""
+def _with_interval(
+    entry: Entry, difference: float, error: float, freedom: float, level: float, method: str
+) -> Entry:
+    """Return the entry with a ``difference`` and Student's interval for it."""
+    width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
+    low, high = difference - width, difference + width
+    real = math.isfinite(width) and math.isfinite(difference) and (low > 0.0 or high < 0.0)
+    return entry._replace(difference=difference, low=low, high=high, real=real, method=method)
+
+
+def _paired_differences(
+    first: RunDirectory, other: RunDirectory, quantity: str, node: int
+) -> FloatArray | None:
+    """Return the differences (R,) of R runs, None without states of several or one truth."""
     end = min(first.rounding_from, other.rounding_from)  # errors are mostly rounding after it
     base_values, values = (finished.by_run(quantity, node, end) for finished in (first, other))
     if base_values is None or values is None or not _same_truth(first, other):
         return None
     differences = np.asarray((values - base_values).dropna(), dtype=np.float64)
-    if len(differences) < 2:
-        return None
-    mean, error = mean_over_runs(differences)
-    ends = _student_interval(mean, error, len(differences) - 1, level)
-    method = "paired" if quantity != "rms_error" else "paired, mean squares"
-    return entry._replace(
-        difference=mean, low=ends[0], high=ends[1], real=_excludes_zero(*ends), method=method
-    )
+    return differences if len(differences) > 1 else None
 
 
 def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
-    base_samples, samples = first.samples, other.samples
+    a, b = first.samples, other.samples
     # The same seed is not enough: keys of the plant may differ.
-    if (
-        base_samples is None
-        or samples is None
-        or first.manifest.get("seed") != other.manifest.get("seed")
-    ):
+    if a is None or b is None or first.manifest["seed"] != other.manifest["seed"]:
         return False
-    columns = [
-        "run",
-        "t",
-        *(c for c in base_samples.columns if c.startswith("x") and c[1:].isdecimal()),
-    ]
-    if not set(columns) <= set(samples.columns):
+    columns = ["run", "t", *(c for c in a.columns if c.startswith("x") and c[1:].isdecimal())]
+    if not set(columns) <= set(b.columns):
         return False
-    states = [s[columns].drop_duplicates().set_index(["run", "t"]) for s in (base_samples, samples)]
+    states = [s[columns].drop_duplicates().set_index(["run", "t"]) for s in (a, b)]
     shared = states[0].index.intersection(states[1].index)
     return bool(len(shared)) and bool(states[0].loc[shared].equals(states[1].loc[shared]))
-
-
-def _welch_difference(
-    base: tuple[float | None, float | None], entry: Entry, runs: tuple[int, int], level: float
-) -> Entry:
-    """Return the entry with the difference of independent runs, by Welch's t interval."""
-    errors = [base[1], entry.se]
-    if base[0] is None or entry.value is None:
-        return entry
-    difference = float(entry.value) - float(base[0])
-    if any(e is None or not math.isfinite(e) for e in errors) or min(runs) < 2:
-        return entry._replace(difference=difference, method="one run")
-    squares = [float(e or 0.0) * float(e or 0.0) for e in errors]
-    total = sum(squares)
-    denominator = sum(s * s / (n - 1) for s, n in zip(squares, runs, strict=True))
-    degrees = total * total / denominator if denominator > 0.0 else float(min(runs) - 1)
-    low, high = _student_interval(difference, math.sqrt(total), degrees, level)
-    return entry._replace(
-        difference=difference, low=low, high=high, real=_excludes_zero(low, high), method="Welch"
-    )
-
-
-def _student_interval(
-    mean: float, error: float, freedom: float, level: float
-) -> tuple[float, float]:
-    """Return the ends of Student's interval for a ``mean`` with this standard ``error``."""
-    width = float(scipy.special.stdtrit(freedom, 1.0 - level / 2.0)) * error
-    return mean - width, mean + width
-
-
-def _excludes_zero(low: float, high: float) -> bool:
-    """Return True if the interval ``low`` .. ``high`` is finite and lies on one side of zero."""
-    return bool(np.isfinite([low, high]).all() and (low > 0.0 or high < 0.0))
