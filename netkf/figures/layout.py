@@ -23,10 +23,10 @@ Positions = dict[int, tuple[float, float]]
 
 def get_positions(topology: Topology) -> Positions:
     """Return the positions of the nodes: those of the topology, or computed ones if it has none."""
-    return topology.positions or _compute_layout(topology)
+    return topology.positions or compute_layout(topology)
 
 
-def _compute_layout(topology: Topology) -> Positions:
+def compute_layout(topology: Topology) -> Positions:
     """Return positions: rings as a circle, small networks by Kamada and Kawai, large by pivots."""
     if len(topology.nodes) > MAX_KAMADA_KAWAI:
         return _pivot_layout(topology)

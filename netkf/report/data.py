@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import networkx
 import numpy as np
 import scipy.special
 
 from netkf.checks.innovations import Innovations
+from netkf.figures.layout import compute_layout
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import innovation_columns
 from netkf.report.messages import (
@@ -27,10 +26,6 @@ from netkf.trace.schema import CODES
 
 BINS = 60
 """Equal intervals of a run in which traffic is counted."""
-MAX_KAMADA_KAWAI = 150
-"""Nodes up to which the layout of Kamada and Kawai is computed, which draws links of about equal
-length; for more nodes a spring layout is faster.
-"""
 MAX_LINKS = 20_000
 """Directed links that a page draws."""
 MAX_MARKS = 5_000
@@ -73,6 +68,11 @@ def run_data(
     instant = worst.time if worst is not None else horizon
     rows = sample_indices(run, budget.values, instant)
     thinned = thin_messages(messages, budget.messages, instant)
+    limits: dict[str, float] = {}
+    if source.promised is not None:
+        limits[source.promised.limit_label] = source.promised.limit
+        limits["centralised filter"] = source.promised.central
+        limits = {name: value for name, value in limits.items() if math.isfinite(value)}
     return {
         "label": source.label,
         "name": source.scenario.name,
@@ -80,7 +80,8 @@ def run_data(
         "replica": run.replica,
         "horizon": horizon,
         "truth": run.truth_known,
-        "broadcasts": _is_broadcast(run),
+        # In slots, messages that a node sends at the same time are one transmission.
+        "broadcasts": bool(len(run.log)) and (source.scenario.slotted or run.count("transmit") > 0),
         "n": run.x.shape[1],
         "nodes": list(run.nodes),
         "names": [str(node) for node in run.nodes],
@@ -110,7 +111,7 @@ def run_data(
             "samples": len(run.times),
             "links": len(source.scenario.topology.directions),
         },
-        "limits": _drawing_limits(source),
+        "limits": limits,
     }
 
 
@@ -177,9 +178,9 @@ def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarra
 
 def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
     """Return the [x, y] of each node on the page, in 0 .. 1: the scenario's, or a layout."""
-    coordinates: Mapping[int, Any] | None = source.scenario.topology.positions
+    coordinates = source.scenario.topology.positions
     if coordinates is None or any(node not in coordinates for node in run.nodes):
-        coordinates = _make_layout(source, run)
+        coordinates = compute_layout(source.scenario.topology)
     points = np.array([coordinates[node] for node in run.nodes], dtype=float).reshape(-1, 2)
     if not len(points) or not np.isfinite(points).all():
         return [[0.5, 0.5] for _ in run.nodes]
@@ -187,17 +188,6 @@ def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
     size = max(float((high - low).max()), 1e-12)
     points = (points - 0.5 * (low + high)) / size
     return [[round(0.5 + x, 5), round(0.5 - y, 5)] for x, y in points.tolist()]
-
-
-def _make_layout(source: ReportSource, run: StoredRun) -> dict[int, Any]:
-    """Return coordinates of nodes without positions, computed from their links."""
-    graph: networkx.Graph[int] = networkx.Graph()
-    graph.add_nodes_from(run.nodes)
-    graph.add_edges_from(source.scenario.topology.links)
-    # The layout of Kamada and Kawai needs a path between all nodes, and time of order N^3.
-    if 0 < len(graph) <= MAX_KAMADA_KAWAI and networkx.is_connected(graph):
-        return networkx.kamada_kawai_layout(graph)
-    return networkx.spring_layout(graph, seed=1, iterations=30)
 
 
 def _flow_kind(source: ReportSource) -> str:
@@ -223,20 +213,6 @@ def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None)
     row, column = int(np.searchsorted(run.times, worst.time)), run.nodes.index(worst.node)
     by_error = np.argsort(-np.abs(run.error[row, column]), kind="stable").tolist()
     return axes if by_error[0] in axes else sorted(by_error[:2])
-
-
-def _is_broadcast(run: StoredRun) -> bool:
-    # Messages in slots have a phase of 0 or more.
-    in_slots = bool((run.log["phase"][run.log["kind"] == CODES["send"]] >= 0).any())
-    return in_slots or run.count("transmit") > 0
-
-
-def _drawing_limits(source: ReportSource) -> dict[str, Any]:
-    promised = source.promised
-    if promised is None:
-        return {}
-    limits = {promised.limit_label: promised.limit, "centralised filter": promised.central}
-    return {name: value for name, value in limits.items() if math.isfinite(value)}
 
 
 def _sample_columns(
