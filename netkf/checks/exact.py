@@ -43,8 +43,8 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.increments import integration_steps
 from netkf.theory.errors import ErrorLaw, diagonal_blocks, error_law
-from netkf.trace.nees import errors
-from netkf.trace.run import BLUR, Run, blurred_samples
+from netkf.trace.nees import BLUR, errors
+from netkf.trace.run import Run, blurred_samples
 
 MAX_REPLAYED, MIN_REPLAYED, MAX_REPLAYED_STEPS = 1000, 20, 250_000
 """Limits on the number of replicas whose exact covariances are computed (the others give errors

@@ -42,12 +42,15 @@ def moments_of(values: FloatArray, size: FloatArray) -> Moments:
     Neighbours are merged pairwise, in a binary tree over R. ``size`` (R, S) is 1 where an
     observation exists and 0 where it does not. Both arrays are overwritten.
     """
-    _, rows, columns = values.shape
-    mean, M2 = np.empty((rows, columns)), np.empty((rows, columns))
-    merge_leaves(size, values, np.empty((len(values), 1, columns)), mean, M2)
-    # Merged in place: row 0 now holds the number of all observations. Copied, so that the result
-    # does not keep ``size`` in memory.
-    return Moments(size[0].copy(), mean, M2)
+    M2 = np.empty_like(values)
+    merge_leaves(size, _in_columns(values), _in_columns(M2))
+    # Copied, so that the result does not keep the arrays in memory.
+    return Moments(size[0].copy(), values[0].copy(), M2[0].copy())
+
+
+def _in_columns(values: FloatArray) -> FloatArray:
+    """Return ``values`` (R, S, C) in the form (R, 1, S C) of nodes."""
+    return values.reshape(len(values), 1, -1)
 
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
@@ -55,75 +58,78 @@ def merge_moments(a: Moments, b: Moments) -> Moments:
     columns.
     """
     size, mean, M2 = (np.stack(pair) for pair in zip(a, b, strict=True))
-    merge_two(size, mean, M2)
+    join_nodes(size, _in_columns(mean), _in_columns(M2), 2, 1)
     return Moments(size[0], mean[0], M2[0])
+
+
+@kernel
+def join_nodes(size: FloatArray, mean: FloatArray, M2: FloatArray, depth: int, number: int) -> int:
+    """Merge the last two of ``depth`` nodes of a binary tree that wait for a neighbour, in place,
+    once for each trailing 1 in the binary form of ``number``; return how many nodes wait now.
+
+    After leaf 0, 1, 2, ... each trailing 1 of its number says that two neighbouring nodes are
+    complete (Chan, Golub and LeVeque 1983, (2.1)). Nodes have size (D, S), and C columns of mean
+    and M2, the sum of squared deviations, (D, C, S F) of F quantities that share a size.
+    """
+    rows = size.shape[1]
+    together = mean.shape[2] // rows
+    while number & 1 and depth > 1:
+        a, b = depth - 2, depth - 1
+        alike = True
+        for s in range(rows):
+            alike = alike and size[a, s] == size[a, 0] and size[b, s] == size[b, 0]
+        if alike:
+            # All columns as one.
+            flat = mean[a].reshape(-1), M2[a].reshape(-1), mean[b].reshape(-1), M2[b].reshape(-1)
+            merge_pair(size[a, 0], size[b, 0], *flat)
+        else:
+            for s in range(rows):
+                part = slice(s * together, (s + 1) * together)
+                for c in range(mean.shape[1]):
+                    merge_pair(
+                        size[a, s],
+                        size[b, s],
+                        mean[a, c, part],
+                        M2[a, c, part],
+                        mean[b, c, part],
+                        M2[b, c, part],
+                    )
+        for s in range(rows):
+            size[a, s] += size[b, s]
+        depth, number = depth - 1, number >> 1
+    return depth
 
 
 @kernel(inlined=True)
 def merge_pair(
-    size: FloatArray, mean: FloatArray, M2: FloatArray, a: int, b: int, s: int, t: int
+    size: float,
+    other_size: float,
+    mean: FloatArray,
+    M2: FloatArray,
+    other: FloatArray,
+    other_M2: FloatArray,
 ) -> None:
-    """Merge the size, mean and M2 (sum of squared deviations) of entry ``b`` into those of entry
-    ``a`` in place (Chan, Golub and LeVeque 1983, (2.1)).
-
-    Of R entries with S rows of C quantities only row ``s`` is merged: of ``size`` (R, S), of
-    ``mean`` (R, S, C), and as row ``t`` of ``M2`` (R, S', C), which may hold fewer rows.
-    """
-    total = size[a, s] + size[b, s]
-    share = size[b, s] / max(total, 1.0)
-    weight = size[a, s] * share
-    for c in range(mean.shape[2]):
+    """Merge the ``other`` moments (Q,) of as many observations into mean and M2 (Q,) in place."""
+    share = other_size / max(size + other_size, 1.0)
+    weight = size * share
+    for c in range(len(mean)):
         # mean <- mean_a + (mean_b - mean_a) size_b / size,
         # M2 <- M2_a + M2_b + (mean_b - mean_a)^2 size_a size_b / size
-        delta = mean[b, s, c] - mean[a, s, c]
-        mean[a, s, c] += delta * share
-        M2[a, t, c] += M2[b, t, c] + delta * delta * weight
-    size[a, s] = total
+        delta = other[c] - mean[c]
+        mean[c] += delta * share
+        M2[c] += other_M2[c] + delta * delta * weight
 
 
 @kernel
-def merge_two(size: FloatArray, mean: FloatArray, M2: FloatArray) -> None:
-    """Merge two moments into the first in place: size (2, S), mean and M2 (2, S, C), for S rows of
-    C quantities.
+def merge_leaves(size: FloatArray, values: FloatArray, M2: FloatArray) -> None:
+    """Merge R observations, ``values`` (R, 1, S C) with ``size`` (R, S), into the first, in a
+    binary tree over R; ``M2`` (R, 1, S C) is overwritten.
     """
-    for s in range(mean.shape[1]):
-        merge_pair(size, mean, M2, 0, 1, s, s)
-
-
-@kernel
-def merge_leaves(
-    size: FloatArray, values: FloatArray, work: FloatArray, mean: FloatArray, M2: FloatArray
-) -> None:
-    """Write ``mean`` and ``M2`` (S, C), the sum of squared deviations, of R observations ``values``
-    (R, S, C), merged pairwise in a binary tree over R.
-
-    S counts rows and C the quantities of a row. ``size`` (R, S), 1 where an observation exists and
-    else 0, and ``values`` are overwritten; ``work`` (R, 1, C) is scratch.
-    """
-    # Row by row, so that the values of a row are still in the cache when they are merged again.
-    for s in range(values.shape[1]):
-        merge_row(size, values, work, s)
+    depth = 0
+    for r in range(len(values)):
+        for s in range(size.shape[1]):
+            size[depth, s] = size[r, s]
         for c in range(values.shape[2]):
-            mean[s, c] = values[0, s, c]
-            M2[s, c] = work[0, 0, c]
-
-
-@kernel
-def merge_row(size: FloatArray, values: FloatArray, work: FloatArray, s: int) -> None:
-    """Merge row ``s`` of R observations pairwise in a binary tree, in place: the mean ends in
-    ``values[0, s]``, M2 (the sum of squared deviations) in ``work[0, 0]``.
-
-    ``size`` (R, S) is 1 where an observation exists, else 0, and becomes the number merged;
-    ``values`` (R, S, C) are the observations, ``work`` (R, 1, C) is scratch.
-    """
-    runs = len(values)
-    # A single observation has M2 = 0.
-    for r in range(runs):
-        for c in range(values.shape[2]):
-            work[r, 0, c] = 0.0
-    # Level by level of the binary tree: a pair is ``stride`` observations apart.
-    stride = 1
-    while stride < runs:
-        for a in range(0, runs - stride, 2 * stride):
-            merge_pair(size, values, work, a, a + stride, s, 0)
-        stride *= 2
+            values[depth, 0, c], M2[depth, 0, c] = values[r, 0, c], 0.0
+        depth = join_nodes(size, values, M2, depth + 1, r)
+    join_nodes(size, values, M2, depth, (1 << depth) - 1)

@@ -18,9 +18,8 @@ from netkf.network.graphs import node_columns
 from netkf.runs.labels import covariance_notes
 from netkf.runs.transmissions import Transmissions
 from netkf.scenario.scenario import Scenario
-from netkf.trace.nees import errors
+from netkf.trace.nees import blurred_from, errors
 from netkf.trace.recorder import Sink
-from netkf.trace.run import carried_size, rounding_from
 from netkf.trace.schema import CODES
 
 CONFIDENCE = 0.95
@@ -82,7 +81,8 @@ class SummarySink(Sink):
         pairs = zip(self.last or blocks, blocks, strict=True)
         self.last = tuple(np.concatenate(pair)[-2:] for pair in pairs)
         if self.rounding_from is None:
-            first = rounding_from(t, carried_size(x, error, self.exact_errors), P, error)
+            one = x[None], P[None], error[None], np.array([len(t)])
+            first = float(blurred_from(t, *one, self.exact_errors)[0])
             self.rounding_from = first if first < np.inf else None
 
     @property

@@ -1,4 +1,4 @@
-"""Squared errors and normalised squared errors (NEES) of estimates."""
+"""Squared errors and normalised squared errors (NEES), and when rounding blurs them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import solve_inplace
+from netkf.linalg.structs import Size, sized
+
+ROUNDING = 4.0 * np.finfo(float).eps  # rounding error of x - xhat as a share of the size of x
+BLUR = 100.0
+"""Errors with a standard deviation below BLUR times their rounding error are not judged."""
 
 
 def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -15,46 +20,160 @@ def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     singular, it is also nan where others are singular up to rounding.
     """
     n, shape = e.shape[-1], e.shape[:-1]
-    flat, nees = np.ascontiguousarray(e).reshape(-1, n), np.empty(shape)
     with np.errstate(all="ignore"):
         square = (e * e).sum(axis=-1)
-        matrices = np.ascontiguousarray(P).reshape(-1, n, n)
-        if not fill_nees(flat, matrices, nees.reshape(-1), np.empty((n, n)), np.empty((n, 1))):
-            nees.reshape(-1)[~_is_regular(matrices)] = np.nan
-    return np.asarray(square), nees
+        flat = e.reshape(1, -1, n), P.reshape(1, -1, n, n)
+        nees = nees_of_runs(*flat, np.array([flat[0].shape[1]]))
+    return np.asarray(square), nees.reshape(shape)
+
+
+def nees_of_runs(e: FloatArray, P: FloatArray, lengths: np.ndarray) -> FloatArray:
+    """Return NEES (R, K) of R runs, each as :func:`errors` does, from errors e (R, K, n) and
+    covariances P (R, K, n, n), of which run r has ``lengths[r]``; the others are unspecified.
+    """
+    n = e.shape[-1]
+    e, P = np.ascontiguousarray(e), np.ascontiguousarray(P)
+    nees, regular = np.empty(e.shape[:-1]), np.ones(len(e), dtype=np.bool_)
+    fill_nees(sized(n), e, P, lengths, nees, regular, np.empty((n, n)), np.empty((n, 1)))
+    for r in np.flatnonzero(~regular):
+        kept = P[r, : lengths[r]]
+        usable = np.asarray(np.isfinite(kept).all(axis=(1, 2)))
+        usable[usable] = is_definite(kept[usable])
+        nees[r, : lengths[r]][~usable] = np.nan
+    return nees
 
 
 @kernel
 def fill_nees(
-    e: FloatArray, P: FloatArray, out: FloatArray, factor: FloatArray, solved: FloatArray
-) -> bool:
-    """Write the normalised squared errors (NEES) ``e' P^-1 e`` into ``out`` (K,), of K errors e (K,
-    n) and covariances P (K, n, n), nan where P is exactly singular; return False if some finite P
-    is exactly singular.
-
-    The caller then tests the ranks of all P, which takes longer. ``factor`` (n, n) and ``solved``
-    (n, 1) are scratch.
+    size: Size,
+    e: FloatArray,
+    P: FloatArray,
+    lengths: np.ndarray,
+    out: FloatArray,
+    regular: np.ndarray,
+    factor: FloatArray,
+    solved: FloatArray,
+) -> None:
+    """Write NEES into ``out`` (R, K), nan where P is exactly singular; set ``regular`` (R,) to
+    False for runs with a finite P that is exactly singular. ``factor`` (n, n) and ``solved`` (n, 1)
+    are scratch.
     """
-    regular, n = True, e.shape[1]
-    for k in range(len(e)):
-        finite = True
-        for i in range(n):
-            solved[i, 0] = e[k, i]
-            finite = finite and np.isfinite(e[k, i])
+    n = len(size)
+    for r in range(len(e)):
+        for k in range(lengths[r]):
+            definite, total = True, 0.0
+            for i in range(n):
+                solved[i, 0] = e[r, k, i]
+                for j in range(i + 1):
+                    factor[i, j] = P[r, k, i, j]
+            # P = G D G' with G unit lower triangular, and e' P^-1 e = z' D^-1 z with G z = e.
             for j in range(n):
-                factor[i, j] = P[k, i, j]
-                finite = finite and np.isfinite(P[k, i, j])
-        solve_inplace(factor, solved, n)  # solved = P^-1 e
-        out[k] = 0.0
+                inverse, z = 1.0 / factor[j, j], solved[j, 0]
+                definite = definite and factor[j, j] > 0.0
+                total += z * z * inverse
+                for i in range(j + 1, n):
+                    share = factor[i, j] * inverse
+                    for m in range(j + 1, i + 1):
+                        factor[i, m] -= share * factor[m, j]
+                    solved[i, 0] -= share * z
+            out[r, k] = total
+            if not definite and not fill_indefinite(e, P, r, k, out, factor, solved):
+                regular[r] = False
+
+
+@kernel
+def fill_indefinite(
+    e: FloatArray,
+    P: FloatArray,
+    r: int,
+    k: int,
+    out: FloatArray,
+    factor: FloatArray,
+    solved: FloatArray,
+) -> bool:
+    """Write NEES of sample ``k`` of run ``r``, whose P is not positive definite, by elimination
+    with pivoting; return False if P is finite and exactly singular.
+    """
+    finite, n = True, e.shape[2]
+    for i in range(n):
+        solved[i, 0] = e[r, k, i]
+        finite = finite and np.isfinite(e[r, k, i])
+        for j in range(n):
+            factor[i, j] = P[r, k, i, j]
+            finite = finite and np.isfinite(P[r, k, i, j])
+    solve_inplace(factor, solved, n)  # solved = P^-1 e
+    out[r, k] = 0.0
+    for i in range(n):
+        out[r, k] += e[r, k, i] * solved[i, 0]
+    return not (finite and np.isnan(solved[0, 0]))
+
+
+def blurred_from(
+    times: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    e: FloatArray,
+    lengths: np.ndarray,
+    exact: bool = False,
+) -> FloatArray:
+    """Return for each of R runs the first of its sample ``times`` (T,), in seconds, from which on
+    errors mean little, inf if there is none: the rounding error of x - xhat exceeds 1 / BLUR of
+    their standard deviation.
+
+    The rounding error is that of states x (R, T, n), with ``exact`` errors that of the errors e
+    (R, T, N, n), which a node may have passed on to others. The standard deviation is the smallest
+    of P (R, T, N, n, n) or, where P is nan, the root mean square of e. Run r has ``lengths[r]``
+    samples.
+    """
+    first = np.full(len(x), np.inf)
+    sizes = (e if exact else x).reshape(*x.shape[:2], -1)
+    arrays = (np.ascontiguousarray(part) for part in (times, sizes, P, e))
+    find_blurred(sized(x.shape[2]), *arrays, lengths, first)
+    return first
+
+
+@kernel
+def find_blurred(
+    size: Size,
+    times: FloatArray,
+    sizes: FloatArray,
+    P: FloatArray,
+    e: FloatArray,
+    lengths: np.ndarray,
+    first: FloatArray,
+) -> None:
+    """Set ``first`` (R,) to the first time at which a sample is blurred, see ``blurred_from``;
+    numbers as large as ``sizes`` (R, T, m) were rounded.
+    """
+    for r in range(len(first)):
+        for t in range(lengths[r]):
+            largest, variance, unknown = 0.0, np.inf, False
+            for i in range(sizes.shape[2]):
+                largest = max(largest, abs(sizes[r, t, i]))
+                unknown = unknown or np.isnan(sizes[r, t, i])
+            for f in range(P.shape[2]):
+                for i in range(len(size)):
+                    variance = min(variance, P[r, t, f, i, i])
+                    unknown = unknown or np.isnan(P[r, t, f, i, i])
+            if unknown:
+                variance = variance_of_errors(P, e, r, t)
+            deviation = np.sqrt(max(variance, 0.0)) / BLUR
+            if deviation > 0.0 and ROUNDING * largest > deviation:
+                first[r] = times[t]
+                break
+
+
+@kernel
+def variance_of_errors(P: FloatArray, e: FloatArray, r: int, t: int) -> float:
+    """Return the mean square of the errors of sample ``t`` of run ``r`` if all of P is nan, else
+    nan.
+    """
+    filters, n = e.shape[2:]
+    total = 0.0
+    for f in range(filters):
         for i in range(n):
-            out[k] += e[k, i] * solved[i, 0]
-        if finite and np.isnan(solved[0, 0]):
-            regular = False
-    return regular
-
-
-def _is_regular(P: FloatArray) -> np.ndarray:
-    """Return a mask (K,) of finite P (K, n, n) of full rank up to rounding."""
-    regular = np.asarray(np.isfinite(P).all(axis=(1, 2)))
-    regular[regular] = is_definite(P[regular])
-    return regular
+            total += e[r, t, f, i] * e[r, t, f, i]
+            for j in range(n):
+                if not np.isnan(P[r, t, f, i, j]):
+                    return np.nan
+    return total / (filters * n)

@@ -12,17 +12,14 @@ from netkf.core.errors import ScenarioError, quote
 from netkf.core.notebook import NotebookTable
 from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
-from netkf.trace.nees import errors
+from netkf.trace.nees import BLUR, ROUNDING, blurred_from, errors
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 
 if TYPE_CHECKING:
     import pandas as pd
 
-ROUNDING = 4.0 * np.finfo(float).eps  # rounding error of x - xhat as a share of the size of x
-BLUR, CERTAIN = 100.0, 1e-14
-"""Errors with a standard deviation below BLUR times their rounding error are not judged; variances
-below the share CERTAIN of the largest one are rounding errors.
-"""
+CERTAIN = 1e-14
+"""Variances below this share of the largest one are rounding errors."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,16 +93,19 @@ class Run(NotebookTable):
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """The magnitude (T,) of the rounding error of ``error``."""
-        return rounding(carried_size(self.x, self.error, self.exact_errors))
+        """The magnitude (T,) of the rounding error of ``error``: that of the numbers that the run
+        computes with.
+        """
+        sizes = np.abs(self.error).max(axis=1) if self.exact_errors else np.abs(self.x)
+        return np.asarray(ROUNDING * sizes.max(axis=1))
 
     @cached_property
     def rounding_from(self) -> float:
         """The first sample time in seconds at which the rounding error of ``error`` is not small
         against its standard deviation, inf if there is none.
         """
-        size = carried_size(self.x, self.error, self.exact_errors)
-        return rounding_from(self.times, size, self.P, self.error)
+        one = self.x[None], self.P[None], self.error[None], np.array([len(self.times)])
+        return float(blurred_from(self.times, *one, self.exact_errors)[0])
 
     def plot(self, figure: str = "error") -> Any:
         """Return a figure of the run as a matplotlib Figure, the one of ``netkf plot --figure``:
@@ -154,38 +154,6 @@ def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
     run = np.full(len(rows), replica, dtype=np.int64)
     columns = {"run": run, "seq": np.arange(first, first + len(rows)), "kind": kinds}
     return {name: columns[name] if name in columns else rows[name] for name in EVENT_COLUMNS}
-
-
-def rounding_from(times: FloatArray, x: FloatArray, P: FloatArray, e: FloatArray) -> float:
-    """Return the first of the ``times`` (T,), in seconds, from which on errors mean little: the
-    rounding error of x - xhat exceeds 1 / BLUR of the standard deviation of the errors; inf if it
-    never does.
-
-    The rounding error is that of states x (T, n), the standard deviation the smallest one of P (T,
-    N, n, n) or, where P is nan, the root mean square of the errors e (T, N, n).
-    """
-    if not len(times):
-        return np.inf
-    with np.errstate(over="ignore", invalid="ignore"):
-        variance = np.diagonal(P, axis1=2, axis2=3).min(axis=(1, 2))
-        variance = np.where(np.isnan(P).all(axis=(1, 2, 3)), (e * e).mean(axis=(1, 2)), variance)
-    limit = np.sqrt(np.maximum(variance, 0.0)) / BLUR
-    blurred = (rounding(x) > limit) & (limit > 0.0)
-    return float(times[np.argmax(blurred)]) if blurred.any() else np.inf
-
-
-def carried_size(x: FloatArray, e: FloatArray, exact: bool) -> FloatArray:
-    """Return the magnitude (T, n) of the numbers that a run computes with.
-
-    These are the states x (T, n); with exact errors they are at most the largest of the errors e
-    (T, N, n), which a node may have passed on to others.
-    """
-    return np.abs(e).max(axis=1) if exact else np.abs(x)
-
-
-def rounding(x: FloatArray) -> FloatArray:
-    """Return the magnitude (T,) of the rounding error of x - xhat if both are about x (T, n)."""
-    return np.asarray(ROUNDING * np.abs(x).max(axis=1))
 
 
 def blurred_samples(run: Run, matrices: FloatArray) -> np.ndarray:

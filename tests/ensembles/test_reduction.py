@@ -5,7 +5,6 @@ import pytest
 
 from netkf.ensembles.reduction import reduce_batch
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
-from netkf.trace.run import carried_size, rounding_from
 from netkf.trace.schema import KINDS
 
 TIMES = np.arange(7) * 0.5
@@ -34,13 +33,13 @@ def plain(given, r):
     """Columns (kept, F, 2 u + 1), averages (F, 3) and rounding_from of run ``r``."""
     stop, kept = given.lengths[r], given.lengths[r] - given.diverged[r]
     P, e, n = given.P[r], given.error[r], given.error.shape[3]
-    with np.errstate(all="ignore"):
-        blurred = rounding_from(
-            TIMES[:stop],
-            carried_size(given.x[r, :stop], e[:stop], given.exact_errors),
-            P[:stop],
-            e[:stop],
-        )
+    sizes = np.abs(e[:stop] if given.exact_errors else given.x[r, :stop, None]).max(axis=(1, 2))
+    variance = np.diagonal(P[:stop], axis1=2, axis2=3).min(axis=(1, 2))
+    squares = (e[:stop] ** 2).mean(axis=(1, 2))
+    variance = np.where(np.isnan(P[:stop]).all(axis=(1, 2, 3)), squares, variance)
+    deviation = np.sqrt(np.maximum(variance, 0.0))
+    blurs = (deviation > 0.0) & (4.0 * np.finfo(float).eps * sizes > 0.01 * deviation)
+    blurred = TIMES[np.argmax(blurs)] if blurs.any() else np.inf
     i, j = np.triu_indices(n)
     nees = np.full(e.shape[:2], np.nan)
     for t, f in np.ndindex(kept, e.shape[1]):
