@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, is_definite
@@ -127,8 +129,8 @@ def blurred_from(
     """
     first = np.full(len(x), np.inf)
     sizes = (e if exact else x).reshape(*x.shape[:2], -1)
-    arrays = (np.ascontiguousarray(part) for part in (times, sizes, P, e))
-    find_blurred(sized(x.shape[2]), *arrays, lengths, first)
+    sizes, P, e = (np.ascontiguousarray(part) for part in (sizes, P, e))
+    find_blurred(sized(x.shape[2]), np.ascontiguousarray(times), sizes, P, e, lengths, first)
     return first
 
 
@@ -175,5 +177,5 @@ def variance_of_errors(P: FloatArray, e: FloatArray, r: int, t: int) -> float:
             total += e[r, t, f, i] * e[r, t, f, i]
             for j in range(n):
                 if not np.isnan(P[r, t, f, i, j]):
-                    return np.nan
-    return total / (filters * n)
+                    return math.nan
+    return float(total / (filters * n))
