@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import scipy.special
@@ -21,8 +20,6 @@ from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
 from netkf.runs.tables import format_number, format_with_error
 from netkf.studies.compare import Comparison
-from netkf.studies.compare_filters import ComparedFilter
-from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
 from netkf.theory.common.papers import PAPERS
 from netkf.trace.messages import DELIVERED, LATE, LOST
@@ -332,7 +329,14 @@ def _describe_bound(source: ReportSource) -> list[str]:
     # The node with the largest ratio need not be one that exceeds the bound beyond its error.
     miss = (1.0 - CONFIDENCE) / len(rows)
     margin = -float(scipy.special.stdtrit(max(1, source.runs - 1), miss))
-    exceeding = [row for row in rows if source.runs > 1 and _excess(row, margin) > 0.0]
+    # Where P does not depend on chance it may equal its bound, up to rounding.
+    exceeding = [
+        row
+        for row in rows
+        if source.runs > 1
+        and float(row["mean_trace"]) - margin * float(row.get("mean_trace_se") or 0.0)
+        > (1.0 + ROUNDING) * float(row["bound"])
+    ]
     top = max(exceeding or rows, key=lambda row: float(row["mean_trace"]) / float(row["bound"]))
     ratio = float(top["mean_trace"]) / float(top["bound"])
     numbers = (
@@ -351,13 +355,6 @@ def _describe_bound(source: ReportSource) -> list[str]:
         f"The bound of {bound} is about the mean over runs. In this one run "
         f"P was {side} it: largest {numbers}. netkf check decides if it holds{PAPER}"
     ]
-
-
-def _excess(row: dict[str, Any], margin: float) -> float:
-    """Return by how much a mean trace exceeds its bound beyond ``margin`` standard errors."""
-    error = float(row.get("mean_trace_se") or 0.0)
-    # Where P does not depend on chance it may equal its bound, up to rounding.
-    return float(row["mean_trace"]) - margin * error - (1.0 + ROUNDING) * float(row["bound"])
 
 
 def _describe_verdict(source: ReportSource) -> list[str]:
@@ -399,18 +396,26 @@ def _describe_sweep(source: ReportSource) -> list[str]:
 
 
 def _describe_filters(comparison: StoredComparison) -> list[str]:
-    rows = [row for row in comparison.rows if row.ran and math.isfinite(_rms_error(row).value)]
+    rows = [row for row in comparison.rows if row.ran and math.isfinite(row.rms_error.value)]
     if not rows:
         return ["No filter has a finite RMS error"]
-    best = min(rows, key=lambda row: _rms_error(row).value)
-    listed = ", ".join(f"{row.filter} {format_number(_rms_error(row).value)}" for row in rows)
+    best = min(rows, key=lambda row: row.rms_error.value)
+    listed = ", ".join(
+        f"{row.filter} {format_number(row.quantities['rms_error'].value)}" for row in rows
+    )
     sentences = [
         f"Of {len(rows)} filters over {comparison.runs:,} runs of each, {best.filter} had the "
         f"smallest RMS error ({listed})"
     ]
-    sentences += [
-        _describe_difference(row, comparison.first) for row in rows if _rms_error(row).real
-    ]
+    for row in rows:
+        error = row.rms_error
+        if error.real:
+            side = "less" if error.difference < 0.0 else "more"
+            sentences.append(
+                f"Certain: the RMS error of {row.filter} is {side} than that of "
+                f"{comparison.first}, by {format_number(abs(error.difference))}; the difference "
+                f"lies in {format_number(error.low)} .. {format_number(error.high)}"
+            )
     if len(sentences) == 1:
         sentences.append(f"No difference of RMS errors from {comparison.first} is certain")
     # "-": unknown, as for a single run.
@@ -423,20 +428,6 @@ def _describe_filters(comparison: StoredComparison) -> list[str]:
         sentences.append(f"P does not describe the errors of {', '.join(inconsistent)}")
     incomplete = [row for row in comparison.rows if row.status != "complete"]
     return sentences + [f"{row.filter}: {row.status}" for row in incomplete]
-
-
-def _describe_difference(row: ComparedFilter, first: str) -> str:
-    error = _rms_error(row)
-    side = "less" if error.difference < 0.0 else "more"
-    return (
-        f"Certain: the RMS error of {row.filter} is {side} than that of {first}, by "
-        f"{format_number(abs(error.difference))}; the difference lies in "
-        f"{format_number(error.low)} .. {format_number(error.high)}"
-    )
-
-
-def _rms_error(row: ComparedFilter) -> Quantity:
-    return row.quantities["rms_error"]
 
 
 def _format_time(seconds: float) -> str:

@@ -142,7 +142,9 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
     were changed since.
     """
     stored = open_directory(directory, trust=trust)
-    label, text = str(directory), _read_scenario_text(directory / "scenario.toml")
+    label, text = str(directory), (directory / "scenario.toml").read_text(encoding="utf-8")
+    if len(text) > MAX_TEXT:
+        text = f"{text[:MAX_TEXT]}\n# ({len(text):,} characters)"
     if isinstance(stored, StoredSweep):
         return ReportSource(label, stored.manifest, stored.scenario, text, sweep=stored)
     if isinstance(stored, StoredComparison):
@@ -188,8 +190,3 @@ def _choose_run(
     if replica is None and not (stored.directory / "states.parquet").exists():
         return None, stored
     return stored.replica(replica or 0), stored
-
-
-def _read_scenario_text(path: Path) -> str:
-    text = path.read_text(encoding="utf-8")
-    return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}\n# ({len(text):,} characters)"

@@ -20,11 +20,7 @@ MAX_RATIO = 10.0
 
 def filters_figure(comparison: StoredComparison) -> str:
     """Return the RMS errors of filters with two standard errors as SVG; empty if none is finite."""
-    rows = [
-        row
-        for row in comparison.rows
-        if row.ran and math.isfinite(row.quantities["rms_error"].value)
-    ]
+    rows = [row for row in comparison.rows if row.ran and math.isfinite(row.rms_error.value)]
     if not rows:
         return ""
     ends = [_bar_end(row) for row in rows]
@@ -51,13 +47,13 @@ def filters_figure(comparison: StoredComparison) -> str:
 
 def _bar_end(row: ComparedFilter) -> float:
     """Return the upper end of a filter's bar: its RMS error plus two standard errors."""
-    error = row.quantities["rms_error"]
+    error = row.rms_error
     return error.value + (2.0 * error.se if math.isfinite(error.se) else 0.0)
 
 
 def _draw_row(row: ComparedFilter, k: int, scale: float) -> str:
     """Return label, bar, dot and number of row ``k`` as SVG; ``scale`` is pixels per unit."""
-    error, y = row.quantities["rms_error"].value, ROW_HEIGHT * k + ROW_HEIGHT // 2 + 4
+    error, y = row.rms_error.value, ROW_HEIGHT * k + ROW_HEIGHT // 2 + 4
     axis_end, high = WIDTH - NUMBER_WIDTH, _bar_end(row)
     low = max(0.0, 2.0 * error - high)  # the bar is symmetric about the error
     x, left, right = (min(axis_end, LABEL_WIDTH + scale * value) for value in (error, low, high))

@@ -34,7 +34,6 @@ from netkf.report.mending import (
 from netkf.report.packing import Packer
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
 from netkf.runs.files import require_own, write_text
-from netkf.runs.stored import StoredRun
 from netkf.scenario.writing import toml_text
 from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.studies.explanation import Why
@@ -147,12 +146,20 @@ def make_page(
         raise ScenarioError("report", "takes one or two directories", len(directories))
     entries = [_analyse_directory(Path(directory), replica, trust) for directory in directories]
     entries = _merge_verdict(entries)
-    command = _report_command(directories, replica, trust, out)
-    comparison = _compare(entries, directories)
+    command = ["netkf", "report", *map(str, directories)]
+    command += ["--replica", str(replica)] if replica is not None else []
+    command += ["--trust"] if trust else []
+    command += ["--out", str(out)] if out is not None else []
+    comparison: Comparison | str | None = None
+    if len(entries) > 1:
+        sources = [entry.source for entry in entries]
+        have_ended = all(s.status in FINAL_STATUSES and s.summary for s in sources)
+        reason = "A run did not finish, so nothing is compared"
+        comparison = compare(directories) if have_ended else reason
     # Data of the runs are thinned until the page is small enough.
     data_limits = Budget(BUDGET.messages // len(entries), BUDGET.values // len(entries))
     while True:
-        page = _assemble_page(entries, comparison, command, data_limits)
+        page = _assemble_page(entries, comparison, shlex.join(command), data_limits)
         size = len(page.encode("utf-8"))
         if size <= MAX_BYTES or data_limits.messages < MIN_BUDGET:
             return page
@@ -185,29 +192,6 @@ def _merge_verdict(entries: list[_AnalysedSource]) -> list[_AnalysedSource]:
         rule = "compares runs and ensembles, and takes a verdict only after its run"
         raise ScenarioError("report", rule, " and ".join(kinds), "give one directory for each page")
     return entries
-
-
-def _report_command(
-    directories: Sequence[str | Path], replica: int | None, trust: bool, out: Path | None
-) -> str:
-    """Return the command line that makes the page, from the arguments of ``write_report``."""
-    command = ["netkf", "report", *map(str, directories)]
-    command += ["--replica", str(replica)] if replica is not None else []
-    command += ["--trust"] if trust else []
-    command += ["--out", str(out)] if out is not None else []
-    return shlex.join(command)
-
-
-def _compare(
-    entries: list[_AnalysedSource], directories: Sequence[str | Path]
-) -> Comparison | str | None:
-    """Return the differences of two directories, the reason why there are none, or None for one."""
-    if len(entries) < 2:
-        return None
-    have_ended = all(
-        entry.source.status in FINAL_STATUSES and entry.source.summary for entry in entries
-    )
-    return compare(directories) if have_ended else "A run did not finish, so nothing is compared"
 
 
 def _assemble_page(
@@ -247,7 +231,7 @@ def _assemble_page(
         entries, comparison, command, rules, bool(runs)
     )
     title = " and ".join(dict.fromkeys(source.scenario.name for source in sources))
-    script, style = _script(), _style()
+    script, style = _script(), _asset("uPlot.min.css") + "\n" + _asset("page.css")
     policy = POLICY.format(script=content_hash(script), style=content_hash(style))
     return _asset("page.html").format(
         policy=text(policy),
@@ -316,23 +300,25 @@ def _main_sections(
         )
         parts.append(section("comparison", "What differs", differences))
     if any(source.kind not in ("filters", "verdict") for source in sources):
-        parts.append(section("figures", "Figures", _curve_area(entries)))
+        reasons = dict.fromkeys(e.readings for e in entries if isinstance(e.readings, str))
+        notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
+        # The script draws the curves in this element.
+        area = '<div id="curves" class="curves"></div>' + "".join(notes)
+        parts.append(section("figures", "Figures", area))
     figures = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
     if figures:
         parts.append(section("figures", "Errors of the filters", figures))
     results = "".join(_result_tables(source) for source in sources)
     parts.append(section("verdicts", "Verdicts and averages", results))
-    scenarios = "".join(_scenario_text(source) for source in sources)
+    scenarios = ""
+    for source in sources:
+        label = text(f"scenario.toml of {source.label}")
+        box = f'<pre tabindex="0" role="group" aria-label="{label}">'
+        scenarios += f"<h3>{label}</h3>{box}{text(source.scenario_text)}</pre>"
     parts.append(section("scenario", "Scenario", scenarios))
     origin = _describe_origin(sources, command, rules)
     parts.append(section("origin", "Versions and command", origin))
     return "<main>" + "".join(parts) + "</main>"
-
-
-def _curve_area(entries: list[_AnalysedSource]) -> str:
-    reasons = dict.fromkeys(entry.readings for entry in entries if isinstance(entry.readings, str))
-    notes = [paragraph(f"No innovations are shown: {reason}.", "note") for reason in reasons]
-    return '<div id="curves" class="curves"></div>' + "".join(notes)
 
 
 def _explain_no_live_views(sources: list[ReportSource]) -> str:
@@ -373,22 +359,6 @@ def _result_tables(source: ReportSource) -> str:
     return "".join(parts)
 
 
-def _scenario_text(source: ReportSource) -> str:
-    """Return the text of a source's scenario file as HTML, in a box that scrolls by itself."""
-    label = f"scenario.toml of {source.label}"
-    return (
-        f"<h3>{text(label)}</h3>"
-        f'<pre tabindex="0" role="group" aria-label="{text(label)}">'
-        f"{text(source.scenario_text)}</pre>"
-    )
-
-
-def _event_counts(run: StoredRun) -> str:
-    counts = [f"{run.count(kind):,} {kind}" for kind in KINDS if run.count(kind)]
-    by_kind = f" ({', '.join(counts)})" if counts else ""
-    return f"Events of replica {run.replica}: {len(run.log):,}{by_kind}"
-
-
 def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]) -> str:
     """Return the commands that make the page, versions, counts and ``rules`` as HTML."""
     parts = [paragraph("This page was made by:"), _command_box(command)]
@@ -397,7 +367,11 @@ def _describe_origin(sources: list[ReportSource], command: str, rules: list[str]
         parts.append(_command_box(_source_command(source)))
         parts.append(tables.versions_table(source))
         if source.run is not None:
-            parts.append(paragraph(_event_counts(source.run)))
+            run = source.run
+            counts = [f"{run.count(kind):,} {kind}" for kind in KINDS if run.count(kind)]
+            by_kind = f" ({', '.join(counts)})" if counts else ""
+            events = f"Events of replica {run.replica}: {len(run.log):,}{by_kind}"
+            parts.append(paragraph(events))
     if rules:
         parts.append(bullets(f"Left out: {rule}." for rule in rules))
     elif any(source.run is not None for source in sources):
@@ -458,8 +432,3 @@ def _script() -> str:
         f'{licence}{_asset("uPlot.iife.min.js")}\n(function () {{\n"use strict";\n{scripts}\n'
         "})();\n"
     )
-
-
-@cache
-def _style() -> str:
-    return _asset("uPlot.min.css") + "\n" + _asset("page.css")

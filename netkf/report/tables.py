@@ -5,7 +5,6 @@ curves that show the same numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -66,11 +65,16 @@ def summary_section(source: ReportSource) -> str:
     if not summary:
         return paragraph("There is no summary: the runs ended before it was written")
     columns = columns_of(summary)
-    rows = [[str(row["node"]), *_summary_cells(row, columns)] for row in summary["nodes"]]
+    # The first cell is the id of a node, or "all".
+    rows = [
+        [row.get("node", "all"), *(format_with_error(row[k], row.get(f"{k}_se")) for k in columns)]
+        for row in (*summary["nodes"], summary["overall"])
+    ]
+    *rows, overall = rows
     listed = rows[:MAX_ROWS]
     if len(rows) > MAX_ROWS:
         listed.append([f"({len(rows) - MAX_ROWS:,} more)", *[""] * len(columns)])
-    listed.append(["all", *_summary_cells(summary["overall"], columns)])
+    listed.append(overall)
     runs = f"averages over {source.runs:,} runs, +- one standard error" if source.runs > 1 else ""
     caption = f"Averages over time{'; ' + runs if runs else ''}: {source.label}"
     messages = summary["messages"]
@@ -88,10 +92,6 @@ def summary_section(source: ReportSource) -> str:
     return table_box(caption, ["node", *columns.values()], listed) + bullets(notes)
 
 
-def _summary_cells(row: dict[str, Any], columns: Iterable[str]) -> list[str]:
-    return [format_with_error(row[key], row.get(f"{key}_se")) for key in columns]
-
-
 def _bound_notes(source: ReportSource) -> list[str]:
     """Return notes on what trace P is compared with: bound, limit, and central filter."""
     summary, promised = source.summary, source.promised
@@ -102,20 +102,17 @@ def _bound_notes(source: ReportSource) -> list[str]:
         limits = {label: summary["limit"], "centralised filter": summary["central"]}
         traces = [f"{name} {format_number(value)}" for name, value in limits.items() if value]
         notes += [f"traces to compare: {', '.join(traces)}"] if traces else []
-        notes += [_explain_limit(label)] if summary["limit"] else []
+        if summary["limit"]:
+            weights = "1/N" if label.startswith("limit S") else "their weights"
+            notes.append(
+                f"{label}: what the bound of every node tends to as links tick ever faster. It "
+                f"solves the Riccati equation with {weights} of the information of all N nodes' "
+                "readings, because nodes average covariances as if they shared one error; the "
+                "centralised filter uses all of it. Errors tend to less than this limit: the "
+                "filters do better than they claim"
+            )
         notes += promised.notes
     return notes
-
-
-def _explain_limit(label: str) -> str:
-    """Return sentences on what the limit ``label`` is, beside the centralised covariance."""
-    weights = "1/N" if label.startswith("limit S") else "their weights"
-    return (
-        f"{label}: what the bound of every node tends to as links tick ever faster. It solves the "
-        f"Riccati equation with {weights} of the information of all N nodes' readings, because "
-        "nodes average covariances as if they shared one error; the centralised filter uses all of "
-        "it. Errors tend to less than this limit: the filters do better than they claim"
-    )
 
 
 def comparison_section(comparison: Comparison) -> str:

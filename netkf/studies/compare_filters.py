@@ -16,7 +16,6 @@ from netkf.core.errors import EngineError, ScenarioError, suggest_nearest
 from netkf.core.fields import integer, number
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
-from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.documents import file_digests, write_sealed
@@ -89,6 +88,11 @@ class ComparedFilter:
         """True if it can run there."""
         return bool(self.quantities)
 
+    @property
+    def rms_error(self) -> Quantity:
+        """The RMS error, with its difference from that of the first filter."""
+        return self.quantities["rms_error"]
+
     def document(self) -> dict[str, Any]:
         """Return plain values, one level deep: the row of the table, nan where a quantity is
         missing.
@@ -99,10 +103,8 @@ class ComparedFilter:
             row[name] = quantity.value
             for part in ("se", "difference", "low", "high", "real"):
                 row[f"{name}_{part}"] = getattr(quantity, part)
-        row |= {"consistency": self.consistency, "transmissions": self.transmissions}
-        row |= {"bytes": self.bytes, "predicts": self.predicts}
-        row |= {"same_losses": self.same_losses}
-        return row | {"status": self.status}
+        names = ("consistency", "transmissions", "bytes", "predicts", "same_losses", "status")
+        return row | {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -175,39 +177,37 @@ def compare_filters(
     traffic: dict[str, Traffic] = {}
     with make_pool(count, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
         for k, candidate in enumerate(candidates):
-            if candidate.scenario is not None:
-                values[candidate.label] = _simulate(candidate.scenario, count, root, engine, pool)
-                chosen = choose_engine(engine, candidate.scenario)
-                traffic[candidate.label] = count_traffic(candidate.scenario, root, chosen)
+            label, case = candidate.label, candidate.scenario
+            if case is not None:
+                chosen = choose_engine(engine, case)
+                task = partial(block_values, engine=chosen)
+                with explain_failures(case):
+                    values[label] = replicate_blocks(
+                        task, join_values, case, count, root, pool=pool
+                    )
+                traffic[label] = count_traffic(case, root, chosen)
             if progress is not None:
                 progress(k + 1, len(candidates))
     first = next(iter(values))
-    scenarios = {one.label: one.scenario for one in candidates if one.scenario is not None}
     # Bonferroni: all differences from the first filter hold together.
     level = (1.0 - confidence) / (len(QUANTITIES) * max(1, len(values) - 1))
-    rows = []
-    for label, scenario_of_filter, reason in candidates:
-        if scenario_of_filter is None:
+    rows, first_scenario = [], next(one.scenario for one in candidates if one.scenario is not None)
+    for label, case, reason in candidates:
+        if case is None:
             # No quantities, consistency and traffic, but the reason why it cannot run.
-            rows.append(
-                ComparedFilter(
-                    filter=label,
-                    quantities={},
-                    consistency="-",
-                    transmissions=math.nan,
-                    bytes=math.nan,
-                    status=reason,
-                )
-            )
+            rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
             continue
-        base = values[first] if label != first else None
-        row = _make_row(label, values[label], base, traffic[label], scenario.plant.n, level)
+        base, n = values[first] if label != first else None, scenario.plant.n
+        diverged = int(values[label].diverged.sum())
         rows.append(
-            dataclasses.replace(
-                row,
-                predicts=scenario_of_filter.slotted
-                and scenario_of_filter.node_filter.timing.predicts,
-                same_losses=_meet_same_losses(scenario_of_filter, scenarios[first]),
+            ComparedFilter(
+                label,
+                estimate_quantities(values[label], base, n, level),
+                credibility(values[label], n, level),
+                *traffic[label],
+                f"{diverged} of {count} runs diverged" if diverged else "complete",
+                predicts=case.slotted and case.node_filter.timing.predicts,
+                same_losses=_meet_same_losses(case, first_scenario),
             )
         )
     return FilterComparison(
@@ -227,33 +227,6 @@ def _meet_same_losses(scenario: Scenario, other: Scenario) -> bool:
         for phases in [(one.timing.schedule or ()).count("exchange")]
     )
     return first == second
-
-
-def _simulate(scenario: Scenario, runs: int, seed: int, engine: str, pool: Pool) -> FilterValues:
-    """Return the errors and NEES of ``runs`` replicas with one of the filters, run by run."""
-    with explain_failures(scenario):
-        task = partial(block_values, engine=choose_engine(engine, scenario))
-        values: FilterValues = replicate_blocks(task, join_values, scenario, runs, seed, pool=pool)
-    return values
-
-
-def _make_row(
-    label: str,
-    values: FilterValues,
-    first: FilterValues | None,
-    traffic: Traffic,
-    n: int,
-    level: float,
-) -> ComparedFilter:
-    """Return the row of a filter, with its differences from the ``first`` one (None: it is)."""
-    diverged = int(values.diverged.sum())
-    return ComparedFilter(
-        label,
-        estimate_quantities(values, first, n, level),
-        credibility(values, n, level),
-        *traffic,
-        f"{diverged} of {len(values.diverged)} runs diverged" if diverged else "complete",
-    )
 
 
 def _candidates(scenario: Scenario, filters: Any, engine: str) -> tuple[FilterEntry, ...]:

@@ -41,17 +41,14 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
         panels[0].set_yticks(range(len(rows)), labels, parse_math=False)
         panels[0].invert_yaxis()
         runs = f"{completed.comparison.runs:,} runs on the same draws; bars: two standard errors."
-        finish_figure(figure, _make_title(rows), [f"{scenario.name}: {runs}"])
+        finite = [row for row in rows if math.isfinite(row.rms_error.value)]
+        title = "No filter has a finite error"
+        if finite:
+            best = min(finite, key=lambda row: row.rms_error.value)
+            error = f"{best.rms_error.value:.3g}"
+            title = f"{shorten(best.filter, MAX_LABEL)} has the smallest RMS error, {error}"
+        finish_figure(figure, title, [f"{scenario.name}: {runs}"])
     write_figure(figure, completed.directory / "filters.png")
-
-
-def _make_title(rows: list[ComparedFilter]) -> str:
-    finite_rows = [row for row in rows if math.isfinite(row.quantities["rms_error"].value)]
-    if not finite_rows:
-        return "No filter has a finite error"
-    best_row = min(finite_rows, key=lambda row: row.quantities["rms_error"].value)
-    error = best_row.quantities["rms_error"].value
-    return f"{shorten(best_row.filter, MAX_LABEL)} has the smallest RMS error, {error:.3g}"
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:
