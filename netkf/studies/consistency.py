@@ -8,6 +8,7 @@ and less for those that are conservative by design, which are then not called in
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
@@ -80,7 +81,10 @@ def run_consistency(
     run = simulate(scenario, seed, replica, engine)
     _, nees = errors(run.error, run.P)
     after_start = np.flatnonzero(run.times > 0.0)
-    sigma = _exact_squares(scenario, run)
+    sigma = None  # (T, N, n, n), E[e e'] given the events; None if unknown or too large
+    if _count_errors(scenario) <= MAX_ERRORS:
+        with contextlib.suppress(TheoryError):
+            sigma = error_squares(scenario, run)
     # Samples in which the error is mostly rounding, by its standard deviation of P and of Sigma.
     blurred = blurred_samples(run, run.P)
     blurred |= False if sigma is None else blurred_samples(run, sigma)
@@ -108,16 +112,6 @@ def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
 
 def _count_errors(scenario: Scenario) -> int:
     return len(scenario.nodes) * scenario.plant.n
-
-
-def _exact_squares(scenario: Scenario, run: Run) -> FloatArray | None:
-    """Return Sigma (T, N, n, n), E[e e'] given the events; None if unknown or too large."""
-    if _count_errors(scenario) > MAX_ERRORS:
-        return None
-    try:
-        return error_squares(scenario, run)
-    except TheoryError:
-        return None
 
 
 def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
@@ -329,14 +323,21 @@ def judge_consistency(
     # ``level`` is the probability that some interval misses.
     n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
     low, high = nees_bounds(n, count, confidence)
-    shares_inside = _share_inside(runs, low, high)
+    shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
+    means = np.mean([run.samples[:shortest] for run in runs], axis=0)
+    usable, inside = np.isfinite(means).sum(axis=0), ((means >= low) & (means <= high)).sum(axis=0)
+    # Shares (N,) of samples whose mean NEES over the runs is in ``low`` .. ``high``.
+    shares_inside = inside / np.where(usable, usable, np.nan)
     # Bonferroni over the nodes, two-sided.
     quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))
     rows = [
         _judge_node(scenario, runs, i, float(shares_inside[i]), quantile)
         for i in range(len(scenario.nodes))
     ]
-    has_covariance, blurred_from = _covariance_given(runs), _blurred_from(runs)
+    has_covariance, blurred_from = (
+        any(run.covariance_given[0] for run in runs),
+        min(run.blurred_from[0] for run in runs),
+    )
     notes = () if has_covariance else (NO_COVARIANCE,)
     if _count_errors(scenario) > MAX_ERRORS:
         reason = (
@@ -359,25 +360,6 @@ def judge_consistency(
     )
 
 
-def _covariance_given(runs: Sequence[RunConsistency]) -> bool:
-    """Return True if the filter gives covariances; without them there is no NEES."""
-    return any(run.covariance_given[0] for run in runs)
-
-
-def _blurred_from(runs: Sequence[RunConsistency]) -> float:
-    """Return the first time in seconds from which rounding blurs errors in some run."""
-    return float(min(run.blurred_from[0] for run in runs))
-
-
-def _share_inside(runs: Sequence[RunConsistency], low: float, high: float) -> FloatArray:
-    """Return the shares (N,) of samples whose mean NEES over the runs is in ``low`` .. ``high``."""
-    shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
-    means = np.mean([run.samples[:shortest] for run in runs], axis=0)
-    usable = np.isfinite(means).sum(axis=0)
-    count_inside = ((means >= low) & (means <= high)).sum(axis=0)
-    return np.asarray(count_inside / np.where(usable, usable, np.nan))
-
-
 def _judge_node(
     scenario: Scenario, runs: Sequence[RunConsistency], i: int, share_inside: float, quantile: float
 ) -> NodeConsistency:
@@ -388,9 +370,9 @@ def _judge_node(
     # NEES of an exact P has the mean n.
     excesses = nees - (expected if is_known else scenario.plant.n)
     width = quantile * float(excesses.std(ddof=1)) / math.sqrt(len(runs))
-    if not _covariance_given(runs):
+    if not any(run.covariance_given[0] for run in runs):
         verdict = NO_COVARIANCE
-    elif np.isfinite(_blurred_from(runs)) and np.isnan(nees).any():
+    elif np.isfinite(min(run.blurred_from[0] for run in runs)) and np.isnan(nees).any():
         verdict = UNDECIDED
     else:
         mean = float(expected.mean()) if is_known else None

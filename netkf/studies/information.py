@@ -128,18 +128,13 @@ def at_once(messages: Messages, log: IntArray) -> Messages:
 
 def rows_until(scenario: DerivedScenario, log: IntArray, at: float) -> IntArray:
     """Return the rows of an EVENT ``log`` that influence the sample at ``at`` seconds."""
-    return np.asarray(log[: _count_events(scenario, log["t"], at)])
-
-
-def _count_events(scenario: DerivedScenario, times: FloatArray, at: float) -> int:
-    """Return how many events at ``times`` (E,), in seconds, influence the sample at ``at``."""
     if not scenario.slotted:
-        return int(np.searchsorted(times, at, side="right"))
+        return np.asarray(log[: np.searchsorted(log["t"], at, side="right")])
     plant = scenario.slot_plant
     slot = round(at / plant.period)
     # A sample of a predicting filter is before the events of its slot, a filtered one after them.
     end = plant.slot_time(slot if scenario.node_filter.timing.predicts else slot + 1)
-    return int(np.searchsorted(times, end, side="left"))
+    return np.asarray(log[: np.searchsorted(log["t"], end)])
 
 
 @dataclass(frozen=True, eq=False)

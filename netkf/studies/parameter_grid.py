@@ -91,16 +91,14 @@ def expand_grid(scenario: Scenario, grid: Mapping[str, Sequence[Any]]) -> list[G
     points = [
         dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*values.values())
     ]
-    return [GridPoint(changes, _apply_changes(scenario, changes)) for changes in points]
-
-
-def _apply_changes(scenario: Scenario, changes: dict[str, Any]) -> Scenario:
-    """Return the scenario of a grid point; errors name the point."""
-    try:
-        return scenario.replace(changes)
-    except ScenarioError as error:
-        point = ", ".join(f"{key} = {toml_text(value)}" for key, value in changes.items())
-        raise error.in_file(f"at {point}") from None
+    grid_points = []
+    for changes in points:
+        try:
+            grid_points.append(GridPoint(changes, scenario.replace(changes)))
+        except ScenarioError as error:
+            point = ", ".join(f"{key} = {toml_text(value)}" for key, value in changes.items())
+            raise error.in_file(f"at {point}") from None
+    return grid_points
 
 
 def table_value(value: Any) -> Any:

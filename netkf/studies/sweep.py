@@ -153,17 +153,11 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
     row["central"] = _value_or_nan(lambda: central_trace(point.scenario))
     sent, delivered, lost = metrics.messages[:, :3].mean(axis=0).tolist()
     row |= {"sent": sent, "delivered": delivered, "lost": lost}
-    row["status"] = _describe_status(point.scenario, metrics)
+    diverged, blurred = int(metrics.diverged.sum()), float(metrics.rounding_from.min())
+    row["status"] = f"{diverged} diverged" if diverged else "complete"
+    if np.isfinite(blurred) and point.scenario.plant.truth_known:
+        row["status"] += f"; rounding blurs errors from {blurred:g} s on, they are left out"
     return row
-
-
-def _describe_status(scenario: Scenario, metrics: RunMetrics) -> str:
-    diverged = int(metrics.diverged.sum())
-    status = f"{diverged} diverged" if diverged else "complete"
-    blurred = float(metrics.rounding_from.min())
-    if np.isfinite(blurred) and scenario.plant.truth_known:
-        status += f"; rounding blurs errors from {blurred:g} s on, they are left out"
-    return status
 
 
 def _same_truth(first: Scenario, other: Scenario) -> bool:

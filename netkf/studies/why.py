@@ -21,7 +21,6 @@ from netkf.studies.information import (
     OUTCOMES,
     USED,
     Flow,
-    IntArray,
     KeptReadings,
     Messages,
     Newest,
@@ -86,7 +85,13 @@ def why(
     most = integer(low=1, high=MAX_MISSING)("most", most)
     limit = None if below is None else number(above=0.0)("below", below)
     replayer = Replayer(run_scenario, run.seed, run.replica, node, at)
-    _require_same_events(rows_until(run_scenario, run.log, at), replayer.log)
+    logged, replayed = rows_until(run_scenario, run.log, at), replayer.log
+    if len(logged) != len(replayed) or not all(
+        np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
+        for name in logged.dtype.names or ()
+    ):
+        rule = "has other events than its replay, so another scenario or version made it"
+        raise ScenarioError("run", rule, None, "run the scenario again")
     outcome = replayer.outcome(error=True)
     if not np.isfinite(outcome.xhat).all() or np.isinf(outcome.P).any():
         raise ScenarioError(
@@ -122,7 +127,13 @@ def _check_run(
     """Return the run with its events and its scenario; raises ScenarioError."""
     name = "run" if isinstance(run, Run) else shorten(run)
     if not isinstance(run, Run):
-        run = _read_run(run, replica, trust)
+        stored = open_directory(run, trust=trust)
+        if isinstance(stored, StoredEnsemble):
+            stored = stored.replica(replica or 0)
+        if not isinstance(stored, Run):
+            rule = f"holds no run with events, but {stored!r}"
+            raise ScenarioError(name, rule, None, "name what netkf run left")
+        run = stored
     if replica is not None and replica != run.replica:
         rule = f"is another one than that of the run, {run.replica}"
         raise ScenarioError("replica", rule, replica, "leave it out")
@@ -137,17 +148,6 @@ def _check_run(
         rule = "has no events, and they tell which messages came"
         raise ScenarioError(name, rule, None, "run it again with --trace full")
     return run, run_scenario
-
-
-def _read_run(directory: str | Path, replica: int | None, trust: bool) -> Run:
-    """Return the run of a ``directory``, or run ``replica`` (None: 0) of the ensemble there."""
-    stored = open_directory(directory, trust=trust)
-    if isinstance(stored, Run):
-        return stored
-    if isinstance(stored, StoredEnsemble):
-        return stored.replica(replica or 0)
-    rule = f"holds no run with events, but {stored!r}"
-    raise ScenarioError(shorten(directory), rule, None, "name what netkf run left")
 
 
 def _default_replays(events: int) -> int:
@@ -165,17 +165,6 @@ def _check_instant(run: Run, scenario: Scenario, at: float) -> float:
         return time
     plant = scenario.slot_plant
     return plant.slot_time(int(plant.slots_of(np.array([time]))[0]))
-
-
-def _require_same_events(logged: IntArray, replayed: IntArray) -> None:
-    """Raise ScenarioError unless an unchanged replay has the events of the run."""
-    same = len(logged) == len(replayed) and all(
-        np.array_equal(logged[name], replayed[name], equal_nan=logged[name].dtype.kind == "f")
-        for name in logged.dtype.names or ()
-    )
-    if not same:
-        rule = "has other events than its replay, so another scenario or version made it"
-        raise ScenarioError("run", rule, None, "run the scenario again")
 
 
 class _Evidence:
@@ -252,7 +241,8 @@ class _Evidence:
             path = route(self._reach, newest_by_budget[0].segment, 0)
             path_nodes = tuple(map(self.scenario.topology.named, path))
         # The fewest missing messages with which a newer reading would have come, if any.
-        budget = next((b for b, r in enumerate(with_more, 1) if _is_newer(r, reading)), None)
+        known_reading = -math.inf if math.isnan(reading) else reading
+        budget = next((b for b, r in enumerate(with_more, 1) if r > known_reading), None)
         missing: tuple[Missing, ...] = ()
         if budget is not None:
             newest = newest_by_budget[budget]
@@ -293,11 +283,6 @@ class _Evidence:
         return last, int((messages.sent[unused] > messages.sent[last]).sum())
 
 
-def _is_newer(reading: float, than: float) -> bool:
-    """Return True if a ``reading`` is later than another; any is later than none (nan)."""
-    return reading > than or (math.isnan(than) and not math.isnan(reading))
-
-
 def _describe_missing(messages: Messages, m: int, topology: Topology) -> Missing:
     sender, receiver, number = messages.key(m)
     return Missing(
@@ -316,11 +301,19 @@ def _make_what_ifs(
     """Return the replays that answer "what if", and how many were left out in a long run."""
     # Label and messages of each replay; None stands for every message.
     delivered_sets: list[tuple[str, tuple[MessageKey, ...] | None]] = [("as it was", ())]
-    newer = _group_by_missing(sources)
+    newer: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
+    for source in sources:
+        if source.missing:
+            newer.setdefault(tuple(m.key for m in source.missing), []).append(source)
+
+    def time_gained(keys: tuple[MessageKey, ...]) -> float:
+        gains = [s.with_more[len(s.missing) - 1] - s.reading for s in newer[keys]]
+        return max(math.inf if math.isnan(gain) else gain for gain in gains)
+
     # If there are too many, replay those that make a reading newer by the most time; ``sorted`` is
     # stable.
     count = _default_replays(len(replayer.log))
-    replayed = set(sorted(newer, key=lambda keys: -max(map(_time_gained, newer[keys])))[:count])
+    replayed = set(sorted(newer, key=time_gained, reverse=True)[:count])
     for keys, sources_of_keys in newer.items():
         if keys in replayed:
             nodes = ", ".join(str(source.node) for source in sources_of_keys)
@@ -338,23 +331,6 @@ def _make_what_ifs(
         outcome = replayer.outcome(delivered, error=True)
         what_ifs.append(WhatIf(label, delivered, outcome.trace, outcome.distance))
     return tuple(what_ifs), len(newer) - len(replayed)
-
-
-def _group_by_missing(
-    sources: Sequence[InformationSource],
-) -> dict[tuple[MessageKey, ...], list[InformationSource]]:
-    groups: dict[tuple[MessageKey, ...], list[InformationSource]] = {}
-    for source in sources:
-        if source.missing:
-            groups.setdefault(tuple(m.key for m in source.missing), []).append(source)
-    return groups
-
-
-def _time_gained(source: InformationSource) -> float:
-    """Return by how many seconds missing messages renew a source's reading; inf without one."""
-    if math.isnan(source.reading):
-        return math.inf
-    return source.with_more[len(source.missing) - 1] - source.reading
 
 
 def _replay_notes(evidence: _Evidence, left_out: int) -> tuple[str, ...]:
