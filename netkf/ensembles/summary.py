@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -26,18 +27,16 @@ def summarise_ensemble(
     # (N + 1, 3): of each node and of all, the mean square error, mean trace of P and mean NEES.
     mean = statistics.averages.mean.reshape(-1, 3)
     error = statistics.averages.standard_error().reshape(-1, 3)
-    bound = _mean_bounds(scenario, promised)
     # JSON has no infinity: None if rounding blurs no errors.
     rounding_from = statistics.rounding_from if np.isfinite(statistics.rounding_from) else None
-    rows = [_make_row(*values) for values in zip(mean, error, bound, strict=True)]
+    *nodes, overall = node_rows(scenario, mean, error, promised)
     messages = statistics.messages.mean[0].tolist()
     messages_se = statistics.messages.standard_error()[0].tolist()
-    nodes = [node_columns(node) | row for node, row in zip(scenario.nodes, rows[:-1], strict=True)]
     summary: dict[str, Any] = {
         "runs": statistics.runs,
         "diverged": int(statistics.totals[1]),
         "nodes": nodes,
-        "overall": rows[-1],
+        "overall": overall,
         "limit": promised.limit,
         "central": promised.central,
         "bound": promised.reason or "Tanwani's H(12), promised by H Theorem 2",
@@ -71,24 +70,36 @@ def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, floa
     return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": share_inside}
 
 
-def _mean_bounds(scenario: Scenario, promised: PromisedTraces) -> list[float | None]:
-    if promised.bound is None:
-        return [None] * (len(scenario.nodes) + 1)
-    after_start: FloatArray = promised.bound[scenario.times > 0.0]
-    nodes = (after_start if len(after_start) else promised.bound).mean(axis=0)
-    return [*nodes.tolist(), float(nodes.mean())]
+def node_rows(
+    scenario: Scenario, mean: FloatArray, error: FloatArray, promised: PromisedTraces
+) -> list[dict[str, Any]]:
+    """Return the rows of an ensemble's summary.json, N + 1: of each node, and of all together.
 
-
-def _make_row(mean: FloatArray, error: FloatArray, bound: float | None) -> dict[str, Any]:
-    rms = float(np.sqrt(mean[0]))
-    return {
-        "rms_error": rms,
-        "rms_error_se": 0.0 if rms == 0.0 else float(error[0]) / (2.0 * rms),
-        "mean_trace": float(mean[1]),
-        "mean_trace_se": float(error[1]),
-        "bound": bound,
-        "ratio": None if bound is None else float(mean[1]) / bound,
-        "ratio_se": None if bound is None else float(error[1]) / bound,
-        "mean_nees": float(mean[2]),
-        "mean_nees_se": float(error[2]),
-    }
+    ``mean`` and ``error`` (N + 1, 3) are the mean square error, mean trace of P and mean NEES, with
+    standard errors.
+    """
+    bounds: list[float | None] = [None] * len(mean)
+    if promised.bound is not None:
+        after_start = promised.bound[scenario.times > 0.0]
+        of_nodes = (after_start if len(after_start) else promised.bound).mean(axis=0)
+        bounds = [*of_nodes.tolist(), float(of_nodes.mean())]
+    rows = []
+    for (square, trace, nees), errors, bound in zip(
+        mean.tolist(), error.tolist(), bounds, strict=True
+    ):
+        rms = math.sqrt(square) if square >= 0.0 else math.nan
+        rows.append(
+            {
+                "rms_error": rms,
+                "rms_error_se": 0.0 if rms == 0.0 else errors[0] / (2.0 * rms),
+                "mean_trace": trace,
+                "mean_trace_se": errors[1],
+                "bound": bound,
+                "ratio": None if bound is None else trace / bound,
+                "ratio_se": None if bound is None else errors[1] / bound,
+                "mean_nees": nees,
+                "mean_nees_se": errors[2],
+            }
+        )
+    columns = [node_columns(node) for node in scenario.nodes]
+    return [*map(dict.__or__, columns, rows), rows[-1]]

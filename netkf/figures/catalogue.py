@@ -90,14 +90,12 @@ class FigureSet:
                         raise UnavailableError(reason)
                 return FIGURES[name](self._data)
             except UnavailableError as unavailable:
-                return message_figure(*self._explain(name, str(unavailable)))
-
-    def _explain(self, name: str, reason: str) -> tuple[str, str, list[str]]:
-        """Return title, message and caption in place of figure ``name``, which cannot be drawn."""
-        headline = f"No {name.upper() if name in ACRONYMS else name} to show"
-        if self._data is None:
-            return headline, reason, [f"{self._sweep.scenario.name}, a sweep."]
-        return self._data.title(headline), reason, self._data.caption()
+                reason = str(unavailable)
+                headline = f"No {name.upper() if name in ACRONYMS else name} to show"
+                if self._data is None:
+                    caption = [f"{self._sweep.scenario.name}, a sweep."]
+                    return message_figure(headline, reason, caption)
+                return message_figure(self._data.title(headline), reason, self._data.caption())
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:

@@ -51,17 +51,10 @@ def nees_figure(data: FigureData) -> Picture:
     inside = float(((values >= low) & (values <= high)).mean())
     divisor = f" over {data.runs:,} runs" if data.runs > 1 else ""
     note = f"Band: chi-square with {data.runs * n:,} degrees of freedom{divisor}."
-    finish_figure(
-        figure,
-        data.title(_nees_headline(inside, float(values.mean()), n)),
-        data.caption(note, notes="nees"),
-    )
+    headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES; their mean "
+    headline += f"is {float(values.mean()):.3g} where exact covariances give {n}"
+    finish_figure(figure, data.title(headline), data.caption(note, notes="nees"))
     return figure
-
-
-def _nees_headline(inside: float, mean: float, n: int) -> str:
-    headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES"
-    return f"{headline}; their mean is {mean:.3g} where exact covariances give {n}"
 
 
 def require_innovations(data: FigureData) -> Innovations:

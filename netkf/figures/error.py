@@ -52,37 +52,37 @@ def error_figure(data: FigureData) -> Picture:
         elif data.promised.bound is None:
             sentences = [f"No bound: {data.promised.reason}."]
     else:
-        sentences = _draw_innovations(lower, data)
+        sentences = [
+            "There is no ground truth: readings are compared with their predictions (NIS)."
+        ]
+        try:
+            draw_nis(lower, require_innovations(data))
+        except UnavailableError as error:
+            draw_message(lower, str(error))
+            sentences = ["There is no ground truth."]
     finish_figure(figure, data.title(bound_headline(data)), data.caption(*sentences, notes="bound"))
     return figure
-
-
-def _draw_innovations(axes: Any, data: FigureData) -> list[str]:
-    """Draw NIS, without ground truth, or the reason why there is none; return the caption."""
-    try:
-        innovations = require_innovations(data)
-    except UnavailableError as error:
-        draw_message(axes, str(error))
-        return ["There is no ground truth."]
-    draw_nis(axes, innovations)
-    return ["There is no ground truth: readings are compared with their predictions (NIS)."]
 
 
 def bound_headline(data: FigureData) -> str:
     """Return the headline on traces of P and their bound, or on the range of the errors."""
     rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
+    if rows and data.runs > 1:
+        return _mean_headline(rows)
     if rows:
-        return (_mean_headline if data.runs > 1 else _one_run_headline)(rows)
-    if data.shows_errors:
-        return _error_range_headline(data)
-    return "Without ground truth: the estimates of the nodes and their innovations"
-
-
-def _one_run_headline(rows: list[dict[str, Any]]) -> str:
-    below, count = sum(row["ratio"] <= 1.0 for row in rows), len(rows)
-    if count == 1:
-        return f"In this run the node claims {'no more' if below else 'more'} than the bound"
-    return f"In this run {below} of {count} nodes claim no more than the bound"
+        # The bound is on the mean over runs.
+        below, count = sum(row["ratio"] <= 1.0 for row in rows), len(rows)
+        if count == 1:
+            return f"In this run the node claims {'no more' if below else 'more'} than the bound"
+        return f"In this run {below} of {count} nodes claim no more than the bound"
+    if not data.shows_errors:
+        return "Without ground truth: the estimates of the nodes and their innovations"
+    values = [row["rms_error"] for row in data.node_averages if _is_known(row.get("rms_error"))]
+    if not values:
+        return "The errors of the nodes over time"
+    if len(values) == 1:
+        return f"The RMS error of the node is {values[0]:.3g}"
+    return f"RMS errors of {len(values)} nodes lie between {min(values):.3g} and {max(values):.3g}"
 
 
 def _mean_headline(rows: list[dict[str, Any]]) -> str:
@@ -96,16 +96,6 @@ def _mean_headline(rows: list[dict[str, Any]]) -> str:
     if above:
         return f"{above} of {count} nodes exceed the bound in the mean"
     return f"{below} of {count} nodes stay below the bound in the mean, the others are undecided"
-
-
-def _error_range_headline(data: FigureData) -> str:
-    """Return the headline of a figure without a bound: the range of the nodes' RMS errors."""
-    values = [row["rms_error"] for row in data.node_averages if _is_known(row.get("rms_error"))]
-    if not values:
-        return "The errors of the nodes over time"
-    if len(values) == 1:
-        return f"The RMS error of the node is {values[0]:.3g}"
-    return f"RMS errors of {len(values)} nodes lie between {min(values):.3g} and {max(values):.3g}"
 
 
 def _is_known(value: Any) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from netkf.checks.innovations import Innovations, compute_innovations
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.monte_carlo import Ensemble
+from netkf.ensembles.summary import node_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.run import CompletedRun
 from netkf.runs.summary import (
@@ -268,7 +269,7 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
         sq_error=np.trace(ensemble.mean_error, axis1=2, axis2=3),
         trace=np.trace(ensemble.mean_P, axis1=2, axis2=3),
         nees=ensemble.mean_nees,
-        node_averages=_average_rows(scenario, ensemble, promised),
+        node_averages=node_rows(scenario, ensemble.average, ensemble.se_average, promised)[:-1],
         promised=promised,
         seed=ensemble.seed,
         # Only ensembles that were read from a directory have a status.
@@ -282,22 +283,3 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
         se_nees=ensemble.se_nees,
         messages=dict(ensemble.messages),
     )
-
-
-def _average_rows(
-    scenario: Scenario, ensemble: Ensemble, promised: PromisedTraces
-) -> list[dict[str, Any]]:
-    after_start = ensemble.times > 0.0
-    bound = None if promised.bound is None else promised.bound[after_start].mean(axis=0)
-    rows = []
-    for k, node in enumerate(scenario.nodes):
-        square, trace, nees = ensemble.average[k].tolist()
-        row: dict[str, Any] = {"node": node, "rms_error": float(np.sqrt(square))}
-        row |= {"mean_trace": trace, "mean_nees": nees}
-        row["mean_trace_se"] = float(ensemble.se_average[k, 1])
-        row["mean_nees_se"] = float(ensemble.se_average[k, 2])
-        row["bound"] = None if bound is None else float(bound[k])
-        row["ratio"] = None if bound is None else trace / float(bound[k])
-        row["ratio_se"] = None if bound is None else row["mean_trace_se"] / float(bound[k])
-        rows.append(row)
-    return rows

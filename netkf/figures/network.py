@@ -25,7 +25,10 @@ def network_figure(data: FigureData) -> Picture:
     """Draw the network once for each known quantity of the nodes, which their colours show."""
     positions = get_positions(data.scenario.topology)
     quantities = _colour_quantities(data)
-    aspect = _network_aspect(positions)
+    xy = np.array(list(positions.values()), dtype=np.float64)
+    # Ratio of width to height.
+    spread = np.ptp(xy, axis=0) if len(xy) else (1.0, 1.0)
+    aspect = float(np.clip(spread[0] / spread[1] if spread[1] > 0.0 else 8.0, 1.0, 8.0))
     is_wide = aspect > MAX_ASPECT
     columns = 1 if is_wide else len(quantities)
     rows = len(quantities) // columns
@@ -99,12 +102,6 @@ def _make_headline(data: FigureData) -> str:
         f"Node {worst} has the largest {quantity}, {values[worst]:.3g}, "
         f"and node {best} the smallest, {values[best]:.3g}"
     )
-
-
-def _network_aspect(positions: Positions) -> float:
-    xy = np.array(list(positions.values()), dtype=np.float64)
-    width, height = np.ptp(xy, axis=0) if len(xy) else (1.0, 1.0)
-    return float(np.clip(width / height if height > 0.0 else 8.0, 1.0, 8.0))
 
 
 def draw_network(

@@ -5,6 +5,7 @@ Here a direction is a directed link, from a sender to a receiver.
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -213,7 +214,9 @@ def links_figure(data: FigureData) -> Picture:
     directions = _require_messages(data)
     rows = select_evenly(np.arange(len(directions)), MAX_DIRECTIONS)
     selection = [directions[k] for k in rows.tolist()]
-    end = _readable_end(selection, _last_time(data))  # seconds
+    # As many seconds as have about MAX_MARKS messages.
+    times = np.sort(np.concatenate([np.append(d.delivered, d.lost) for d in selection]))
+    end = float(times[MAX_MARKS]) if len(times) > MAX_MARKS else _last_time(data)
     figure = new_figure(8.4, min(9.0, 2.0 + 0.16 * len(selection)))
     axes = figure.add_subplot()
     for row, direction in enumerate(selection):
@@ -257,12 +260,6 @@ def _require_messages(data: FigureData) -> list[DirectedMessages]:
     return directions
 
 
-def _readable_end(directions: list[DirectedMessages], end: float) -> float:
-    """Return the time (s), at most ``end``, up to which there are about MAX_MARKS messages."""
-    times = np.sort(np.concatenate([np.concatenate([d.delivered, d.lost]) for d in directions]))
-    return float(times[MAX_MARKS]) if len(times) > MAX_MARKS else end
-
-
 def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
     """Return Wilson's interval of a delivery probability, at the level CONFIDENCE."""
     interval = binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
@@ -302,7 +299,14 @@ def _draw_shares(
     width = max(0.4, min(3.0, 150.0 / len(order)))
     axes.vlines(positions, low, high, color=SKY, lw=width, label="95% interval")
     axes.plot(positions, shares[order], ls="", marker=".", color=INK, ms=4, label="delivered")
-    probabilities = np.array([_delivery_probability(data, d) for d in directions])
+    probabilities = np.full(len(directions), np.nan)
+    for k, direction in enumerate(directions):
+        link = direction.sender, direction.receiver
+        table = data.scenario.table_probability(link)
+        # A user's class of losses may have no mean, or raise.
+        with contextlib.suppress(ArithmeticError, LookupError, TypeError, ValueError):
+            loss = data.scenario.network.channel.loss
+            probabilities[k] = float(loss.mean_delivery(link, table))
     misses = None
     if np.isfinite(probabilities).any():
         style = {"ls": "", "marker": "_", "ms": 5, "color": SENSING}
@@ -319,16 +323,6 @@ def _draw_shares(
     axes.set_ylabel("share of messages delivered")
     draw_legend(axes)
     return misses
-
-
-def _delivery_probability(data: FigureData, direction: DirectedMessages) -> float:
-    """Return the mean delivery probability of a direction; nan if the loss model has none."""
-    link = direction.sender, direction.receiver
-    loss = data.scenario.network.channel.loss
-    try:
-        return float(loss.mean_delivery(link, data.scenario.table_probability(link)))
-    except (ArithmeticError, LookupError, TypeError, ValueError):  # in a user's class of losses
-        return float("nan")
 
 
 def _draw_losses(axes: Any, directions: list[DirectedMessages], end: float) -> None:

@@ -60,7 +60,7 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
         axes.axvline(1.0, color=INK, lw=0.8, ls=":", label="tolerated")
         axes.set_yticks(
             range(len(rows)),
-            [_make_label(row) for row in reversed(rows)],
+            [textwrap.shorten(r.promise, MAX_LABEL_LENGTH, placeholder=" ...") for r in rows[::-1]],
             fontsize=7.5,
             parse_math=False,
         )
@@ -70,16 +70,12 @@ def verdict_picture(path: Path, verdict: Verdict, claim: str) -> bool:
         draw_legend(axes)
         note = f"{verdict.scenario}: {verdict.runs:,} runs. Intervals hold together with "
         note += f"probability {verdict.confidence:.6g}."
-        finish_figure(figure, _make_title(rows, claim or verdict.scenario), [note])
+        title, broken = claim or verdict.scenario, sum(row.verdict == BROKEN for row in rows)
+        if broken:
+            title = f"{broken} of {len(rows)} promises with an interval are broken: {title}"
+        finish_figure(figure, title, [note])
     write_figure(figure, path)
     return True
-
-
-def _make_title(rows: list[Evidence], claim: str) -> str:
-    """Return the title: the claim, after the number of broken promises if there are any."""
-    broken = sum(row.verdict == BROKEN for row in rows)
-    count = f"{broken} of {len(rows)} promises with an interval are broken"
-    return f"{count}: {claim}" if broken else claim
 
 
 def _draw_row(axes: Any, height: int, row: Evidence) -> None:
@@ -93,7 +89,3 @@ def _draw_row(axes: Any, height: int, row: Evidence) -> None:
     if np.isfinite(row.detectable):
         detectable = min(row.detectable / unit, FURTHEST)
         axes.plot([detectable], [height], "|", color=INK, ms=9)
-
-
-def _make_label(row: Evidence) -> str:
-    return textwrap.shorten(row.promise, MAX_LABEL_LENGTH, placeholder=" ...")

@@ -334,11 +334,8 @@ def judge_consistency(
         _judge_node(scenario, runs, i, float(shares_inside[i]), quantile)
         for i in range(len(scenario.nodes))
     ]
-    has_covariance, blurred_from = (
-        any(run.covariance_given[0] for run in runs),
-        min(run.blurred_from[0] for run in runs),
-    )
-    notes = () if has_covariance else (NO_COVARIANCE,)
+    blurred_from = min(run.blurred_from[0] for run in runs)
+    notes = () if any(run.covariance_given[0] for run in runs) else (NO_COVARIANCE,)
     if _count_errors(scenario) > MAX_ERRORS:
         reason = (
             f"the expected NEES is left out: the exact covariance of {_count_errors(scenario):,} "
