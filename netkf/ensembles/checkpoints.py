@@ -93,7 +93,9 @@ class BlockCheckpoints:
         bad: list[tuple[str, str]] = []
         for file in self._block_paths():
             try:
-                number = _block_number(file, identity)
+                number = int(file.stem[:12])
+                if file != self._block_path(number) or number >= identity.blocks:
+                    raise DamagedError("has a number that no block has")
                 self._check(file, identity.of(number))
             except DamagedError as error:
                 bad.append((file.name, str(error)))
@@ -247,14 +249,6 @@ def is_block_size(value: object) -> bool:
     """Return True for a power of two, as numbers of runs in a block are."""
     is_integer = isinstance(value, int) and not isinstance(value, bool)
     return is_integer and 0 < value <= MAX_BLOCK and value & (value - 1) == 0  # type: ignore[operator]
-
-
-def _block_number(file: Path, identity: RunIdentity) -> int:
-    """Return the number of the block in a file, by the file's name."""
-    number = int(file.stem[:12])
-    if file.name != f"{number:06d}.npz" or number >= identity.blocks:
-        raise DamagedError("has a number that no block has")
-    return number
 
 
 def _describe(bad: list[tuple[str, str]]) -> list[str]:

@@ -86,10 +86,14 @@ def find_stored_blocks(
     }
     for key, (planned, remedy) in requirements.items():
         if manifest.get(key) != planned:
-            rule = f"{out} holds a run of another {key.removesuffix('s')}"
-            raise ScenarioError(
-                "--resume", rule, _describe_difference(manifest.get(key), planned), remedy
+            rule, stored = (
+                f"{out} holds a run of another {key.removesuffix('s')}",
+                manifest.get(key),
             )
+            if isinstance(stored, dict) and isinstance(planned, dict):
+                names = [k for k in {**stored, **planned} if stored.get(k) != planned.get(k)]
+                stored = {name: stored.get(name) for name in names}
+            raise ScenarioError("--resume", rule, stored, remedy)
     remedy = "remove it: each block is checked by a digest of its own"
     _require(out / "manifest.json", lambda: check_seal(manifest), remedy)
     _check_scenario(out, scenario)
@@ -99,17 +103,6 @@ def find_stored_blocks(
     if is_block_size(manifest.get("block")):
         size = manifest["block"]
     return StoredBlocks(directory=out, block=size, finished=finished)
-
-
-def _describe_difference(stored: Any, planned: Any) -> Any:
-    """Return what an error shows of a stored value that differs: of a table, what differs."""
-    if isinstance(stored, dict) and isinstance(planned, dict):
-        return {
-            key: stored.get(key)
-            for key in {**stored, **planned}
-            if stored.get(key) != planned.get(key)
-        }
-    return stored
 
 
 def clear_unfinished_runs(
@@ -155,12 +148,6 @@ def remove_unfinished(directory: Path, scenario: Scenario, names: Collection[str
     Raises ScenarioError if they are of another scenario, or the only copies of what this one reads.
     """
     _check_scenario(directory, scenario)
-    _check_sources_elsewhere(directory, scenario)
-    remove_files(directory, names)
-
-
-def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
-    """Raise ScenarioError if the scenario reads files of ``directory``, to be removed."""
     files = [source.full for source in source_files(scenario)]
     files += [file for file in find_module_files(scenario).values() if file is not None]
     for file in files:
@@ -168,6 +155,7 @@ def _check_sources_elsewhere(directory: Path, scenario: Scenario) -> None:
             rule = f"{file} is in the directory whose run is done again"
             remedy = "copy the scenario with its files to another folder, and run that"
             raise ScenarioError("--resume", rule, None, remedy)
+    remove_files(directory, names)
 
 
 def _has_own_files(directory: Path, scenario: Scenario) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.runs.stored import SUMMARY_FORM, StoredRun, WithPromises, read_checked_document, read_run
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import ensemble_columns
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 FORM: dict[str, Any] = {**SUMMARY_FORM, "runs": COUNT, "diverged": COUNT}
 FORM["messages"] = {f"{name}?": NUMBER for name in MESSAGES}
@@ -155,7 +152,9 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     runs = table["runs"]
     if runs.dtype.kind != "i" or (runs < 0).any():
         raise DamagedError(f"{path.name} has numbers of runs that are no counts")
-    values = _select_columns(table, ensemble_columns(n)[3:], (T, N))
+    # Without ground truth the columns of errors are nan.
+    columns = table.reindex(columns=ensemble_columns(n)[3:])
+    values = columns.to_numpy(dtype=np.float64).reshape(T, N, -1)
     # The upper triangles of four matrices, then mean and standard error of NEES.
     matrices = np.empty((4, T, N, n, n))
     for matrix, upper in zip(matrices, np.split(values[:, :, :-2], 4, axis=2), strict=True):
@@ -167,10 +166,3 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
         "mean_nees": values[:, :, -2],
         "se_nees": values[:, :, -1],
     }
-
-
-def _select_columns(table: pd.DataFrame, names: list[str], shape: tuple[int, int]) -> FloatArray:
-    """Return the columns ``names`` of a ``table`` with T N rows, sorted by time and node."""
-    return np.asarray(
-        table.reindex(columns=names).to_numpy(dtype=np.float64).reshape(*shape, len(names))
-    )

@@ -72,9 +72,9 @@ def bound_headline(data: FigureData) -> str:
     if rows:
         # The bound is on the mean over runs.
         below, count = sum(row["ratio"] <= 1.0 for row in rows), len(rows)
-        if count == 1:
-            return f"In this run the node claims {'no more' if below else 'more'} than the bound"
-        return f"In this run {below} of {count} nodes claim no more than the bound"
+        claim = "the node claims no more" if below else "the node claims more"
+        claim = f"{below} of {count} nodes claim no more" if count > 1 else claim
+        return f"In this run {claim} than the bound"
     if not data.shows_errors:
         return "Without ground truth: the estimates of the nodes and their innovations"
     values = [row["rms_error"] for row in data.node_averages if _is_known(row.get("rms_error"))]

@@ -135,8 +135,10 @@ def require_form(value: Any, form: Any, key_path: str = "") -> None:
     A form is NUMBER, COUNT, TEXT or TEXTS, a list [form of every item], or a dictionary {key: form
     of its value}. Keys that end in ``?`` are optional, and other keys are allowed.
     """
+    named = {dict: "a table", list: "a list"}.get(type(form), form)
+    if not (_FORMS[form](value) if named is form else isinstance(value, type(form))):
+        raise DamagedError(f"needs {named} at {key_path}" if key_path else f"is not {named}")
     if isinstance(form, dict):
-        _raise_unless(isinstance(value, dict), "a table", key_path)
         for key, inner_form in form.items():
             name = key.removesuffix("?")
             inner_path = f"{key_path}.{name}" if key_path else name
@@ -145,18 +147,9 @@ def require_form(value: Any, form: Any, key_path: str = "") -> None:
             elif name == key:
                 raise DamagedError(f"lacks {inner_path}")
     elif isinstance(form, list):
-        _raise_unless(isinstance(value, list), "a list", key_path)
         # A list in a form has one item, the form of all items.
         for item in value:
             require_form(item, form[0], key_path)
-    else:
-        _raise_unless(_FORMS[form](value), form, key_path)
-
-
-def _raise_unless(has_form: bool, form: str, key_path: str) -> None:
-    """Raise DamagedError, with the form that is needed at ``key_path``, unless ``has_form``."""
-    if not has_form:
-        raise DamagedError(f"needs {form} at {key_path}" if key_path else f"is not {form}")
 
 
 def _is_number(value: Any) -> bool:

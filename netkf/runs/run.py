@@ -101,7 +101,11 @@ def run_to_directory(
     recorder = Recorder(output.sinks)
     is_complete = False
     try:
-        status, seconds = _simulate(chosen_engine, scenario, replica, recorder, progress)
+        start, compiled_before = time.perf_counter(), compiling.seconds_spent()
+        streams = Streams(scenario.seed, replica)
+        status = chosen_engine.run(scenario, streams, recorder, progress)
+        compile_seconds = compiling.seconds_spent() - compiled_before
+        seconds = time.perf_counter() - start - compile_seconds
         is_complete = status == "complete"
         output.close_tables()
         promised = promise_traces(scenario, np.array(output.samples.times))
@@ -124,7 +128,7 @@ def run_to_directory(
         if explained is error:
             raise
         raise explained from error
-    totals = _event_totals(recorder)
+    totals = _event_totals(recorder.total, recorder.fingerprint, recorder.stats)
     output.manifest.write(status, totals, is_complete, names=run_file_names(scenario))
     return completed
 
@@ -151,8 +155,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
         sink.states(run.times, run.x, run.xhat, run.P, run.error)
     output.close_tables()
     output.write_summary(promise_traces(scenario, run.times), run.count, run.sums, run.status)
-    totals: dict[str, Any] = {"events": len(run.log), "fingerprint": run.fingerprint}
-    totals |= {"simpy": run.stats} if run.stats else {}
+    totals = _event_totals(len(run.log), run.fingerprint, run.stats)
     is_complete = run.status == "complete"
     output.manifest.write(run.status, totals, is_complete, names=run_file_names(scenario))
     return output.directory
@@ -242,16 +245,6 @@ def _create_output(
     )
 
 
-def _simulate(
-    engine: Engine, scenario: Scenario, replica: int, recorder: Recorder, progress: Progress
-) -> tuple[str, float]:
-    """Simulate run number ``replica`` of the scenario's seed."""
-    start, compiled_before = time.perf_counter(), compiling.seconds_spent()
-    status = engine.run(scenario, Streams(scenario.seed, replica), recorder, progress)
-    compile_seconds = compiling.seconds_spent() - compiled_before
-    return status, time.perf_counter() - start - compile_seconds
-
-
 def _keep_partial_results(
     output: _Output, recorder: Recorder, is_complete: bool, error: BaseException
 ) -> None:
@@ -269,13 +262,18 @@ def _keep_partial_results(
         )
         with contextlib.suppress(OSError):
             output.write_summary(unknown, recorder.count, recorder.sums, status)
-    output.manifest.write(status, _event_totals(recorder), is_complete, error)
+    output.manifest.write(
+        status,
+        _event_totals(recorder.total, recorder.fingerprint, recorder.stats),
+        is_complete,
+        error,
+    )
 
 
-def _event_totals(recorder: Recorder) -> dict[str, Any]:
-    """Return the entries of the manifest about events: number, fingerprint, counts of SimPy."""
-    totals: dict[str, Any] = {"events": recorder.total, "fingerprint": recorder.fingerprint}
-    return totals | ({"simpy": recorder.stats} if recorder.stats else {})
+def _event_totals(events: int, fingerprint: str, stats: dict[str, int]) -> dict[str, Any]:
+    """Return the entries of the manifest about events; ``stats`` are counts of SimPy, if any."""
+    totals: dict[str, Any] = {"events": events, "fingerprint": fingerprint}
+    return totals | ({"simpy": stats} if stats else {})
 
 
 @dataclass(frozen=True, eq=False)

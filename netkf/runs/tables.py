@@ -101,16 +101,16 @@ def columns_of(summary: dict[str, Any]) -> dict[str, str]:
 def _node_table(summary: dict[str, Any]) -> Iterator[str]:
     columns = columns_of(summary)
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
-    names = [str(row["node"]) for row in nodes]
-    rows = [_row_cells(*row, columns) for row in zip(names, nodes, strict=True)]
-    omitted = max(len(nodes) - MAX_NODES, 0)
-    half = MAX_NODES // 2
+    omitted, half = max(len(nodes) - MAX_NODES, 0), MAX_NODES // 2
     if omitted:
         known = any(row["rms_error"] is not None for row in nodes)
         ranking = "rms_error" if known else "mean_trace"
-        order = sorted(range(len(nodes)), key=lambda k: -_sort_key(nodes[k][ranking]))
-        gap = [f"({omitted} more)", *[""] * len(columns)]
-        rows = [*(rows[k] for k in order[:half]), gap, *(rows[k] for k in order[-half:])]
+        # A node whose value is unknown is listed among the worst.
+        values = {row["node"]: row[ranking] for row in nodes}
+        worst = {node for node, v in values.items() if v is None or not math.isfinite(v)}
+        nodes.sort(key=lambda row: -math.inf if row["node"] in worst else -values[row["node"]])
+    rows = [_row_cells(str(row["node"]), row, columns) for row in nodes]
+    rows = shorten_rows(rows, MAX_NODES)
     rows.append(_row_cells("all", summary["overall"], columns))
     yield format_table(["node", *columns.values()], rows)
     if omitted:
@@ -119,11 +119,6 @@ def _node_table(summary: dict[str, Any]) -> Iterator[str]:
             f"{COLUMNS[ranking]}; all are in summary.json"
         )
     yield ""
-
-
-def _sort_key(value: float | None) -> float:
-    """Return the value; inf if it is unknown, so that such a node is listed among the worst."""
-    return math.inf if value is None or not math.isfinite(value) else value
 
 
 def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[str]:
