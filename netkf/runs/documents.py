@@ -135,7 +135,7 @@ def require_form(value: Any, form: Any, key_path: str = "") -> None:
     A form is NUMBER, COUNT, TEXT or TEXTS, a list [form of every item], or a dictionary {key: form
     of its value}. Keys that end in ``?`` are optional, and other keys are allowed.
     """
-    named = {dict: "a table", list: "a list"}.get(type(form), form)
+    named = "a table" if isinstance(form, dict) else "a list" if isinstance(form, list) else form
     if not (_FORMS[form](value) if named is form else isinstance(value, type(form))):
         raise DamagedError(f"needs {named} at {key_path}" if key_path else f"is not {named}")
     if isinstance(form, dict):

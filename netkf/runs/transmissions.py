@@ -51,23 +51,17 @@ class Transmissions:
         if not len(sends):
             return
         t, phase = sends["t"], sends["phase"]
-        step_starts = np.flatnonzero((t[1:] != t[:-1]) | (phase[1:] != phase[:-1])) + 1
-        bounds = [0, *step_starts.tolist(), len(sends)]
-        if (float(t[0]), int(phase[0])) != self._step:
-            self._senders = set()
-        first_senders = set(sends["node"][: bounds[1]].tolist())
-        self._slot_transmissions.update(first_senders - self._senders)
-        # Pairs (step, sender), each once, as the number step * (number of senders) + sender index.
-        is_start = np.zeros(len(sends), dtype=np.int64)
-        is_start[step_starts] = 1
-        nodes, index = np.unique(sends["node"], return_inverse=True)
-        pairs = np.unique(np.cumsum(is_start) * len(nodes) + index)
-        later_pairs = pairs[pairs >= len(nodes)]  # step 0 has been counted above
-        _add_counts(self._slot_transmissions, nodes[later_pairs % len(nodes)])
-        if len(step_starts):
-            self._senders = set(sends["node"][bounds[-2] :].tolist())
-        else:
-            self._senders = self._senders | first_senders
+        step = np.cumsum(np.append(False, (t[1:] != t[:-1]) | (phase[1:] != phase[:-1])))
+        # Each pair of step and sender once.
+        order = np.lexsort((sends["node"], step))
+        step, node = step[order], sends["node"][order]
+        is_new = np.append(True, (step[1:] != step[:-1]) | (node[1:] != node[:-1]))
+        step, node = step[is_new], node[is_new]
+        # The first step may have begun in the block before.
+        seen = self._senders if (float(t[0]), int(phase[0])) == self._step else set()
+        repeated = [sender in seen for sender in node[step == 0].tolist()]
+        _add_counts(self._slot_transmissions, np.delete(node, np.flatnonzero(repeated)))
+        self._senders = {*node[step == step[-1]].tolist(), *(seen if not step[-1] else ())}
         self._step = float(t[-1]), int(phase[-1])
 
     def count_for(self, node: int) -> int:
