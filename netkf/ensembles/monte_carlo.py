@@ -15,7 +15,7 @@ from netkf.core.notebook import NotebookTable
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate_blocks
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, from_upper
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import plot_by_name
@@ -188,12 +188,9 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
 
 def _unpack_samples(values: FloatArray, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return means of P and of e e' (T, N, n, n) and of NEES (T, N) from ``values``."""
-    i, j = np.triu_indices(n)
-    matrices = np.empty((2, *values.shape[:2], n, n))
-    for matrix, upper in zip(matrices, np.split(values[..., :-1], 2, axis=-1), strict=True):
-        matrix[..., i, j] = upper
-        matrix[..., j, i] = upper
-    return matrices[0], matrices[1], values[..., -1]
+    P, error = np.split(values[..., :-1], 2, axis=-1)
+    # Copied: of errors some are set to nan later.
+    return from_upper(P, n), from_upper(error, n), values[..., -1].copy()
 
 
 def ensemble_table(ensemble: Ensemble) -> dict[str, np.ndarray]:

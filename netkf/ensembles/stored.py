@@ -14,7 +14,7 @@ from netkf.core.printable import shorten
 from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of
 from netkf.ensembles.statistics import MESSAGES, merge
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, from_upper
 from netkf.network.graphs import name_rows
 from netkf.runs.documents import COUNT, NUMBER, DamagedError, check_files
 from netkf.runs.files import scenario_digest
@@ -134,11 +134,10 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
 
 def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     n, N = scenario.plant.n, len(scenario.nodes)
-    i, j = np.triu_indices(n)
     names = ensemble_columns(n)
     if not scenario.plant.truth_known:
         # Time, node, runs, and means and standard errors of P only: no errors, no NEES.
-        names = names[: 3 + 2 * len(i)]
+        names = names[: 3 + n * (n + 1)]
     if column_names(path) != names:
         raise DamagedError(f"{path.name} does not have the columns of this scenario")
     table = read_numbers(path, names, allow_empty=True)
@@ -156,9 +155,7 @@ def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
     columns = table.reindex(columns=ensemble_columns(n)[3:])
     values = columns.to_numpy(dtype=np.float64).reshape(T, N, -1)
     # The upper triangles of four matrices, then mean and standard error of NEES.
-    matrices = np.empty((4, T, N, n, n))
-    for matrix, upper in zip(matrices, np.split(values[:, :, :-2], 4, axis=2), strict=True):
-        matrix[:, :, i, j] = matrix[:, :, j, i] = upper
+    matrices = [from_upper(upper, n) for upper in np.split(values[:, :, :-2], 4, axis=2)]
     return {
         "times": scenario.times,
         "runs": runs.to_numpy(dtype=np.int64)[::N],

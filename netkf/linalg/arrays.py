@@ -107,3 +107,13 @@ def as_kernel_array(matrix: FloatArray) -> FloatArray:
     if matrix.flags.c_contiguous and matrix.flags.writeable:
         return matrix
     return np.array(matrix, order="C")
+
+
+def from_upper(values: FloatArray, n: int) -> FloatArray:
+    """Return symmetric matrices (..., n, n) from their upper triangles ``values`` (..., u), row by
+    row.
+    """
+    i, j = np.triu_indices(n)
+    matrices = np.empty((*values.shape[:-1], n, n))
+    matrices[..., i, j] = matrices[..., j, i] = values
+    return matrices

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, from_upper
 from netkf.network.graphs import name_rows
 from netkf.runs.documents import (
     COUNT,
@@ -156,6 +156,9 @@ def read_run(
     states, arrays = _read_states(directory / "states.parquet", scenario, replica)
     log = _read_events(directory / "events.parquet", scenario, replica)
     conserved = summary.get("conserved", {}) if is_single_run else {}
+    require_form(conserved, {}, "conserved")
+    for name, entry in conserved.items():
+        require_form(entry, {"exact": NUMBER, "total": NUMBER}, f"conserved.{name}")
     # The fingerprint of an ensemble is that of its first run.
     has_fingerprint = is_single_run or replica == 0
     ended = "diverged" if (log["kind"] == CODES["diverged"]).any() else "complete"
@@ -168,7 +171,7 @@ def read_run(
         engine=str(manifest.get("engine", "")),
         status=str(manifest["status"]) if is_single_run else ended,
         fingerprint=str(manifest.get("fingerprint", "")) if has_fingerprint else "",
-        sums=_read_sums(conserved),
+        sums={name: (entry["exact"], entry["total"]) for name, entry in conserved.items()},
         truth_known=scenario.plant.truth_known,
         stats=dict(manifest.get("simpy", {})) if is_single_run else {},
         scenario=scenario,
@@ -177,15 +180,6 @@ def read_run(
         summary=summary,
         stored=states,
     )
-
-
-def _read_sums(conserved: Any) -> dict[str, tuple[float, float]]:
-    """Return (exact value, last total) of each conserved sum by name, from summary.json."""
-    form = {"exact": NUMBER, "total": NUMBER}
-    require_form(conserved, {}, "conserved")
-    for name, entry in conserved.items():
-        require_form(entry, form, f"conserved.{name}")
-    return {name: (entry["exact"], entry["total"]) for name, entry in conserved.items()}
 
 
 def _read_states(
@@ -216,9 +210,7 @@ def _read_states(
     # After run, t and node: x, xhat and the upper triangle of P, row by row.
     values = table[names[3:]].to_numpy(dtype=np.float64).reshape(T, N, len(names) - 3)
     x, xhat = values[:, 0, :n], values[:, :, n : 2 * n]
-    i, j = np.triu_indices(n)
-    P = np.empty((T, N, n, n))
-    P[:, :, i, j] = P[:, :, j, i] = values[:, :, 2 * n : 2 * n + len(i)]
+    P = from_upper(values[:, :, 2 * n : 2 * n + n * (n + 1) // 2], n)
     return table, {"times": times, "x": x, "xhat": xhat, "P": P, "error": x[:, None] - xhat}
 
 
