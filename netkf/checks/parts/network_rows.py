@@ -53,18 +53,15 @@ which nothing else is simulated.
 
 class Clocks(NamedTuple):
     """The clocks of the network, or of sensors: which these are in a scenario, the field of
-    PartSamples with their counts, how they are drawn, and the statements about them.
+    PartSamples with their counts, how they are drawn, the group of their rows, and words of these.
     """
 
     group: Callable[[Scenario], ClockGroup]
     field: str
     draw: Draw
     about: str
-    rates: str
-    exponential: str
-    apart: str
-    lattice: str
-    law: str
+    act: str
+    noun: str
 
 
 NETWORK = Clocks(
@@ -72,22 +69,16 @@ NETWORK = Clocks(
     "ticks",
     events.count_drawn_ticks,
     evidence.CLOCKS,
-    rates="clocks tick at the rates of the scenario",
-    exponential="gaps between ticks are exponential, and independent of those before",
-    apart="clocks tick independently of each other",
-    lattice="clocks tick at the times of the scenario",
-    law="ticks follow the law of their clocks, and do not depend on those before",
+    "clocks tick",
+    "ticks",
 )
 SENSORS = Clocks(
     events.sampling_clocks,
     "sampling",
     events.count_drawn_samples,
     evidence.SAMPLING,
-    rates="sensors sample at the rates of the scenario",
-    exponential="gaps between samples are exponential, and independent of those before",
-    apart="sensors sample independently of each other",
-    lattice="sensors sample at the times of the scenario",
-    law="samples follow the law of their clocks, and do not depend on those before",
+    "sensors sample",
+    "samples",
 )
 CONTACT_SENTENCE = "links tick in their contacts only"
 
@@ -172,23 +163,28 @@ def _clocks_apart(clocks: Clocks, samples: PartSamples, level: float) -> Finding
 
 def _clock_promises(clocks: Clocks, samples: PartSamples) -> list[Promise]:
     counts, group = getattr(samples, clocks.field), clocks.group(samples.scenario)
-    # Rows (statement, test, whether it is exact, that is uses none of the level).
-    rows: list[tuple[str, Callable[..., Finding], bool]] = []
+    act, noun, rows = clocks.act, clocks.noun, []
+
+    def add(text: str, test: Callable[..., Finding], exact: bool = False) -> None:
+        rows.append(_row(text, clocks.about, partial(test, clocks), exact=exact))
+
     if counts is None:
         return []
     if clocks is NETWORK and isinstance(samples.scenario.network.activation, Contacts):
-        rows.append((CONTACT_SENTENCE, _check_lattice, True))
-    if np.isfinite(group.rates).all():
-        if group.on_lattice:
-            rows.append((clocks.lattice, _check_lattice, True))
-        rows.append((clocks.rates, _check_rates, False))
-        if group.poisson:
-            rows += [(clocks.exponential, _check_gaps, False), (clocks.apart, _clocks_apart, False)]
-        elif counts.cells.any():
-            rows.append((clocks.law, _check_gaps, False))
-    return [
-        _row(text, clocks.about, partial(test, clocks), exact=exact) for text, test, exact in rows
-    ]
+        add(CONTACT_SENTENCE, _check_lattice, exact=True)
+    if not np.isfinite(group.rates).all():
+        return rows
+    if group.on_lattice:
+        add(f"{act} at the times of the scenario", _check_lattice, exact=True)
+    add(f"{act} at the rates of the scenario", _check_rates)
+    if group.poisson:
+        exponential = f"gaps between {noun} are exponential, and independent of those before"
+        add(exponential, _check_gaps)
+        add(f"{act} independently of each other", _clocks_apart)
+    elif counts.cells.any():
+        law = f"{noun} follow the law of their clocks, and do not depend on those before"
+        add(law, _check_gaps)
+    return rows
 
 
 def _of_losses(compare: Callable[..., Comparison], tolerance: float) -> Test:
