@@ -17,11 +17,12 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
+from weakref import WeakSet
 
 from netkf.core.errors import quote
 
@@ -89,10 +90,8 @@ def describe_method(cls: type, function: FunctionType) -> str:
 
 def hold_to_contract(cls: type) -> None:
     """Wrap the methods of a user's class that override a method of netkf, so that their results are
-    looked at; raise ContractError if one takes other arguments, or if a member of the class can
-    never be used and looks like one of the contract.
+    looked at; raise ContractError if one takes other arguments, or is no method where one is due.
     """
-    _require_known_members(cls)
     for name, own in list(vars(cls).items()):
         if name.startswith("_"):
             continue
@@ -159,33 +158,35 @@ def hold_to_flags(part: Any, called_if: Mapping[str, str]) -> None:
 
 SIMILAR = 0.8
 """Similarity of two names, by difflib, from which on one is taken for the other misspelled."""
+_SOUND: WeakSet[type] = WeakSet()
 
 
-def _require_known_members(cls: type) -> None:
-    """Raise ContractError for a member that no code of the class uses and whose name is similar to
-    one of the contract that the class does not define, or to a field of one of its values.
+def require_known_members(cls: type) -> None:
+    """Raise ContractError for a member of a user's class that nothing in the class uses and whose
+    name is similar to one of the contract that it does not define, or to a field of a value of it.
     """
-    parents = cls.__mro__[1:]
-    known = set().union(*map(_own_names, parents))
-    new = _own_names(cls) - known - _used_names(cls)
-    defined = _own_names(cls).union(*(_own_names(p) for p in parents if not is_netkf_class(p)))
-    contracts = [parent for parent in parents if is_netkf_class(parent)]
+    if cls in _SOUND:
+        return
+    own = [one for one in cls.__mro__ if not is_netkf_class(one) and one is not object]
+    contracts = [one for one in cls.__mro__ if is_netkf_class(one)]
+    defined, known = (set().union(*map(_own_names, classes)) for classes in (own, contracts))
     advice: dict[str, str] = {}
     for name, kind, fields in (stated for contract in contracts for stated in _values_of(contract)):
         advice.update((f, f"state it in {name}, as {kind}({f}=...)") for f in fields)
         advice[kind.lower()] = f"state it in {name}, as {kind}(...)"
-    for name in set().union(*map(_own_names, contracts)) - defined:
-        advice[name] = f"did you mean {name}?"
-    for name in sorted(new):
-        own = vars(cls).get(name)
+    advice.update((name, f"did you mean {name}?") for name in known - defined)
+    for name in sorted(defined - known - _used_names(own)):
+        owner = next(one for one in own if name in _own_names(one))
+        member = vars(owner).get(name)
         similar = difflib.get_close_matches(name, sorted(advice), 1, SIMILAR)
-        if not similar or isinstance(own, type):
+        if not similar or isinstance(member, type):
             continue
-        where, verb = f"{cls.__name__}.{name}", "read"
-        if isinstance(own, FunctionType):
-            where, verb = describe_method(cls, own), "called"
+        where, verb = f"{owner.__name__}.{name}", "read"
+        if isinstance(member, FunctionType):
+            where, verb = describe_method(owner, member), "called"
         rule = f"is never {verb}: {advice[similar[0]]}"
         raise ContractError(f"{where} {rule}; give a member of your own another name")
+    _SOUND.add(cls)
 
 
 def _values_of(contract: type) -> Iterator[tuple[str, str, tuple[str, ...]]]:
@@ -207,36 +208,62 @@ def _values_of(contract: type) -> Iterator[tuple[str, str, tuple[str, ...]]]:
                 yield name, kind.__name__, fields
 
 
-def _used_names(cls: type) -> set[str]:
-    """Return the names that a class's own functions read from their first argument, and those of
-    members that other members hold.
+def _used_names(classes: Sequence[type]) -> set[str]:
+    """Return the names that the functions of classes, and functions of their modules that these
+    call, read from their arguments, and those of members that other members hold.
     """
-    members, used = dict(vars(cls)), set()
-    for owner, member in members.items():
-        parts = getattr(member, "__match_args__", ())
-        used |= {part for part in parts if getattr(member, part, None) is members.get(part, dis)}
-        functions = [getattr(member, part, None) for part in (*parts, "fget", "func", "__func__")]
-        functions = [inspect.unwrap(f) for f in (member, *functions) if callable(f)]
-        used |= {n for n, f in members.items() if n != owner and callable(f) and f in functions}
-        for code in (getattr(function, "__code__", None) for function in functions):
-            if isinstance(code, CodeType) and code.co_varnames:
-                used |= _names_read(code, {code.co_varnames[0], cls.__name__})
+    used: set[str] = set()
+    todo: list[tuple[Any, int, str]] = []  # functions, how many arguments count, and a name
+    for cls in classes:
+        members = dict(vars(cls))
+        for owner, member in members.items():
+            parts = getattr(member, "__match_args__", ())
+            used |= {
+                part for part in parts if getattr(member, part, None) is members.get(part, dis)
+            }
+            held = [getattr(member, part, None) for part in (*parts, "fget", "func", "__func__")]
+            functions = [inspect.unwrap(f) for f in (member, *held) if callable(f)]
+            used |= {n for n, f in members.items() if n != owner and callable(f) and f in functions}
+            # Not those that a dataclass makes, which read all fields.
+            if owner == "__post_init__" or not owner.startswith("__"):
+                todo += [(function, 1, cls.__name__) for function in functions]
+    seen: set[CodeType] = set()
+    while todo:
+        function, count, name = todo.pop()
+        code = getattr(function, "__code__", None)
+        if not isinstance(code, CodeType) or code in seen:
+            continue
+        seen.add(code)
+        names, called = _names_read(code, {name, *code.co_varnames[:count]})
+        used |= names
+        for helper in (function.__globals__.get(one) for one in called):
+            if isinstance(helper, FunctionType) and helper.__module__ == function.__module__:
+                todo.append((helper, helper.__code__.co_argcount, name))
     return used
 
 
-def _names_read(code: CodeType, objects: set[str]) -> set[str]:
-    """Return the names of attributes that ``code`` and functions in it read from variables."""
-    names, last = set(), None
+def _names_read(code: CodeType, objects: set[str]) -> tuple[set[str], set[str]]:
+    """Return the names of attributes that ``code`` and functions in it may read from ``objects``,
+    and all names that it asks for.
+    """
+    read, asked, last = set(), set(code.co_names), None
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
-            source = last[-1:] if isinstance(last, tuple) else (last,)
-            names |= {str(instruction.argval)} if objects.intersection(source) else set()
+            source: Any = last.argval if last is not None else None
+            source = source[-1] if isinstance(source, tuple) else source
+            # Of a variable it must be one of these; of any other value it may be.
+            kind = last.opname if last is not None else ""
+            if source in objects or not any(word in kind for word in ("FAST", "GLOBAL", "NAME")):
+                read.add(str(instruction.argval))
         if instruction.opname != "EXTENDED_ARG":
-            last = instruction.argval
+            last = instruction
     for constant in code.co_consts:
+        if isinstance(constant, str):
+            read.add(constant)  # as in getattr(self, "name")
         if isinstance(constant, CodeType):
-            names |= _names_read(constant, objects)
-    return names
+            inner, more = _names_read(constant, objects)
+            read, asked = read | inner, asked | more
+    return read, asked
 
 
 def _require_arguments(cls: type, own: FunctionType, contract: FunctionType) -> None:

@@ -19,7 +19,12 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from netkf.core.contracts import hold_to_contract, hold_to_flags, is_netkf_class
+from netkf.core.contracts import (
+    hold_to_contract,
+    hold_to_flags,
+    is_netkf_class,
+    require_known_members,
+)
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.instants import as_written
 from netkf.core.printable import MAX_NAME
@@ -98,6 +103,8 @@ class Component:
         """Return a new object; raises ScenarioError for settings without a name that must have one,
         and for names that are none.
         """
+        if not is_netkf_class(cls):
+            require_known_members(cls)
         # Not of classes with an __init__ of their own, which that of a dataclass is not: it has no
         # file.
         code = getattr(cls.__init__, "__code__", None)

@@ -9,6 +9,7 @@ from typing import Any
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.registry import built_in_filters, default_timing, split_choice
 from netkf.core.clock import Clock
+from netkf.core.contracts import ContractError, is_netkf_class, require_known_members
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
 from netkf.network import channels, clocks, contacts, graph_files, graphs, matchings, recorded
@@ -230,10 +231,14 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
     # A filter has kernels, or says in Python what it does with messages.
     if family == "filter" and getattr(cls, "kernels", None) is None:
         missing += ["absorb"] * (vars(base)["absorb"] is getattr(cls, "absorb", None))
-    if missing:
-        raise ScenarioError(
-            "kind", f"must define {', '.join(missing)}", kind, "write what the contract asks for"
-        )
+    rule = f"must define {', '.join(missing)}" if missing else ""
+    try:
+        if not is_netkf_class(cls):
+            require_known_members(cls)
+    except ContractError as error:  # a misspelled method is why one is missing
+        rule = str(error)
+    if rule:
+        raise ScenarioError("kind", rule, kind, "write what the contract asks for")
     found: type[Component] = cls
     return found
 

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from netkf.core.contracts import is_netkf_class, place_of_error
+from netkf.core.contracts import ContractError, is_netkf_class, place_of_error
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
@@ -230,7 +230,9 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
         place = place_of_error(error)
         where = f"; {place}" if place else ""
         rule = f"{cls.__name__} could not be made ({describe_error(error)}{where})"
-        if is_netkf_class(cls):
+        if isinstance(error, ContractError):
+            rule = str(error)
+        elif is_netkf_class(cls):
             rule = explain_user_error(tuple(values.values()), error) or ""
         if not rule:
             raise

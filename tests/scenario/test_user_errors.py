@@ -313,6 +313,14 @@ HEALTHY = {
     "a property as a value, a value as a property": (
         "Loss", "independent = False\ndef delivery_probability(self, *arguments): return 1.0\n"
         "@property\ndef stateful(self): return self.independent"),
+    "a helper of the module, and getattr": (
+        "Filter", "max_age: float = setting(positive, default=3.0)\nsteps = 2\n"
+        "timing = property(lambda self: timing_of(self))\n"
+        f"_first = property(lambda self: getattr(self, 'steps'))\n{SAME}"),
+    "the class, and a value inside another": (
+        "Hybrid", "steps = 2\nredraws = True\n"
+        "def absorb(self, state, messages, exchange): return type(self).steps\n"
+        "_first = property(lambda self: self.__class__.redraws)"),
     "a setting instead of a property": (
         "Delay", "fixed: float = setting(positive, default=1.0)\ndef draw(self, random): return self.fixed"),
 }  # fmt: skip
@@ -322,7 +330,35 @@ HEALTHY = {
 def test_members_of_their_own_are_no_mistakes(name):
     base, body = HEALTHY[name]
     source = f"{HEAD}@dataclass(frozen=True, eq=False)\nclass F({base}):\n"
-    exec(source + textwrap.indent(body, "    "), {"__name__": __name__})  # raises no ContractError
+    source += (
+        textwrap.indent(body, "    ") + "\ndef timing_of(part): return Timing(max_age=part.max_age)"
+    )
+    names = {"__name__": __name__}
+    exec(source, names)
+    settings = {"Hybrid": {"epsilon": 0.3}, "Poisson": {"rate": 1.0}}.get(base, {})
+    assert names["F"](**settings)  # raises no ContractError
+
+
+def test_members_that_derived_classes_and_mixed_in_ones_use_are_no_mistakes():
+    class Mixed:
+        def absorb(self, state, messages, exchange):
+            return self.steps
+
+    @dataclass(frozen=True, eq=False)
+    class Base(Mixed, parts.Filter):
+        steps = 2
+        redraws = True
+
+    class Derived(Base):
+        @property
+        def timing(self):
+            return parts.Timing(redraws=lambda phase, step: self.redraws)
+
+    assert Derived().timing.redraws(0, 0)
+    with pytest.raises(
+        TypeError, match=r"Base.redraws is never read: state it in timing, as Timing"
+    ):
+        Base()
 
 
 def test_overrides_that_no_engine_calls_are_told_and_settings_may_decide():
