@@ -103,9 +103,7 @@ def hold_to_contract(cls: type) -> None:
 
 
 def _member_of_netkf(cls: type, name: str) -> Any:
-    """Return the member ``name`` of the first of netkf's classes from which ``cls`` derives, a
-    dataclass field of it if it is one; None if there is none.
-    """
+    """Return the nearest of netkf's members ``name``, a dataclass field if it is one, or None."""
     for parent in cls.__mro__[1:]:
         if is_netkf_class(parent) and name in _own_names(parent):
             fields = vars(parent).get("__dataclass_fields__", {})
@@ -119,9 +117,7 @@ def _own_names(cls: type) -> set[str]:
 
 
 def _require_same_kind(cls: type, name: str, own: Any, contract: Any) -> None:
-    """Raise ContractError if ``own`` is a method where the contract has a value, or a value where
-    it has a method: neither would ever be called.
-    """
+    """Refuse a method where the contract has a value, and a value where it has a method."""
     if isinstance(own, FunctionType):
         where = describe_method(cls, own)
         if isinstance(contract, dataclasses.Field) and "ClassVar" not in str(contract.type):
@@ -190,9 +186,7 @@ def require_known_members(cls: type) -> None:
 
 
 def _values_of(contract: type) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Yield the name of each value with fields that a class of netkf states, the name of the
-    value's class, and those of its fields.
-    """
+    """Yield each value that a class of netkf states, its class, and the names of its fields."""
     stated = {
         name: str(member.fget.__annotations__.get("return", ""))
         for name, member in vars(contract).items()
@@ -209,9 +203,7 @@ def _values_of(contract: type) -> Iterator[tuple[str, str, tuple[str, ...]]]:
 
 
 def _used_names(classes: Sequence[type]) -> set[str]:
-    """Return the names that the functions of classes, and functions of their modules that these
-    call, read from their arguments, and those of members that other members hold.
-    """
+    """Return the names of members that functions may read, or that other members hold."""
     used: set[str] = set()
     todo: list[tuple[Any, int, str]] = []  # functions, how many arguments count, and a name
     for cls in classes:
@@ -243,9 +235,7 @@ def _used_names(classes: Sequence[type]) -> set[str]:
 
 
 def _names_read(code: CodeType, objects: set[str]) -> tuple[set[str], set[str]]:
-    """Return the names of attributes that ``code`` and functions in it may read from ``objects``,
-    and all names that it asks for.
-    """
+    """Return the names that code may read from ``objects``, and all that it asks for."""
     read, asked, last = set(), set(code.co_names), None
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):

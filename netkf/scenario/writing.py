@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import Filter
 from netkf.algorithms.registry import split_choice
 from netkf.core.fields import Component, SourceFile
 from netkf.network.channels import Channel
@@ -83,10 +82,10 @@ def _scenario_table(
     grid = scenario.time_grid.as_table() if style.with_defaults else {}
     if time := {**_field_values(scenario.time, style), **grid}:
         table["time"] = time
-    table["plant"] = _kind_table("plant", plant, style)
-    table["sensors"] = [_sensor_table(sensor, style) for sensor in scenario.sensors]
-    table["network"] = _network_table(network, style)
-    table["filter"] = _filter_table(filtering, style)
+    table["plant"] = _part_table(plant, style)
+    table["sensors"] = [_part_table(sensor, style) for sensor in scenario.sensors]
+    table["network"] = _part_table(network, style)
+    table["filter"] = _part_table(filtering, style)
     return {"format": 1, **table}
 
 
@@ -96,63 +95,27 @@ def part_as_table(part: Component) -> dict[str, Any]:
     ``part`` is a plant, sensor, filter or network, a component inside one of these, a Filtering or
     a Belief.
     """
-    if isinstance(part, Network):
-        return _network_table(part, _Style())
-    if isinstance(part, Channel):
-        return _channel_table(part, _Style())
+    return _part_table(part, _Style())
+
+
+def _part_table(part: Component, style: _Style) -> dict[str, Any]:
+    values = _field_values(part, style)
     if isinstance(part, Filtering):
-        return _filter_table(part, _Style())
-    if isinstance(part, Sensor):
-        return _sensor_table(part, _Style())
-    families = (family for family, base in FAMILIES.items() if isinstance(part, base))
-    family = next(families, None)
-    if family == "sampling" and isinstance(part, FAMILIES["activation"]):
-        family = "activation"  # every clock of links is of both families
+        rest = {key: values[key] for key in ("mean", "cov", "model") if values.get(key)}
+        return {**_part_table(part.algorithm, style), **rest}
+    family = next((family for family, base in FAMILIES.items() if isinstance(part, base)), None)
     if family is None:
-        return _field_values(part, _Style())
-    return _kind_table(family, part, _Style())
-
-
-def _network_table(network: Network, style: _Style) -> dict[str, Any]:
-    table = {"graph": _kind_table("graph", network.graph, style)}
-    if network.activation is not None:
-        table["activation"] = _kind_table("activation", network.activation, style)
-    return {**table, "channel": _channel_table(network.channel, style)}
-
-
-def _channel_table(channel: Channel, style: _Style) -> dict[str, Any]:
-    table = _field_values(channel, style._replace(with_defaults=True))
-    table["loss"] = _kind_table("loss", channel.loss, style)
-    table["delay"] = _kind_table("delay", channel.delay, style)
-    return table
-
-
-def _sensor_table(sensor: Sensor, style: _Style) -> dict[str, Any]:
-    table = _kind_table("sensor", sensor, style)
-    clock = getattr(sensor, "sampling", None)
-    if clock is not None:
-        clock_table = _kind_table("sampling", clock, style)
-        # Fields of clocks of links, which a sampling clock must not have.
-        table["sampling"] = {k: v for k, v in clock_table.items() if k not in ("at", "rates")}
-    return table
-
-
-def _filter_table(filtering: Filtering, style: _Style) -> dict[str, Any]:
-    table = _kind_table("filter", filtering.algorithm, style)
-    for name, value in _field_values(filtering, style).items():
-        if name in ("mean", "cov"):
-            table[name] = value
-    model = _field_values(filtering.model, style)
-    return {**table, "model": model} if model else table
-
-
-def _kind_table(family: str, part: Component, style: _Style) -> dict[str, Any]:
-    kind, choice = split_choice(name_of(family, part))
-    return {"kind": kind, **choice, **_field_values(part, style)}
+        return values
+    # Every clock of links is of two families.
+    name = name_of("activation" if isinstance(part, LinkClock) else family, part)
+    kind, choice = split_choice(name)
+    return {"kind": kind, **choice, **values}
 
 
 def _field_values(part: Component, style: _Style) -> dict[str, Any]:
     table: dict[str, Any] = {}
+    # All keys of a network are written, whatever their values.
+    with_defaults = style.with_defaults or isinstance(part, Network | Channel)
     for field in dataclasses.fields(part):
         if not field.init:
             continue
@@ -163,8 +126,13 @@ def _field_values(part: Component, style: _Style) -> dict[str, Any]:
         rule = field.metadata.get("rule")
         if style.names and rule is not None and rule.of_nodes:
             value = map_nodes(value, lambda node: style.names.get(node, node))
-        if value is not None and (style.with_defaults or not is_default):
-            table[field.name] = _toml_value(value, style)
+        if value is None or (is_default and not with_defaults):
+            continue
+        table[field.name] = _toml_value(value, style)
+        if isinstance(value, LinkClock) and not isinstance(part, Network):
+            # Keys of clocks of links, which another clock must not have.
+            for key in ("at", "rates") if isinstance(part, Sensor) else ("at",):
+                table[field.name].pop(key, None)
     return table
 
 
@@ -173,12 +141,7 @@ def _toml_value(value: Any, style: _Style) -> Any:
         return value.tolist()
     if isinstance(value, tuple):
         return [_toml_value(item, style) for item in value]
-    if isinstance(value, LinkClock):  # the clock of links in contact, whose ``at`` is theirs
-        table = _kind_table("activation", value, style)
-        return {key: item for key, item in table.items() if key != "at"}
-    if isinstance(value, Filter):  # a filter inside another one
-        return _kind_table("filter", value, style)
-    return value
+    return _part_table(value, style) if isinstance(value, Component) else value
 
 
 def to_toml(table: dict[str, Any]) -> str:

@@ -62,9 +62,7 @@ def check_filter(filter: Any, /, same_as_parent: bool | None = None, **settings:
 
 
 def _check_shift(watched: WatchedPart, seen: list[Seen], shifted: list[Seen]) -> None:
-    """Check that estimates are those with a shifted truth, less the shift: simulations of growing
-    states move the truth back to 0 from time to time, and all estimates with it.
-    """
+    # Simulations of growing states move the truth back to 0, and all estimates with it.
     for one, other in zip(seen, shifted, strict=True):
         pairs = [("xhat", one.xhat, other.xhat, 1.0 + one.size + other.size)]
         if one.P is not None and other.P is not None:
