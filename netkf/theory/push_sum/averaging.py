@@ -73,21 +73,9 @@ class Averaging:
         """E[M^gamma (x) M^gamma] (N^2, N^2), with M (N, N) one averaging step of the N nodes."""
         if self.enumerated:
             return self._moments[1]
-        N, (i, j) = self.nodes, self.links.T
-        step = self.mean_step.toarray()
-        expected = np.kron(step, step)
-        # To E[M] Y E[M]' each link adds cov(b, b) d with d = Y_ii - Y_ij - Y_ji + Y_jj and b_ij = 1
-        # if i hears j: ``difference`` computes d from the four entries of a link, and ``spread``
-        # adds it, times covariances, to the same four.
-        entry_indices = (i * N + i, i * N + j, j * N + i, j * N + j)
-        spread = np.zeros((N * N, len(i)))
-        difference = np.zeros((len(i), N * N))
-        link_indices = np.arange(len(i))
-        entries = zip(entry_indices, self._covariances, (1.0, -1.0, -1.0, 1.0), strict=True)
-        for index, covariance, sign in entries:
-            spread[index, link_indices] = sign * covariance
-            difference[link_indices, index] = sign
-        return np.linalg.matrix_power(expected + spread @ difference, self.gamma)
+        units = np.eye(self.nodes**2).reshape(-1, self.nodes, self.nodes)
+        step = np.stack([self._step(unit).reshape(-1) for unit in units], axis=1)
+        return np.linalg.matrix_power(step, self.gamma)
 
     def second_moment(self, Y: FloatArray) -> FloatArray:
         """Return E[(M^gamma (x) I) Y (M^gamma (x) I)'] (N n, N n) for the second moments Y
@@ -98,24 +86,26 @@ class Averaging:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)
             result = (self.kron @ pairs).reshape(N, N, n, n).transpose(0, 2, 1, 3)
             return np.asarray(result.reshape(N * n, N * n))
-        i, j = self.links.T
-        first_variance, covariance, _, second_variance = (
-            c[:, None, None] for c in self._covariances
-        )
-        node_indices = np.arange(N)
         for _ in range(self.gamma):
-            Z = Y.reshape(N, n, N, n)
-            # The second moment of the difference of the two ends of each link.
-            d = Z[i, :, i] - Z[i, :, j] - Z[j, :, i] + Z[j, :, j]
-            # E[M] Y E[M]', then what the randomness of each link adds in its four blocks.
-            Y = self._multiply(self._multiply(Y).T).T.copy()
-            Z = Y.reshape(N, n, N, n)
-            at_node = np.zeros((N, n, n))
-            np.add.at(at_node, i, first_variance * d)
-            np.add.at(at_node, j, second_variance * d)
-            Z[node_indices, :, node_indices] += at_node
-            Z[i, :, j] -= covariance * d
-            Z[j, :, i] -= covariance * d
+            Y = self._step(Y)
+        return Y
+
+    def _step(self, Y: FloatArray) -> FloatArray:
+        """Return E[(M (x) I) Y (M (x) I)'] (N n, N n) of one averaging step."""
+        N, n, (i, j) = self.nodes, len(Y) // self.nodes, self.links.T
+        first_variance, covariance, second_variance = (c[:, None, None] for c in self._covariances)
+        Z, node_indices = Y.reshape(N, n, N, n), np.arange(N)
+        # The second moment of the difference of the two ends of each link.
+        d = Z[i, :, i] - Z[i, :, j] - Z[j, :, i] + Z[j, :, j]
+        # E[M] Y E[M]', then what the randomness of each link adds in its four blocks.
+        Y = self._multiply(self._multiply(Y).T).T.copy()
+        Z = Y.reshape(N, n, N, n)
+        at_node = np.zeros((N, n, n))
+        np.add.at(at_node, i, first_variance * d)
+        np.add.at(at_node, j, second_variance * d)
+        Z[node_indices, :, node_indices] += at_node
+        Z[i, :, j] -= covariance * d
+        Z[j, :, i] -= covariance * d
         return Y
 
     def _multiply(self, Y: FloatArray) -> FloatArray:
@@ -134,13 +124,12 @@ class Averaging:
         return self.held and self.gamma > 1 and not self.deterministic
 
     @cached_property
-    def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Covariances (E,) of (b_ij, b_ji) / delta^2 of each link; b_ij = 1 if i hears j."""
+    def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The moments var b_ij, cov(b_ij, b_ji), var b_ji of each link (E,), over delta^2."""
         first, second = self.hears.T
-        # cov(b_ij, b_ji) = P(both) - p q; variances p (1 - p) and q (1 - q)
         covariance = (self.both - first * second) / self.delta**2
         first_variance, second_variance = (p * (1.0 - p) / self.delta**2 for p in (first, second))
-        return first_variance, covariance, covariance, second_variance
+        return first_variance, covariance, second_variance
 
     @cached_property
     def _moments(self) -> tuple[FloatArray, FloatArray]:

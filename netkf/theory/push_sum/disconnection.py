@@ -102,7 +102,10 @@ def _probability(
     for (i, j), p in probabilities.items():
         if p > 0.0:
             neighbours[i][j] = neighbours[j][i] = p
-    if not _is_connected(neighbours):
+    pairs = np.array([(i, j) for i, links in enumerate(neighbours) for j in links], dtype=np.int64)
+    pairs = pairs.reshape(-1, 2).T
+    adjacency = scipy.sparse.coo_array((np.ones(pairs.shape[1]), pairs), shape=(nodes, nodes))
+    if scipy.sparse.csgraph.connected_components(adjacency, directed=False)[0] > 1:
         return Probability(1.0, 1.0, 1.0, exact=True)
     order = _elimination_order(neighbours)
     cut = None if order is None else _exact_probability(neighbours, order)
@@ -187,15 +190,6 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
             raise TheoryError("the two directions of a link fail apart: give delivery")
         probabilities[i, j] = forward
     return probabilities
-
-
-def _is_connected(neighbours: list[dict[int, float]]) -> bool:
-    reached, waiting = {0}, [0]
-    while waiting:
-        for node in neighbours[waiting.pop()].keys() - reached:
-            reached.add(node)
-            waiting.append(node)
-    return len(reached) == len(neighbours)
 
 
 def _elimination_order(neighbours: list[dict[int, float]]) -> list[int] | None:
