@@ -87,7 +87,7 @@ class DerivedScenario(ScenarioModel):
         in the order of ``nodes``.
         """
         total_information = np.zeros((self.plant.n, self.plant.n))
-        for information in self._informations:
+        for information in self.informations:
             total_information = total_information + information
         receiver_counts = dict.fromkeys(self.nodes, 0)
         senders: dict[int, list[int]] = {node: [] for node in self.nodes}
@@ -122,7 +122,7 @@ class DerivedScenario(ScenarioModel):
         return len(sensor.R) * max(1, *map(len, slots.values()), 1)
 
     @property
-    def _informations(self) -> Iterator[FloatArray]:
+    def informations(self) -> Iterator[FloatArray]:
         """Believed ``H' R^-1 H`` (n, n) of the sensors of each node, in the order of ``nodes``."""
         for node in self.nodes:
             H, R = self._stack_sensors(self.placed_sensors.get(node, ()), believed=True)
@@ -137,7 +137,7 @@ class DerivedScenario(ScenarioModel):
         for sender, receiver in self.topology.directions:
             senders[receiver].append(self.topology.index[sender])
         sender_indices = tuple(tuple(sorted(senders[node])) for node in self.nodes)
-        return NetworkInfo(np.stack(list(self._informations)), sender_indices)
+        return NetworkInfo(np.stack(list(self.informations)), sender_indices)
 
     @property
     def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:

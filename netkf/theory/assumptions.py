@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +16,13 @@ from netkf.theory.common.evidence import (
     judge_plant,
     true_model_row,
 )
-from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
+from netkf.theory.common.plant_assumptions import (
+    connected_row,
+    judge_driven,
+    judge_observed,
+    slot_plant_rows,
+    start_rows,
+)
 from netkf.theory.folders import theory_of
 from netkf.theory.hybrid.coupled import concerns_hybrid_paper, has_balanced_rates
 from netkf.theory.hybrid.samples import (
@@ -25,7 +30,6 @@ from netkf.theory.hybrid.samples import (
     sampling_clock,
     transmits_at_samples,
 )
-from netkf.theory.numerics.matrices import unobservable_mode
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,24 +82,9 @@ def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:
     rows = [*_plant_rows(scenario), *_sampling_rows(scenario)]
     if scenario.filter.algorithm.timing.talks:
         network = [*_link_clock_rows(scenario), *_channel_rows(scenario)]
-        rows = [*_graph_rows(scenario), *rows, *network]
+        graph = connected_row(scenario, "H II-B a")
+        rows = [graph, *_weight_rows(scenario), *rows, *network]
     return [*rows, *start_rows(scenario, "H (9), (10)")]
-
-
-def _graph_rows(scenario: Scenario) -> list[AssumptionRow]:
-    topology = scenario.topology
-    components = len(topology.components)
-    rows: list[AssumptionRow] = [
-        (
-            "the graph is undirected and connected",
-            "H II-B a",
-            components == 1 and not topology.directed,
-            f"{len(topology.nodes)} nodes, {len(topology.links)} links, {components} part"
-            + ("" if components == 1 else "s")
-            + (", directed" if topology.directed else ""),
-        )
-    ]
-    return [*rows, *_weight_rows(scenario)]
 
 
 def _weight_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -120,52 +109,15 @@ def _reach_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    plant = scenario.diffusion
-    # (A, B) is controllable if and only if (A', B') is observable; Q = B B' has the same kernel.
-    idle = unobservable_mode(plant.A.T, plant.Q)
-    driven = (
-        "every mode is driven by the noise"
-        if idle is None
-        else f"the mode with eigenvalue {idle:.6g} is not driven"
-    )
+    plant, observed = scenario.diffusion, (None, "H differs from reading to reading")
+    if not any(sensor.varying for sensor in scenario.sensors):
+        observed = judge_plant(scenario, *judge_observed(scenario, plant.A))
+    driven = judge_plant(scenario, *judge_driven(plant.A, plant.Q))
     return [
-        ("(A, B) is controllable", "H II-A", *judge_plant(scenario, idle is None, driven)),
-        (
-            "(A, H) is observable, all sensors together",
-            "H II-A",
-            *_judge_observability(scenario),
-        ),
+        ("(A, B) is controllable", "H II-A", *driven),
+        ("(A, H) is observable, all sensors together", "H II-A", *observed),
         true_model_row(scenario, "H (4)", "same A, B and R"),
     ]
-
-
-def _judge_observability(scenario: Scenario) -> tuple[bool | None, str]:
-    """Return whether (A, H) of all sensors is observable (None: not known), and why."""
-    if any(sensor.varying for sensor in scenario.sensors):
-        return None, "H differs from reading to reading"
-    A, n = scenario.diffusion.A, scenario.plant.n
-    # Thousands of nodes may have the sensors of one [[sensors]] entry.
-    counts = Counter(_entries(scenario, node) for node in scenario.nodes)
-    information_by_sensors = {entries: _information(scenario, entries) for entries in counts}
-    # (A, H) is observable if and only if (A, sum H' R^-1 H) is: both hide the same modes.
-    information = np.zeros((n, n))
-    for node in scenario.sensing_nodes:
-        information += information_by_sensors[_entries(scenario, node)]
-    hidden = unobservable_mode(A, information)
-    if hidden is not None:
-        evidence = f"the mode with eigenvalue {hidden:.6g} is not seen"
-        return judge_plant(scenario, False, evidence)
-    observing = sum(
-        count
-        for entries, count in counts.items()
-        if unobservable_mode(A, information_by_sensors[entries]) is None
-    )
-    evidence = f"every mode is seen; {observing} of {len(scenario.nodes)} nodes see all alone"
-    return judge_plant(scenario, True, evidence)
-
-
-def _entries(scenario: Scenario, node: int) -> tuple[int, ...]:
-    return tuple(placed_sensor.entry for placed_sensor in scenario.placed_sensors.get(node, ()))
 
 
 def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -180,15 +132,6 @@ def _sampling_rows(scenario: Scenario) -> list[AssumptionRow]:
             evidence = f"node {node} samples by another random clock: the bound is not promised"
             return [(name, source, False, evidence)]
     return [(name, source, True, "the bound on the mean of P then has them")]
-
-
-def _information(scenario: Scenario, entries: tuple[int, ...]) -> np.ndarray:
-    """Return ``sum H' R^-1 H`` (n, n) over sensors; a sampled one counts by one sample."""
-    information = np.zeros((scenario.plant.n, scenario.plant.n))
-    for entry in entries:
-        H, R = scenario.sensors[entry].H, scenario.noise_covariance(entry, believed=False)
-        information += H.T @ np.linalg.solve(R, H)
-    return information
 
 
 def _link_clock_rows(scenario: Scenario) -> list[AssumptionRow]:

@@ -2,12 +2,48 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
-from netkf.linalg.arrays import is_definite
+from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, judge_plant, true_model_row
 from netkf.theory.intermittent.riccati import undetectable_slot_mode
+from netkf.theory.numerics.matrices import unobservable_mode
+
+
+def connected_row(scenario: Scenario, source: str) -> AssumptionRow:
+    """Return the row that the graph is undirected and connected, by ``source``."""
+    topology, parts = scenario.topology, len(scenario.topology.components)
+    evidence = f"{len(topology.nodes)} nodes, {len(topology.links)} links, {parts} part"
+    evidence += ("" if parts == 1 else "s") + (", directed" if topology.directed else "")
+    holds = parts == 1 and not topology.directed
+    return "the graph is undirected and connected", source, holds, evidence
+
+
+def judge_driven(F: FloatArray, Q: FloatArray, note: str = "") -> tuple[bool, str]:
+    """Return whether the noise Q (n, n) drives every mode of F (n, n), and why; or a ``note``."""
+    # (F, Q^1/2) is controllable if and only if (F', Q) is observable.
+    idle = unobservable_mode(F.T, Q)
+    if idle is None:
+        return True, "every mode is driven by the noise"
+    return False, f"the mode with eigenvalue {idle:.6g} is not driven{note}"
+
+
+def judge_observed(scenario: Scenario, F: FloatArray, note: str = "") -> tuple[bool, str]:
+    """Return whether all sensors together see every mode of F (n, n), and why; or a ``note``."""
+    informations = list(scenario.informations)
+    # (F, H) is observable if and only if (F, sum H' R^-1 H) is: both hide the same modes.
+    hidden = unobservable_mode(F, np.sum(informations, axis=0))
+    if hidden is not None:
+        return False, f"the mode with eigenvalue {hidden:.6g} is not seen{note}"
+    # Thousands of nodes may have equal sensors.
+    counts, distinct = Counter(G.tobytes() for G in informations), {}
+    for G in informations:
+        distinct[G.tobytes()] = G
+    observing = sum(counts[k] for k, G in distinct.items() if unobservable_mode(F, G) is None)
+    return True, f"every mode is seen; {observing} of {len(informations)} nodes see all alone"
 
 
 def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:

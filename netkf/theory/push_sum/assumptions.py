@@ -12,7 +12,7 @@ from netkf.linalg.spectra import contracts
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow, true_model_row
-from netkf.theory.numerics.matrices import unobservable_mode
+from netkf.theory.common.plant_assumptions import connected_row, judge_driven, judge_observed
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.certified_gamma import Moment, minimum_gamma
 from netkf.theory.push_sum.disconnection import disconnection_probability
@@ -35,36 +35,13 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    F, Q = scenario.slot_belief
-    # (F, Q^1/2) is controllable if and only if (F', Q) is observable.
-    idle = unobservable_mode(F.T, Q)
-    rows: list[AssumptionRow] = [
-        (
-            "(F, Q^1/2) is controllable",
-            "P Assumption 2",
-            idle is None,
-            "every mode is driven by the noise"
-            if idle is None
-            else f"the mode with eigenvalue {idle:.6g} is not driven; P_inf needs only "
-            "those that do not decay",
-        )
-    ]
+    (F, Q), source = scenario.slot_belief, "P Assumption 2"
+    driven = judge_driven(F, Q, "; P_inf needs only those that do not decay")
+    rows: list[AssumptionRow] = [("(F, Q^1/2) is controllable", source, *driven)]
     if not any(sensor.varying for sensor in scenario.sensors):
-        rows.append(_observability_row(scenario))
+        seen = judge_observed(scenario, F, "; a mode that decays does no harm")
+        rows.append(("(F, H) is observable, all sensors together", source, *seen))
     return [*rows, true_model_row(scenario, "P (7), (8)", "same F, Q and R")]
-
-
-def _observability_row(scenario: Scenario) -> AssumptionRow:
-    F, _ = scenario.slot_belief
-    informations = [model.information for model in scenario.slot_models]
-    hidden = unobservable_mode(F, np.sum(informations, axis=0))
-    observing = sum(unobservable_mode(F, G) is None for G in informations)
-    evidence = f"every mode is seen; {observing} of {len(informations)} nodes see all alone"
-    if hidden is not None:
-        evidence = (
-            f"the mode with eigenvalue {hidden:.6g} is not seen; a mode that decays does no harm"
-        )
-    return "(F, H) is observable, all sensors together", "P Assumption 2", hidden is None, evidence
 
 
 def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
@@ -74,23 +51,11 @@ def _link_rows(scenario: Scenario) -> list[AssumptionRow]:
     except TheoryError as error:
         law, reason = None, str(error)
     return [
-        _graph_row(scenario),
+        connected_row(scenario, "P Assumption 1"),
         _fresh_links_row(scenario, law, reason),
         _joint_failure_row(scenario, law),
         _connection_row(scenario),
     ]
-
-
-def _graph_row(scenario: Scenario) -> AssumptionRow:
-    topology = scenario.topology
-    components = len(topology.components)
-    return (
-        "the graph is undirected and connected",
-        "P Assumption 1",
-        components == 1 and not topology.directed,
-        f"{len(topology.nodes)} nodes, {len(topology.links)} links, {components} part"
-        + ("" if components == 1 else "s"),
-    )
 
 
 def _fresh_links_row(scenario: Scenario, law: Averaging | None, reason: str) -> AssumptionRow:
