@@ -24,8 +24,8 @@ from netkf.checks.exact import (
     with_promised_filter,
 )
 from netkf.checks.paper import PaperChecks
-from netkf.checks.points import checked_samples, sampled_indices
-from netkf.checks.rounding import compare_identities, first_wrong
+from netkf.checks.points import check_slots, checked_samples, sampled_indices
+from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
 from netkf.core.errors import TheoryError
 from netkf.network.clocks import LinkClock
@@ -95,23 +95,23 @@ def design_of(scenario: Scenario) -> str:
 
 def _mass_conserved(samples: RunSamples, level: float) -> Finding:
     drift, scenario = np.abs(samples.runs.drift), samples.scenario
-    message = f"drift of the total weight in {samples.count} runs"
-    # Running totals grow with every broadcast, and their rounding remains in their differences.
-    clock, rate = scenario.network.activation, 0.0
-    if isinstance(clock, LinkClock):
+    message = f"drift of the totals in {samples.count} runs"
+    # Every addition may add a rounding error. Running totals grow with every broadcast, and their
+    # rounding remains in their differences.
+    clock, terms = scenario.network.activation, 1.0
+    if scenario.slotted:
+        terms = float(check_slots(scenario)[-1] * len(scenario.nodes))
+    elif isinstance(clock, LinkClock):
         rate = sum(clock.mean_rate(entity) for entity in clock.entities(scenario.topology))
-    terms = 1.0 + scenario.horizon * float(np.nan_to_num(rate))
-    # Size of the compared values, of the terms whose rounding errors they inherit, and relative
-    # tolerance; the drift is relative already.
-    limits = np.ones_like(drift), terms, MASS_TOLERANCE
-    finding = compare_identities(drift, *limits, message)
-    return finding._replace(replica=first_wrong(drift, *limits))
+        terms += scenario.horizon * float(np.nan_to_num(rate))
+    # The drift is relative already.
+    return compare_identities(drift, np.ones_like(drift), terms, MASS_TOLERANCE, message)
 
 
 MASS_CONSERVED = Promise("mass is conserved", "P (67), derived", (), _mass_conserved, exact=True)
 
 
-def _summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
+def summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
     """Return the summary of a run with ``drift``, the largest relative one of conserved sums."""
     drift = [abs(total - start) / abs(start) for start, total in run.sums.values()]
     summary = summarise_exactly(scenario, run)
@@ -126,7 +126,7 @@ def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
     return (*mass, FOLLOWS_EVENTS, *bound, *ERRORS)
 
 
-UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=_summarise_drift)
+UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=summarise_drift)
 """Filters under clocks whose papers are about slots, and filters that hear nothing."""
 
 

@@ -42,7 +42,7 @@ from netkf.checks.mode_sequences import (
 )
 from netkf.checks.paper import PaperChecks, usual_assumptions
 from netkf.checks.points import check_slots, sampled_indices, sampled_nodes
-from netkf.checks.rounding import compare_identities, first_wrong
+from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, check_replay, compare_points
 from netkf.checks.statistics import distance_to_law, law_distance, pearson_test
 from netkf.core.errors import TheoryError
@@ -284,7 +284,6 @@ def _in_support(samples: IntermittentSamples, level: float) -> Finding:
     # Size of the values, of the terms whose rounding errors they inherit, and relative tolerance.
     limits = size, terms, SUPPORT_TOLERANCE
     finding = compare_identities(gap, *limits, message)
-    finding = finding._replace(replica=first_wrong(gap, *limits))
     if converged.any() or finding.margin[0] < 0.0:
         return finding
     end = samples.scenario.horizon

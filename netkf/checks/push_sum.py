@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.equations import error_promises
+from netkf.checks.equations import MASS_CONSERVED, error_promises, summarise_drift
 from netkf.checks.evidence import (
     COMPUTED,
     Assumption,
@@ -27,16 +27,13 @@ from netkf.checks.exact import (
     detectable_length,
     gaussian_radius,
     max_replayed,
-    summarise_exactly,
     with_promised_filter,
 )
 from netkf.checks.laws import find_largest
 from netkf.checks.paper import PaperChecks, usual_assumptions
-from netkf.checks.points import check_slots, sampled_indices
-from netkf.checks.rounding import compare_identities, first_wrong
+from netkf.checks.points import sampled_indices
 from netkf.checks.samples import (
     REPLAY_TOLERANCE,
-    ReplicaSummary,
     RunSamples,
     check_replay,
     relative_difference,
@@ -59,7 +56,6 @@ from netkf.theory import (
 from netkf.theory.push_sum.assumptions import HEAVY_TAIL_RADIUS
 from netkf.theory.push_sum.certified_gamma import searches_gamma
 from netkf.theory.push_sum.promises import MAX_STEPS as MAX_CERTIFIED
-from netkf.trace.run import Run
 
 STEADY_TOLERANCE = 0.01
 """Distance from a limit, relative to its largest entry, that counts as reached."""
@@ -114,18 +110,6 @@ class PushSumSamples(RunSamples):
         e = np.einsum("iab,rib->ria", W, self.runs.e[self.followed, -1])
         weights = np.linalg.eigvalsh(W @ Sigma @ np.swapaxes(W, 1, 2))
         return (e**2).mean(axis=-1), np.maximum(weights, 0.0)
-
-
-def _mass_conserved(samples: PushSumSamples, level: float) -> Finding:
-    drift = np.abs(samples.runs.drift)
-    message = f"drift of the totals of weight and number in {len(samples.runs.P)} runs"
-    # Size of the compared values, of the terms whose rounding errors they inherit, and relative
-    # tolerance: the drift is relative, and every addition may add a rounding error.
-    # Additions (slots times nodes) whose rounding a total may carry.
-    additions = float(check_slots(samples.scenario)[-1] * len(samples.scenario.nodes))
-    limits = np.ones_like(drift), additions, 1e-9
-    finding = compare_identities(drift, *limits, message)
-    return finding._replace(replica=first_wrong(drift, *limits))
 
 
 def _at_steady_state(samples: PushSumSamples, level: float) -> Finding:
@@ -257,12 +241,8 @@ FOLLOWED = (
     "exact errors are within reach",
 )
 PROMISES = (
-    Promise(
-        "mass is conserved",
-        "P (67), (3)-(5) corrected",
-        ("both directions of a link",),
-        _mass_conserved,
-        exact=True,
+    dataclasses.replace(
+        MASS_CONSERVED, source="P (67), (3)-(5) corrected", needs=("both directions of a link",)
     ),
     Promise(
         "P follows steps 2 and 3 with the links that were up",
@@ -314,17 +294,6 @@ CERTIFIED = Promise(
 )
 
 
-def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run with ``drift`` (2,): how far the totals over all nodes of the
-    push-sum weight w and number n~ are at the end from those at the start, relative; exchanges
-    should conserve both.
-    """
-    summary = summarise_exactly(scenario, run)
-    drift = [(total - exact) / exact for exact, total in run.sums.values()]
-    summary.drift = np.array(drift) if drift else np.full(2, np.nan)
-    return summary
-
-
 def _assumptions(scenario: Scenario) -> list[Assumption]:
     try:
         # Errors have a steady mean square if the mean-square radius is below 1, and a fourth
@@ -372,4 +341,4 @@ def _every_slot(scenario: Scenario) -> Assumption:
     return Assumption("mass is exchanged in every slot", "P step 2", holds, evidence)
 
 
-CHECKS = PaperChecks(_promises, _assumptions, _summarise, PushSumSamples, slots_only=True)
+CHECKS = PaperChecks(_promises, _assumptions, summarise_drift, PushSumSamples, slots_only=True)

@@ -20,21 +20,12 @@ def allowed_deviation(size: FloatArray, terms: ArrayLike, base: float) -> FloatA
     return np.asarray(np.maximum(base * np.asarray(size), OPERATIONS * EPS * largest))
 
 
-def first_wrong(gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float) -> int | None:
-    """Return the index of the first run whose deviations ``gap`` (R, ...) exceed those of
-    :func:`allowed_deviation`; None if there is none.
-    """
-    wrong = ~(np.asarray(gap) <= allowed_deviation(size, terms, base))
-    runs = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))
-    return int(runs[0]) if len(runs) else None
-
-
 def compare_identities(
     gap: FloatArray, size: FloatArray, terms: ArrayLike, base: float, message: str
 ) -> Finding:
-    """Return the finding on values that should be equal up to rounding: the pair whose deviation
-    ``gap`` (R, ...) is largest relative to :func:`allowed_deviation` of ``size``, ``terms``,
-    ``base`` decides.
+    """Return the finding on values of R runs that should be equal up to rounding, and the first run
+    where they are not: the pair whose deviation ``gap`` (R, ...) is largest relative to
+    :func:`allowed_deviation` of ``size``, ``terms``, ``base`` decides.
     """
     deviations = np.nan_to_num(np.abs(np.asarray(gap, dtype=np.float64)), nan=np.inf).reshape(-1)
     scale = np.broadcast_to(size, np.shape(gap)).reshape(-1)
@@ -47,9 +38,10 @@ def compare_identities(
     worst_index = int(np.argmax(relative))
     # Relative to the size of the result or, if that is 0, of the terms.
     unit = float(scale[worst_index] or largest[worst_index] or 1.0)
+    wrong = np.flatnonzero(deviations > limit)
     return find_identity(
         float(deviations[worst_index]) / unit, float(limit[worst_index]) / unit, message
-    )
+    )._replace(replica=int(wrong[0] * len(gap) // len(deviations)) if len(wrong) else None)
 
 
 def largest_terms(P: FloatArray, start: FloatArray, information: float = 0.0) -> FloatArray:

@@ -109,7 +109,8 @@ def _reach_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    plant, observed = scenario.diffusion, (None, "H differs from reading to reading")
+    plant = scenario.diffusion
+    observed: tuple[bool | None, str] = None, "H differs from reading to reading"
     if not any(sensor.varying for sensor in scenario.sensors):
         observed = judge_plant(scenario, *judge_observed(scenario, plant.A))
     driven = judge_plant(scenario, *judge_driven(plant.A, plant.Q))
