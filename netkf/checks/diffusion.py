@@ -162,9 +162,7 @@ PROMISES = (
 
 
 def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run with ``alone`` (N, n, n): exact covariances of the errors at the
-    end without cooperation.
-    """
+    """Return the summary with ``alone`` (N, n, n), exact covariances at the end, each alone."""
     summary, sampled = summarise_exactly(scenario, run), sampled_indices(scenario)
     summary.alone = np.full(summary.P[0].shape, np.nan)
     if run.replica < ALONE and few_errors(scenario).holds:

@@ -44,9 +44,7 @@ NO_LOSS = "no message is lost"
 def error_promises(
     source: str, needs: tuple[str, ...] = (REACH,), by: str = "the equations give them"
 ) -> tuple[Promise, Promise]:
-    """Return the promises that errors have the covariance that is known ``by`` something, and no
-    bias beyond it, from the equations of a ``source``.
-    """
+    """Return the promises of a ``source`` that errors have the covariance known ``by``, no bias."""
     covariance = f"errors have the covariance that {by}"
     bias = "errors have no bias that the equations do not give them"
     return (

@@ -15,9 +15,7 @@ from netkf.laws.intervals import student_interval
 
 @error_test
 def check_nees_bound(samples: RunSamples, level: float) -> Finding:
-    """Test that the mean of NEES / n is at most 1 at every time and node. Decisions to send depend
-    on data, so that errors given the events are not Gaussian: by Student's interval over the runs.
-    """
+    """Test that the mean of NEES / n is at most 1, by Student's interval: events depend on data."""
     n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
     finite = np.flatnonzero(np.isfinite(nees).all(axis=0))
     if not len(finite):

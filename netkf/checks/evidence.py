@@ -329,9 +329,7 @@ def _unpromised_row(promise: Promise, reason: str) -> Evidence:
 
 
 def find_identity(deviation: float, allowed: float, message: str) -> Finding:
-    """Return the finding on two computations of the same values: broken if their largest relative
-    ``deviation`` exceeds what rounding has ``allowed``.
-    """
+    """Return the finding on equal values: broken if ``deviation`` exceeds what is ``allowed``."""
     margin = allowed - deviation
     text = f"largest relative deviation {deviation:.1e}, rounding explains {allowed:.0e}; {message}"
     finding = Finding((margin, margin, margin), 0.0, text)
@@ -339,9 +337,7 @@ def find_identity(deviation: float, allowed: float, message: str) -> Finding:
 
 
 def find_nothing(tolerance: float) -> Finding:
-    """Return the finding, with this ``tolerance``, of a test without any usable estimation error,
-    because rounding of a large state is of the size of the errors: undecided.
-    """
+    """Return the undecided finding of a test whose errors are all blurred by rounding."""
     nan = math.nan
     message = (
         "the state is so large that rounding blurs the errors wherever they are looked at; shorten "

@@ -125,9 +125,7 @@ def _exact_statistics(
 
 
 def max_replayed(scenario: Scenario) -> int:
-    """Return the number of replicas, the first ones, whose exact covariances are computed: enough
-    to reveal a wrong one (ENOUGH_ERRORS, ENOUGH_RUNS), within MAX_REPLAYED and the time for it.
-    """
+    """Return the number of first replicas whose exact covariances are computed, for their time."""
     per_run = len(probe_times(scenario)) * errors_at_once(scenario)
     steps, min_replicas = integration_steps(scenario), 0
     if scenario.slotted:
@@ -200,9 +198,7 @@ def _variance_floor(scenario: Scenario) -> float:
 
 
 def few_errors(scenario: Scenario) -> Assumption:
-    """Return the assumption that the joint error covariance of all nodes can be computed, a row of
-    the table of assumptions: it holds for up to MAX_ERRORS errors at one time.
-    """
+    """Return the assumption that all nodes have at most MAX_ERRORS errors together at one time."""
     size = len(scenario.nodes) * scenario.plant.n
     evidence = f"{size} errors of all nodes together, at most {MAX_ERRORS}"
     return Assumption("exact errors are within reach", "netkf", size <= MAX_ERRORS, evidence)
@@ -224,18 +220,14 @@ def whiten_errors(
 
 
 def with_promised_filter(scenario: Scenario) -> Scenario:
-    """Return the scenario with the filter whose promises are checked: its own if that is built in
-    or overrides only weights of links, else the built-in one that its class derives from.
-    """
+    """Return the scenario with the filter whose promises are checked, see ``promised_filter``."""
     is_promised = promised_filter(scenario.filter.algorithm) is scenario.filter.algorithm
     return scenario if is_promised else with_base_filter(scenario)
 
 
 @lru_cache(maxsize=8)
 def with_base_filter(scenario: Scenario) -> Scenario:
-    """Return the scenario with the built-in filter that a user's class derives from, with the same
-    parameters; cached, since its tables take time and every replica asks for it.
-    """
+    """Return the scenario with the built-in base of a user's filter; cached with its tables."""
     algorithm: Any = scenario.filter.algorithm
     filtering = dataclasses.replace(scenario.filter, algorithm=base_filter(algorithm))
     return dataclasses.replace(scenario, filter=filtering)
@@ -263,9 +255,7 @@ def promised_filter(algorithm: Any) -> Any:
 
 
 def check_upper_bound(samples: RunSamples, level: float) -> Finding:
-    """Check that P of the runs is at least Sigma, the exact covariance of the errors given the
-    events of the run, by the least eigenvalue of P - Sigma; no interval is estimated.
-    """
+    """Check by the least eigenvalue that P is at least Sigma, exact given the events of the run."""
 
     def shortfall(gap: FloatArray) -> FloatArray:
         # Covariances that are not finite count as below Sigma; eigvalsh needs finite entries.
@@ -276,9 +266,7 @@ def check_upper_bound(samples: RunSamples, level: float) -> Finding:
 
 
 def check_exact_covariance(samples: RunSamples, level: float) -> Finding:
-    """Check that P of the runs is Sigma, the exact covariance of the error given the events of the
-    run, up to rounding; no interval is estimated.
-    """
+    """Check that P is Sigma, the exact covariance given the events of the run, up to rounding."""
 
     def largest(gap: FloatArray) -> FloatArray:
         deviations = np.abs(gap).max(axis=(-1, -2))
@@ -373,9 +361,7 @@ def gaussian_radius(level: float, n: int) -> float:
 
 
 def detectable_length(radius: float, n: int) -> float:
-    """Return the length of the mean of a standard Gaussian vector (n,) with which the vector is
-    longer than ``radius`` with probability POWER.
-    """
+    """Return the length of a mean that makes a Gaussian (n,) exceed ``radius`` by chance POWER."""
     return math.sqrt(float(scipy.special.chndtrinc(radius**2, n, 1.0 - POWER)))
 
 

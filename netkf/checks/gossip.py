@@ -175,9 +175,7 @@ class GossipSamples(SwitchedSamples):
 
     @cached_property
     def matching(self) -> FloatArray:
-        """Mean matching Abar (N, N): the probability that i gets j's pair in a slot, with the
-        losses of the channel.
-        """
+        """Abar (N, N): the probability that i gets j's pair in a slot, with losses."""
         return effective_matching(self.scenario)
 
     def draw_reference(self) -> Chains:

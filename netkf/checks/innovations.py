@@ -87,9 +87,7 @@ class TimedState(NamedTuple):
 
 
 class ExpectedIncrements:
-    """Predictions of increments under one ``model`` with A, Q, H and R, for intervals of any
-    length.
-    """
+    """Predictions of increments under one ``model`` with A, Q, H and R, over any interval."""
 
     def __init__(self, model: Any) -> None:
         """Take A and Q (n, n), H (p, n) and R (p, p) of ``model``."""
@@ -117,9 +115,7 @@ class ExpectedIncrements:
 
 @dataclass(frozen=True, eq=False)
 class Recorder(Filter):
-    """The filter ``inner``, whose innovations are appended to ``recorded``; ``expected`` are the
-    predictions of increments under each of its models, by id.
-    """
+    """The filter ``inner``, which appends to ``recorded``; ``expected`` is by id of its models."""
 
     inner: Filter
     recorded: list[Recorded]
@@ -243,9 +239,7 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
 
 
 def with_filter(scenario: Scenario, filtering: Any) -> Scenario:
-    """Return a copy of a scenario with the [filter] ``filtering``, in the same folder and with the
-    same topology, which need not be drawn again.
-    """
+    """Return a copy of a scenario with another [filter], in the same folder and topology."""
     copy = dataclasses.replace(scenario, filter=filtering)
     # These are no fields, so that replace() does not copy them.
     for name in ("_folder", "_trust", "topology"):
@@ -268,17 +262,13 @@ def innovation_series(recorded: Innovations) -> dict[int, FloatArray]:
 
 
 def autocorrelation(values: FloatArray, lags: int) -> FloatArray:
-    """Return the autocorrelations (lags,) at lags 1 .. ``lags`` of a series ``values`` (M,) with
-    expectation 0, relative to lag 0.
-    """
+    """Return autocorrelations (lags,) from lag 1 on, relative to lag 0, of mean-free ``values``."""
     total = float(values @ values)
     return np.array([values[k:] @ values[:-k] for k in range(1, lags + 1)]) / max(total, 1e-300)
 
 
 def autocorrelations(recorded: Innovations) -> tuple[dict[int, FloatArray], dict[int, int]]:
-    """Return, by node with at least MIN_READINGS readings, the autocorrelations (L,) of its
-    innovations at lags 1 .. L in readings, the same for all nodes, and the number of its readings.
-    """
+    """Return the autocorrelations (L,) of innovations by node, and the number of readings."""
     series = innovation_series(recorded)
     counts = {node: len(values) for node, values in series.items()}
     lags = min([MAX_LAG, *(count - 2 for count in counts.values())])

@@ -69,9 +69,7 @@ def find_largest(
 
 
 def find(comparison: Comparison, tolerance: float) -> Finding:
-    """Return the finding of a ``comparison`` of draws with the law that a part states: the most
-    significant distance, or else that of all values together with the largest one of a part.
-    """
+    """Return the finding of a ``comparison`` with stated laws: the most significant distance."""
     distances, text, overall = comparison
     if not distances:
         return Finding((0.0, -np.inf, 0.0), tolerance, text)
@@ -150,9 +148,7 @@ def compare_laws(pairs: Sequence[Pair], level: float, start: float = 0.0) -> Fin
 
 
 def diagonal_distances(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the largest differences (n,), one for each state, between the empirical distribution
-    functions of the diagonals of two samples ``first`` (S, n, n) and ``second`` (S', n, n).
-    """
+    """Return the distances (n,) between the laws of the diagonals of two samples (S, n, n)."""
     # Only the value of each interval is used, for which the level does not matter.
     return np.array(
         [
@@ -223,18 +219,14 @@ def compare_chi_square(
 
 
 def fixed_readings(scenario: Scenario) -> Assumption:
-    """Return the assumption that H is the same in every slot, on which laws of P that are computed
-    from sets of readings rely: a row of the table of assumptions that says whether it holds.
-    """
+    """Return the assumption, a row, that H is the same in every slot, as laws of P need."""
     holds = not any(sensor.varying for sensor in scenario.sensors)
     evidence = "as the scenario gives it" if holds else "a sensor's H differs from slot to slot"
     return Assumption(FIXED_READINGS, "G II-B, R (16)", holds, evidence)
 
 
 def exact_start(scenario: Scenario) -> Assumption:
-    """Return the assumption that every filter starts with the mean and the covariance of x(0), a
-    row of the table of assumptions that says whether it holds.
-    """
+    """Return the assumption, a row, that filters start with the mean and covariance of x(0)."""
     plant = scenario.plant
     different = [
         node

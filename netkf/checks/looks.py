@@ -30,9 +30,7 @@ def is_decided(rows: Sequence[Evidence]) -> bool:
 
 
 def next_runs(rows: Sequence[Evidence], runs: int, max_runs: int) -> int:
-    """Return the number of runs after which promises are judged again, up to ``max_runs``: the most
-    that a row is forecast to need, between MIN_GROWTH and MAX_GROWTH times the ``runs`` so far.
-    """
+    """Return the runs of the next look, as forecast, MIN_GROWTH to MAX_GROWTH times ``runs``."""
     needed = [row.needed for row in rows if row.verdict == UNDECIDED and row.needed is not None]
     forecast = MARGIN * max(needed, default=runs)
     growth = min(max(forecast, MIN_GROWTH * runs), MAX_GROWTH * runs)
@@ -40,9 +38,7 @@ def next_runs(rows: Sequence[Evidence], runs: int, max_runs: int) -> int:
 
 
 def keep_decisions(earlier: Sequence[Evidence], rows: Sequence[Evidence]) -> tuple[Evidence, ...]:
-    """Return the ``rows`` of a new judgement, in which undecided rows keep the decision of an
-    ``earlier`` one: the intervals of all judgements hold jointly. A broken promise stays broken.
-    """
+    """Return the new ``rows``, undecided ones with an ``earlier`` decision: all intervals hold."""
     earlier_rows = {(row.promise, row.source): row for row in earlier}
     decisions = []
     for row in rows:

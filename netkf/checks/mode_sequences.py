@@ -45,9 +45,7 @@ class ModeTable(NamedTuple):
     modes: ReadingModes
 
     def apply(self, roots: FloatArray, sequences: np.ndarray) -> FloatArray:
-        """Return the roots (K, n, n) of K covariances after the modes ``sequences`` (K, T), one
-        mode for each of T slots, from ``roots`` (K, n, n) on.
-        """
+        """Return the roots (K, n, n) from ``roots`` after the modes ``sequences`` (K, T)."""
         return move_roots(roots, sequences, self.F, self.root_Q, self.modes)
 
     def covariances(
@@ -173,9 +171,7 @@ def growth_of(earlier: FloatArray, later: FloatArray) -> float:
 
 
 def slots_until(distance: Callable[[int], float], slots: int, n: int, tolerance: float) -> float:
-    """Return a number of slots, doubled from ``slots`` on, after which ``distance`` of it is at
-    most half of ``tolerance``; nan if simulating that would take too long.
-    """
+    """Return slots with ``distance`` at most ``tolerance`` / 2, doubled; nan if it takes long."""
     operations, count = 0.0, slots
     while True:
         count *= 2
@@ -204,9 +200,7 @@ class TokenHistory(NamedTuple):
 
 
 def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
-    """Return the index (slots, N) of the node whose pair (estimate, covariance) each node used in
-    each slot of a run of a gossip filter; its own without a swap.
-    """
+    """Return the index (slots, N) of the node whose pair each node used in each slot of gossip."""
     index = scenario.topology.index  # index of each node id
     sources = np.tile(np.arange(len(index)), (slots, 1))
     swaps = run.log[run.log["kind"] == CODES["swap"]]
@@ -219,9 +213,7 @@ def pair_sources(scenario: Scenario, run: Run, slots: int) -> np.ndarray:
 
 
 def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
-    """Return where the pairs that the N nodes hold at the start of a ``slot`` began (N,), and where
-    they were in each slot before (N, slot), from the ``sources`` of :func:`pair_sources`.
-    """
+    """Return where the pairs of the N nodes at the start of a ``slot`` began, and were since."""
     path = np.empty((sources.shape[1], slot), dtype=int)
     # Backwards in time: the node that held, in slot t, the pair that node k holds at the end.
     holder = np.arange(sources.shape[1])
@@ -232,9 +224,7 @@ def trace_tokens(sources: np.ndarray, slot: int) -> TokenHistory:
 
 
 def token_positions(sources: np.ndarray, slot: int) -> np.ndarray | None:
-    """Return the index (N,) of the node where each token, the pair that started at node n, took its
-    last reading, p_n(slot - 1) of paper G (13). None if pairs were copied.
-    """
+    """Return where each token took its last reading (N,), paper G (13); None for copied pairs."""
     origin = trace_tokens(sources, slot).origin
     if len(set(origin.tolist())) < len(origin):
         return None
@@ -270,9 +260,7 @@ def sensing_neighbours(scenario: Scenario) -> dict[int, tuple[int, ...]]:
 
 
 def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeTable:
-    """Return the table in which mode m is all readings of the nodes (ids) ``sets[m]`` together, R
-    (17).
-    """
+    """Return the table in which mode m is all readings of the nodes ``sets[m]``, R (17)."""
     F, Q = scenario.slot_belief
     index = scenario.topology.index
     readings = []
@@ -284,9 +272,7 @@ def intermittent_modes(scenario: Scenario, sets: list[tuple[int, ...]]) -> ModeT
 
 
 def find_arrivals(scenario: Scenario, run: Run | None, slots: int) -> Arrivals:
-    """Return the readings that W sampled nodes used in the first ``slots`` slots of a run, their
-    own and those delivered; without a run those that they would use if none were lost.
-    """
+    """Return the readings that sampled nodes used in the first ``slots``; all without a run."""
     arrived: dict[tuple[int, int], list[int]] = {}
     if run is not None:
         delivered = run.log[run.log["kind"] == CODES["deliver"]]

@@ -24,9 +24,7 @@ MAX_ENTRIES = 6400
 
 
 def check_slots(scenario: Scenario) -> tuple[int, ...]:
-    """Return the slots at which promises are checked: 2, 5, half of the horizon and its last one,
-    which is one earlier for filtered estimates, whose last exchanges are not in the trace.
-    """
+    """Return the slots at which promises are checked: 2, 5, half of the horizon, its last one."""
     period = scenario.slot_plant.period
     # 1e-9: a horizon of a whole number of periods keeps its last slot despite rounding.
     last = max(1, int(np.floor(scenario.horizon / period + 1e-9)))
@@ -36,9 +34,7 @@ def check_slots(scenario: Scenario) -> tuple[int, ...]:
 
 
 def check_times(scenario: Scenario) -> list[float]:
-    """Return the times at which promises are checked, in seconds: those of :func:`check_slots`, or
-    an eighth, a quarter, half and all of the horizon.
-    """
+    """Return the times (s) at which promises are checked: of slots, or shares of the horizon."""
     if scenario.slotted:
         return [scenario.slot_plant.slot_time(slot) for slot in check_slots(scenario)]
     return [scenario.time_grid.instant(scenario.horizon * share) for share in HORIZON_SHARES]
@@ -69,17 +65,13 @@ def probe_times(scenario: Scenario) -> list[float]:
 
 
 def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
-    """Return the indices (K,), in the sample ``times`` (T,) of a run in seconds, of the K times at
-    which promises are checked.
-    """
+    """Return the indices (K,) in the sample ``times`` (T,) at which promises are checked."""
     targets = np.array(check_times(scenario))
     return np.asarray(np.argmin(np.abs(times[None] - targets[:, None]), axis=1), dtype=np.int64)
 
 
 def sampled_indices(scenario: Scenario) -> IntArray:
-    """Return the indices (W,) of the nodes whose samples are kept: all of up to MAX_NODES, else
-    MIN_SAMPLED to MAX_SAMPLED evenly spaced ones, fewer the larger covariances are.
-    """
+    """Return the indices (W,) of the nodes whose samples are kept: all, or evenly spaced ones."""
     nodes, n = len(scenario.nodes), scenario.plant.n
     if nodes <= MAX_NODES:
         return np.arange(nodes)
@@ -93,9 +85,7 @@ def sampled_nodes(scenario: Scenario) -> list[int]:
 
 
 def sampling_note(scenario: Scenario) -> str:
-    """Return a text for the verdict on the nodes of a large network whose samples are not kept;
-    empty if those of all nodes are.
-    """
+    """Return a text on the nodes of a large network whose samples are not kept; or empty."""
     count, nodes = len(sampled_indices(scenario)), len(scenario.nodes)
     if count == nodes:
         return ""
@@ -106,9 +96,7 @@ def sampling_note(scenario: Scenario) -> str:
 
 
 def all_sampled(scenario: Scenario) -> Assumption:
-    """Return the assumption that samples of all nodes are kept, which promises about the whole
-    network need.
-    """
+    """Return the assumption that samples of all nodes are kept, as promises about all need."""
     note = sampling_note(scenario)
     evidence = note or "samples of all nodes are kept"
     return Assumption("every node is watched", "netkf", not note, evidence)

@@ -67,9 +67,7 @@ MAX_STEPS = 4096
 
 @dataclass(frozen=True)
 class PushSumSamples(RunSamples):
-    """Adds errors at the end and their exact covariance given the links that failed, for the R'
-    replicas whose exact covariances were computed.
-    """
+    """Adds errors at the end, with their exact covariance, of the R' replicas that have one."""
 
     @cached_property
     def followed(self) -> np.ndarray:
@@ -79,9 +77,7 @@ class PushSumSamples(RunSamples):
 
     @cached_property
     def standardised(self) -> FloatArray:
-        """Errors (R', N, n) of R' replicas and N nodes at the end, each whitened by its exact
-        covariance: standard normal unless there is a bias.
-        """
+        """Errors (R', N, n) at the end, whitened by their exact covariance."""
         Sigma, e = self.runs.Sigma[self.followed, -1], self.runs.e[self.followed, -1]
         values, vectors = np.linalg.eigh(Sigma)
         # Smaller variances are rounding: they are raised, so that they do not blow up a component.
@@ -91,9 +87,7 @@ class PushSumSamples(RunSamples):
 
     @cached_property
     def steady_root(self) -> FloatArray:
-        """W (N, n, n) with W S W' = I, for the exact steady covariance S of each sampled node's
-        error, by theory and averaged over the links that fail.
-        """
+        """W (N, n, n) with W S W' = I, S the exact steady covariance of sampled nodes."""
         Sigma = push_sum_error_covariance(with_promised_filter(self.scenario))
         values, vectors = np.linalg.eigh(Sigma[sampled_indices(self.scenario)])
         return np.swapaxes(vectors / np.sqrt(values)[:, None, :], 1, 2)

@@ -13,9 +13,7 @@ OPERATIONS = 1e3
 
 
 def allowed_deviation(size: FloatArray, terms: ArrayLike, base: float) -> FloatArray:
-    """Return the largest deviations that rounding explains, in the shape of ``size``: the share
-    ``base`` of the sizes of results, or rounding of the ``terms`` that they came from.
-    """
+    """Return what rounding explains: ``base`` of the ``size``, or rounding of their ``terms``."""
     largest = np.maximum(np.broadcast_to(terms, np.shape(size)), size)
     return np.asarray(np.maximum(base * np.asarray(size), OPERATIONS * EPS * largest))
 

@@ -73,9 +73,7 @@ class RunSamples:
         return float(np.trace(self.first_covariances, axis1=-2, axis2=-1).max())
 
     def largest_terms(self, P: FloatArray) -> FloatArray:
-        """Return the sizes (R, K, N) of the largest terms from which the covariances ``P``
-        (R, K, N, n, n) of R runs, K times and N nodes were computed: their roundings remain in P.
-        """
+        """Return the sizes (R, K, N) of the terms whose roundings remain in ``P``."""
         information = float(np.linalg.norm(self.scenario.node_infos[0].information, 2))
         return largest_terms(P, self.first_covariances, information)
 
@@ -100,9 +98,7 @@ class RunSamples:
 
 
 def check_replay(samples: RunSamples, level: float) -> Finding:
-    """Compare the covariances of the runs (R, K, N, n, n) with ``runs.replayed``, by the equations
-    of the filter from the events of the run; those that are not known are left out.
-    """
+    """Compare P of the runs with ``runs.replayed``, by the equations; unknown ones are left out."""
     replayed = np.isfinite(samples.runs.replayed).any(axis=(1, 2, 3, 4))
     P, expected = samples.runs.P[replayed], samples.runs.replayed[replayed]
     if not len(P):
@@ -151,9 +147,7 @@ def compare_points(
 
 
 def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
-    """Return |P - expected| over the largest entry of each expected matrix, in the shape of ``P``
-    (..., n, n); inf where that is not finite.
-    """
+    """Return |P - expected| over the largest entry of each matrix (..., n, n); inf for nan."""
     size = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.abs(P - expected)
@@ -162,9 +156,7 @@ def relative_difference(P: FloatArray, expected: FloatArray) -> FloatArray:
 
 
 def check_growth(samples: RunSamples, level: float) -> Finding:
-    """Test that P is stochastically bounded by its growth in the second half of the horizon and
-    that of P replayed from the events (:func:`compare_growth`).
-    """
+    """Test that P does not grow more in the second half than its replay (``compare_growth``)."""
     P, replayed = samples.runs.P, samples.runs.replayed
     # Only some runs are replayed, the entries of the others are nan.
     replays = replayed[~np.isnan(replayed).all(axis=(1, 2, 3, 4))]

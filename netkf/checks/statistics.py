@@ -33,16 +33,12 @@ def affine(interval: Interval, scale: float, shift: float) -> Interval:
 
 
 def band_width(samples: int, level: float) -> float:
-    """Return the half width of the band around the distribution function of ``samples`` values that
-    misses with probability ``level`` (Dvoretzky, Kiefer and Wolfowitz; Massart's constant).
-    """
+    """Return the half width of the DKW band of ``samples`` values, which misses with ``level``."""
     return math.sqrt(math.log(2.0 / level) / (2.0 * samples))
 
 
 def round_digits(values: FloatArray) -> FloatArray:
-    """Return ``values``, of any shape, rounded to 9 significant digits, so that rounding errors
-    make no difference between laws.
-    """
+    """Return ``values`` rounded to 9 significant digits, so that rounding makes no difference."""
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 10.0 ** (DIGITS - 1 - np.floor(np.log10(np.abs(values))))
         return np.asarray(np.where(np.isfinite(scale), np.round(values * scale) / scale, values))
@@ -104,9 +100,7 @@ def _band_interval(gaps: FloatArray, a: int, b: int, level: float, grow: bool) -
 def distance_to_law(
     cdf: Callable[[FloatArray], FloatArray], values: FloatArray, level: float
 ) -> Interval:
-    """Return an interval for the largest difference between the exact distribution function ``cdf``
-    and that of ``values`` (S,), with its DKW band, which misses with probability ``level``.
-    """
+    """Return an interval for the distance of ``values`` (S,) from ``cdf``, by its DKW band."""
     points = np.unique(round_digits(values))
     slack = 10.0 ** (1 - DIGITS) * np.maximum(np.abs(points), 1e-300)
     ranks = np.searchsorted(np.sort(round_digits(values)), points, "right") / len(values)
@@ -122,9 +116,7 @@ def distance_to_law(
 
 
 def band_around(value: float, width: float, detectable: float = math.nan) -> Interval:
-    """Return the interval ``value`` +- ``width``, clipped to [0, 1], of a distance between laws,
-    whose width shrinks as 1 / sqrt(runs); ``detectable`` is found with probability POWER.
-    """
+    """Return ``value`` +- ``width`` in [0, 1], a distance that shrinks as 1 / sqrt(runs)."""
 
     def limits(value: float, factor: float) -> tuple[float, float]:
         reach = width / math.sqrt(factor)
@@ -224,9 +216,7 @@ def eigenvalue_interval(samples: FloatArray, level: float) -> Interval:
 
 
 def pearson_test(counts: np.ndarray, probabilities: FloatArray) -> tuple[float, int]:
-    """Return the p-value of Pearson's test of ``counts`` (C,) with ``probabilities`` (C,) in
-    decreasing order, and its number of cells: the last, rarer than MIN_EXPECTED, are pooled.
-    """
+    """Return Pearson's p-value of ``counts`` (C,) and the number of cells; rare ones are pooled."""
     expected = probabilities * counts.sum()
     frequent = max(1, int((expected >= MIN_EXPECTED).sum()))
     expected = np.append(expected[: frequent - 1], counts.sum() - expected[: frequent - 1].sum())

@@ -52,9 +52,7 @@ RATE = Promise(
 
 
 def _summarise(scenario: Scenario, run: Run) -> ReplicaSummary:
-    """Return the summary of a run with ``sends`` (2,): the number of messages sent, and the sum of
-    the probabilities of sending given the past.
-    """
+    """Return the summary with ``sends`` (2,): messages, and the sum of their probabilities."""
     summary = summarise_exactly(scenario, run)
     summary.sends = np.full(2, np.nan)
     # Without losses, and if all hear all, silence is information.

@@ -51,9 +51,7 @@ NUMBERS = ("margin", "low", "high", "tolerance", "seen", "expected", "off", "det
 
 
 def save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: str = "") -> None:
-    """Write scenario.toml, verdict.json, verdict.csv, verdict.txt, with ``text``, and results.npz
-    into ``directory``.
-    """
+    """Write scenario.toml, results.npz and the verdict with its ``text`` into ``directory``."""
     with defer_signals():  # an interrupt must not leave a verdict that does not match its results
         _save_verdict(directory, scenario, verdict, text or verdict_text(verdict, scenario.claim))
 
@@ -97,9 +95,7 @@ def _require_same(path: Path, columns: dict[str, Any]) -> None:
 
 
 def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
-    """Remove the files of a check that was stopped during its first verdict; return True if the
-    directory holds no verdict. Raises ScenarioError for files of another scenario.
-    """
+    """Remove files of a check that was stopped before a verdict; return True if there is none."""
     if not directory.is_dir() or not any(directory.iterdir()):
         return True
     # Files of a run are not in the list: those of a finished run must not be removed.
@@ -113,9 +109,7 @@ def clear_unfinished(directory: Path, scenario: Scenario) -> bool:
 
 
 def load_verdict(directory: Path, scenario: Scenario, seed: int) -> Verdict:
-    """Return the verdict in a directory, to which runs can be added. Raises ScenarioError if there
-    is none, or one of another scenario, seed or version.
-    """
+    """Return the verdict in a directory; raises ScenarioError for none or that of others."""
     remedy = "give a directory that netkf check --out has written"
     try:
         document = read_document(directory / VERDICT)

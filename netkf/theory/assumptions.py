@@ -51,9 +51,7 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 
 
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return a row for each assumption: text, equation, whether it holds, and why. Under clocks
-    those of H if it is about the filter, in slots those of its paper, else those of any filter.
-    """
+    """Return a row for each assumption: text, equation, whether it holds, and why."""
     rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
     if not scenario.is_linear:
         rows = [("readings are linear in the state", "all papers", False, NONLINEAR), *rows]

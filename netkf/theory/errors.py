@@ -72,9 +72,7 @@ def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
 
 
 def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
-    """Return the diagonal blocks (T, N, n, n) of T stacked covariances (T, N n, N n) of N
-    ``nodes``: block (t, i) is the covariance of the error of node i at time t.
-    """
+    """Return the blocks (T, N, n, n) on the diagonals of T stacked covariances (T, N n, N n)."""
     n = stacked.shape[-1] // nodes
     # Entry (t, i, a, j, b) is the covariance of entry a of e_i and entry b of e_j.
     blocks = stacked.reshape(len(stacked), nodes, n, nodes, n)

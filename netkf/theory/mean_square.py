@@ -118,9 +118,7 @@ def _make_system(scenario: Scenario) -> LinearErrors:
 
 
 def linear_errors(scenario: Scenario) -> LinearErrors:
-    """Return the errors of a scenario's filter as a linear system with jumps at readings and
-    messages; raises TheoryError if they are none, because gains depend on what happens.
-    """
+    """Return the errors as a linear system with jumps; TheoryError if gains follow events."""
     _require_known_law(scenario)
     make = _system_maker(scenario)
     if make is None:
@@ -198,9 +196,7 @@ def _require_size(shape: tuple[int, int, int]) -> None:
 
 
 def silent_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of Kalman filters in slots at their steady gains as a linear system, one
-    block of n errors for each node, or one if they share a pooled filter.
-    """
+    """Return the errors of silent Kalman filters in slots; one block if they share a filter."""
     F, Q = scenario.slot_belief
     if scenario.node_filter.timing.pooled:
         model = scenario.pooled_slot_model

@@ -163,9 +163,7 @@ def _value_or_reason(function: Callable[[], FloatArray]) -> dict[str, Any]:
 
 
 def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
-    """Return what theory states about a scenario, the ``promises`` of :func:`compute_promises`, as
-    text for a terminal.
-    """
+    """Return the ``promises`` of :func:`compute_promises` as text for a terminal."""
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
     lines += paper_legend(row["source"] for row in promises["assumptions"])

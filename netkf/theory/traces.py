@@ -31,9 +31,7 @@ MAX_STEADY_ENTRIES = 100_000
 
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
-    """Return the bound on the mean of P at ``times`` (T,), its limit for fast links, and a
-    centralised filter's trace, or the reason why theory does not apply.
-    """
+    """Return traces at ``times``: bound on P, its limit, a central filter's; or the reason."""
     bound, reason = None, ""
     try:
         if len(times):
@@ -95,9 +93,7 @@ def _trace_or_nan(function: Any, scenario: Scenario) -> float:
 
 
 def limit_label(scenario: Scenario) -> str:
-    """Return the name of the limit that the bound on P approaches as the link rates grow; empty if
-    the hybrid paper, whose bound it is, is not about the filter.
-    """
+    """Return the name of the limit of the bound for fast links; empty without the paper H."""
     if not concerns_hybrid_paper(scenario):
         return ""
     balanced = has_balanced_rates(scenario)
@@ -106,8 +102,6 @@ def limit_label(scenario: Scenario) -> str:
 
 
 def delay_suffix(scenario: Scenario) -> str:
-    """Return text to append to the name of a limit that assumes no delays: empty unless messages
-    are delayed.
-    """
+    """Return text for the name of a limit that assumes no delays; empty without delays."""
     delayed = scenario.filter.algorithm.timing.talks and scenario.network.channel.delay.fixed != 0.0
     return ", if messages took no time" if delayed else ""

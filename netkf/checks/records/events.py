@@ -53,9 +53,7 @@ TIME_TOLERANCE = 1e-9
 
 
 def event_fault(scenario: Scenario, run: Run) -> str:
-    """Return one line about the first fault of the record of a run's events: their order, numbers,
-    ends of messages, readings, ticks and absorptions; empty without one.
-    """
+    """Return one line about the first fault of the record of a run's events; empty without one."""
     log = run.log
     rules = [_ordered, _numbered, _decided, _absorbed]
     rules += [_read_in_slots, _sent_in_slots] if scenario.slotted else [_read, _ticked, _caused]

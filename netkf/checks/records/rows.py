@@ -61,9 +61,7 @@ class Audit(NamedTuple):
 
 
 def audit_run(scenario: Scenario, run: Run, seed: int, replica: int, engine: Engine) -> Audit:
-    """Return what is wrong with the record of ``run``, made by ``engine`` as ``replica`` of the
-    runs of ``seed``. For replica 0 a shorter run is done besides on both engines and into files.
-    """
+    """Return what is wrong with the record of a ``run``; of replica 0 also on both engines."""
     if replica >= AUDITED_RUNS or (replica > 0 and len(run.log) > AUDITED_EVENTS):
         return Audit()
     audit = audit_record(scenario, run, seed, replica)

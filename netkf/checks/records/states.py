@@ -32,9 +32,7 @@ SUM_ROUNDINGS = 64.0
 
 
 def sample_fault(scenario: Scenario, run: Run, seed: int, replica: int) -> str:
-    """Return one line about the first fault of the samples of run number ``replica`` of ``seed``:
-    number, status, fingerprint, times, true states and errors; empty without one.
-    """
+    """Return one line about the first fault of the samples of a run; empty without one."""
     if (run.seed, run.replica, run.nodes) != (seed, replica, scenario.nodes):
         return f"run {run.replica} of seed {run.seed} stands for run {replica} of seed {seed}"
     return (
@@ -73,9 +71,7 @@ def _truth_fault(scenario: Scenario, run: Run) -> str:
 def drawn_states(
     scenario: Scenario, seed: int, replica: int, times: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the true states (T, n) of one run at its first sample ``times`` (T,), drawn again from
-    its streams without sensors, filters or network, and the differences (T,) that rounding allows.
-    """
+    """Return the states (T, n) drawn again at ``times``, and differences (T,) by rounding."""
     streams, truth = Streams(seed, replica), None
     moments: list[Any]
     if scenario.slotted:
@@ -112,9 +108,7 @@ def _error_fault(run: Run) -> str:
 
 
 def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None) -> Scenario:
-    """Return the scenario cut at ``horizon`` (s), with a sample at time 0 and, in continuous time,
-    at the instants of some events of the ``log`` of a run, which come before them.
-    """
+    """Return the scenario cut at ``horizon``, with samples at 0 and before events of ``log``."""
     times = [np.zeros(1), scenario.times]
     if not scenario.slotted and log is not None:
         for kind in ("absorb", "tick", "sense"):
@@ -125,9 +119,7 @@ def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None
 
 
 def weight_fault(scenario: Scenario) -> str:
-    """Return one line about the first link whose weight is not that of [filter]: entry [l, i] of a
-    matrix, or Metropolis'. Empty without a fault, and for weights of other kinds.
-    """
+    """Return one line about the first link whose weight is not that of [filter]; or empty."""
     weights, nodes = getattr(scenario.filter.algorithm, "weights", None), scenario.nodes
     heard = {node: {j for j, i in scenario.topology.directions if i == node} for node in nodes}
     for sender, receiver in scenario.topology.directions:
@@ -144,9 +136,7 @@ def weight_fault(scenario: Scenario) -> str:
 
 
 def start_fault(scenario: Scenario, run: Run) -> str:
-    """Return one line about the first node whose estimate or covariance at time 0, or a weight, is
-    not that of the scenario; empty without one. ``run`` has a sample at time 0.
-    """
+    """Return one line about the first wrong estimate, covariance or weight at time 0; or empty."""
     plant, start = scenario.plant, scenario.filter
     for k, node in enumerate(scenario.nodes):
         for name, given, default, seen in (

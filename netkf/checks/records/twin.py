@@ -16,9 +16,7 @@ entry, above which two engines do not compute the same.
 
 
 def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
-    """Return one line about the first difference between a ``run`` and the same one on another
-    engine; empty if their events are equal, and their states up to rounding.
-    """
+    """Return one line about the first difference of a ``run`` on two engines; empty without one."""
     difference = first_difference(run, twin)
     if difference is not None:
         return difference

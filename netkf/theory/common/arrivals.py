@@ -11,9 +11,7 @@ from netkf.trace.run import Run
 
 
 def with_last_exchanges(scenario: Scenario, run: Run) -> Run:
-    """Return the run with the exchanges of the slot at the horizon, on which filtered estimates
-    there depend: those of the same run over a longer horizon. Raises TheoryError without one.
-    """
+    """Return the run with the exchanges at the horizon, from a longer one; else TheoryError."""
     algorithm, plant, horizon = scenario.node_filter, scenario.slot_plant, scenario.horizon
     slots = plant.slots_of(run.times).tolist()
     last = slots[-1] if slots else 0

@@ -147,9 +147,7 @@ class ClockColumns(ErrorColumns):
         self._now = time
 
     def _keep_digits(self, nodes: Sequence[int]) -> None:
-        """Move the origin if the true state has become so large that errors of ``nodes`` would lose
-        digits.
-        """
+        """Move the origin if the state is so large that errors of ``nodes`` lose digits."""
         if not self._now >= self._checked + self._unit:
             return
         self._checked, forms = self._now, self._forms_of_all
@@ -207,9 +205,7 @@ class ClockColumns(ErrorColumns):
         self._filters.update(h, self._gap(h, time), H, y)
 
     def _whiten(self, observation: Observation) -> tuple[FloatArray, FloatArray]:
-        """Return H (p, n) and the root (p, p) of the noise as multiples of the assumed root of R;
-        many observations are one object.
-        """
+        """Return H (p, n) and root (p, p) in units of the assumed root of R; by object."""
         key = id(observation)
         if key not in self._whitened:
             root = np.linalg.cholesky(observation.R)

@@ -16,9 +16,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def has_columns(scenario: Scenario) -> bool:
-    """Return True if the filter of a scenario is affine and its verbs are kernels: then its errors
-    follow from the verbs. A filter that commutes with a shift of the truth says that it is affine.
-    """
+    """Return True if errors follow from the verbs: affine kernels that commute with a shift."""
     kernels = compiled_kernels(scenario.node_filter, clocked=not scenario.slotted)
     return kernels is not None and kernels.affine and commutes(scenario.node_filter)
 
@@ -60,9 +58,7 @@ class ErrorColumns:
         return np.asarray(forms @ forms.T)
 
     def law(self) -> tuple[FloatArray, FloatArray]:
-        """Return the mean (K M n,) and the covariance (K M n, K M n) of the errors at the K times
-        at which ``keep`` was called.
-        """
+        """Return the mean (K M n,) and the covariance of the errors at the K times of ``keep``."""
         width = max(form.shape[1] for form in self._kept)
         # Columns that came after a time are zero there.
         forms = np.concatenate([padded(form, width - form.shape[1]) for form in self._kept])

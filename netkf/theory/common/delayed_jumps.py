@@ -275,17 +275,13 @@ class DelayedJumps:
         return np.asarray(symmetric(self.instant.sampled(Z[:, :M, :M]) + heard)[0])
 
     def apply_jumps(self, Phi: FloatArray) -> FloatArray:
-        """Return T(Phi) (1, M, M), the Phi that jumps cause in errors driven by white noise of
-        covariance Phi (1, M, M) per second; T is a positive map.
-        """
+        """Return T(Phi) (1, M, M), what jumps cause in errors driven by noise Phi; positive."""
         K = self._autocovariances(self._driven_by(Phi[0]), jumps=False)
         return self._inflow(self._moments(K, noise=False))[None]
 
     @cached_property
     def is_bounded(self) -> bool:
-        """True if mean squares are proved to be bounded: the radius of ``apply_jumps``, T, is below
-        1, because a positive definite Phi (M, M) solves ``Phi = T(Phi) + I``.
-        """
+        """True if a definite Phi (M, M) solves ``Phi = T(Phi) + I``: mean squares stay bounded."""
         unit = self._driven_by(np.eye(len(self.instant.drift)))
         try:
             moments = self._moments(self._autocovariances(unit, jumps=True), noise=False)
@@ -322,16 +318,12 @@ class DelayedJumps:
 
 
 def chebyshev_points(K: int) -> FloatArray:
-    """Return the extreme points (K + 1,) of the Chebyshev polynomial of degree K, increasing from 0
-    to 1.
-    """
+    """Return the extreme points (K + 1,) of the Chebyshev polynomial of degree K on [0, 1]."""
     return np.asarray(0.5 * (1.0 - np.cos(np.pi * np.arange(K + 1) / K)))
 
 
 def chebyshev_integrals(K: int) -> FloatArray:
-    """Return the matrix (K + 1, K + 1) that maps the values of a polynomial of degree K at the
-    Chebyshev points of [0, 1] (:func:`chebyshev_points`) to its integrals from 0 to each of them.
-    """
+    """Return the matrix (K + 1, K + 1) from values at Chebyshev points to integrals up to each."""
     x = 2.0 * chebyshev_points(K) - 1.0
     coefficients = np.linalg.inv(np.polynomial.chebyshev.chebvander(x, K))
     integrals = np.polynomial.chebyshev.chebint(coefficients, lbnd=-1.0, axis=0)

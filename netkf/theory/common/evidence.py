@@ -24,9 +24,7 @@ def is_recorded(channel: Channel) -> bool:
 
 
 def true_model_row(scenario: Scenario, source: str, matrices: str) -> AssumptionRow:
-    """Return the row that says if the filters' model is the true one, in which ``matrices`` are the
-    same, by ``source``; None for records.
-    """
+    """Return the row of ``source`` that the filters' model is the true one; None for records."""
     if not scenario.is_random:
         return TRUE_MODEL, source, None, UNKNOWN_LAW
     same = scenario.filters_know_the_truth
@@ -34,9 +32,7 @@ def true_model_row(scenario: Scenario, source: str, matrices: str) -> Assumption
 
 
 def judge_plant(scenario: Scenario, holds: bool, evidence: str) -> tuple[bool | None, str]:
-    """Return the verdict ``holds`` and the ``evidence`` for a statement about the plant's matrices;
-    None where the state is recorded, so that they are assumed.
-    """
+    """Return ``holds`` and ``evidence`` about the plant; None where the state is recorded."""
     if scenario.plant.is_random:
         return holds, evidence
     return None, f"assumed, not known: {evidence}"

@@ -51,9 +51,7 @@ class Forms:
         self._free += rows.tolist()
 
     def inputs(self, count: int) -> int:
-        """Add ``count`` inputs, independent of all before; return the column of the first, which is
-        valid until the next call.
-        """
+        """Add ``count`` inputs; return the column of the first, valid until the next call."""
         if self.used + count > self.table.shape[1]:
             self._reduce(count)
         first = self.used
@@ -62,9 +60,7 @@ class Forms:
         return first
 
     def freeze(self, forms: FloatArray) -> FloatArray:
-        """Return ``forms`` (k, used) of numbers in the columns that they have from now on, which
-        later reductions leave alone; numbers of later times depend on further columns too.
-        """
+        """Return ``forms`` (k, used) in columns that later reductions leave alone."""
         frozen = self._reduce(0, forms)
         self.frozen = min(self.used, self.frozen + len(forms))
         return frozen[:, : self.frozen]

@@ -45,9 +45,7 @@ class IncrementFlows(NamedTuple):
     def advance(
         self, forms: Forms, state: IntArray, estimates: IntArray, roots: FloatArray, gap: float
     ) -> None:
-        """Move the true state, rows (n,) of ``forms``, and the estimates that read increments, of
-        rows (M, n), with their ``roots`` (M, n, n), over ``gap`` seconds.
-        """
+        """Move state and estimates that read increments, rows of ``forms``, over ``gap`` (s)."""
         steps = math.ceil(gap / self.unit)
         for _ in range(steps):
             self._step(forms, state, estimates, roots, gap / steps)
@@ -80,9 +78,7 @@ class IncrementFlows(NamedTuple):
 
 
 def integration_steps(scenario: Scenario) -> int:
-    """Return the least number of steps in which the errors of a run are propagated, by which its
-    cost is estimated; 0 if no sensor senses increments.
-    """
+    """Return the least number of steps in which errors are propagated; 0 without increments."""
     if scenario.slotted:
         return 0
     flows = increment_flows(scenario, len(scenario.nodes))
@@ -90,9 +86,7 @@ def integration_steps(scenario: Scenario) -> int:
 
 
 def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | None:
-    """Return how errors of the first ``estimators`` nodes evolve between messages, or None if no
-    sensor senses increments.
-    """
+    """Return how errors of the first ``estimators`` evolve between messages; None if alike."""
     observations = increment_observations(scenario)
     if not any(len(observation.H) for observation in observations):
         return None

@@ -165,9 +165,7 @@ class ClockJumps:
 
     @cached_property
     def all_pairs(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Pairs of directions of all clocks together, as two arrays (P,) of indices, and the rates
-        (S, P) per second, by mode, at which both messages arrive.
-        """
+        """Pairs (P,) of directions of all clocks, and the rates (S, P) at which both arrive."""
         first, second = (np.concatenate([pair[k] for pair in self._pairs]) for k in (0, 1))
         return first, second, np.concatenate([rates for *_, rates in self._pairs], axis=1)
 
@@ -180,9 +178,7 @@ class ClockJumps:
         ]
 
     def sampled(self, X: FloatArray) -> FloatArray:
-        """Return the part (S, M, M) of ``inflow`` that samples of the nodes add, for second moments
-        X (S, M, M).
-        """
+        """Return the part (S, M, M) of ``inflow`` that samples add, for moments X (S, M, M)."""
         inflow = np.zeros_like(X)
         for node, rate, lost in self.samples:
             block = _block_slice(X, self.nodes, node)
@@ -190,9 +186,7 @@ class ClockJumps:
         return inflow
 
     def inflow(self, X: FloatArray) -> FloatArray:
-        """Return the rate (S, M, M) per second at which jumps increase second moments X (S, M, M)
-        beyond ``flows``, ``dX/dt = B X + X B' + inflow(X) + noise``: a positive map.
-        """
+        """Return what jumps add to dX/dt beyond B X + X B' and the noise: a positive map."""
         total = self.sampled(X)
         if self.directions is None or not self.ticks:
             return total
@@ -208,9 +202,7 @@ class ClockJumps:
         return total
 
     def maps(self) -> tuple[PositiveMap, FloatArray | None]:
-        """Return X -> L^-1(inflow(X)) and L^-1(noise) (S, M, M), L X = -(B X + X B'); None for the
-        noise where B is not stable.
-        """
+        """Return X -> L^-1(inflow(X)) and L^-1(noise), L X = -(B X + X B'); None if unstable."""
         if max(map(growth_rate, self.flows)) >= 0.0:
             return self.inflow, None
         inverse = LyapunovInverse(self.flows)
@@ -238,9 +230,7 @@ class LyapunovInverse:
     """The inverse of ``X -> -(B X + X B')`` for stable matrices B (S, M, M), by Schur forms."""
 
     def __init__(self, B: FloatArray) -> None:
-        """Compute the Schur forms of S stable matrices ``B`` (S, M, M), which each solution
-        uses.
-        """
+        """Compute the Schur forms of S stable matrices ``B`` (S, M, M)."""
         self._forms = [scipy.linalg.schur(matrix)[:2] for matrix in B]
 
     def __call__(self, Y: FloatArray) -> FloatArray:

@@ -35,9 +35,7 @@ NO_PLACES, NO_FORMS = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))
 
 @kernel
 def find_inputs(words: IntArray, written: int, row: IntArray, inputs: IntArray) -> int:
-    """Write the places of ``words`` (w,) that depend on noise, but the last ``written``, into
-    ``inputs``; return how many there are.
-    """
+    """Write the places of ``words`` that depend on noise into ``inputs``; return their number."""
     number = 0
     for i in range(len(words) - written):
         if row[words[i]] >= 0:
@@ -50,9 +48,7 @@ def find_inputs(words: IntArray, written: int, row: IntArray, inputs: IntArray) 
 def fill_blocks(
     run: Any, blocks: FloatArray, stored: FloatArray, words: IntArray, count: int, changes: int
 ) -> None:
-    """Copy ``words`` (w,) of the ``stored`` filters into ``changes`` + 1 blocks, and give each the
-    first ``count`` readings.
-    """
+    """Copy the ``stored`` words into ``changes`` + 1 blocks, each with the ``count`` readings."""
     for b in range(changes + 1):
         for i in range(len(words)):
             blocks[b, words[i]] = stored[words[i]]
@@ -110,9 +106,7 @@ def move_forms(
     table: FloatArray, used: int, words: IntArray, row: IntArray, keep: int, inputs: IntArray,
     number: int, others: FloatArray, out: FloatArray, moved: FloatArray,
 ) -> None:  # fmt: skip
-    """Apply a linear map ``out`` to the first ``used`` columns of the forms of its ``number``
-    inputs, and of ``others`` (k, C).
-    """
+    """Apply a linear map ``out`` to the forms of its ``number`` inputs and ``others`` (k, C)."""
     for i in range(keep):
         if row[words[i]] < 0:
             continue
@@ -204,9 +198,7 @@ class LinearVerbs:
     """
 
     def __init__(self, scenario: Scenario, forms: Forms, messages: int, rows: int) -> None:
-        """Make the filters at time 0, with room for some ``messages`` and readings of up to
-        ``rows`` rows.
-        """
+        """Make the filters at time 0, with room for ``messages`` and readings of ``rows``."""
         kernels = compiled_kernels(scenario.node_filter, clocked=True)
         assert kernels is not None
         self.kernels: Kernels = kernels
@@ -308,9 +300,7 @@ class LinearVerbs:
         self._memories[:, offset] = self._payloads.ctypes.data + places
 
     def node_words(self, h: int, events: int = 0) -> IntArray:
-        """Return the words of node ``h`` and its incoming links; its past with room for so many
-        more ``events``.
-        """
+        """Return the words of node ``h`` and its links; its past with room for ``events``."""
         if h not in self._node_words:
             first, parts = self.run.first, []
             for name, begin in self._begin.items():
@@ -478,9 +468,7 @@ class LinearVerbs:
 
 
 def _memories(struct: Any, arrays: dict[str, np.ndarray], steps: IntArray) -> np.ndarray:
-    """Return the memories (B, words) of structs like ``struct`` whose ``arrays`` lie so many bytes
-    further on: ``steps`` (B,).
-    """
+    """Return the memories (B, words) of structs whose ``arrays`` lie ``steps`` (B,) further on."""
     memories = np.tile(struct.memory, (len(steps), 1))
     for name in arrays:
         memories[:, struct.struct_offsets[name]] += steps

@@ -33,9 +33,7 @@ class Observation(NamedTuple):
 
 
 def stack_observations(observations: list[Observation], n: int) -> Observation:
-    """Join ``observations`` of a state (n,) with independent noises into one: H (p, n) stacked, R
-    and root (p, p) block diagonal, for p readings together.
-    """
+    """Join ``observations`` with independent noises into one: H (p, n), R and root (p, p)."""
     if len(observations) == 1:
         return observations[0]
     H = np.concatenate([np.zeros((0, n)), *(observation.H for observation in observations)])
@@ -44,9 +42,7 @@ def stack_observations(observations: list[Observation], n: int) -> Observation:
 
 
 def joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
-    """Return ``(I - K H) P (I - K H)' + K R K'`` (n, n), the covariance after a reading in the form
-    of Joseph, for ``P`` (n, n) before it.
-    """
+    """Return ``(I - K H) P (I - K H)' + K R K'`` (n, n), Joseph's form, after a reading."""
     H, R = observation.H, observation.R
     K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
     closed = np.eye(len(P)) - K @ H
@@ -86,9 +82,7 @@ def _noise(
 
 
 def increment_observations(scenario: Scenario) -> list[Observation]:
-    """Return the continuous readings of each estimator; p is 0 without any. Estimators with sensors
-    of the same entries share one object.
-    """
+    """Return the continuous readings of each estimator; equal ones are one object."""
     placed, n = scenario.increment_sensors, scenario.plant.n
     entries_in_use = {sensor.entry for sensors in placed.values() for sensor in sensors}
     noises = _noises(scenario)
@@ -112,9 +106,7 @@ def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
 
 
 def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
-    """Return a function from a slot, increasing from call to call, to its readings by index of the
-    estimator; those without sensors are missing.
-    """
+    """Return a function from an increasing slot to its readings by index of the estimator."""
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     noises = _noises(scenario)
     estimators = [
@@ -152,9 +144,7 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
 
 
 def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObservations]:
-    """Return the readings of a run's sampled sensors by time (seconds) and index of the estimator.
-    Samples of one instant are one observation; equal ones are one object.
-    """
+    """Return the sampled readings of a run by time (s) and estimator; equal ones are one object."""
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     by_node, noises = scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)

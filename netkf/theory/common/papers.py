@@ -22,9 +22,7 @@ PAPERS = {
 
 
 def paper_legend(sources: Iterable[str]) -> list[str]:
-    """Return lines with the title of each paper whose letter begins one of the ``sources`` of the
-    rows of a table, or a part of one, such as "G Theorem 8".
-    """
+    """Return lines with the title of each paper whose letter begins a part of the ``sources``."""
     joined = "; ".join(sources)
     return [
         line

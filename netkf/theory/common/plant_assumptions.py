@@ -47,9 +47,7 @@ def judge_observed(scenario: Scenario, F: FloatArray, note: str = "") -> tuple[b
 
 
 def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the assumptions on the plant that papers about slots share: (F, Q^1/2) is
-    stabilisable, Q definite, and the filters know the model.
-    """
+    """Return the rows that papers about slots share: stabilisable, Q definite, model known."""
     plant = scenario.slot_plant
     smallest = float(np.linalg.eigvalsh(plant.Q)[0])
     # (F, Q^1/2) is stabilisable if and only if (F', Q^1/2) is detectable.
@@ -74,9 +72,7 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
-    """Return the assumption, as a list of one row of the table, that each P_i(0) is at least the
-    second moment of the node's first error; ``source`` is the equation that the row names.
-    """
+    """Return the row, by ``source``, that P_i(0) is at least the second moment of the error."""
     plant, smallest = scenario.plant, np.inf
     starts = (scenario.initial_estimate(node) for node in scenario.nodes)
     # Most networks have one start for all nodes.
@@ -99,9 +95,7 @@ def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
 def model_and_start_rows(
     scenario: Scenario, source: str, *between: AssumptionRow
 ) -> list[AssumptionRow]:
-    """Return the rows, by ``source``, of a filter in slots of which little is assumed: it knows the
-    model, those ``between``, and its first covariances.
-    """
+    """Return the rows, by ``source``: the model, those ``between``, and the first covariances."""
     return [
         true_model_row(scenario, source, "same F, Q and R"),
         *between,

@@ -66,9 +66,7 @@ class Directions(NamedTuple):
         return probabilities
 
     def advance(self, X: FloatArray, chains: IntArray) -> FloatArray:
-        """Return second moments (S, M, M) by mode after a step of the given bursty ``chains``, from
-        those X (S, M, M) before it, each weighted by the probability of its mode.
-        """
+        """Return second moments (S, M, M) by mode after a step of the bursty ``chains``."""
         if self.steps is None:
             return X
         to_bad, to_good = self.steps
@@ -80,9 +78,7 @@ class Directions(NamedTuple):
         return X
 
     def stay(self, chains: IntArray) -> FloatArray:
-        """Return the probability (S,), by mode, that a step of the given ``chains`` (indices of
-        two-state chains of bursty losses, whose joint state is the mode) leaves the mode as it is.
-        """
+        """Return the probability (S,), by mode, that a step of ``chains`` leaves the mode."""
         if self.steps is None:
             return np.ones(1)
         to_bad, to_good = self.steps
@@ -92,9 +88,7 @@ class Directions(NamedTuple):
         return probability
 
     def mean(self, nodes: int, directions: IntArray) -> FloatArray:
-        """Return E[D] (S, N n, N n), the mean change of the stacked errors of N = ``nodes`` nodes
-        by one exchange over the given ``directions``, by mode.
-        """
+        """Return E[D] (S, N n, N n), by mode, of one exchange over the given ``directions``."""
         n = self.weight.shape[-1]
         blocks = np.zeros((self.modes, nodes, nodes, n, n))
         terms = self.delivery[:, directions, None, None] * self.weight[directions]
@@ -124,9 +118,7 @@ class Directions(NamedTuple):
         return _join_blocks(blocks_out)
 
     def joint(self, first: IntArray, second: IntArray) -> FloatArray:
-        """Return the probability (S, P), by mode, that the messages of both directions arrive in
-        one activation, for P pairs of directions with the indices ``first`` and ``second`` (P,).
-        """
+        """Return the probability (S, P), by mode, that both of each pair of directions arrive."""
         p, q = self.delivery[:, first], self.delivery[:, second]
         # Directions of one source share one uniform draw: both arrive if it is below min(p, q).
         same = self.source[first] == self.source[second]
@@ -203,9 +195,7 @@ def all_messages_arrive(scenario: Scenario) -> bool:
 
 
 def delivery_of(scenario: Scenario, direction: tuple[int, int]) -> float:
-    """Return the probability with which each message on a link (sender, receiver) arrives. Raises
-    TheoryError if it is unknown before a run, or not the same for all messages.
-    """
+    """Return the probability that a message of a link arrives; raises TheoryError if unknown."""
     loss, table = scenario.network.channel.loss, scenario.table_probability(direction)
     mean = loss.mean_delivery(direction, table)
     if math.isnan(mean):
@@ -217,9 +207,7 @@ def delivery_of(scenario: Scenario, direction: tuple[int, int]) -> float:
 
 @lru_cache(maxsize=8)
 def has_constant_losses(scenario: Scenario) -> bool:
-    """Return True if all messages of a directed link arrive with one probability; a user's class is
-    asked for its first MESSAGES_ASKED messages.
-    """
+    """Return True if all messages of a link arrive with one probability; a class is asked."""
     loss = scenario.network.channel.loss
     if identical_per_link(loss) or isinstance(loss, GilbertElliott):
         return True

@@ -12,9 +12,7 @@ from netkf.scenario.scenario import Scenario
 
 
 def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
-    """Return the public ``functions`` of ``netkf.theory`` whose first parameter is a Scenario, by
-    name, each refusing anything else by a ScenarioError that says how to load one.
-    """
+    """Return ``functions`` by name, each of which refuses anything but a Scenario first."""
     wrapped = {}
     for name, function in functions.items():
         if inspect.isfunction(function):

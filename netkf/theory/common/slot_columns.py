@@ -103,9 +103,7 @@ class SlotColumns(ErrorColumns):
         self._fit(self._x.shape[1])
 
     def _fit(self, columns: int) -> None:
-        """Give the filters room for so many columns; all that are not used are as the column
-        without noise.
-        """
+        """Give the filters room for so many columns; unused ones are as without noise."""
         former = self._filters.records.arrays
         old, blocks = len(former["xhat"]), blocks_of(columns)
         if blocks <= old:
@@ -253,9 +251,7 @@ def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSam
 
 
 def _arrivals(scenario: Scenario, run: Run, setup: SlotSetup) -> dict[int, np.ndarray]:
-    """Return by slot which messages were used, (E, W) in the order of exchanges of a slot and of
-    the directed links.
-    """
+    """Return by slot which messages were used, (E, W) by exchange and directed link."""
     log, index = run.log, setup.index_of_direction
     sends, delivers = (log[log["kind"] == CODES[kind]] for kind in ("send", "deliver"))
     slots, phases = scenario.slot_plant.slots_of(sends["t"]), np.maximum(sends["phase"], 0)

@@ -27,9 +27,7 @@ def link_weights(scenario: Scenario) -> dict[tuple[int, int], FloatArray]:
 
 
 def slot_jumps(scenario: Scenario) -> SlotJumps:
-    """Return the errors of all nodes in slots as a linear system: predicted, corrected by the gain
-    of each node, averaged in the exchange. Raises TheoryError for recorded exchanges.
-    """
+    """Return the errors in slots as a linear system; raises TheoryError for recorded exchanges."""
     gains, n = _node_gains(scenario), scenario.plant.n
     sensors = [scenario.observation_matrices(node) for node in scenario.nodes]
     closed = [np.eye(n) - L @ H for L, (H, _) in zip(gains, sensors, strict=True)]
@@ -39,9 +37,7 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
 
 
 def broadcast_directions(scenario: Scenario) -> Directions | None:
-    """Return the directed links of a scenario with broadcasts in slots, None without links; raises
-    TheoryError for recorded exchanges.
-    """
+    """Return the directed links of broadcasts, None without; TheoryError for recorded ones."""
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
     weights = link_weights(scenario)
@@ -49,9 +45,7 @@ def broadcast_directions(scenario: Scenario) -> Directions | None:
 
 
 class JointErrorFlow(NamedTuple):
-    """The errors between ticks: the ``drift`` A - L H (N, n, n) of each node, and the covariance
-    ``noise`` (N n, N n) per second of all.
-    """
+    """The ``drift`` A - L H (N, n, n) of errors, and ``noise`` (N n, N n) per second of all."""
 
     drift: FloatArray
     noise: FloatArray
@@ -108,9 +102,7 @@ def _node_slice(k: int, n: int) -> slice:
 
 
 def _error_flow(scenario: Scenario) -> JointErrorFlow:
-    """Return the drift A - L H (N, n, n) of errors between events and the covariance (N n, N n) of
-    their noise, per second.
-    """
+    """Return the drift (N, n, n) of errors between events, and their noise, per second."""
     gains, truth = _node_gains(scenario), scenario.diffusion
     N, n = len(gains), len(truth.A)
     drift, noise = np.tile(truth.A, (N, 1, 1)), np.tile(truth.B @ truth.B.T, (N, N))
@@ -136,9 +128,7 @@ def _sampled_nodes(scenario: Scenario) -> list[SampledNode]:
 def _poisson_samples(
     scenario: Scenario, samples: list[SampledNode]
 ) -> tuple[tuple[tuple[int, float, FloatArray], ...], FloatArray]:
-    """Return (node, rate in 1/s, L H) of each sensor that samples, and the covariance per second (N
-    n, N n) that samples add. Raises TheoryError for other than Poisson clocks.
-    """
+    """Return (node, rate, L H) of sensors that sample, and their noise per second; TheoryError."""
     N, n = len(scenario.nodes), scenario.plant.n
     noise, sampled_nodes = np.zeros((N * n, N * n)), []
     for sensor in samples:
@@ -205,9 +195,7 @@ def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
 
 
 def _move_errors(flow: JointErrorFlow, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the transition (N n, N n) of errors over ``gap`` seconds, and the covariance of the
-    noise over it.
-    """
+    """Return the transition (N n, N n) of errors over ``gap`` seconds, and its noise."""
     transitions = Transitions(block_diagonal(list(flow.drift)), square_root(flow.noise))
     F, root = (law[0] for law in transitions.laws(np.array([gap])))
     return F, root @ root.T

@@ -35,9 +35,7 @@ def slot_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 
 def sparse_weights(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return the weights W (N, N), sparse, by which nodes combine estimates, paper D (8): node i
-    gives weight W[l, i] to the estimate of l. These are the weights if all messages arrive.
-    """
+    """Return the weights W (N, N), sparse, D (8): node i gives W[l, i] to the estimate of l."""
     index, own_weights = scenario.topology.index, scenario.own_weights
     size, directions = len(scenario.nodes), scenario.topology.directions
     rows = [*range(size), *(index[sender] for sender, _ in directions)]

@@ -249,9 +249,7 @@ def _window_excitation(source: _Source, states: FloatArray, window: int) -> Floa
 
 
 def normalised_outer(mean: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return ``E[phi phi' / (1 + |phi|^2)]`` (K, n, n) of a Gaussian phi with means ``mean`` (K, n)
-    and one ``cov`` (n, n), by 1 / (1 + r) = int exp(-u (1 + r)) du.
-    """
+    """Return ``E[phi phi' / (1 + |phi|^2)]`` (K, n, n), phi of ``mean`` (K, n) and ``cov``."""
     spread, axes = np.linalg.eigh(cov)
     spread = np.maximum(spread, 0.0)
     # In the axes of the covariance the entries of phi are independent.

@@ -35,9 +35,7 @@ def mean_matching(scenario: Scenario) -> FloatArray:
 
 
 def effective_matching(scenario: Scenario) -> FloatArray:
-    """Return the mean (N, N) of the swaps that succeed: Abar with the losses of the channel. Raises
-    TheoryError if slots depend on each other, swaps can become copies, or messages be late.
-    """
+    """Return Abar (N, N) with losses; TheoryError for dependent slots, copies and late messages."""
     activation, channel = scenario.network.activation, scenario.network.channel
     if not isinstance(activation, Matching):
         raise TheoryError("the matching is recorded, not drawn")
@@ -75,9 +73,7 @@ def _recorded_mean(scenario: Scenario, activation: RecordedSlots) -> FloatArray:
 
 
 def primitive(matrix: FloatArray) -> tuple[bool, bool, int]:
-    """Return (is irreducible, is also aperiodic, period) of a nonnegative ``matrix`` (N, N); the
-    period is the gcd of the lengths of its cycles, 0 if it is reducible.
-    """
+    """Return (irreducible, also aperiodic, period) of a nonnegative ``matrix``; 0 if reducible."""
     import networkx
 
     graph = networkx.from_numpy_array((matrix > 1e-15).astype(int), create_using=networkx.DiGraph)

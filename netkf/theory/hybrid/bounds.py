@@ -81,9 +81,7 @@ def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:
 
 
 def _solve_explicitly(packed: PackedRiccati, times: FloatArray) -> FloatArray:
-    """Return the packed bound (T, N, m) without delays and samples, step by step, so that nothing
-    but the samples is stored; raises StiffError after too many evaluations.
-    """
+    """Return the packed bound (T, N, m) without delays and samples; StiffError if it takes long."""
     # It takes 0.4 s to import.
     import scipy.integrate
 

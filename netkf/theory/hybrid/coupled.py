@@ -91,18 +91,14 @@ class CoupledRiccati(NamedTuple):
 
 
 def concerns_hybrid_paper(scenario: Scenario) -> bool:
-    """Return True if results of the hybrid paper are about the scenario's filter: the hybrid filter
-    and covariance intersection, and in continuous time any filter that does not talk.
-    """
+    """Return True if H is about the filter: its own ones, and under clocks silent ones."""
     if not scenario.slotted and not scenario.filter.algorithm.timing.talks:
         return True
     return scenario.node_filter.analysis.paper == "hybrid"
 
 
 def reason_without_bound(scenario: Scenario) -> str | None:
-    """Return the reason why H Theorem 2 of the hybrid paper, that the solution of the coupled
-    Riccati equations H(12) bounds the mean of P, does not apply to a scenario; None if it applies.
-    """
+    """Return why H Theorem 2, that H(12) bounds the mean of P, does not apply; None if it does."""
     algorithm, network = scenario.filter.algorithm, scenario.network
     if not scenario.slotted and not algorithm.timing.talks:
         return _reason_of_samples(scenario)
@@ -151,9 +147,7 @@ def require_bound(scenario: Scenario) -> None:
 
 
 def increment_informations(scenario: Scenario) -> FloatArray:
-    """Return ``G_i = H_i' R_i^-1 H_i`` (N, n, n) of the increments, with the R that filters assume;
-    a pooled filter has all at every node.
-    """
+    """Return ``H_i' R_i^-1 H_i`` (N, n, n) of increments; a pooled filter has all of them."""
     observations, n = increment_observations(scenario), scenario.plant.n
     distinct = {
         id(observation): observation for observation in observations
@@ -172,9 +166,7 @@ def increment_informations(scenario: Scenario) -> FloatArray:
 
 @lru_cache(maxsize=4)
 def coupling(scenario: Scenario) -> scipy.sparse.csr_array:
-    """Return the coefficients c (N, N), sparse: the rate (1/s) of arrivals from j at i times their
-    weight. Calls with one scenario share the array.
-    """
+    """Return c (N, N), sparse: rates (1/s) of arrivals from j at i times weights; one object."""
     index, size = scenario.topology.index, len(scenario.nodes)
     rates = {} if transmits_at_samples(scenario) else scenario.effective_rates()
     # Losses thin the Poisson process of arrivals: the effective rate counts what arrives.
@@ -220,9 +212,7 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
 
 
 def has_balanced_rates(scenario: Scenario) -> bool | None:
-    """Return True if both directions of each link have one rate, so that S is the limit, H (13);
-    None if rates are not known beforehand.
-    """
+    """Return True if both directions of each link have one rate, H (13); None if unknown."""
     if not np.isfinite(list(scenario.effective_rates().values())).all():
         return None
     return _is_symmetric(coupling(scenario))

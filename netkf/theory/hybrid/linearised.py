@@ -34,9 +34,7 @@ def solve_linearised(
     right: FloatArray,
     tolerance: float = RESIDUAL_TOLERANCE,
 ) -> FloatArray:
-    """Return X (N, m) with ``op_P(X) = -right``, op_P the linearisation of H(12) at P (N, n, n),
-    see :func:`solve_map`.
-    """
+    """Return X (N, m) with ``op_P(X) = -right``, H(12) linearised at P, see :func:`solve_map`."""
     return solve_map(packed.linear(P), right, tolerance)
 
 

@@ -31,9 +31,7 @@ class PackedRiccati:
     """
 
     def __init__(self, equations: CoupledRiccati) -> None:
-        """Pack the coefficients of the equations of N nodes with n states: symmetric matrices
-        (n, n) become rows of m = n (n + 1) / 2 numbers.
-        """
+        """Pack the coefficients: symmetric (n, n) become rows of m = n (n + 1) / 2 numbers."""
         self.equations = equations
         n = len(equations.A)
         self._i, self._j = np.triu_indices(n)
@@ -59,9 +57,7 @@ class PackedRiccati:
         self._C = _low_rank_factors(equations.G[self._sensed])
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
-        """Return the equations with another drift A (n, n) and noise Q (n, n) or (N, n, n), per
-        second; arrays of the network are shared.
-        """
+        """Return the equations with another drift A (n, n) and noise Q, per second."""
         shifted = copy.copy(self)
         shifted.equations = self.equations._replace(A=A, Q=Q)
         shifted._set_drift(A, Q)
@@ -75,9 +71,7 @@ class PackedRiccati:
 
     @cached_property
     def eliminates_cheaply(self) -> bool:
-        """True if linear equations for all nodes can be solved by elimination with little fill-in,
-        because the network has small cuts everywhere: the band of its reordered matrix is narrow.
-        """
+        """True if elimination has little fill-in: the network has small cuts everywhere."""
         coupling = scipy.sparse.csr_array(self.equations.coupling)
         order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling)
         index = np.empty(len(order), dtype=np.int64)
@@ -106,9 +100,7 @@ class PackedRiccati:
         return np.asarray(Y @ self._predicted + self._q)
 
     def slope(self, Y: FloatArray, sent: FloatArray | None = None) -> FloatArray:
-        """Return dY/dt (N, m), per second, of the covariances in rows Y (N, m); ``sent`` (N, m) is
-        Y a delay ago, and Y itself if None.
-        """
+        """Return dY/dt (N, m) of rows Y (N, m); ``sent`` is Y a delay ago, Y itself if None."""
         if sent is None:
             change = self._exchange @ Y + Y @ self._drift_map + self._Q
         else:
@@ -156,9 +148,7 @@ class PackedRiccati:
         return LinearisedRiccati(np.asarray(blocks), heard, self)
 
     def linear_with_gains(self, corrections: FloatArray) -> LinearisedRiccati:
-        """Return the linear map of P with constant gains, of which ``corrections`` (N, n, n) are
-        ``L_i H_i``, for equations without samples.
-        """
+        """Return the map of P with gains whose ``L_i H_i`` are ``corrections`` (N, n, n)."""
         blocks = self._blocks(np.arange(len(corrections)), corrections)
         heard = [(self.equations.coupling, np.arange(len(corrections)), self._predicted[None])]
         return LinearisedRiccati(blocks, heard, self)
@@ -199,9 +189,7 @@ class LinearisedRiccati(NamedTuple):
         return total
 
     def mean_map(self) -> FloatArray:
-        """Return the map (m, m) that gives the mean over the nodes of the image of rows that are
-        equal everywhere; it is the coarse part of a preconditioner.
-        """
+        """Return the mean map (m, m) of rows that are equal everywhere, to precondition."""
         total = self.blocks.mean(axis=0)
         for rates, _, maps in self.heard:
             # the rate at which each sender is heard, over the number of nodes

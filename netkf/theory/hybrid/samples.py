@@ -107,9 +107,7 @@ def transmits_at_samples(scenario: Scenario) -> bool:
 
 
 def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
-    """Return, by the indices (receiver, sender), the delivery probability times the weight of
-    messages that nodes send when they sample; empty if they do not.
-    """
+    """Return delivery times weight by (receiver, sender), of messages sent at samples."""
     if not scenario.filter.algorithm.timing.talks or not transmits_at_samples(scenario):
         return {}
     index, loss = scenario.topology.index, scenario.network.channel.loss

@@ -79,9 +79,7 @@ def has_stabilising_gains(scenario: Scenario) -> bool:
 
 
 def steady_by_node(scenario: Scenario) -> FloatArray:
-    """Return the steady covariance (N, n, n) that each node has without messages; nan if it has
-    none. Raises TheoryError if nodes communicate.
-    """
+    """Return the steady covariance (N, n, n) of nodes that hear nothing; nan without one."""
     equations = coupled_riccati(scenario)
     if equations.talks:
         raise TheoryError("the nodes hear each other: their steady state is one for all")
@@ -91,9 +89,7 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
 
 
 def steady_state(equations: CoupledRiccati) -> FloatArray | None:
-    """Return the steady state (N, n, n) of H(12), or None. Raises TheoryError for samples at known
-    times, which lead to a cycle, and for too large a residual.
-    """
+    """Return the steady state (N, n, n) of H(12), or None. Raises TheoryError for a cycle."""
     packed = PackedRiccati(equations)
     P = _stabilising_covariances(packed)
     if P is None:

@@ -60,9 +60,7 @@ def step_weights(scenario: Scenario) -> FloatArray:
 def effective_weights(
     scenario: Scenario, weights: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how often node i counts the prediction and the reading of node j after an exchange,
-    (N, N) each; ``weights`` (N, N) of each step are those of the messages that arrived.
-    """
+    """Return how often i counts prediction and reading of j, (N, N) each, by ``weights``."""
     algorithm: Any = scenario.node_filter
     N = len(scenario.nodes)
     mixing = np.eye(N)

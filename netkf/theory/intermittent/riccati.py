@@ -42,9 +42,7 @@ class SlotSystem(NamedTuple):
 
 
 def check_system(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) -> SlotSystem:
-    """Return F (n, n), Q (n, n), H (p, n) and R (p, p) as arrays; raises TheoryError if shapes or
-    definiteness are wrong.
-    """
+    """Return F, Q (n, n), H (p, n), R (p, p); raises TheoryError for wrong shapes or signs."""
     F_ = as_square("F", F)
     n = len(F_)
     H_ = _check_observation(H, n)
@@ -103,9 +101,7 @@ def riccati_step(
 
 
 def covariance_root(P: FloatArray) -> FloatArray:
-    """Return a root (n, n) of a covariance P (n, n), lower triangular if it is positive
-    definite.
-    """
+    """Return a root (n, n) of a covariance P, lower triangular if it is positive definite."""
     try:
         return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
     except np.linalg.LinAlgError:  # semidefinite: a root from eigenvalues
@@ -146,9 +142,7 @@ def steady_covariance(F: ArrayLike, Q: ArrayLike, H: ArrayLike, R: ArrayLike) ->
 
 
 def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the steady Kalman gain (n, p) by which a reading corrects the prediction. Raises
-    TheoryError if P* does not exist.
-    """
+    """Return the gain (n, p) of readings at P*. Raises TheoryError if P* does not exist."""
     if not len(H):
         return np.zeros((len(F), 0))
     P = steady_covariance(F, Q, H, R)
@@ -156,9 +150,7 @@ def steady_gain(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> F
 
 
 def filtered_covariance(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the steady covariance (n, n) after a reading, paper P (12). Raises TheoryError if (F,
-    H) is not detectable or P* cannot be computed precisely.
-    """
+    """Return the steady covariance (n, n) after a reading, P (12); TheoryError without P*."""
     P = steady_covariance(F, Q, H, R)
     information = H.T @ np.linalg.solve(R, H)
     # (P^-1 + G)^-1 = (I + P G)^-1 P, which needs no inverse of P.

@@ -46,24 +46,18 @@ class ScalarLaw:
             return np.asarray(self.F**2 * P + self.Q)
 
     def with_reading(self, P: FloatArray) -> FloatArray:
-        """Return ``f_1(P) = F^2 P R / (H^2 P + R) + Q`` elementwise, an array of the shape of P,
-        also at infinity.
-        """
+        """Return ``f_1(P) = F^2 P R / (H^2 P + R) + Q`` elementwise, also at infinity."""
         with np.errstate(invalid="ignore"):
             gain = np.where(np.isinf(P), self.R / self.H**2, P * self.R / (self.H**2 * P + self.R))
         return np.asarray(self.F**2 * gain + self.Q)
 
     @property
     def hole(self) -> tuple[float, float]:
-        """The open interval between the largest value after a slot with a reading and the least
-        after one without, (sup f_1, f_0(P*)), which P never enters.
-        """
+        """The interval (sup f_1, f_0(P*)), which P never enters."""
         return self.F**2 * self.R / self.H**2 + self.Q, float(self.without(np.array(self.least)))
 
     def cdf(self, x: ArrayLike) -> FloatArray:
-        """Return P(X <= x) of the invariant law, exact to about 1e-15, in the shape of ``x``: slot
-        by slot backwards, since x tells whether the last slot had a reading.
-        """
+        """Return P(X <= x) to about 1e-15, slot by slot: x tells if the last had a reading."""
         point = np.array(x, dtype=np.float64)
         total, weight = np.zeros_like(point), np.ones_like(point)
         top = self.hole[0]
@@ -111,9 +105,7 @@ class ScalarLaw:
         return total.reshape(x.shape)
 
     def quantile(self, u: ArrayLike) -> FloatArray:
-        """Return the least x with P(X <= x) >= u, in the shape of ``u``, which must lie in [0, 1),
-        else it raises TheoryError.
-        """
+        """Return the least x with P(X <= x) >= u, for u in [0, 1); else TheoryError."""
         level = np.array(u, dtype=np.float64)
         if ((level < 0.0) | (level >= 1.0)).any():
             raise TheoryError("quantiles are for levels in [0, 1)")

@@ -88,9 +88,7 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
 
 
 def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray:
-    """Return the stabilising solution S (n, n) of ``0 = A S + S A' + Q - S G S``, all (n, n).
-    Raises TheoryError if there is none, or the computed one fails the check of its residual.
-    """
+    """Return the stabilising solution S of ``0 = A S + S A' + Q - S G S``; TheoryError without."""
     hidden = undetectable_mode(A, G)
     if hidden is not None:
         raise TheoryError(
@@ -115,9 +113,7 @@ def algebraic_riccati(A: FloatArray, Q: FloatArray, G: FloatArray) -> FloatArray
 
 
 def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return the solution X (n, n) of ``0 = A X + X A' + Q`` for A and Q (n, n), the steady
-    covariance of ``dx = A x dt`` and noise Q per second; raises TheoryError for an unstable A.
-    """
+    """Return X (n, n) with ``0 = A X + X A' + Q``; raises TheoryError for an unstable A."""
     if not growth_rate(A) < 0.0:
         raise TheoryError("the error dynamics are not stable, their covariance has no limit")
     X = _solve_lyapunov(A, Q)
@@ -133,14 +129,10 @@ def _solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def undetectable_mode(A: FloatArray, G: FloatArray) -> complex | None:
-    """Return an eigenvalue of A (n, n) with nonnegative real part that G (n, n) does not observe,
-    or None; ``G = H' R^-1 H``, or any semidefinite matrix with the null space of H.
-    """
+    """Return an eigenvalue of A (n, n) in the right half plane that G hides, or None."""
     return hidden_mode(A, outputs_of(G), RATE)
 
 
 def unobservable_mode(A: FloatArray, G: FloatArray) -> complex | None:
-    """Return an eigenvalue of A (n, n) that the semidefinite matrix G (n, n), such as ``H' R^-1
-    H``, does not observe (Popov, Belevitch, Hautus), or None.
-    """
+    """Return an eigenvalue of A (n, n) that the semidefinite G (n, n) hides (PBH), or None."""
     return hidden_mode(A, outputs_of(G))

@@ -36,9 +36,7 @@ RESIDUAL, MAX_ROUNDS = 1e-10, 20
 
 
 def spectral_radius(T: PositiveMap, shape: Shape) -> float:
-    """Return the spectral radius of a positive map ``T`` on stacks of a ``shape`` (S, M, M). Raises
-    TheoryError if it is neither proved nor found by two different searches.
-    """
+    """Return the radius of a positive map ``T`` on stacks (S, M, M); TheoryError if unproved."""
     if _count_numbers(shape) > MAX_DENSE:
         value, X = _extreme_eigenvalue(T, np.broadcast_to(np.eye(shape[-1]), shape), "LR")
         if _least_factor(T, X) <= value * (1.0 + PROOF_TOLERANCE):

@@ -97,9 +97,7 @@ class StateFlow:
         self.inputs = len(NODES) * B.shape[1]
 
     def __call__(self, gap: float) -> tuple[FloatArray, FloatArray]:
-        """Return the state's transition (n, n) and its response (n, 8 m) to the plant's independent
-        inputs over a ``gap`` in seconds, at most MAX_NORM / |A|.
-        """
+        """Return transition (n, n) and response (n, 8 m) to inputs over a short ``gap`` (s)."""
         E = self._exp(np.append((1.0 - NODES) * gap, gap))
         root_weights = np.sqrt(WEIGHTS * gap)[:, None, None]
         responses = root_weights * (E[:-1] @ self._B)

@@ -62,9 +62,7 @@ def identity(n: int) -> FloatArray:
 
 @kernel(allocates=True)
 def exponential(series: FloatArray, share: float) -> FloatArray:
-    """Return ``sum_k share^k series[k]`` (d, d), T terms of a power ``series`` (T, d, d), by
-    Horner's scheme.
-    """
+    """Return ``sum_k share^k series[k]`` (d, d) of a power ``series`` (T, d, d) by Horner."""
     d = series.shape[1]
     E = np.empty((d, d))
     for i in range(d):
@@ -120,9 +118,7 @@ def flow_gramian(
 def flow_start(
     F: FloatArray, blocks: FloatArray, B: FloatArray, gain: FloatArray, root_weights: FloatArray
 ) -> FloatArray:
-    """Return the root (n, n) of P at the end of a gap from P = 0; ``B`` (n, m) is the filters'
-    noise factor, ``gain`` (n, p) is ``H' R^-1/2``.
-    """
+    """Return the root (n, n) of P at the end of a gap from P = 0, of noise ``B``, ``gain``."""
     count, n, m, p = len(root_weights), B.shape[0], B.shape[1], gain.shape[1]
     factor = np.zeros((n, max(n, count * (m + p))))
     for k in range(count):

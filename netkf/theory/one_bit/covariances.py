@@ -33,9 +33,7 @@ def one_bit_update(P: ArrayLike, H: ArrayLike, R: ArrayLike) -> FloatArray:
 
 
 def bit_covariances(scenario: Scenario, run: Run) -> FloatArray:
-    """Return P (T, N, n, n) of the sign-of-innovations filters at the times of a run in slots, from
-    the bits that arrived. Raises TheoryError if nobody hears a node with a sensor, or H varies.
-    """
+    """Return P (T, N, n, n) of a run by the bits that arrived; TheoryError if H varies."""
     unheard = [node for node in scenario.sensing_nodes if not scenario.topology.receivers(node)]
     if unheard:
         raise TheoryError(f"nobody hears node {unheard[0]}: the log does not show its bits")

@@ -78,9 +78,7 @@ class Averaging:
         return np.linalg.matrix_power(step, self.gamma)
 
     def second_moment(self, Y: FloatArray) -> FloatArray:
-        """Return E[(M^gamma (x) I) Y (M^gamma (x) I)'] (N n, N n) for the second moments Y
-        (N n, N n) of the stacked errors of N nodes with n states.
-        """
+        """Return E[(M^gamma (x) I) Y (M^gamma (x) I)'] (N n, N n) for second moments Y."""
         N, n = self.nodes, len(Y) // self.nodes
         if self.enumerated or N <= MAX_KRONECKER:
             pairs = Y.reshape(N, n, N, n).transpose(0, 2, 1, 3).reshape(N * N, n * n)

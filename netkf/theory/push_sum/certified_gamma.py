@@ -192,9 +192,7 @@ def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
-    """Return the spectral radius of A_S(gamma) of paper P (45), with c_B = ``bound``; below 1 it
-    certifies gamma for mean squares.
-    """
+    """Return rho(A_S(gamma)) of paper P (45), c_B = ``bound``; below 1 it certifies gamma."""
     root_lambda, bound_square = constants.contraction**0.5, bound * bound
     mean_factor, square_factor = constants.mean**gamma, constants.mean_square**gamma
     # Norms of second moments: of the mean of all nodes, of the mean with the disagreement (twice),

@@ -39,9 +39,7 @@ class EstimationSteps:
     limits: PushSumLimits
 
     def with_gamma(self, gamma: int) -> EstimationSteps:
-        """Return the steps of a filter that averages ``gamma`` times in a slot. Raises TheoryError
-        unless that is a whole number of at least 1.
-        """
+        """Return the steps with ``gamma`` averagings in a slot, an integer; else TheoryError."""
         averaging = replace(self.averaging, gamma=as_integer("gamma", gamma, 1))
         return replace(self, averaging=averaging)
 
@@ -58,9 +56,7 @@ class EstimationSteps:
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Covariance (N n, N n) of h, the noise that a slot adds to the stacked errors before
-        averaging.
-        """
+        """Covariance (N n, N n) of h, the noise of a slot before averaging."""
         N, n, _ = self.closed.shape
         # The plant's noise is common to all nodes, the sensors' noises are independent.
         covariance = np.einsum(

@@ -70,9 +70,7 @@ def push_sum_limits(scenario: Scenario) -> PushSumLimits:
 
 
 def push_sum_filter(scenario: Scenario) -> Any:
-    """Return the scenario's filter; raises TheoryError unless it is the push-sum filter, with all
-    equations as they are built in.
-    """
+    """Return the filter; TheoryError unless it is push-sum with all equations as built in."""
     algorithm: Any = scenario.filter.algorithm
     name, built_in = type(algorithm).__name__, built_in_filters()["push-sum"]
     if not isinstance(algorithm, built_in):

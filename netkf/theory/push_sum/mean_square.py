@@ -68,16 +68,12 @@ def push_sum_stability(
 
 
 def radius(steps: EstimationSteps) -> float:
-    """Return the spectral radius of the map of second moments over a slot, the largest over groups
-    of states that do not mix. Raises TheoryError for more than MAX_ROWS states in a group.
-    """
+    """Return the largest radius of second moments over groups of states; TheoryError if large."""
     return max(_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 
 
 def mean_radius(steps: EstimationSteps) -> float:
-    """Return the spectral radius of the mean errors' dynamics, paper P (30): if it is below 1,
-    estimates become unbiased.
-    """
+    """Return the radius of mean errors, paper P (30): unbiased in the end if below 1."""
     return max(_mean_radius(steps.averaging, closed) for closed in _groups(steps.scaled))
 
 
@@ -144,9 +140,7 @@ def _radius(law: Averaging, closed: FloatArray) -> float:
 
 
 def second_moment_map(law: Averaging, closed: FloatArray) -> PositiveMap:
-    """Return the map ``T(X) = E[M diag(A_j) X diag(A_j)' M']`` of stacks (1, N n, N n) of symmetric
-    matrices: one slot of filters with the closed loops A_j, ``closed`` (N, n, n), and averaging M.
-    """
+    """Return ``T(X) = E[M diag(A_j) X diag(A_j)' M']`` of (1, N n, N n), loops ``closed``."""
     N, n, _ = closed.shape
 
     def left(X: FloatArray) -> FloatArray:

@@ -27,9 +27,7 @@ MAX_LEADER_SLOTS, AGREEMENT = 200, 0.99  # slots of an election; probability tha
 
 
 def slot_promises(scenario: Scenario) -> dict[str, Any]:
-    """Return the results of the push-sum paper by name, for ``netkf theory``, each ``{"value",
-    "reason"}`` with JSON values, one of them None.
-    """
+    """Return the results of P by name, each ``{"value", "reason"}``, one of them None."""
 
     def limit() -> float:
         return float(np.trace(push_sum_limits(scenario).P))
@@ -92,9 +90,7 @@ def _value_or_reason(function: Callable[[], Any]) -> dict[str, Any]:
 
 
 def slot_lines(results: dict[str, Any], number: Callable[[Any], str]) -> list[str]:
-    """Return the ``results`` of :func:`slot_promises` as lines for a terminal; ``number`` formats a
-    value.
-    """
+    """Return the ``results`` as lines for a terminal; ``number`` formats a value."""
 
     def text(name: str, make: Callable[[Any], str] = number) -> str:
         """Return the value ``name`` as text by ``make``, or the reason why there is none."""

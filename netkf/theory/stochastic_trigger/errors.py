@@ -37,18 +37,14 @@ Decisions = set[tuple[int, int]]
 
 
 def all_hear_all(scenario: Scenario) -> bool:
-    """Return True if every node hears every other, without losses, so that the log of a run shows
-    all decisions: one node alone decides too, but sends to nobody.
-    """
+    """Return True if every node hears every other, without losses: the log shows decisions."""
     N = len(scenario.nodes)
     complete = N > 1 and len(scenario.topology.directions) == N * (N - 1)
     return complete and all_messages_arrive(scenario)
 
 
 def start_alike(scenario: Scenario) -> bool:
-    """Return True if all filters start with the same mean and covariance; hearing everything, they
-    then have the same estimate at all times.
-    """
+    """Return True if all filters start alike; hearing everything, they have one estimate."""
     mean, cov = scenario.initial_estimate(scenario.nodes[0])
     starts = [scenario.initial_estimate(node) for node in scenario.nodes[1:]]
     return all(np.array_equal(mean, m) and np.array_equal(cov, P) for m, P in starts)
@@ -62,9 +58,7 @@ def decisions(scenario: Scenario, run: Run) -> Decisions:
 
 
 class ScheduleColumns(SlotColumns):
-    """The error of the one estimate that all nodes have: that of a filter with all readings, for
-    which silence is a reading that equals its prediction, with the noise R + Y^-1.
-    """
+    """The error of the common estimate: all readings, silence as one of noise R + Y^-1."""
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
         algorithm: Any = scenario.filter.algorithm
@@ -88,9 +82,7 @@ def _with_one_filter(scenario: Scenario) -> Scenario:
 
 
 def silence(reading: Observation, Y: float | FloatArray) -> Observation:
-    """Return the observation to which a node's silence is equivalent for the others: the H of its
-    ``reading`` with noise R + Y^-1 (p, p), Y the matrix of the trigger, or a number times I.
-    """
+    """Return the observation that a node's silence is to others: its H, with noise R + Y^-1."""
     R = silence_noise(reading.R, Y)
     # The true noise, whose root the reading has, may differ from the believed R.
     root = np.asarray(np.linalg.cholesky(reading.root @ reading.root.T + R - reading.R))
@@ -98,9 +90,7 @@ def silence(reading: Observation, Y: float | FloatArray) -> Observation:
 
 
 def error_columns(scenario: Scenario, run: Run) -> ErrorColumns:
-    """Return the errors of all nodes under the stochastic trigger, for the replay of a run. Raises
-    TheoryError where silence may be a loss, or the filters do not know the law of innovations.
-    """
+    """Return the errors of all nodes in a run; TheoryError if silence may be a loss."""
     if not all_hear_all(scenario):
         raise TheoryError(UNHEARD)
     if not scenario.filters_know_the_truth:

@@ -31,9 +31,7 @@ def trigger_rate(P: ArrayLike, H: ArrayLike, R: ArrayLike, Y: ArrayLike) -> floa
 
 
 def expected_sends(scenario: Scenario, run: Run) -> tuple[int, float]:
-    """Return the number of transmissions in a run and the sum of their probabilities given the
-    past, without the first slot; all nodes must hear each other.
-    """
+    """Return the transmissions of a run and the sum of their probabilities, from slot 1 on."""
     algorithm: Any = scenario.filter.algorithm
     sent = decisions(scenario, run)
     (F, Q), Y = scenario.slot_belief, algorithm.Y

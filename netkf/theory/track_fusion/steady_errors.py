@@ -43,9 +43,7 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
 
 
 def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
-    """Return the joint covariances (N, N, n, n) of the errors of all steady tracks, and the radius
-    above.
-    """
+    """Return the joint covariances (N, N, n, n) of the errors of steady tracks, and the radius."""
     (F, Q), n = scenario.slot_belief, scenario.plant.n
     closed, noises = [], []
     for node in scenario.nodes:
