@@ -189,7 +189,8 @@ def judge(
             reason = "; ".join(
                 f"it assumes that {row.assumption} [{row.source}]: {row.evidence}" for row in rows
             )
-            evidence.append(_unpromised_row(promise, reason))
+            nothing = Finding((math.nan,) * 3, math.nan, "")
+            evidence.append(_judge(promise, nothing, runs, reason))
         else:
             finding = _run_test(promise, samples, level / max(statistical, 1))
             evidence.append(_judge(promise, finding, runs))
@@ -242,9 +243,9 @@ def _is_needed(promise: Promise, row: Assumption) -> bool:
     return any(need in f"{row.assumption} [{row.source}]" for need in needs)
 
 
-def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
+def _judge(promise: Promise, finding: Finding, runs: int, void: str = "") -> Evidence:
     margin, low, high = finding.margin
-    verdict, needed, message = _decide(finding, runs)
+    verdict, needed, message = (NOT_PROMISED, None, "") if void else _decide(finding, runs)
     off = finding.off
     if math.isnan(off) and (low < high or verdict == BROKEN):
         off = max(0.0, -margin)
@@ -254,7 +255,7 @@ def _judge(promise: Promise, finding: Finding, runs: int) -> Evidence:
     return Evidence(
         promise=promise.statement,
         source=promise.source,
-        assumptions="hold",
+        assumptions=void or "hold",
         margin=margin,
         low=low,
         high=high,
@@ -309,23 +310,6 @@ def _factor_needed(finding: Finding, max_factor: float) -> float:
         middle = math.sqrt(lower * upper)
         lower, upper = (lower, middle) if finding.forecast(middle) <= tolerance else (middle, upper)
     return upper
-
-
-def _unpromised_row(promise: Promise, reason: str) -> Evidence:
-    nan = math.nan
-    return Evidence(
-        promise.statement,
-        promise.source,
-        assumptions=reason,
-        margin=nan,
-        low=nan,
-        high=nan,
-        tolerance=nan,
-        verdict=NOT_PROMISED,
-        needed=None,
-        evidence="",
-        group=promise.kind,
-    )
 
 
 def find_identity(deviation: float, allowed: float, message: str) -> Finding:
