@@ -1,6 +1,5 @@
 """Rows look at their assumptions before they judge, and a test without a number judges nothing."""
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -23,6 +22,7 @@ from netkf.checks.evidence import (
 from netkf.checks.laws import find_largest
 from netkf.checks.mode_sequences import sensing_neighbours
 from netkf.checks.report import verdict_text
+from netkf.checks.samples import ReplicaSummary
 from netkf.laws.intervals import Interval
 from netkf.laws.losses import mean_correlation
 from netkf.laws.ticks import largest_correlation
@@ -254,7 +254,8 @@ def test_a_replay_that_equations_cannot_give_accuses_nobody(ring):
     for one in results:
         replayed = one.summary.replayed.copy()
         replayed[0, 0] = np.nan
-        changed.append(one._replace(summary=dataclasses.replace(one.summary, replayed=replayed)))
+        summary = ReplicaSummary(**vars(one.summary) | {"replayed": replayed})
+        changed.append(one._replace(summary=summary))
     rows = judge_replicas(scenario, changed, 5, 0.99).rows
     assert not broken(rows)
     assert rows[0].verdict == HOLDS
