@@ -2,7 +2,7 @@
 
 The terms then have their natural cost: one sparse product over neighbours for all entries at once,
 one small matrix for A P + P A' that is the same at all nodes, and P G P only at nodes with a
-sensor, as ``(P C)(P C)'`` with ``G = C C'``.
+sensor.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.samples import PoissonSamples
 
-NO_INFORMATION = 1e-15  # eigenvalue of G, scaled to a unit diagonal, up to which it is rounding
 MAX_PRODUCTS = 1 << 20  # entries of gains times unit matrices at once
 ELIMINATION_WORK = 3e9  # multiplications up to which elimination is taken
 
@@ -54,7 +53,6 @@ class PackedRiccati:
         leave = scipy.sparse.diags_array(self.leaving)
         self._exchange = scipy.sparse.csr_array(equations.coupling - leave)
         self._sensed = np.flatnonzero(np.abs(equations.G).max(axis=(1, 2)) > 0.0)
-        self._C = _low_rank_factors(equations.G[self._sensed])
 
     def shift(self, A: FloatArray, Q: FloatArray) -> PackedRiccati:
         """Return the equations with another drift A (n, n) and noise Q, per second."""
@@ -106,9 +104,8 @@ class PackedRiccati:
         else:
             change = Y @ self._drift_map + self._Q - self.leaving[:, None] * Y
             change += self.equations.coupling @ self.predict(sent)
-        # - P G P = - (P C)(P C)' at the nodes with a sensor
-        M = self.unpack(Y[self._sensed]) @ self._C
-        change[self._sensed] -= self.pack(M @ np.swapaxes(M, 1, 2))
+        P = self.unpack(Y[self._sensed])
+        change[self._sensed] -= self.pack(P @ self.equations.G[self._sensed] @ P)
         for group in self.equations.samples:
             self._add_samples(
                 change, group, self.unpack(Y), None if sent is None else self.unpack(sent)
@@ -218,16 +215,3 @@ class LinearisedRiccati(NamedTuple):
             arrivals = scipy.sparse.coo_array(coo_arrays, shape=shape)
             operator = operator + scipy.sparse.csr_array(arrivals)
         return scipy.sparse.csc_array(operator)
-
-
-def _low_rank_factors(G: FloatArray) -> FloatArray:
-    """Return C (S, n, r) with ``C C' = G`` for semidefinite G (S, n, n)."""
-    # Scaled to a diagonal of ones, so that the units of the states do not matter to what is small.
-    scale = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
-    divided = 1.0 / np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(G * divided[:, :, None] * divided[:, None, :])
-    positive = values > NO_INFORMATION
-    rank = int(positive.sum(axis=1).max(initial=0))
-    C = scale[:, :, None] * vectors * np.sqrt(np.where(positive, values, 0.0))[:, None, :]
-    # Eigenvalues increase, so that the positive ones are among the last ``rank``.
-    return np.ascontiguousarray(C[:, :, C.shape[2] - rank :])
