@@ -52,18 +52,16 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return a row for each assumption: text, equation, whether it holds, and why."""
-    rows = _slot_rows(scenario) if scenario.slotted else _clock_rows(scenario)
+    paper_rows = theory_of(scenario).slot_rows
+    if not scenario.slotted:
+        rows = _clock_rows(scenario)
+    elif paper_rows is None:
+        rows = [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
+    else:
+        rows = paper_rows(scenario)
     if not scenario.is_linear:
         rows = [("readings are linear in the state", "all papers", False, NONLINEAR), *rows]
     return rows
-
-
-def _slot_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return the rows for slots: those of the filter's paper, or of any filter in slots."""
-    paper_rows = theory_of(scenario).slot_rows
-    if paper_rows is None:
-        return [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
-    return paper_rows(scenario)
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:

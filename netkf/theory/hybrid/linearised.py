@@ -53,7 +53,13 @@ def solve_map(
                 f"not computed: GMRES did not converge for {right.size:,} unknowns, and the "
                 "network has no small cuts to eliminate them by"
             )
-        return _eliminate(linear, right) if X is None else X
+        if X is not None:
+            return X
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
+            # A singular map yields nan, which the caller takes as unstable.
+            X = scipy.sparse.linalg.spsolve(linear.matrix(), -right.reshape(-1))
+    return np.asarray(X).reshape(right.shape)
 
 
 def is_stable(linear: LinearisedRiccati) -> bool:
@@ -73,15 +79,6 @@ def is_stable(linear: LinearisedRiccati) -> bool:
     # inverse of a rounding error, of either sign.
     slowest = values.max() * float(np.abs(linear.blocks).max())
     return bool(values.min() > 0.0 and slowest < MAX_CONDITION)
-
-
-def _eliminate(linear: LinearisedRiccati, right: FloatArray) -> FloatArray:
-    """Return X (N, m) of ``L(X) = -right`` by sparse elimination; nan where L is singular."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", scipy.sparse.linalg.MatrixRankWarning)
-        # A singular map yields nan, which the caller takes as unstable.
-        X = scipy.sparse.linalg.spsolve(linear.matrix(), -right.reshape(-1))
-    return np.asarray(X).reshape(right.shape)
 
 
 def _solve_by_gmres(

@@ -106,16 +106,15 @@ def transmits_at_samples(scenario: Scenario) -> bool:
     return isinstance(clock, LinkClock) and clock.at == "readings"
 
 
-def mean_link_weights(scenario: Scenario) -> dict[tuple[int, int], float]:
-    """Return delivery times weight by (receiver, sender), of messages sent at samples."""
-    if not scenario.filter.algorithm.timing.talks or not transmits_at_samples(scenario):
-        return {}
+def _mean_link_weights(scenario: Scenario) -> scipy.sparse.csr_array:
+    """Return delivery times weight (receivers, senders), sparse, of messages sent at samples."""
     index, loss = scenario.topology.index, scenario.network.channel.loss
-    return {
-        (index[j], index[i]): loss.mean_delivery((i, j), scenario.table_probability((i, j)))
-        * scenario.weight(j, i)
-        for i, j in scenario.topology.directions
-    }
+    weights = scipy.sparse.lil_array((len(index), len(index)))
+    if scenario.filter.algorithm.timing.talks and transmits_at_samples(scenario):
+        for i, j in scenario.topology.directions:
+            delivery = loss.mean_delivery((i, j), scenario.table_probability((i, j)))
+            weights[index[j], index[i]] = delivery * scenario.weight(j, i)
+    return scipy.sparse.csr_array(weights)
 
 
 def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
@@ -135,24 +134,13 @@ def poisson_samples(scenario: Scenario) -> tuple[PoissonSamples, ...]:
         for reader in range(size) if pooled else [index[node]]:
             entry = (reader, np.asarray(sensor.H), R, rate, index[node])
             entries_by_rows.setdefault(len(R), []).append(entry)
-    groups = []
+    groups, weights = [], _mean_link_weights(scenario)
     for entries in entries_by_rows.values():
         nodes, H, R, rates = (np.array([entry[k] for entry in entries]) for k in range(4))
         senders = [entry[4] for entry in entries]
-        groups.append(PoissonSamples(nodes, H, R, rates, _arrival_rates(scenario, senders, rates)))
+        heard = weights[:, senders] * rates
+        groups.append(PoissonSamples(nodes, H, R, rates, scipy.sparse.csr_array(heard)))
     return tuple(groups)
-
-
-def _arrival_rates(
-    scenario: Scenario, senders: list[int], rates: FloatArray
-) -> scipy.sparse.csr_array:
-    """Return ``heard`` (N, S), sparse: weighted rates (1/s) of messages sent at samples."""
-    heard = np.zeros((len(scenario.nodes), len(senders)))
-    for (i, j), weight in mean_link_weights(scenario).items():
-        for k, sender in enumerate(senders):
-            if j == sender:
-                heard[i, k] = rates[k] * weight
-    return scipy.sparse.csr_array(heard)
 
 
 def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
@@ -180,27 +168,16 @@ def sample_jumps(scenario: Scenario) -> tuple[SampleJump, ...]:
             by_time.setdefault(time, {}).setdefault(index[node], []).append(
                 Observation(H, own, own)
             )
-    everyone = range(len(scenario.nodes))
-    jumps = []
+    everyone = list(range(len(scenario.nodes)))
+    jumps, link_weights = [], _mean_link_weights(scenario)
     for time in sorted(by_time):
         observations = {
             node: stack_observations(readings, n) for node, readings in by_time[time].items()
         }
-        weights = _sent_weights(scenario, list(observations))
+        sends = np.isin(everyone, list(observations))
+        weights = (link_weights * sends).toarray() if link_weights.nnz else None
         if scenario.filter.algorithm.timing.pooled:
             joint = stack_observations(list(itertools.chain(*by_time[time].values())), n)
             observations = dict.fromkeys(everyone, joint)
         jumps.append(SampleJump(time, observations, weights))
     return tuple(jumps)
-
-
-def _sent_weights(scenario: Scenario, senders: list[int]) -> FloatArray | None:
-    """Return the weights (N, N) of messages sent at a sample; None if nodes send none."""
-    weights = mean_link_weights(scenario)
-    if not weights:
-        return None
-    matrix = np.zeros((len(scenario.nodes),) * 2)
-    for (i, j), weight in weights.items():
-        if j in senders:
-            matrix[i, j] = weight
-    return matrix

@@ -91,7 +91,8 @@ class Averaging:
     def _step(self, Y: FloatArray) -> FloatArray:
         """Return E[(M (x) I) Y (M (x) I)'] (N n, N n) of one averaging step."""
         N, n, (i, j) = self.nodes, len(Y) // self.nodes, self.links.T
-        first_variance, covariance, second_variance = (c[:, None, None] for c in self._covariances)
+        first, second = self.hears.T[..., None, None] / self.delta
+        covariance = self.both[:, None, None] / self.delta**2 - first * second
         Z, node_indices = Y.reshape(N, n, N, n), np.arange(N)
         # The second moment of the difference of the two ends of each link.
         d = Z[i, :, i] - Z[i, :, j] - Z[j, :, i] + Z[j, :, j]
@@ -99,8 +100,8 @@ class Averaging:
         Y = self._multiply(self._multiply(Y).T).T.copy()
         Z = Y.reshape(N, n, N, n)
         at_node = np.zeros((N, n, n))
-        np.add.at(at_node, i, first_variance * d)
-        np.add.at(at_node, j, second_variance * d)
+        np.add.at(at_node, i, (first / self.delta - first**2) * d)
+        np.add.at(at_node, j, (second / self.delta - second**2) * d)
         Z[node_indices, :, node_indices] += at_node
         Z[i, :, j] -= covariance * d
         Z[j, :, i] -= covariance * d
@@ -120,14 +121,6 @@ class Averaging:
     def enumerated(self) -> bool:
         """True if moments need all outcomes of the links, because one draw serves all steps."""
         return self.held and self.gamma > 1 and not self.deterministic
-
-    @cached_property
-    def _covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The moments var b_ij, cov(b_ij, b_ji), var b_ji of each link (E,), over delta^2."""
-        first, second = self.hears.T
-        covariance = (self.both - first * second) / self.delta**2
-        first_variance, second_variance = (p * (1.0 - p) / self.delta**2 for p in (first, second))
-        return first_variance, covariance, second_variance
 
     @cached_property
     def _moments(self) -> tuple[FloatArray, FloatArray]:

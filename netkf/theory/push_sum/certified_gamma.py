@@ -71,7 +71,11 @@ def _bound_constants(scenario: Scenario) -> GammaConstants:
     # is the least of all connected graphs.
     gap = (1.0 - np.cos(np.pi / N)) / law.delta
     theta = 1.0 - float(law.hears.min(initial=1.0)) * gap
-    cut = _disconnection_bound(scenario, law)
+    up = {
+        (scenario.nodes[i], scenario.nodes[j]): float(p)
+        for (i, j), p in zip(law.links, law.both, strict=True)
+    }
+    cut = disconnection_probability(scenario.topology, up).high
     return GammaConstants(
         contraction=_weighted_norm(central.T, P) ** 2,
         printed=(1.0 + N * size * _weighted_norm(G, P)) * _weighted_norm(F, P),
@@ -96,12 +100,6 @@ def _require_conditions(scenario: Scenario, law: Averaging, P: FloatArray) -> No
         raise TheoryError("P Theorems 5 and 6 need failures of both directions together")
     if not np.linalg.eigvalsh(P)[0] > 1e-14 * np.abs(P).max():
         raise TheoryError("P_inf is singular, so the norms of P (35) do not exist")
-
-
-def _disconnection_bound(scenario: Scenario, law: Averaging) -> float:
-    links, nodes = law.links, scenario.nodes
-    up = {(nodes[i], nodes[j]): float(p) for (i, j), p in zip(links, law.both, strict=True)}
-    return disconnection_probability(scenario.topology, up).high
 
 
 def _weighted_norm(A: FloatArray, P: FloatArray) -> float:
