@@ -15,7 +15,6 @@ import numpy as np
 from netkf.algorithms.registry import LINK_WEIGHTS, own_attributes
 from netkf.checks import (
     diffusion,
-    event_triggered,
     gossip,
     hybrid,
     intermittent,
@@ -117,7 +116,6 @@ class Verdict(NotebookTable):
 
 OF_PAPERS: dict[str, PaperChecks] = OF_EQUATIONS | {
     "diffusion": diffusion.CHECKS,
-    "event_triggered": event_triggered.CHECKS,
     "gossip": gossip.CHECKS,
     "hybrid": hybrid.CHECKS,
     "intermittent": intermittent.CHECKS,

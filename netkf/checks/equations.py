@@ -18,11 +18,13 @@ from netkf.checks.exact import (
     check_error_covariance,
     check_exact_covariance,
     check_expected_nees,
+    check_nees_bound,
     check_upper_bound,
     max_replayed,
     summarise_exactly,
     with_promised_filter,
 )
+from netkf.checks.laws import exact_start
 from netkf.checks.paper import PaperChecks
 from netkf.checks.points import check_slots, checked_samples, sampled_indices
 from netkf.checks.rounding import compare_identities
@@ -145,6 +147,12 @@ BITS = Promise(
     check_replay,
     exact=True,
 )
+NEES_BOUND = Promise(
+    "P is at least the second moment of the error: the mean NEES is at most n",
+    "Battistelli et al. 2018, derived",
+    (KNOWN, NO_LOSS, START),
+    check_nees_bound,
+)
 LINEAR = "readings are linear in the state"
 FOLLOWS_DATA = Promise(
     "P and errors follow the equations",
@@ -173,6 +181,9 @@ OF_EQUATIONS = {
     # H (10) holds for any gains.
     "constant_gain": about_equations(UPPER_BOUND),
     "diffusion_kalman": about_equations(),
+    "event_triggered": PaperChecks(
+        lambda _: (NEES_BOUND,), lambda scenario: [exact_start(scenario)], slots_only=True
+    ),
     "information_consensus": about_equations(
         replace(
             UPPER_BOUND,

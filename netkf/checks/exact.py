@@ -37,7 +37,13 @@ from netkf.checks.rounding import EPS, OPERATIONS
 from netkf.checks.samples import ReplicaSummary, RunSamples, compare_points
 from netkf.checks.statistics import quadratic_interval
 from netkf.core.errors import TheoryError
-from netkf.laws.intervals import POWER, Interval, deviation_interval, scale_interval
+from netkf.laws.intervals import (
+    POWER,
+    Interval,
+    deviation_interval,
+    scale_interval,
+    student_interval,
+)
 from netkf.laws.noise import MIN_VARIANCE_SHARE, whiten
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.scenario import Scenario
@@ -447,6 +453,33 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
             NEES_TOLERANCE,
         )
     return finding._replace(message=finding.message + samples.blurred_note)
+
+
+@error_test
+def check_nees_bound(samples: RunSamples, level: float) -> Finding:
+    """Test that the mean of NEES / n is at most 1, by Student's interval: events depend on data."""
+    n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
+    finite = np.flatnonzero(np.isfinite(nees).all(axis=0))
+    if not len(finite):
+        return find_nothing(NEES_TOLERANCE)
+    ratios, single_level = nees[:, finite] / n, level / len(finite)
+    means, spreads = ratios.mean(axis=0), ratios.std(axis=0, ddof=1) / math.sqrt(samples.count)
+    # The point reported: that with the largest mean plus two standard errors.
+    k = int(np.argmax(means + 2.0 * spreads))
+    intervals = [
+        student_interval(float(mean), float(spread), samples.count, single_level)
+        for mean, spread in zip(means, spreads, strict=True)
+    ]
+    highest = max(interval.high for interval in intervals)
+    # The promise is broken if the lower limit of some point is above 1.
+    lowest = max(interval.low for interval in intervals)
+    label = samples.point_labels[int(finite[k])]
+    message = f"NEES / n, at most 1, the largest of {len(finite)} points at {label}"
+    message += samples.blurred_note
+    margin = 1.0 - float(means[k]), 1.0 - highest, 1.0 - lowest
+    detectable = max(interval.detectable for interval in intervals)
+    finding = Finding(margin, NEES_TOLERANCE, message, detectable=detectable)
+    return finding._replace(seen=float(means[k]), expected=1.0)
 
 
 def pooled_nees(nees: FloatArray, mean: FloatArray, square: FloatArray, level: float) -> Interval:

@@ -15,8 +15,7 @@ from netkf.checks.paper import PaperChecks
 from netkf.checks.samples import ReplicaSummary, RunSamples
 from netkf.laws.intervals import deviation_interval, student_interval
 from netkf.scenario.scenario import Scenario
-from netkf.theory.stochastic_trigger.errors import all_hear_all
-from netkf.theory.stochastic_trigger.rates import expected_sends
+from netkf.theory.stochastic_trigger.errors import all_hear_all, expected_sends
 from netkf.trace.run import Run
 
 RATE_TOLERANCE = 0.05  # of the share of slots with a message

@@ -2,8 +2,7 @@
 
 from netkf.theory.assumptions import assumptions
 from netkf.theory.common.requirements import require_scenario
-from netkf.theory.diffusion.information import information_level
-from netkf.theory.diffusion.tracking import TrackingLevel, tracking_level
+from netkf.theory.diffusion.information import TrackingLevel, information_level, tracking_level
 from netkf.theory.errors import error_covariance
 from netkf.theory.gossip.invariant import SwitchedSamples, switched_samples
 from netkf.theory.gossip.matchings import detecting_walk, mean_matching
@@ -50,7 +49,7 @@ from netkf.theory.push_sum.mean_square import (
     push_sum_radius,
     push_sum_stability,
 )
-from netkf.theory.stochastic_trigger.rates import trigger_rate
+from netkf.theory.stochastic_trigger.errors import trigger_rate
 
 __all__ = [
     "CorollaryTwo",
