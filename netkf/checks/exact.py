@@ -320,12 +320,16 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     labels = [*samples.point_labels, *(f"{time}, all nodes" for time in samples.time_labels)]
     # Half of the level for the points, half for all of them pooled, which is far more sensitive.
     finding = compare_chi_square(ratios, freedom.tolist(), labels, level / 2.0, "e' Sigma^-1 e")
-    joint, pooled = runs.joint[:max_runs], Interval(math.nan, 0.0, math.inf)
-    total, degrees = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
-    if degrees > 0.0:
-        pooled = deviation_interval(1.0, scale_interval(total, degrees, level / 2.0))
+    pooled = _compare_pooled(runs.joint[:max_runs], level / 2.0)
     finding = pool(finding, pooled, EVERYTHING)
     return finding._replace(message=finding.message + samples.blurred_note, most_runs=max_runs)
+
+
+def _compare_pooled(joint: FloatArray, level: float) -> Interval:
+    total, freedom = joint[np.isfinite(joint).all(axis=1)].sum(axis=0).tolist()
+    if not freedom > 0.0:
+        return Interval(math.nan, 0.0, math.inf)
+    return deviation_interval(1.0, scale_interval(total, freedom, level))
 
 
 @error_test

@@ -70,13 +70,13 @@ class ClockColumns(ErrorColumns):
         )
         self.estimators = self._filters.estimators
         self._times = [0.0] * self.estimators
-        self._now, self._kept = 0.0, []
+        super().__init__()
+        self._now = 0.0
         self._free = list(range(self._filters.messages))[::-1]
         self._uses: Counter[int] = Counter()
         self._source: int | None = None
         self._sent: dict[tuple[int, int, int], Sent] = {}
         self._inboxes: dict[int, list[Sent]] = {}
-        self._whitened: dict[int, tuple[Observation, FloatArray, FloatArray]] = {}
         self._read: dict[int, tuple[float, FloatArray, IntArray]] = {}
         self._transitions = Transitions(plant.A, plant.B)
         # The state grows by less than e in between; other filters do not commute with a shift.
@@ -203,15 +203,6 @@ class ClockColumns(ErrorColumns):
             forms.table[rows, : forms.used] = y
             self._read[h] = time, H, rows
         self._filters.update(h, self._gap(h, time), H, y)
-
-    def _whiten(self, observation: Observation) -> tuple[FloatArray, FloatArray]:
-        """Return H (p, n) and root (p, p) in units of the assumed root of R; by object."""
-        key = id(observation)
-        if key not in self._whitened:
-            root = np.linalg.cholesky(observation.R)
-            H, noise = (np.linalg.solve(root, part) for part in (observation.H, observation.root))
-            self._whitened[key] = observation, H, noise
-        return self._whitened[key][1:]
 
     def _send(self, key: tuple[int, int, int], time: float) -> None:
         node, peer, number = key

@@ -13,6 +13,7 @@ import numpy as np
 from netkf.algorithms.filter import commutes, compiled_kernels
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.observations import Observation
 
 
 def has_columns(scenario: Scenario) -> bool:
@@ -29,7 +30,19 @@ class ErrorColumns:
 
     estimators: int
     n: int
-    _kept: list[FloatArray]
+
+    def __init__(self) -> None:
+        self._kept: list[FloatArray] = []
+        self._whitened: dict[int, tuple[Observation, FloatArray, FloatArray]] = {}
+
+    def _whiten(self, observation: Observation) -> tuple[FloatArray, FloatArray]:
+        """Return H (p, n) and root (p, p) in units of the assumed root of R; by object."""
+        key = id(observation)
+        if key not in self._whitened:
+            root = np.linalg.cholesky(observation.R)
+            H, noise = (np.linalg.solve(root, part) for part in (observation.H, observation.root))
+            self._whitened[key] = observation, H, noise
+        return self._whitened[key][1:]
 
     def replay(self) -> Iterator[None]:
         """Replay the events of the run; yield at each of ``run.times``."""

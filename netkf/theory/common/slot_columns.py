@@ -52,10 +52,9 @@ class SlotColumns(ErrorColumns):
         plant = scenario.slot_plant
         self._F, self._noise = plant.F, square_root(plant.Q)
         self._kernels = replace(kernels, decides=False)
-        self._kept = []
+        super().__init__()
         self._fewest = 0
         self._all_observations = slot_observations(scenario, run)
-        self._whitened: dict[int, tuple[Observation, FloatArray]] = {}
         # The true state (n, columns).
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._filters = self._begin()
@@ -136,10 +135,10 @@ class SlotColumns(ErrorColumns):
         H = np.zeros((1, 1, setup.estimators, setup.p, n, LANES))
         for h, observation in observations.items():
             rows, noises = observation.root.shape
-            whitened = self._whiten(h, observation)
-            y[h, :rows, :columns] = whitened[:, :n] @ self._x
-            y[h, :rows, first : first + noises] += whitened[:, n:]
-            H[0, 0, h, :rows] = whitened[:, :n, None]
+            whitened, noise = self._whiten(observation)
+            y[h, :rows, :columns] = whitened @ self._x
+            y[h, :rows, first : first + noises] += noise
+            H[0, 0, h, :rows] = whitened[..., None]
             first += noises
         y = y.reshape(*y.shape[:2], blocks, LANES).transpose(2, 0, 1, 3)[:, None]
         algorithm, steps = setup.algorithm, len(setup.fresh)
@@ -165,15 +164,6 @@ class SlotColumns(ErrorColumns):
         )
         if framed:
             self._x[:] = 0.0
-
-    def _whiten(self, h: int, observation: Observation) -> FloatArray:
-        """Return [H, root of the true R] of a reading, such that the filter's R is the identity."""
-        known = self._whitened.get(h)
-        if known is None or known[0] is not observation:
-            whole = np.column_stack([observation.H, observation.root])
-            whitened = np.linalg.solve(np.linalg.cholesky(observation.R), whole)
-            known = self._whitened[h] = observation, whitened
-        return known[1]
 
     def _compress(self) -> None:
         """Turn the columns of noises into as few as their rank allows."""
