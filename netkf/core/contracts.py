@@ -181,7 +181,7 @@ def require_known_members(cls: type) -> None:
         if isinstance(member, FunctionType):
             where, verb = describe_method(owner, member), "called"
         rule = f"is never {verb}: {advice[similar[0]]}"
-        raise ContractError(f"{where} {rule}; give a member of your own another name")
+        raise ContractError(f"{where} {rule}; give your member another name")
     _SOUND.add(cls)
 
 
