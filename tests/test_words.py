@@ -51,6 +51,13 @@ def texts():
     return [(file, file.read_text(encoding="utf-8")) for file in files]
 
 
+@cache
+def joined_texts():
+    """Each text in one line."""
+    joined = [(f, re.sub(r"\"\s*\n\s*f?\"|\s*\n\s*(# )?", " ", text)) for f, text in texts()]
+    return [(file, re.sub(r"\s+", " ", text)) for file, text in joined]
+
+
 def test_the_readme_is_one_screen_and_the_changes_are_few():
     assert len(README.read_text(encoding="utf-8")) < 7000
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) < 60
@@ -93,9 +100,7 @@ def test_the_overview_has_every_kind_of_filter_and_every_command():
 def test_nobody_has_to_decode_a_phrase(phrase):
     pattern = re.compile(phrase, re.IGNORECASE)
     found = []
-    for file, text in texts():
-        joined = re.sub(r"\"\s*\n\s*f?\"|\s*\n\s*(# )?", " ", text)  # texts in several lines
-        joined = re.sub(r"\s+", " ", joined)
+    for file, joined in joined_texts():
         for match in pattern.finditer(joined):
             start = max(0, match.start() - 40)
             found.append(f"{file}: {joined[start : match.end() + 40]}")

@@ -253,12 +253,12 @@ def exact_covariances(F, slots):
 
 
 @pytest.mark.parametrize("name", MODES)
-def test_evidence_is_kept_for_thousands_of_slots(name, tmp_path):
+def test_evidence_is_kept_for_a_thousand_slots(name, tmp_path):
     F, engines = MODES[name], ("compiled", "simpy") if "fast" in name else ("compiled",)
     plant = {**STILL, "F": F, "cov": [[1.0, 0.0], [0.0, 1.0]]}
     sensors = [{"nodes": [0], "H": H_1, "R": [[R_1]]}, {"nodes": [1], "H": H_2, "R": [[R_2]]}]
-    slots = [1, 2, 10, 20, 40, 60, 100, 500, 2000]
-    more = {"plant": plant, "sensors": sensors, "network": PAIR, "horizon": 2001.0}
+    slots = [1, 2, 10, 20, 40, 60, 100, 500, 1000]
+    more = {"plant": plant, "sensors": sensors, "network": PAIR, "horizon": 1001.0}
     more["probe"] = [float(slot) for slot in slots]
     scenario = scenario_of({**BELIEF, "memory": "all"}, tmp_path, **more)
     central = netkf.simulate(scenario_of(CENTRAL, tmp_path, **more), engine="compiled")

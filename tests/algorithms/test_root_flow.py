@@ -69,6 +69,7 @@ CASES = [
         for n in (1, 2, 3, 5, 8)
     )
     for R, size in [(10.0 ** ((5 * k) % 16 - 9), 10.0 ** ((7 * k) % 19 - 6))]
+    if n in (1, 3, 8)
 ]
 
 
@@ -104,7 +105,7 @@ def test_single_gaps(kind, noise, n, R, size):
         ("unstable", "none", 4, 1e3, 1e-6, 1e-9),
     ],
 )
-def test_hundreds_of_short_gaps_mixed_with_samples(kind, noise, n, R, size, sample):
+def test_many_short_gaps_mixed_with_samples(kind, noise, n, R, size, sample):
     random = np.random.default_rng(n)
     A, Q = system(kind, noise, n, random)
     H, R = random.normal(size=(1, n)), np.array([[R]])
@@ -117,7 +118,7 @@ def test_hundreds_of_short_gaps_mixed_with_samples(kind, noise, n, R, size, samp
     with reference.precisely():
         P, r = S @ S.T, r @ r.T
     worst = far = 0.0
-    for k, gap in enumerate(random.choice([1e-6, 1e-3, 0.017, 0.1], size=300)):
+    for k, gap in enumerate(random.choice([1e-6, 1e-3, 0.017, 0.1], size=150)):
         if k % 5 == 4:
             y = C @ x + root_R @ random.normal(size=2)
             x, root = sample_update(x, root, y, C, cov)

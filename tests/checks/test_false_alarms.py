@@ -180,7 +180,7 @@ def test_few_runs_in_one_dimension_are_judged_by_their_exact_law(tmp_path):
     scenario = from_table(table, tmp_path)
     accused = [
         row.source
-        for seed in range(10)
+        for seed in range(5)
         for row in check(scenario, runs=10, seed=seed, workers=1).rows
         if row.verdict == BROKEN
     ]
@@ -353,8 +353,7 @@ def test_parts_are_held_to_what_they_state(name, tmp_path):
     scenario = scenario_of(table, tmp_path, **changes)
     # With seed 0, 24 of 93 messages of a link that loses one in ten are lost: one such chance in
     # 6000 checks. Over 25 seeds the numbers of all links have their law.
-    for seed in (1, 2):
-        assert not broken_rows(scenario, runs=30, seed=seed)
+    assert not broken_rows(scenario, runs=30, seed=1)
 
 
 def test_squares_of_other_noises_are_not_taken_for_chi_square(tmp_path):

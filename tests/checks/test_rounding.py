@@ -17,15 +17,15 @@ from netkf.trace.run import blurred_samples
 from tests.conftest import SCENARIOS
 
 ROTATIONS = [
-    [1.05, -0.25, 0.0, 0.0],
-    [0.25, 1.05, 0.0, 0.0],
-    [0.0, 0.0, 1.07, 0.1],
-    [0.0, 0.0, -0.1, 1.07],
+    [1.15, -0.35, 0.0, 0.0],
+    [0.35, 1.15, 0.0, 0.0],
+    [0.0, 0.0, 1.2, 0.1],
+    [0.0, 0.0, -0.1, 1.2],
 ]
-"""They grow faster than those of the file: by 1e21 in 640 slots instead of 1600."""
+"""They grow faster than those of the file: by 1e21 in 260 slots instead of 1600."""
 UNSTABLE = {
     "intermittent_scalar": {"horizon": 150.0, "probe": 10.0},
-    "gossip_ring": {"plant.F": ROTATIONS, "horizon": 640.0, "probe": 40.0},
+    "gossip_ring": {"plant.F": ROTATIONS, "horizon": 260.0, "probe": 20.0},
     "threshold": {"network.activation.rate": 6.0, "horizon": 120.0, "probe": 10.0},
 }
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -44,7 +45,7 @@ def test_every_scenario_agrees(file):
 
 @pytest.mark.parametrize(
     "file",
-    [file for file in scenario_files() if type(netkf.load(file).node_filter) is Hybrid],
+    [f for f in scenario_files() if tomllib.loads(f.read_text())["filter"]["kind"] == "hybrid"],
     ids=lambda file: file.stem,
 )
 def test_every_scenario_in_continuous_time_agrees_with_covariance_intersection(file):
@@ -53,6 +54,7 @@ def test_every_scenario_in_continuous_time_agrees_with_covariance_intersection(f
     assert assert_agree(scenario.replace({"horizon": horizon})).count("absorb") > 50
 
 
+STOPPING = [(1e-2, "fresh"), (1e-6, "held"), (1e-16, "fresh"), (0.0, "held")]
 SLOTS = {
     "local": ("gossip_ring", {"filter": {"kind": "local"}}),
     "central": ("gossip_ring", {"filter": {"kind": "central"}}),
@@ -80,11 +82,16 @@ def test_slots_made_together_agree(monkeypatch, name, rows):
     assert_agree(scenario.replace({"horizon": 12.0 * scenario.slot_plant.period, **changes}))
 
 
-@pytest.mark.parametrize("stop", ["safe", "paper"])
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-16, 0.0])
-@pytest.mark.parametrize("links", ["fresh", "held"])
+@pytest.mark.parametrize(
+    ("stop", "tolerance", "links"),
+    [
+        *((stop, size, links) for stop in ("safe", "paper") for size, links in STOPPING),
+        ("safe", 1e-16, "held"),
+        ("paper", 1e-2, "held"),
+    ],
+)
 def test_push_sum_stops_in_the_same_slots(stop, tolerance, links):
-    """1e-16 is where rounding decides."""
+    """1e-16 is where rounding decides; more are drawn below."""
     planar = netkf.load(SCENARIOS / "push_sum_planar.toml")
     rule = {"filter.stop": stop, "filter.tolerance": tolerance, "filter.links": links}
     ways = {"network.channel.symmetric": links == "fresh"}

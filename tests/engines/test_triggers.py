@@ -18,9 +18,7 @@ INNER = {
     "intermittent": {"kind": "intermittent"},
     "hcmci": {"kind": "hcmci", "steps": 2},
     "diffusion-kalman": {"kind": "diffusion-kalman"},
-    "track-fusion": {"kind": "track-fusion", "rule": "ci"},
     "cross-covariance": {"kind": "track-fusion", "rule": "cross-covariance"},
-    "consensus-innovations": {"kind": "consensus-innovations"},
     "belief-propagation": {"kind": "belief-propagation", "steps": 2},
     "diffusion": {"kind": "diffusion"},
     "gossip": {"kind": "gossip"},
@@ -33,7 +31,9 @@ INNER = {
     "one-bit": {"kind": "one-bit"},
     "consensus": CONSENSUS,
 }
-"""Push-sum exchanges before and after the reading; diffusion and gossip predict last."""
+"""Push-sum exchanges before and after the reading; diffusion and gossip predict last. All flags of
+Kernels are set for one of them, and filters without any are three.
+"""
 
 ONE_WAY = {"graph": {"kind": "edges", "edges": [[0, 1], [1, 2], [2, 0], [3, 4], [1, 4]]}}
 ONE_WAY["graph"]["directed"] = True

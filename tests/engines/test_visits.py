@@ -81,7 +81,7 @@ def test_lanes_leave_what_the_event_loop_leaves(ring, monkeypatch, name):
     assert_close(ring.replace({"horizon": 8.0, **CASES[name]}), monkeypatch)
 
 
-@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("n", [1, 4])
 def test_states_of_any_size(build, monkeypatch, n):
     assert_close(dimensions(build, n), monkeypatch)
 

@@ -50,9 +50,10 @@ def elsewhere(code, **environment):
     return subprocess.run(command, check=False, env=told, capture_output=True, text=True, cwd=ROOT)
 
 
-def results_elsewhere(first, files, engine, **environment):
+def results_elsewhere(first, files, *engines, **environment):
     code = f"{first}import json; from tests.engines.test_without_numba import results\n"
-    done = elsewhere(f"{code}print(json.dumps(results({files!r}, {engine!r})))", **environment)
+    code += f"print(json.dumps([results({files!r}, engine) for engine in {engines!r}]))"
+    done = elsewhere(code, **environment)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -67,15 +68,16 @@ def assert_same(got, expected):
 def test_simpy_runs_every_scenario_without_numba():
     files = [str(path) for path in sorted((ROOT / "scenarios").rglob("*.toml"))]
     assert len(files) > 20
-    assert_same(results_elsewhere(HIDDEN, files, "simpy"), results(files))
+    (got,) = results_elsewhere(HIDDEN, files, "simpy")
+    assert_same(got, results(files))
 
 
-@pytest.mark.parametrize("engine", ["simpy", "compiled"])
-def test_both_engines_run_with_compiling_disabled(engine):
+def test_both_engines_run_with_compiling_disabled():
     names = ("delayed_links", "intel_lab_radio", "gossip_ring", "push_sum_planar")
     files = [str(ROOT / "scenarios" / f"{name}.toml") for name in names]
-    got = results_elsewhere("", files, engine, NUMBA_DISABLE_JIT="1")
-    assert_same(got, results(files))
+    expected = results(files)
+    for got in results_elsewhere("", files, "simpy", "compiled", NUMBA_DISABLE_JIT="1"):
+        assert_same(got, expected)
 
 
 def test_auto_takes_simpy_with_a_note_and_compiled_is_refused_in_one_line(tmp_path):

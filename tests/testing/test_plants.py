@@ -118,8 +118,7 @@ def test_what_is_of_another_family_is_told():
         check_plant(parts.LinearPlant, Q=[[1.0]])
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_false_alarms_are_as_rare_as_stated(seed, monkeypatch):
+def test_false_alarms_are_as_rare_as_stated(monkeypatch):
     """At a level of 5 % for a whole check."""
     monkeypatch.setattr(noise, "LEVEL", 0.05)
     alarms = 0
@@ -127,10 +126,10 @@ def test_false_alarms_are_as_rare_as_stated(seed, monkeypatch):
         family = (parts.LinearSensor, parts.Plant, parts.Matching)
         checker = next(c for f, c in zip(family, CHECKERS, strict=True) if isinstance(part, f))
         try:
-            checker(part, seed)
+            checker(part, 0)
         except AssertionError:
             alarms += 1
-    assert alarms <= 2  # of 7: more happen once in 250 seeds
+    assert alarms <= 2  # of 7: for one seed of 250 there are more
 
 
 CHECKERS = (
