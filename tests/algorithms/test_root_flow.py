@@ -84,7 +84,7 @@ def test_single_gaps(kind, noise, n, R, size):
         S, mean = reference.exactly(root, x)
         with reference.precisely():
             P = S @ S.T
-        for gap in (1e-6, 1e-3, 0.3, 10.0 if kind == "unstable" else LONGEST):
+        for gap in (1e-6, 0.3, 10.0 if kind == "unstable" else LONGEST):
             made, moved = flow_root(table, root, x, gap)
             expected, moved_exactly = exact.flow(P, mean, gap)
             assert distance(made, expected) < allowed(size), gap

@@ -42,7 +42,7 @@ def subtracted(run):
 
 
 def test_no_promise_is_broken_by_rounding(unstable):
-    found = netkf.check(unstable, 15, workers=1)
+    found = netkf.check(unstable, 10, workers=1)
     assert found, [row for row in found.rows if row.verdict == "broken"]
 
 
