@@ -15,18 +15,13 @@ from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.regressors import RegressorSensor
-from netkf.scenario.combination import (
-    check_nonlinear,
-    check_regressor,
-    check_weights,
-)
 from netkf.scenario.compatibility import check_activation, check_time, filter_name
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.preconditions import check_preconditions
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import explain_time_mismatch, kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
-from netkf.scenario.shapes import require_shape
+from netkf.scenario.shapes import check_nonlinear, check_regressor, check_weights, require_shape
 from netkf.scenario.time_grid import check_grid
 
 MAX_SAMPLES = 10_000_000  # state samples of one run

@@ -1,9 +1,14 @@
-"""The check of array shapes."""
+"""Checks of shapes: of arrays, of what regressor and nonlinear sensors read, and of weights."""
 
 from __future__ import annotations
 
-from netkf.core.errors import ScenarioError
+import numpy as np
+
+from netkf.core.errors import ScenarioError, errors_under
 from netkf.linalg.arrays import FloatArray
+from netkf.plants.nonlinear import NonlinearSensor
+from netkf.plants.regressors import RegressorSensor
+from netkf.scenario.derived import DerivedScenario
 
 
 def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], why: str) -> None:
@@ -19,3 +24,55 @@ def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], wh
         actual_shape = " x ".join(map(str, value.shape))
         rule = f"must be {expected}, not {actual_shape}, because {why}"
         raise ScenarioError(key, rule, value, "correct the shape")
+
+
+def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:
+    """Raise ScenarioError if a regressor's matrices have wrong shapes or the plant is continuous.
+
+    ``key`` is the key path of the sensor.
+    """
+    if not scenario.slotted:
+        raise ScenarioError(
+            f"{key}.kind",
+            "belongs to plants in slots (linear), and this plant is in continuous time",
+            "regressor",
+            "change the plant or use a linear sensor",
+        )
+    m, q = len(sensor.A), sensor.B.shape[1]
+    why = f"{key}.A has {m} rows"
+    require_shape(f"{key}.B", sensor.B, (m, None), why)
+    require_shape(
+        f"{key}.C", sensor.C, (scenario.plant.n, m), f"the state has {scenario.plant.n} components"
+    )
+    require_shape(f"{key}.start", sensor.start, (m,), why)
+    require_shape(f"{key}.xi_cov", sensor.xi_cov, (q, q), f"{key}.B has {q} columns")
+    require_shape(f"{key}.R", sensor.R, (1, 1), "a regressor gives one number a slot")
+
+
+def check_nonlinear(scenario: DerivedScenario, key: str, sensor: NonlinearSensor) -> None:
+    """Raise ScenarioError if a nonlinear sensor cannot read the state, or has no positions.
+
+    ``key`` is the key path of the sensor.
+    """
+    with errors_under(key):
+        # First as it is: a wrong field is reported before positions that the graph lacks.
+        for candidate in (sensor, sensor.located(scenario.topology.positions)):
+            candidate.check_state(scenario.plant.n)
+
+
+def check_weights(scenario: DerivedScenario) -> None:
+    """Raise ScenarioError if a matrix ``filter.weights`` (N, N) does not fit nodes and links."""
+    weights, nodes = scenario.node_filter.link_weights.matrix, scenario.nodes
+    if weights is None:
+        return
+    require_shape("filter.weights", weights, (len(nodes),) * 2, f"there are {len(nodes)} nodes")
+    links = set(scenario.topology.directions)
+    for sender, receiver in np.argwhere(weights > 0.0).tolist():
+        pair = (nodes[sender], nodes[receiver])
+        if sender != receiver and pair not in links:
+            raise ScenarioError(
+                f"filter.weights[{sender}][{receiver}]",
+                f"must be 0, because no link goes from node {pair[0]} to node {pair[1]}",
+                float(weights[sender, receiver]),
+                "add the link; rows are senders, columns receivers",
+            )
