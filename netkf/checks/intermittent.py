@@ -52,7 +52,7 @@ from netkf.linalg.spectra import contracts, growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.random_links import delivery_of
+from netkf.theory.common.random_links import arrival_of
 from netkf.theory.intermittent.averages import mean_covariance_bounds
 from netkf.theory.intermittent.riccati import steady_covariance
 from netkf.theory.intermittent.scalar_law import ScalarLaw, scalar_law
@@ -239,14 +239,9 @@ class IntermittentSamples(SwitchedSamples):
 
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
-    channel = scenario.network.channel
-    if not channel.loss.independent:
+    if not scenario.network.channel.loss.independent:
         raise TheoryError("losses come in bursts or recorded")
-    delay = channel.delay.fixed
-    if delay is None:
-        raise TheoryError("random delays make some readings late")
-    delivery = delivery_of(scenario, direction)
-    return delivery if delay <= scenario.phase_length else 0.0
+    return arrival_of(scenario, direction)
 
 
 def _above_least(samples: IntermittentSamples, level: float) -> Finding:

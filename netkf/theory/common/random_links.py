@@ -205,6 +205,14 @@ def delivery_of(scenario: Scenario, direction: tuple[int, int]) -> float:
     return mean
 
 
+def arrival_of(scenario: Scenario, direction: tuple[int, int]) -> float:
+    """Return the probability that a message of a slot arrives in its exchange; TheoryError."""
+    delay = scenario.network.channel.delay.fixed
+    if delay is None:
+        raise TheoryError("random delays make some messages late")
+    return delivery_of(scenario, direction) if delay <= scenario.phase_length else 0.0
+
+
 @lru_cache(maxsize=8)
 def has_constant_losses(scenario: Scenario) -> bool:
     """Return True if all messages of a link arrive with one probability; a class is asked."""

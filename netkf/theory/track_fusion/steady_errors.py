@@ -19,7 +19,7 @@ from netkf.linalg.spectra import growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import RECORDED_CHANNEL, is_recorded
-from netkf.theory.common.random_links import delivery_of
+from netkf.theory.common.random_links import arrival_of
 from netkf.theory.intermittent.riccati import steady_gain
 
 MAX_NEIGHBOURS = 10
@@ -64,12 +64,15 @@ def steady_tracks(scenario: Scenario) -> tuple[FloatArray, float]:
 
 def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> FloatArray:
     """Return the mean covariance (n, n) of what node i reports; raises TheoryError."""
-    probabilities = _hearing_probabilities(scenario, scenario.nodes[i])
+    node, topology = scenario.nodes[i], scenario.topology
+    probabilities = {
+        topology.index[j]: arrival_of(scenario, (j, node)) for j in topology.senders(node)
+    }
     certain = [j for j, p in probabilities.items() if p == 1.0]
     unsure = [j for j, p in probabilities.items() if 0.0 < p < 1.0]
     if len(unsure) > MAX_NEIGHBOURS:
         raise TheoryError(
-            f"node {scenario.nodes[i]} hears {len(unsure)} nodes with losses; at most "
+            f"node {node} hears {len(unsure)} nodes with losses; at most "
             f"{MAX_NEIGHBOURS} are looked at, in all combinations"
         )
     total: FloatArray = np.zeros_like(joint[i, i])
@@ -86,12 +89,3 @@ def _mean_reported_covariance(scenario: Scenario, joint: FloatArray, i: int) -> 
             own = np.asarray(root @ root.T)
         total += probability * own
     return total
-
-
-def _hearing_probabilities(scenario: Scenario, node: int) -> dict[int, float]:
-    topology, delay = scenario.topology, scenario.network.channel.delay.fixed
-    if delay is None:
-        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
-    if delay > scenario.phase_length:
-        return {}
-    return {topology.index[j]: delivery_of(scenario, (j, node)) for j in topology.senders(node)}
