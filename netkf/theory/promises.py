@@ -235,17 +235,14 @@ def _limit_lines(scenario: Scenario, promises: dict[str, Any]) -> list[str]:
     for name, label in labels.items():
         value = promises[name]
         lines.append(f"  {label}: {value['reason'] or format_number(value['trace'])}")
-    if promises["link_rate"]["reason"] is None:
-        lines.append(_link_rate_line(promises["link_rate"]))
+    link_rate = promises["link_rate"]
+    if link_rate["reason"] is None:
+        rates = f"{format_number(link_rate['factor'])} times the rates given"
+        if link_rate["value"] is not None:
+            rates = f"links from {format_number(link_rate['value'])} per second on"
+        lines.append(f"  {rates} keep the steady bound within {CLOSE_TO_S:.0%} of S, H Theorem 3")
     note = mismatch_note(scenario)
     return [*lines, f"note: {note}"] if note else lines
-
-
-def _link_rate_line(link_rate: dict[str, Any]) -> str:
-    rates = f"{format_number(link_rate['factor'])} times the rates given"
-    if link_rate["value"] is not None:
-        rates = f"links from {format_number(link_rate['value'])} per second on"
-    return f"  {rates} keep the steady bound within {CLOSE_TO_S:.0%} of S, H Theorem 3"
 
 
 def _bound_table(scenario: Scenario, columns: list[dict[str, Any]]) -> str:

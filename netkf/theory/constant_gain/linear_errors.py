@@ -165,11 +165,11 @@ def _from_tick_to_tick(
         closed[sensor.node] -= sensor.correction
         sample_noise[_node_slice(sensor.node, n), _node_slice(sensor.node, n)] += sensor.noise
     # From the last arrival to the tick, its samples, and from there to the arrival of its messages.
-    (to_tick, noise), (to_arrival, arrival_noise) = (
-        _move_errors(flow, gap) for gap in (clock.period - delay, delay)
-    )
+    transitions = Transitions(block_diagonal(list(flow.drift)), square_root(flow.noise))
+    (to_tick, to_arrival), roots = transitions.laws(np.array([clock.period - delay, delay]))
+    tick_noise, arrival_noise = roots @ np.swapaxes(roots, 1, 2)
     C = block_diagonal(list(closed))
-    noise = to_arrival @ (C @ noise @ C.T + sample_noise) @ to_arrival.T + arrival_noise
+    noise = to_arrival @ (C @ tick_noise @ C.T + sample_noise) @ to_arrival.T + arrival_noise
     transition = to_arrival @ C @ to_tick
     steps = np.stack([transition[_node_slice(k, n), _node_slice(k, n)] for k in range(N)])
     # ``steps`` has the whole way from exchange to exchange, so that nothing is left to predict:
@@ -192,13 +192,6 @@ def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:
             same_clock = (sensor_clock.period, sensor_clock.phase) == (clock.period, clock.phase)
         if not same_clock:
             raise TheoryError("sensors do not sample at the ticks of the network's periodic clock")
-
-
-def _move_errors(flow: JointErrorFlow, gap: float) -> tuple[FloatArray, FloatArray]:
-    """Return the transition (N n, N n) of errors over ``gap`` seconds, and its noise."""
-    transitions = Transitions(block_diagonal(list(flow.drift)), square_root(flow.noise))
-    F, root = (law[0] for law in transitions.laws(np.array([gap])))
-    return F, root @ root.T
 
 
 def _node_gains(scenario: Scenario) -> list[FloatArray]:

@@ -63,7 +63,10 @@ def information_level(
     runs, seed = as_integer("runs", runs, 2), as_integer("seed", seed, 0)
     window = None if window is None else as_integer("window", window, 1)
     sources = _make_sources(scenario)
-    past = _draw_pasts(scenario, sources, runs, Streams(seed).generator("past"))
+    # States of each source (runs, m) at random slots, the same for all.
+    random, last = Streams(seed).generator("past"), scenario.horizon / scenario.slot_plant.period
+    slots = random.integers(max(1, int(last)), size=runs)
+    past = [_draw_states(source, slots, random) for source in sources]
     network = (-1, sources, past)
     if window is None:
         longest = 2 * scenario.plant.n
@@ -118,15 +121,6 @@ def _make_sources(scenario: Scenario) -> list[_Source]:
     if not sources:
         raise TheoryError("no node has a sensor")
     return sources
-
-
-def _draw_pasts(
-    scenario: Scenario, sources: list[_Source], runs: int, random: np.random.Generator
-) -> list[FloatArray]:
-    """Return for each source its states (runs, m) at random slots, the same for all."""
-    last = max(1, int(scenario.horizon / scenario.slot_plant.period))
-    slots = random.integers(last, size=runs)
-    return [_draw_states(source, slots, random) for source in sources]
 
 
 def _draw_states(source: _Source, slots: np.ndarray, random: np.random.Generator) -> FloatArray:
