@@ -86,7 +86,7 @@ def integration_steps(scenario: Scenario) -> int:
 
 
 def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | None:
-    """Return how errors of the first ``estimators`` evolve between messages; None if alike."""
+    """Return how errors of the first ``estimators`` evolve; None if no sensor has increments."""
     observations = increment_observations(scenario)
     if not any(len(observation.H) for observation in observations):
         return None

@@ -18,11 +18,11 @@ import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.sparse.linalg
 
-from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
 from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, square_root
 from netkf.network.clocks import LinkClock
+from netkf.plants.transitions import Transitions
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import NONLINEAR
@@ -189,10 +189,8 @@ def coupled_riccati(scenario: Scenario) -> CoupledRiccati:
         delay = 0.0
     T, q = np.eye(n), np.zeros((n, n))
     if delay > 0.0:
-        # Without readings (G = 0) the Riccati flow is the prediction; T from its unit vectors.
-        table = riccati_table(A, Q, np.zeros((n, n)), delay)
-        q, _ = propagate_riccati(table, q, np.zeros(n), delay)
-        T = np.column_stack([propagate_riccati(table, q, e, delay)[1] for e in np.eye(n)])
+        (T,), (root,) = Transitions(A, square_root(Q)).laws(np.array([delay]))
+        q = root @ root.T
     spread = scenario.initial_estimate(scenario.nodes[0])[1]
     start = np.broadcast_to(spread, (len(scenario.nodes), n, n)).copy()
     if isinstance(scenario.filter.cov, tuple):
