@@ -188,7 +188,7 @@ def test_elimination_is_refused_where_its_fill_in_has_no_bound(tmp_path, monkeyp
         )
     )
     with pytest.raises(TheoryError, match="GMRES did not converge for 9,000 unknowns"):
-        linearised.solve_linearised(packed, packed.equations.start, packed.start)
+        linearised.solve_map(packed.linear(packed.equations.start), packed.start)
 
 
 def test_a_steady_bound_with_many_unknowns_is_left_out_of_the_report(tmp_path, monkeypatch):

@@ -155,7 +155,7 @@ def _from_tick_to_tick(
     """
     _require_one_clock(clock, samples)
     N, n, _ = flow.drift.shape
-    if delay > 0.0 and (delay >= clock.period or not all_equal(flow.drift)):
+    if delay > 0.0 and (delay >= clock.period or not (flow.drift == flow.drift[0]).all()):
         raise TheoryError(
             "periodic clocks with a delay are known where it is below the period and sensors take "
             "samples"
@@ -175,11 +175,6 @@ def _from_tick_to_tick(
     # ``steps`` has the whole way from exchange to exchange, so that nothing is left to predict:
     # F = I and Q = 0.
     return SlotJumps(np.eye(n), np.zeros((n, n)), steps, symmetric(noise), directions)
-
-
-def all_equal(drift: FloatArray) -> bool:
-    """Return True if all N nodes have the same ``drift`` (N, n, n) of the error."""
-    return bool((drift == drift[0]).all())
 
 
 def _require_one_clock(clock: Periodic, samples: list[SampledNode]) -> None:

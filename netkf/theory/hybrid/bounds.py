@@ -193,7 +193,7 @@ class _PiecewiseSolution:
                 self._append(end, output)
             else:
                 self._iterate(begin, end, slope)
-            if self._jumps.jumps_at(end):
+            if end in self._jumps:
                 self._start_value = self._values_after_jumps[end] = self._jumps.apply(
                     end, self._start_value
                 )
@@ -370,8 +370,7 @@ class _SampleJumps:
         index = bisect.bisect_right(self._times, begin)
         return min(end, self._times[index]) if index < len(self._times) else end
 
-    def jumps_at(self, time: float) -> bool:
-        """Return True if the solution jumps at ``time``."""
+    def __contains__(self, time: float) -> bool:
         return time in self._samples or time in self._arrivals
 
     def apply(self, time: float, Y: FloatArray) -> FloatArray:

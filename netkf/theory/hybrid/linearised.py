@@ -16,7 +16,7 @@ import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.theory.hybrid.packed import LinearisedRiccati, PackedRiccati
+from netkf.theory.hybrid.packed import LinearisedRiccati
 
 MAX_CONDITION = 1e13
 """A map whose slowest time constant is longer, in units of the fastest, is singular but for
@@ -26,16 +26,6 @@ MAX_ELIMINATED = 6000  # unknowns of a network without small cuts, whose fill-in
 ROUNDS, ROUND_TOLERANCE = 4, 1e-7  # each round reduces the residual by this factor
 RESIDUAL_TOLERANCE = 1e-14  # relative to the right-hand side
 RESTART, RESTARTS = 60, 3  # of GMRES
-
-
-def solve_linearised(
-    packed: PackedRiccati,
-    P: FloatArray,
-    right: FloatArray,
-    tolerance: float = RESIDUAL_TOLERANCE,
-) -> FloatArray:
-    """Return X (N, m) with ``op_P(X) = -right``, H(12) linearised at P, see :func:`solve_map`."""
-    return solve_map(packed.linear(P), right, tolerance)
 
 
 def solve_map(

@@ -24,7 +24,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import growth_rate
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
-from netkf.theory.hybrid.linearised import is_stable, solve_linearised
+from netkf.theory.hybrid.linearised import is_stable, solve_map
 from netkf.theory.hybrid.packed import PackedRiccati
 from netkf.theory.hybrid.samples import transmits_at_samples
 
@@ -132,7 +132,7 @@ def _stabilising_covariances(packed: PackedRiccati) -> FloatArray | None:
 def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
     """Return one step (N, n, n) of Newton's method (Kleinman), solved for the change of P."""
     Y = packed.pack(P)
-    change = solve_linearised(packed, P, packed.slope(Y, Y), NEWTON_TOLERANCE)
+    change = solve_map(packed.linear(P), packed.slope(Y, Y), NEWTON_TOLERANCE)
     return packed.unpack(Y + change)
 
 

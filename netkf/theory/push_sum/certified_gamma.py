@@ -17,7 +17,7 @@ import scipy.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.spectra import contracts
+from netkf.linalg.spectra import contracts, growth_factor
 from netkf.scenario.scenario import Scenario
 from netkf.theory.push_sum.averaging import Averaging
 from netkf.theory.push_sum.disconnection import disconnection_probability
@@ -186,37 +186,21 @@ def theorem_5(constants: GammaConstants, bound: float, gamma: int) -> float:
     """Return rho(A_R(gamma)) of paper P (36) with c_B = ``bound``; below 1 it certifies gamma."""
     # Rows: the mean of all nodes, and the disagreement, which gamma steps reduce by theta^gamma.
     contracted = constants.mean**gamma * bound
-    return _spectral_radius([[constants.contraction**0.5, contracted], [bound, contracted]])
+    return growth_factor(np.array([[constants.contraction**0.5, contracted], [bound, contracted]]))
 
 
 def theorem_6(constants: GammaConstants, bound: float, gamma: int) -> float:
     """Return rho(A_S(gamma)) of paper P (45), c_B = ``bound``; below 1 it certifies gamma."""
-    root_lambda, bound_square = constants.contraction**0.5, bound * bound
-    mean_factor, square_factor = constants.mean**gamma, constants.mean_square**gamma
+    root, factor = constants.contraction**0.5, bound * constants.mean**gamma
     # Norms of second moments: of the mean of all nodes, of the mean with the disagreement (twice),
     # and of the disagreement.
-    return _spectral_radius(
-        [
-            [root_lambda * root_lambda, bound * root_lambda, bound * root_lambda, bound_square],
-            [
-                bound * mean_factor * root_lambda,
-                bound * mean_factor * root_lambda,
-                bound_square * mean_factor,
-                bound_square * mean_factor,
-            ],
-            [
-                bound * mean_factor * root_lambda,
-                bound_square * mean_factor,
-                bound * mean_factor * root_lambda,
-                bound_square * mean_factor,
-            ],
-            [bound_square * square_factor] * 4,
-        ]
-    )
-
-
-def _spectral_radius(matrix: list[list[float]]) -> float:
-    return float(np.abs(np.linalg.eigvals(np.array(matrix))).max())
+    rows = [
+        [root * root, bound * root, bound * root, bound * bound],
+        [factor * size for size in (root, root, bound, bound)],
+        [factor * size for size in (root, bound, root, bound)],
+        [bound * bound * constants.mean_square**gamma] * 4,
+    ]
+    return growth_factor(np.array(rows))
 
 
 def searches_gamma(scenario: Scenario) -> bool:
