@@ -32,7 +32,8 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.estimates import copy_vector, transform_root
-from netkf.algorithms.kernels.intersection import finish_lanes, merge_lanes
+from netkf.algorithms.kernels.information import clear_part, copy_part
+from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes
 from netkf.algorithms.kernels.run import ALL as ALL_RECEIVERS
 from netkf.algorithms.kernels.run import carry_mean, predict_estimate, shift_vector
 from netkf.algorithms.kernels.square_root import lower_root
@@ -56,27 +57,7 @@ MAX_LOSS = float(np.log(1e6))
 SLOT, ALL = "slot", "all"
 """Values of ``BeliefPropagation.memory``."""
 
-# A ``part`` is evidence [Z, z] (n, n + 1, L); entries above the diagonal of Z are never read.
-
-
-@kernel
-def clear_part(lanes: Lanes, part: FloatArray) -> None:
-    """Set a part to no information."""
-    n = len(part)
-    for i in range(n):
-        for j in range(i + 1):
-            store(lanes, part, i, j, 0.0)
-        store(lanes, part, i, n, 0.0)
-
-
-@kernel
-def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
-    """Copy a part."""
-    n = len(source)
-    for i in range(n):
-        for j in range(i + 1):
-            store(lanes, target, i, j, load(lanes, source, i, j))
-        store(lanes, target, i, n, load(lanes, source, i, n))
+# A ``part`` is evidence [Z, z] (n, n + 1, L), see ``kernels.information``.
 
 
 @kernel
@@ -86,24 +67,6 @@ def add_part(
     """Add the independent evidence ``part`` to ``total``; ``work`` is scratch of that shape."""
     copy_part(lanes, part, work)
     merge_lanes(lanes, size, total, work)
-
-
-@kernel
-def write_prior(lanes: Lanes, root: FloatArray, part: FloatArray) -> None:
-    """Write an estimate whose covariance has the ``root`` S (n, n, L), relative to itself, as
-    evidence [S^-1, 0] into ``part``.
-    """
-    n = len(part)
-    for i in range(n):
-        inverse = 1.0 / load(lanes, root, i, i)
-        # Forward substitution, row i of S^-1.
-        for j in range(i):
-            value = spread(lanes, 0.0)
-            for m in range(j, i):
-                value -= load(lanes, root, i, m) * load(lanes, part, m, j)
-            store(lanes, part, i, j, value * inverse)
-        store(lanes, part, i, i, inverse)
-        store(lanes, part, i, n, 0.0)
 
 
 @kernel
@@ -192,7 +155,9 @@ def predict(record: Any, h: int, run: Any) -> None:
         store(lanes, record.base, h, i, load(lanes, record.xhat, h, i))
     set_growing(record, lanes, record.centre[h], record.base[h])
     if record.keeps == 0:
-        write_prior(lanes, record.root[h], record.prior[h])
+        # Relative to itself the prediction is [S^-1, 0] for P = S S'.
+        clear_part(lanes, record.prior[h])
+        invert_lanes(lanes, run.size, record.prior, h, record.root, h)
         clear_part(lanes, record.own[h])
         for w in range(first, stop):
             clear_part(lanes, record.received[w])

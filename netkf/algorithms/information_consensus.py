@@ -31,12 +31,10 @@ from netkf.algorithms.diffusion import DiffusionFilter, diffusion_filter_record
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.information import (
     add_reading_pair,
-    copy_parts,
-    store_part,
+    copy_part,
     weigh_part,
-    write_information,
 )
-from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes
+from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
 from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
@@ -73,15 +71,13 @@ def recipe(shares: Sequence[Sequence[float]], counts: Sequence[float]) -> Recipe
 @kernel
 def begin_pairs(record: Any, h: int, run: Any) -> None:
     """Make the pairs with which node ``h`` begins a slot, of its prediction and its reading."""
-    lanes, shares = run.lanes, record.shares
+    lanes, shares, x = run.lanes, record.shares, record.xhat
     invert_lanes(lanes, run.size, record.inverse, h, record.root, h)
     for k in range(len(shares)):
-        write_information(lanes, run.total, shares[k, 0], record.inverse, h)
+        whiten(lanes, run.size, run.total, shares[k, 0], record.inverse, x, h, x, h)
         if shares[k, 1] > 0.0:
-            add_reading_pair(
-                run, run.total, shares[k, 1], run.reading, record.xhat, h, run.whitened
-            )
-        store_part(lanes, record.parts, h, k, run.total)
+            add_reading_pair(run, run.total, shares[k, 1], run.reading, x, h, run.whitened)
+        copy_part(lanes, run.total, record.parts[h, k])
 
 
 @kernel
@@ -89,7 +85,8 @@ def emit_pairs(record: Any, h: int, m: int, run: Any) -> None:
     """Send the pairs of node ``h``, and the prediction to which they are relative."""
     for i in range(len(run.size)):
         store(run.lanes, record.payload.xhat, m, i, load(run.lanes, record.xhat, h, i))
-    copy_parts(run.lanes, record.payload.parts, m, record.parts, h)
+    for k in range(len(record.shares)):
+        copy_part(run.lanes, record.parts[h, k], record.payload.parts[m, k])
 
 
 @kernel
@@ -113,11 +110,11 @@ def mix_pairs(record: Any, h: int, run: Any) -> None:
                     lanes, work, weight, payload.parts, run.message[k], p, payload.xhat, x, h
                 )
                 merge_lanes(lanes, run.size, total, work)
-        store_part(lanes, parts, h, p, total)
+        copy_part(lanes, total, parts[h, p])
     if run.step == record.steps - 1:
         # The information of the estimate is the sum of the prediction's and that of the pairs.
         counts, K = record.counts, len(record.shares)
-        write_information(lanes, total, counts[K], record.inverse, h)
+        whiten(lanes, run.size, total, counts[K], record.inverse, x, h, x, h)
         for p in range(K):
             weigh_part(lanes, work, spread(lanes, counts[p]), parts, h, p, x, x, h)
             merge_lanes(lanes, run.size, total, work)

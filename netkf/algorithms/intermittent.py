@@ -21,6 +21,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.estimates import update_by_row
+from netkf.algorithms.kernels.information import clear_part
 from netkf.algorithms.kernels.intersection import merge_lanes
 from netkf.algorithms.kernels.neighbours import use_readings_heard
 from netkf.algorithms.kernels.run import (
@@ -195,20 +196,17 @@ def store_reading(record: Any, h: int, run: Any, e: int, r: int) -> None:
         return
     # More rows than states: the root [Z, z] of their information has the same.
     total, row = run.total, run.whitened
-    for i in range(n):
-        for j in range(n + 1):
-            total[i, j, 0] = row[i, j, 0] = 0.0
+    clear_part(run.lanes, total)
     for k in range(rows):
+        clear_part(run.lanes, row)
         for j in range(n):
             row[n - 1, j, 0] = run.H[matrix, k, j, 0]
-            for i in range(n - 1):
-                row[i, j, 0] = row[i, n, 0] = 0.0
         row[n - 1, n, 0] = run.y[first, k, 0]
         merge_lanes(run.lanes, run.size, total, row)
     for i in range(n):
         y[h, e, i, 0] = total[i, n, 0]
         for j in range(n):
-            H[h, e, i, j, 0] = total[i, j, 0]
+            H[h, e, i, j, 0] = total[i, j, 0] if j <= i else 0.0
 
 
 @kernel

@@ -36,7 +36,7 @@ from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.estimates import copy_vector, rotate, transform_mean
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector
 from netkf.algorithms.kernels.square_root import lower_root
-from netkf.algorithms.kernels.stopping import NEVER, PAPER, RULES, MassStep, has_stopped
+from netkf.algorithms.kernels.triggers import is_positive
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
@@ -61,6 +61,11 @@ from netkf.linalg.structs import Size
 
 MASS, AVERAGE = 0, 1
 """The two exchanges of a slot, steps 2 and 5: their numbers, ``phase`` in methods."""
+RULES = ("never", "safe", "paper")
+NEVER, SAFE, PAPER = range(3)
+"""When a node freezes its network estimate. The rule of the paper also fires when all links of a
+node fail in one step, and then freezes a wrong one.
+"""
 
 NEVER_STOPPED = np.iinfo(np.int64).max
 """A slot that no run reaches, for a node that never stops."""
@@ -225,18 +230,70 @@ def learn_network(record: Any, h: int, run: Any) -> None:
 
 @kernel
 def stops(record: Any, h: int, q: int, all_up: bool) -> bool:
-    """Return True if node h freezes its network estimate in this slot, in lane ``q``; ``all_up``:
-    all its links were up.
+    """Return True if node h freezes its network estimate in this slot, in lane ``q``: by the rule
+    of the paper if it has information, which moved by less than the tolerance; by the safe rule if
+    its network estimate did while all its links were up (``all_up``) and its weight is positive.
     """
-    step, n = record.step, record.new_information.shape[0]
-    for i in range(record.mass.shape[1]):
-        step.mass[i], step.before[i] = record.mass[h, i, q], record.before[i, q]
-    for i in range(n):
-        for j in range(n):
-            step.information[i, j] = record.new_information[i, j, q]
-            step.former[i, j] = record.information[h, i, j, q]
-    step.number[0], step.former_number[0] = record.new_number[0, q], record.number[h, q]
-    return has_stopped(record.rule, record.tolerance, step, all_up)
+    mass, tolerance = record.mass, record.tolerance
+    if record.rule == PAPER:
+        # A mass of zero, before information has reached the node, does not change either.
+        has_mass = False
+        for i in range(2, mass.shape[1]):
+            has_mass = has_mass or mass[h, i, q] != 0.0
+        return has_mass and moved_within(record.before, mass, h, q, tolerance, record.work)
+    # In an outage estimates do not change either.
+    if not (all_up and mass[h, 0, q] > 0.0):
+        return False
+    former, number = record.number[h, q], record.new_number[0, q]
+    information = record.new_information
+    return has_converged(record.information, h, information, q, former, number, tolerance)
+
+
+@kernel
+def moved_within(
+    before: FloatArray, mass: FloatArray, h: int, q: int, bound: float, work: FloatArray
+) -> bool:
+    """Return True if the change D (n, n) of the information, entries 2 and on, from the mass
+    ``before`` (2 + n n, L) to ``mass[h]`` has a spectral norm below ``bound`` in lane ``q``: both
+    ``bound I - D`` and ``bound I + D`` are positive definite. ``work`` (n, n) is scratch.
+    """
+    n = len(work)
+    for sign in (-1.0, 1.0):
+        for i in range(n):
+            for j in range(n):
+                index = 2 + i * n + j
+                work[i, j] = sign * (mass[h, index, q] - before[index, q])
+            work[i, i] += bound
+        if not is_positive(ONE, work):
+            return False
+    return True
+
+
+@kernel
+def has_converged(
+    former: FloatArray,
+    h: int,
+    information: FloatArray,
+    q: int,
+    former_number: float,
+    number: float,
+    tolerance: float,
+) -> bool:
+    """Return True if N^(i), from ``former_number`` to ``number``, and G^(i), from ``former[h]``
+    (n, n, L) to ``information`` (n, n, L), changed by at most ``tolerance`` (relative; Frobenius
+    norm) in lane ``q``.
+    """
+    # ``not <`` rejects nan.
+    if not abs(number - former_number) < tolerance * number:
+        return False
+    change = square = 0.0
+    for i in range(len(information)):
+        for j in range(len(information)):
+            entry = information[i, j, q]
+            change += (entry - former[h, i, j, q]) ** 2
+            square += entry * entry
+    # <=, so that an information of 0 that stays 0 has converged.
+    return math.sqrt(change) <= tolerance * math.sqrt(square)
 
 
 @kernel
@@ -419,9 +476,6 @@ def push_sum_record(filtering: PushSum, infos: Sequence[NodeInfo], models: Seque
         # Every node knows G, of all sensors. _check_scenario() refuses where there is no P_inf.
         found = asymptotic_root(models[0].F, models[0].Q, infos[0].information)
         limit = limit if found is None else found
-    shapes: dict[str, tuple[int, ...]] = {"mass": (m,), "before": (m,), "work": (n, n)}
-    shapes |= dict.fromkeys(("information", "former"), (n, n))
-    shapes |= dict.fromkeys(("number", "former_number"), (1,))
     return Record(
         node={
             "mass": (m,),
@@ -441,7 +495,7 @@ def push_sum_record(filtering: PushSum, infos: Sequence[NodeInfo], models: Seque
             "silent": ((), np.uint8),
         },
         settings={
-            "step": MassStep(**{name: np.zeros(shape) for name, shape in shapes.items()}),
+            "work": np.zeros((n, n)),
             "alone": np.stack([model.information for model in models]),
             "limit": np.ascontiguousarray(limit),
             "rule": RULES.index(filtering.stop),

@@ -88,9 +88,10 @@ def _least_roots(scenario: Scenario) -> FloatArray:
     roots = np.full((len(arrivals.sequences), n, n), np.nan)
     for k, mode in enumerate(arrivals.sequences[:, 0].tolist()):
         p = int(modes.rows[mode])
-        H, root = modes.H[mode, :p], modes.root_R[mode, :p, :p]
         try:
-            roots[k] = np.linalg.cholesky(steady_covariance(F, Q, H, root @ root.T))
+            # Whitened rows have noise of variance 1.
+            P = steady_covariance(F, Q, modes.H[mode, :p], np.eye(p))
+            roots[k] = np.linalg.cholesky(P)
         except (TheoryError, np.linalg.LinAlgError):
             continue
     return roots

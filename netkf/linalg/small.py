@@ -15,42 +15,13 @@ from netkf.linalg.compiling import kernel
 @kernel(allocates=True)
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the product ``a b`` (r, c) of ``a`` (r, m) and ``b`` (m, c), as a new array."""
-    return add_matmul(np.zeros((a.shape[0], b.shape[1])), a, b)
-
-
-@kernel(allocates=True)
-def add_matmul(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return ``c + a b`` (r, s) of ``c`` (r, s), ``a`` (r, m) and ``b`` (m, s), as a new array."""
-    out = np.empty(c.shape)
-    for i in range(c.shape[0]):
-        for j in range(c.shape[1]):
-            total = c[i, j]
+    out = np.empty((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            total = 0.0
             for k in range(a.shape[1]):
                 total += a[i, k] * b[k, j]
             out[i, j] = total
-    return out
-
-
-@kernel(allocates=True)
-def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the product ``a x`` (r,) of ``a`` (r, m) and ``x`` (m,), as a new array."""
-    out = np.empty(a.shape[0])
-    for i in range(a.shape[0]):
-        total = 0.0
-        for k in range(a.shape[1]):
-            total += a[i, k] * x[k]
-        out[i] = total
-    return out
-
-
-@kernel(allocates=True)
-def symmetrize(P: FloatArray) -> FloatArray:
-    """Return the symmetric part (n, n) of one matrix ``P`` (n, n), as a new array."""
-    out = np.empty(P.shape)
-    for i in range(P.shape[0]):
-        for j in range(i + 1):
-            # Both entries from one expression, so that the result is exactly symmetric.
-            out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
     return out
 
 
@@ -107,15 +78,6 @@ def swap_rows(a: FloatArray, i: int, k: int, first: int, last: int) -> None:
     """
     for j in range(first, last):
         a[i, j], a[k, j] = a[k, j], a[i, j]
-
-
-@kernel(allocates=True)
-def solve(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return ``left^-1 right`` (n, c) of (n, n) and (n, c); nan if it is singular or overflows."""
-    # Copies, since the elimination overwrites both.
-    out = right.copy()
-    solve_inplace(left.copy(), out, len(left))
-    return out
 
 
 @kernel

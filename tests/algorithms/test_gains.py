@@ -7,7 +7,7 @@ import scipy.linalg
 from netkf.algorithms.filter import Estimate, Exchange, Increments, Message, NodeInfo
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.kernels.gains import gain_table, longest_interval
-from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
+from netkf.algorithms.kernels.riccati import move_covariances, riccati_flow
 from netkf.algorithms.kernels.root_flow import gain_update_root
 from netkf.algorithms.models import FlowModel
 from tests import reference
@@ -28,9 +28,8 @@ def test_gains_are_the_projections_of_the_exact_weight(seed):
     """K_j = (2j+1)/g int P_j(s) Phi(g, s) P(s) H' R^-1 ds, with Phi from the closed loop's ODE."""
     A, Q, H, R, P0 = system(seed)
     g, G = 0.05, H.T @ np.linalg.solve(R, H)
-    table = riccati_table(A, Q, G, g)
     model = FlowModel(A, Q, H, R, 1.0, g)
-    flow = lambda s: propagate_riccati(table, P0, np.zeros(3), s)[0]  # noqa: E731
+    flow = lambda s: move_covariances(riccati_flow(A, Q, G, s), P0)  # noqa: E731
     steps = 2000
 
     def transition(s):  # product of midpoint exponentials from s to g

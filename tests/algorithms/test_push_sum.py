@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netkf.algorithms.filter import Exchange, Message, NodeInfo
-from netkf.algorithms.kernels import stopping
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.push_sum import (
     AVERAGE,
@@ -17,6 +16,8 @@ from netkf.algorithms.push_sum import (
     PushSum,
     asymptotic_root,
     corrected_root,
+    has_converged,
+    moved_within,
 )
 
 EXCHANGE = Exchange(phase=MASS, step=0, slot=1)
@@ -231,11 +232,14 @@ def test_the_stop_rule_of_the_paper_breaks_and_the_safe_one_does_not(delivery, w
 
 def within(D, bound):
     mass = np.concatenate([[1.0, 1.0], D.reshape(-1)])
-    return stopping.moved_within(np.zeros(len(mass)), mass, bound, np.empty(D.shape))
+    return moved_within(
+        np.zeros((len(mass), 1)), mass[None, :, None], 0, 0, bound, np.empty(D.shape)
+    )
 
 
 def settled(information, number, former, former_number, tolerance):
-    return stopping.has_converged(former, information, former_number, number, tolerance)
+    former, information = former[None, ..., None], information[..., None]
+    return has_converged(former, 0, information, 0, former_number, number, tolerance)
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7])

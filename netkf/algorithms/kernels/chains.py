@@ -17,40 +17,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.square_root import lower_triangular, step_root
+from netkf.algorithms.kernels.estimates import rotate, transform_root
+from netkf.algorithms.kernels.square_root import lower_triangular
 from netkf.linalg.arrays import FloatArray, as_kernel_array
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
 
 FEW = 4096  # slots of all chains together, below which threads cost more than they save
 
 
 class ReadingModes(NamedTuple):
-    """Readings of M modes: ``H`` (M, p, n) and lower triangular ``root_R`` (M, p, p), of which the
-    first ``rows[m]`` rows count, ``rows`` (M,).
+    """Readings of M modes: ``H`` (M, p, n), whitened so that each row has noise of variance 1, of
+    which the first ``rows[m]`` count, ``rows`` (M,).
     """
 
     H: FloatArray
-    root_R: FloatArray
     rows: np.ndarray
 
 
 def reading_modes(readings: Sequence[tuple[FloatArray, FloatArray]], n: int) -> ReadingModes:
     """Return the modes of M readings ``(H, R)``, (p, n) and (p, p), each with its own p >= 0, for
-    ``n`` states; R is factored and rows are padded to the largest p.
+    ``n`` states; rows are padded to the largest p.
     """
-    max_rows = max((len(H) for H, _ in readings), default=0)
     rows = np.array([len(H) for H, _ in readings], dtype=np.int64)
-    padded_H, root_R = (
-        np.zeros((len(readings), max_rows, n)),
-        np.zeros((len(readings), max_rows, max_rows)),
-    )
+    whitened = np.zeros((len(readings), rows.max(initial=0), n))
     for m, (H, R) in enumerate(readings):
-        # Padding with zero rows keeps one array for all modes; kernels read the first rows[m]
-        # only.
-        padded_H[m, : len(H)] = H
         if len(H):
-            root_R[m, : len(H), : len(H)] = np.linalg.cholesky(R)
-    return ReadingModes(padded_H, root_R, rows)
+            whitened[m, : len(H)] = np.linalg.solve(np.linalg.cholesky(R), H)
+    return ReadingModes(whitened, rows)
 
 
 def move_roots(
@@ -62,28 +56,27 @@ def move_roots(
 
     Uses all cores if there is enough to do.
     """
-    lower_roots = np.ascontiguousarray(lower_triangular(roots))
-    F = as_kernel_array(F)
-    low_Q = np.ascontiguousarray(lower_triangular(root_Q))
+    lows, F, low_Q = _as_kernels_take(roots, F, root_Q)
     # One byte per mode where it suffices, an eighth of an int64: there may be millions of them.
     mode_type = np.uint8 if len(modes.rows) < 256 else np.int64
     sequences = np.ascontiguousarray(sequences, dtype=mode_type)
+    no_paths = np.empty((len(lows), 0, *F.shape))
     # More threads than chains or cores would only wait.
     workers = min(os.cpu_count() or 1, len(roots))
     if sequences.size < FEW or workers < 2:
-        run_sequences(lower_roots, sequences, F, low_Q, *modes)
-        return lower_roots
+        run_sequences(lows, sequences, F, low_Q, *modes, no_paths)
+        return lows
     # Threads own contiguous blocks of chains, as views of one array, so nothing is copied back.
     cuts = np.linspace(0, len(roots), workers + 1).astype(int)
     with ThreadPoolExecutor(workers) as pool:
         jobs = [
-            pool.submit(run_sequences, lower_roots[a:b], sequences[a:b], F, low_Q, *modes)
+            pool.submit(run_sequences, lows[a:b], sequences[a:b], F, low_Q, *modes, no_paths[a:b])
             for a, b in itertools.pairwise(cuts)
         ]
         for job in jobs:
             # Without result() an exception in a worker would be lost.
             job.result()
-    return lower_roots
+    return lows
 
 
 def trace_path(
@@ -106,40 +99,19 @@ def trace_paths(
 
     Axes: T slots.
     """
-    lows = np.ascontiguousarray(lower_triangular(roots))
-    F = as_kernel_array(F)
-    low_Q = np.ascontiguousarray(lower_triangular(root_Q))
-    n = len(F)
-    work = np.empty((modes.H.shape[1] + n, 2 * n + modes.H.shape[1]))
+    lows, F, low_Q = _as_kernels_take(roots, F, root_Q)
     for low, sequence in zip(lows, sequences, strict=True):
-        path = np.empty((len(sequence), *low.shape))
-        run_path(low[None], sequence, F, low_Q, *modes, work, path)
-        yield path
+        path = np.empty((1, len(sequence), *low.shape))
+        run_sequences(low[None], sequence[None], F, low_Q, *modes, path)
+        yield path[0]
 
 
-@kernel
-def run_path(
-    roots: FloatArray,
-    sequence: np.ndarray,
-    F: FloatArray,
-    root_Q: FloatArray,
-    H: FloatArray,
-    root_R: FloatArray,
-    rows: np.ndarray,
-    work: FloatArray,
-    path: FloatArray,
-) -> None:
-    """Move one lower triangular root ``roots`` (1, n, n) in place along its mode ``sequence`` (T,);
-    store the root after each step in ``path`` (T, n, n).
-
-    F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) are those of
-    ``ReadingModes``; ``work`` (p + n, 2 n + p) is scratch. Axes: M modes, T slots.
-    """
-    for step in range(len(sequence)):
-        step_root(roots, 0, sequence[step], F, root_Q, H, root_R, rows, work)
-        for i in range(len(F)):
-            for j in range(len(F)):
-                path[step, i, j] = roots[0, i, j]
+def _as_kernels_take(
+    roots: FloatArray, F: FloatArray, root_Q: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return lower triangular roots of the same covariances, and F, C-contiguous."""
+    lows, low_Q = (np.ascontiguousarray(lower_triangular(root)) for root in (roots, root_Q))
+    return lows, as_kernel_array(F), low_Q
 
 
 @kernel(allocates=True)
@@ -149,18 +121,30 @@ def run_sequences(
     F: FloatArray,
     root_Q: FloatArray,
     H: FloatArray,
-    root_R: FloatArray,
     rows: np.ndarray,
+    paths: FloatArray,
 ) -> None:
     """Move the lower triangular roots (K, n, n) of K chains in place along their mode ``sequences``
-    (K, T).
+    (K, T): update with the reading of the mode, then predict. Store the root after each step in
+    ``paths`` (K, T, n, n), unless that has no slots (K, 0, n, n).
 
-    F and ``root_Q``, lower triangular too, are (n, n); H (M, p, n), ``root_R`` (M, p, p) and
-    ``rows`` (M,) are those of ``ReadingModes``. Axes: M modes, T slots.
+    F and ``root_Q``, lower triangular too, are (n, n); H (M, p, n) and ``rows`` (M,) are those of
+    ``ReadingModes``. Axes: M modes, T slots.
     """
-    # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]] of the largest reading, reused by all
-    # steps.
-    work = np.empty((H.shape[1] + len(F), 2 * len(F) + H.shape[1]))
+    n = len(F)
+    size, row, gains, scratch = F[0], np.empty(n), np.empty(n), (np.empty((n, n)), np.empty((n, n)))
     for chain in range(sequences.shape[0]):
         for step in range(sequences.shape[1]):
-            step_root(roots, chain, sequences[chain, step], F, root_Q, H, root_R, rows, work)
+            m = sequences[chain, step]
+            for r in range(rows[m]):
+                for j in range(n):
+                    total = 0.0
+                    for i in range(j, n):
+                        total += H[m, r, i] * roots[chain, i, j]
+                    row[j] = total
+                rotate(ONE, size, roots, chain, row, gains)
+            transform_root(ONE, size, roots, chain, F, root_Q, scratch)
+            if paths.shape[1] > 0:
+                for i in range(n):
+                    for j in range(n):
+                        paths[chain, step, i, j] = roots[chain, i, j]

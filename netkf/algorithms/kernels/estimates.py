@@ -10,22 +10,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from netkf.algorithms.kernels.square_root import triangularise
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    Lanes,
-    load,
-    magnitude,
-    root_of,
-    select,
-    spread,
-    store,
-    with_sign,
-)
+from netkf.linalg.lanes import Lanes, load, root_of, select, spread, store
 from netkf.linalg.local import local_lanes_matrix, local_lanes_vector
 from netkf.linalg.structs import Size
-
-TINY = 1e-290  # below any squared length of a row that counts, yet above underflow
 
 
 @kernel(inlined=True)
@@ -133,66 +123,7 @@ def transform_root(
             store(lanes, moved, i, j, total)
         for j in range(i + 1):
             store(lanes, noise, i, j, root_Q[i, j])
-    triangularise(lanes, size, root, k, moved, noise)
-
-
-@kernel(inlined=True)
-def triangularise(
-    lanes: Lanes, size: Size, root: FloatArray, k: int, moved: FloatArray, noise: FloatArray
-) -> None:
-    """Write the lower triangular root of ``[moved, noise]`` into ``root[k]``; ``moved`` (n, n, L)
-    is any matrix, ``noise`` (n, n, L) lower triangular, and both are overwritten.
-    """
-    for i in range(len(size)):
-        reflect_column(lanes, size, root, k, i, moved, noise)
-
-
-@kernel(inlined=True)
-def reflect_column(
-    lanes: Lanes,
-    size: Size,
-    root: FloatArray,
-    k: int,
-    i: int,
-    moved: FloatArray,
-    noise: FloatArray,
-) -> None:
-    """Write column ``i`` of the root of ``[moved, noise]`` into ``root[k]``: the Householder
-    reflection that zeroes row i right of its diagonal, applied to the rows below.
-    """
-    # The squared length of row i; the columns of ``noise`` right of i are still zero here.
-    n, pivot, square = len(size), load(lanes, moved, i, i), spread(lanes, 0.0)
-    for j in range(i + 1, n):
-        entry = load(lanes, moved, i, j)
-        square += entry * entry
-    for j in range(i + 1):
-        entry = load(lanes, noise, i, j)
-        square += entry * entry
-    length = root_of(pivot * pivot + square)
-    # head = pivot + sign(pivot) length: nothing cancels.
-    sign = with_sign(spread(lanes, 1.0), pivot)
-    head = pivot + sign * length
-    # The sign of the column is chosen so that its diagonal is nonnegative.
-    store(lanes, root, k, i, i, length)
-    if i == n - 1:
-        return
-    # TINY keeps a row of zeros from dividing by zero: its reflection then only flips a column.
-    scale = 1.0 / (length * (length + magnitude(pivot)) + TINY)
-    for r in range(i + 1, n):
-        first = load(lanes, moved, r, i)
-        total = head * first
-        for j in range(i + 1, n):
-            total += load(lanes, moved, i, j) * load(lanes, moved, r, j)
-        for j in range(i + 1):
-            total += load(lanes, noise, i, j) * load(lanes, noise, r, j)
-        total *= scale
-        store(lanes, root, k, r, i, sign * (total * head - first))
-        for j in range(i + 1, n):
-            entry = load(lanes, moved, r, j) - total * load(lanes, moved, i, j)
-            store(lanes, moved, r, j, entry)
-        for j in range(i + 1):
-            entry = load(lanes, noise, r, j) - total * load(lanes, noise, i, j)
-            store(lanes, noise, r, j, entry)
+    triangularise(lanes, size, root[k], moved, noise)
 
 
 @kernel(inlined=True)

@@ -5,7 +5,8 @@ An information pair (Omega, q), with Omega = P^-1 and q = P^-1 x for an estimate
 root (Z, z), n by n + 1, with ``Omega = Z' Z`` and ``q = Omega c + Z' z``. Z is lower triangular,
 and z is relative to a centre c (n,), the estimate of the node that holds the pair, so that
 differences of near states lose no digits. Omega may be singular, as that of a single reading is.
-Pairs add up by ``merge_lanes``, which triangularises one root on top of the other.
+Pairs add up by ``merge_lanes``, which triangularises one root on top of the other. What is above
+the diagonal of Z is never read.
 
 Stacks ``parts`` (M, K, n, n + 1, L) hold K pairs of each of M nodes or messages, relative to the
 estimates ``x`` (M, n, L), for L runs side by side (``netkf.linalg.lanes``).
@@ -22,20 +23,23 @@ from netkf.linalg.lanes import Lanes, load, root_of, store
 
 
 @kernel(inlined=True)
-def write_information(
-    lanes: Lanes, out: FloatArray, share: float, inverse: FloatArray, h: int
-) -> None:
-    """Write the root [Z, z] of ``share`` times the information ``P^-1 = Z' Z`` of node ``h`` into
-    ``out`` (n, n + 1, L), relative to the node's estimate, so that z = 0; ``inverse[h]`` (n, n, L)
-    is S^-1 for P = S S'.
-    """
-    # P^-1 = S^-T S^-1, whose root is the inverse of S, lower triangular like S.
-    n, factor = len(out), share**0.5
+def clear_part(lanes: Lanes, part: FloatArray) -> None:
+    """Set the root ``part`` (n, n + 1, L) to no information."""
+    n = len(part)
     for i in range(n):
         for j in range(i + 1):
-            store(lanes, out, i, j, factor * load(lanes, inverse, h, i, j))
-        # Relative to itself an estimate has the mean 0.
-        store(lanes, out, i, n, 0.0)
+            store(lanes, part, i, j, 0.0)
+        store(lanes, part, i, n, 0.0)
+
+
+@kernel(inlined=True)
+def copy_part(lanes: Lanes, source: FloatArray, target: FloatArray) -> None:
+    """Copy the root ``source`` (n, n + 1, L) to ``target``."""
+    n = len(source)
+    for i in range(n):
+        for j in range(i + 1):
+            store(lanes, target, i, j, load(lanes, source, i, j))
+        store(lanes, target, i, n, load(lanes, source, i, n))
 
 
 @kernel(inlined=True)
@@ -50,10 +54,7 @@ def add_reading_pair(
     first, matrix = run.first_y + r, run.first_H + run.matrix[r]
     for k in range(run.rows[r]):
         # Merge a row [H, y - H c], as the last row of a lower triangular root.
-        for i in range(n - 1):
-            for j in range(i + 1):
-                store(lanes, work, i, j, 0.0)
-            store(lanes, work, i, n, 0.0)
+        clear_part(lanes, work)
         innovation = load(lanes, run.y, first, k)
         for j in range(n):
             entry = load(lanes, run.H, matrix, k, j)
@@ -87,26 +88,3 @@ def weigh_part(
             mean += entry * (load(lanes, x, m, j) - load(lanes, centre, h, j))
             store(lanes, out, i, j, factor * entry)
         store(lanes, out, i, n, factor * mean)
-
-
-@kernel(inlined=True)
-def store_part(lanes: Lanes, parts: FloatArray, m: int, k: int, total: FloatArray) -> None:
-    """Copy the root ``total`` (n, n + 1, L) of an information pair into ``parts[m, k]``; zeros
-    above the diagonal are not copied.
-    """
-    n = len(total)
-    for i in range(n):
-        for j in range(i + 1):
-            store(lanes, parts, m, k, i, j, load(lanes, total, i, j))
-        store(lanes, parts, m, k, i, n, load(lanes, total, i, n))
-
-
-@kernel(inlined=True)
-def copy_parts(lanes: Lanes, target: FloatArray, m: int, parts: FloatArray, h: int) -> None:
-    """Copy the K information pairs ``parts[h]`` to ``target[m]``."""
-    n = parts.shape[2]
-    for k in range(parts.shape[1]):
-        for i in range(n):
-            for j in range(i + 1):
-                store(lanes, target, m, k, i, j, load(lanes, parts, h, k, i, j))
-            store(lanes, target, m, k, i, n, load(lanes, parts, h, k, i, n))

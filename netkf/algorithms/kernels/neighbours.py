@@ -19,17 +19,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from netkf.algorithms.kernels.estimates import triangularise
 from netkf.algorithms.kernels.run import carry, use_reading
+from netkf.algorithms.kernels.square_root import triangularise
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    load,
-    load_flags,
-    root_of,
-    select,
-    spread,
-    store,
-)
+from netkf.linalg.lanes import load, load_flags, root_of, select, spread, store
 
 
 @kernel(inlined=True)
@@ -71,7 +64,7 @@ def combine_convex(record: Any, h: int, run: Any) -> None:
                 store(lanes, run.noise, i, j, factor * load(lanes, payload.root, m, i, j))
             difference = load(lanes, payload.xhat, m, i) - load(lanes, record.xhat, h, i)
             store(lanes, run.moved_mean, i, load(lanes, run.moved_mean, i) + weight * difference)
-        triangularise(lanes, run.size, root, h, run.moved, run.noise)
+        triangularise(lanes, run.size, root[h], run.moved, run.noise)
     for i in range(n):
         mean = load(lanes, record.xhat, h, i) + load(lanes, run.moved_mean, i)
         store(lanes, record.xhat, h, i, mean)

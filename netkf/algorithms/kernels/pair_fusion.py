@@ -17,9 +17,10 @@ from __future__ import annotations
 import math
 
 from netkf.algorithms.kernels.intersection import NEGLIGIBLE, SINGULAR, TINY
-from netkf.algorithms.kernels.square_root import reflect
+from netkf.algorithms.kernels.square_root import triangularise
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
 
 SWEEPS, BISECTIONS = 40, 60  # at most, of Jacobi rotations; and for full precision of w in [0, 1]
 ORTHOGONAL = 1e-15
@@ -224,13 +225,11 @@ def fuse_pair(
         for i in range(n):
             x[i] += W[i, k] * component
             W[i, k] *= math.sqrt(p)
-    # W diag(p)^1/2 is a root of P: reflections make it lower triangular, with a diagonal >= 0.
+    # W diag(p)^1/2 is a root of P, to be made lower triangular; U is not needed any more.
     for i in range(n):
-        reflect(W, i, n, n)
-    for j in range(n):
-        for i in range(n):
-            entry = -W[i, j] if W[j, j] < 0.0 else W[i, j]
-            root[i, j] = entry if i > j else abs(entry) if i == j else 0.0
+        for j in range(i + 1):
+            U[i, j] = 0.0
+    triangularise(ONE, x, root, W, U)
 
 
 @kernel(inlined=True)

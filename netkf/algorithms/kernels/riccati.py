@@ -7,46 +7,29 @@ theory of paper H (Tanwani 2021) uses these covariances; filters carry roots of 
 
 The flow is the linear-fractional action of ``exp(M gap)`` with the Hamiltonian ``M = [[-A', G], [Q,
 A]]``: if ``[X; Y] = exp(M gap) [I; P]`` then ``P(gap) = Y X^-1``. One exponential over a long gap
-loses every digit, so a gap is cut into whole units, in which ``|M| unit <= 1``, and a rest. The
-rest uses a Taylor series whose coefficients are tabulated; the number of whole units is written in
-binary digits: the flow over ``unit * 2^k`` is tabulated as the triple ``(F, G, Q)`` with ``P -> Q +
-F P (I + G P)^-1 F'``, and a triple follows from the one before it by the doubling formulas (Davison
-and Maki 1973; Anderson 1978), which only add positive terms.
-
-Without readings, ``G = 0``, the rest needs no inverse: ``P(gap) = e P e' + W`` with
-``e = exp(A gap)`` and the covariance W of the noise of the gap.
+loses every digit. So a gap is halved until ``|M| gap <= 1``, and the flow over it is the triple
+``(F, G, Q)`` with ``P -> Q + F P (I + G P)^-1 F'``, which is doubled by formulas that only add
+positive terms (Davison and Maki 1973; Anderson 1978).
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, symmetric
-from netkf.linalg.compiling import kernel
-from netkf.linalg.series import polynomial, with_reach
-from netkf.linalg.small import add_matmul, matmul, matvec, solve, symmetrize
 
-TAYLOR_TERMS = 19  # 1 / 19! is below double rounding when |M| unit <= 1
+WIDE = np.longdouble  # extended precision where the machine has it
+WIDE_TERMS = 27  # of an exponential in it, for a norm of at most 1
 
 
-class RiccatiTable(NamedTuple):
-    """Everything that depends on ``A, Q, G`` (n, n) and not on ``P`` or the gap.
-
-    n      : number of states
-    unit   : gap that the series covers, seconds
-    series : (terms, 5 n n + 1) Taylor coefficients of the blocks of ``exp(M g)`` and of
-             ``exp(A g)``, and in the last column their reach, the longest gap for which the terms
-             so far suffice (linalg/series)
-    unobserved : (terms, 2 n n + 1) those of ``exp(A g)`` and of W where G = 0, else no row
-    transition, F, G, Q : (levels, n, n) ``exp(A g)`` and the triple for ``g = unit * 2^level``
+class RiccatiFlow(NamedTuple):
+    """The flow over one gap, in extended precision: matrices (n, n) with ``x -> transition x`` of a
+    mean without readings and ``P -> Q + F P (I + G P)^-1 F'``.
     """
 
-    n: int
-    unit: float
-    series: FloatArray
-    unobserved: FloatArray
     transition: FloatArray
     F: FloatArray
     G: FloatArray
@@ -62,19 +45,6 @@ def exponential_series(M: FloatArray, terms: int) -> FloatArray:
     for k in range(1, terms):
         # (M g)^k / k! from the term before it.
         series[k] = series[k - 1] @ M / k
-    return series
-
-
-def lyapunov_series(A: FloatArray, Q: FloatArray, terms: int) -> FloatArray:
-    """Return the power series (terms, n, n) in g of the noise covariance W(g) with
-    ``dW/dg = A W + W A' + Q`` and W(0) = 0; A and Q are (n, n).
-    """
-    series = np.zeros((terms, *A.shape))
-    series[1] = Q
-    for k in range(2, terms):
-        # k W_k = A W_(k-1) + W_(k-1) A' from k = 2 on: Q is constant and enters W_1 only.
-        A_W = A @ series[k - 1]
-        series[k] = (A_W + A_W.T) / k
     return series
 
 
@@ -96,134 +66,68 @@ def hamiltonian(A: FloatArray, Q: FloatArray, G: FloatArray) -> tuple[FloatArray
     return np.block([[-A.T, G * scale], [Q / scale, A]]), scale
 
 
-def riccati_table(A: FloatArray, Q: FloatArray, G: FloatArray, longest: float) -> RiccatiTable:
-    """Return the table of the Riccati flow ``dP = A P + P A' + Q - P G P`` for gaps up to
-    ``longest`` seconds; ``A, Q, G`` are (n, n).
+def riccati_flow(A: FloatArray, Q: FloatArray, G: FloatArray, gap: float) -> RiccatiFlow:
+    """Return the flow of ``dP = A P + P A' + Q - P G P`` over ``gap`` >= 0 seconds; ``A, Q, G`` are
+    (n, n). Entries are nan or infinite where an unstable plant overflows.
     """
-    n = len(A)
     M, scale = hamiltonian(A, Q, G)
-    norm, abs_A, unobserved = float(np.abs(M).sum(axis=0).max()), np.abs(A), not G.any()
-    if unobserved:  # W grows by A from both sides
-        norm = max(norm, float(abs_A.sum(axis=0).max() + abs_A.sum(axis=1).max()))
-    # A power of two, so that a whole number of units is exact.
-    unit = 2.0 ** np.floor(np.log2(min(1.0 / max(norm, 1e-300), longest)))
-    blocks = exponential_series(M, TAYLOR_TERMS)
-    # Undo the scaling of hamiltonian(): G and Q get their units back, and kernels need no scale.
-    blocks[:, :n, n:] /= scale
-    blocks[:, n:, :n] *= scale
-    transition = exponential_series(A, TAYLOR_TERMS)
-    series, unobserved_series = (
-        _side_by_side(unit, blocks, transition),
-        np.zeros((0, 2 * n * n + 1)),
-    )
-    if unobserved:
-        unobserved_series = _side_by_side(unit, transition, lyapunov_series(A, Q, TAYLOR_TERMS))
-    # Binary digits of the largest number of whole units.
-    levels = max(1, int(longest / unit).bit_length())
-    return RiccatiTable(
-        n, unit, series, unobserved_series, *_doubling_tables(M, scale, A, unit, levels)
-    )
-
-
-def _side_by_side(unit: float, *parts: FloatArray) -> FloatArray:
-    """Return power series side by side (terms, size + 1), the reach of each row last."""
-    rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-    return with_reach(rows, unit)
-
-
-def _doubling_tables(
-    M: FloatArray, scale: float, A: FloatArray, unit: float, levels: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return exp(A t), F, G and Q (levels, n, n) over 1, 2, 4, ... units."""
-    # Doubling also doubles the relative error, so it works in extended precision (where the
-    # machine has it): after 2^14 units a table in double would have lost 1e-12.
-    n, wide = len(A), np.longdouble
-    # E = exp(M unit) gives the first triple: with [X; Y] = E [I; P], F = E11^-T, G = E11^-1 E12 and
-    # Q = E21 E11^-1. Extended precision needs 24 terms, more than TAYLOR_TERMS.
-    E = np.tensordot(wide(unit) ** np.arange(24), exponential_series(M.astype(wide), 24), 1)
-    inverse = _invert_extended(E[:n, :n])
-    F, G, Q = inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
-    transition = np.tensordot(
-        wide(unit) ** np.arange(24), exponential_series(A.astype(wide), 24), 1
-    )
-    tables = tuple(np.empty((levels, n, n)) for _ in range(4))
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable plant overflows late
-        for level in range(levels):
+    norm = max(float(np.abs(matrix).sum(axis=0).max()) for matrix in (M, A))
+    # By powers of two, so that halving is exact. Doubling also doubles the relative error: after
+    # 2^14 parts a triple in double precision would have lost 1e-12.
+    doublings = max(0, math.frexp(norm * gap)[1])
+    part = gap / 2.0**doublings
+    transition, (F, G, Q) = wide_exponential(A, part), flow_triple(wide_exponential(M, part))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(doublings):
             # Symmetry would drift by rounding, and doubling would amplify the drift.
             G, Q = symmetric(G), symmetric(Q)
-            for table, value in zip(tables, (transition, F, G / scale, Q * scale), strict=True):
-                table[level] = value
             # Two equal gaps in a row: V = (I + G Q)^-1 joins the noise of the first with the
             # information of the second. G and Q are symmetric, so that V' = (I + Q G)^-1.
-            V = _invert_extended(np.eye(n) + G @ Q)
+            V = wide_inverse(np.eye(len(A)) + G @ Q)
             transition, F, G, Q = (
                 transition @ transition,
                 F @ V.T @ F,
                 G + F.T @ V @ G @ F,
                 Q + F @ Q @ V @ F.T,
             )
-    return tables  # type: ignore[return-value]
+    # Undo the scaling of hamiltonian().
+    return RiccatiFlow(transition, F, G / scale, Q * scale)
 
 
-def _invert_extended(matrix: FloatArray) -> FloatArray:
-    """Return the inverse of ``matrix`` in its precision by Newton's iteration, or nan."""
-    if not np.isfinite(matrix).all():
-        return np.full_like(matrix, np.nan)
+def move_covariances(flow: RiccatiFlow, P: FloatArray) -> FloatArray:
+    """Return the covariances (..., n, n) at the end of the gap of a ``flow``, from those at its
+    begin, ``P`` (..., n, n).
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        # P (I + G P)^-1 = (I + P G)^-1 P
+        middle = wide_inverse(np.eye(len(flow.G)) + P @ flow.G) @ P
+        return symmetric(flow.Q + flow.F @ middle @ flow.F.T).astype(np.float64)
+
+
+def wide_exponential(M: FloatArray, gap: float) -> FloatArray:
+    """Return exp(M gap) (n, n) in extended precision, for ``|M| gap`` of at most 1, M (n, n)."""
+    series = exponential_series(M.astype(WIDE), WIDE_TERMS)
+    return np.asarray(np.tensordot(WIDE(gap) ** np.arange(WIDE_TERMS), series, 1))
+
+
+def flow_triple(E: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return F, G and Q (n, n) of the flow over a gap, from E = exp(M gap) (2 n, 2 n) with the
+    Hamiltonian M: ``F = E11^-T``, ``G = E11^-1 E12`` and ``Q = E21 E11^-1``.
+    """
+    n = len(E) // 2
+    inverse = wide_inverse(E[:n, :n])
+    return inverse.T, inverse @ E[:n, n:], E[n:, :n] @ inverse
+
+
+def wide_inverse(matrices: FloatArray) -> FloatArray:
+    """Return the inverses (..., n, n) of ``matrices`` (..., n, n) in their precision, by Newton's
+    iteration from double precision; nan where one is singular or not finite.
+    """
     try:
-        inverse = np.linalg.inv(matrix.astype(np.float64)).astype(matrix.dtype)
+        inverse = np.linalg.inv(matrices.astype(np.float64)).astype(matrices.dtype)
     except np.linalg.LinAlgError:
-        return np.full_like(matrix, np.nan)
+        return np.full_like(matrices, np.nan)
     # X <- X (2 I - M X) doubles the correct digits: twice takes double precision to extended.
     for _ in range(2):
-        inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
-    return inverse
-
-
-@kernel(allocates=True)
-def substep(
-    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (n, n) after the Riccati flow of a ``table`` over ``gap`` seconds, at
-    most one of its units, from P (n, n), and ``exp(A gap) x`` (n,).
-    """
-    n = table.n
-    # G = 0, a Lyapunov equation: P <- e P e' + W, and no inverse is needed.
-    if len(table.unobserved):
-        values = polynomial(table.unobserved, gap)
-        transition, noise = values[: n * n].reshape(n, n), values[n * n :].reshape(n, n)
-        transition_P = matmul(transition, P)
-        return symmetrize(add_matmul(noise, transition_P, transition.T)), matvec(transition, x)
-    values = polynomial(table.series, gap)
-    E, transition = values[: 4 * n * n].reshape(2 * n, 2 * n), values[4 * n * n :].reshape(n, n)
-    # [X; Y] = E [I; P], and the new P is Y X^-1
-    X = add_matmul(E[:n, :n], E[:n, n:], P)
-    Y = add_matmul(E[n:, :n], E[n:, n:], P)
-    # Y X^-1 by a linear solve with X'; P is symmetric, so the transpose of the result does not
-    # matter.
-    return symmetrize(solve(X.T, Y.T)), matvec(transition, x)
-
-
-@kernel(allocates=True)
-def propagate_riccati(
-    table: RiccatiTable, P: FloatArray, x: FloatArray, gap: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (n, n) after the Riccati flow of a ``table`` over ``gap`` >= 0 seconds
-    from P (n, n), and ``exp(A gap) x`` (n,): the covariance counts the readings of the gap, the
-    estimate does not (``root_flow.gain_update_root`` corrects it by them).
-    """
-    P, x = P.copy(), x.copy()  # C-contiguous, so that one version of this code is compiled
-    # One step for each binary digit 1 of the number of whole units, with its tabulated triple.
-    units, level = int(gap / table.unit), 0
-    while units >> level:
-        if units >> level & 1:  # Q + F P (I + G P)^-1 F' over 2^level units
-            F = table.F[level]
-            # P (I + G P)^-1 = (I + P G)^-1 P.
-            middle = solve(add_matmul(np.eye(table.n), P, table.G[level]), P)
-            P = symmetrize(add_matmul(table.Q[level], matmul(F, middle), F.T))
-            x = matvec(table.transition[level], x)
-        level += 1
-    # The rest, less than a unit, by the power series.
-    rest = gap - units * table.unit
-    if rest <= 0.0:
-        return P, x
-    return substep(table, P, x, rest)
+        inverse = inverse @ (2.0 * np.eye(matrices.shape[-1]) - matrices @ inverse)
+    return np.asarray(inverse)

@@ -49,8 +49,13 @@ import numpy as np
 
 from netkf.algorithms.kernels.estimates import rotate
 from netkf.algorithms.kernels.gains import GainTable
-from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
-from netkf.algorithms.kernels.square_root import reflect_row
+from netkf.algorithms.kernels.riccati import (
+    WIDE,
+    flow_triple,
+    hamiltonian,
+    wide_exponential,
+)
+from netkf.algorithms.kernels.square_root import triangularise
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, Lanes, aligned, load, root_of, select, spread, store
@@ -67,8 +72,6 @@ BLOCKS = 13  # Legendre coefficients at most: the next one is below 1e-40 of the
 NEGLIGIBLE = 1e-18  # trace(P dG) of information that may be left out
 GROWTH = 2.0**8  # of F over one level at most, where something is observed
 PIVOT = 2.0**-48  # least pivot of Q_g, relative to its diagonal
-
-WIDE = np.longdouble  # extended precision where the machine has it, for tables only
 
 
 class FlowTable(Struct):
@@ -282,23 +285,16 @@ def transitions_at(
     M, scale = hamiltonian(A, Q, whitened_H.T @ whitened_H)
     # exp over half a unit, which is a third of the first middle (3/2 units): all middles are odd
     # multiples of it.
-    powers = (middles[1] / WIDE(3.0)) ** np.arange(TERMS)
-    half_unit, half_unit_A = (
-        np.tensordot(powers, exponential_series(matrix.astype(WIDE), TERMS), 1) for matrix in (M, A)
-    )
+    half_unit, half_unit_A = (wide_exponential(part, middles[1] / WIDE(3.0)) for part in (M, A))
     E_M, E[1:] = half_unit, half_unit_A
     # Each middle is two halves of a unit after the one before it; the first step goes from 1/2 to
     # 3/2 units.
     for k in range(1, count):
         E_M = half_unit @ half_unit @ E_M
         E[k] = half_unit_A @ half_unit_A @ (E[k - 1] if k > 1 else half_unit_A)
-        inverse = wide_inverse(E_M[:n, :n])
-        # P(g) = Y X^-1 with [X; Y] = E_M [I; P] gives, from the blocks of E_M = exp(M g),
-        # F = E11^-T, G_g = E11^-1 E12 and Q_g = E21 E11^-1. M belongs to P / scale: undo that.
-        F[k] = inverse.T
-        G[k] = inverse @ E_M[:n, n:] / scale
-        Q_g[k] = E_M[n:, :n] @ inverse * scale
-    return E, F, symmetric(Q_g), symmetric(G)
+        F[k], G[k], Q_g[k] = flow_triple(E_M)
+    # M belongs to P / scale.
+    return E, F, symmetric(Q_g) * scale, symmetric(G) / scale
 
 
 def wide_zeros(*shape: int) -> Any:
@@ -306,17 +302,6 @@ def wide_zeros(*shape: int) -> Any:
     tables are computed before they are rounded to double.
     """
     return np.zeros(shape, dtype=WIDE)
-
-
-def wide_inverse(matrix: FloatArray) -> FloatArray:
-    """Return the inverse (n, n) of ``matrix`` (n, n) in extended precision, by Newton's iteration
-    from double.
-    """
-    inverse = np.linalg.inv(matrix.astype(np.float64)).astype(WIDE)
-    # X <- X (2 I - M X) doubles the correct digits: twice takes double precision to extended.
-    for _ in range(2):
-        inverse = inverse @ (2.0 * np.eye(len(matrix)) - matrix @ inverse)
-    return np.asarray(inverse)
 
 
 def information_blocks(
@@ -902,20 +887,7 @@ def transform_root(
             for r in range(j, n):
                 total += load(lanes, F, begin + i * n + r) * load(lanes, S, r, j)
             store(lanes, wide, i, j, total)
-    # Triangularise [F S, T] from the right by one Householder reflection for each row.
-    for i in range(n):
-        # Two sums, neither of which waits for the other.
-        square = of_noise = spread(lanes, 0.0)
-        for j in range(i, n):
-            square += load(lanes, wide, i, j) * load(lanes, wide, i, j)
-        # T is lower triangular: its columns beyond i are 0 in row i.
-        for j in range(i + 1):
-            of_noise += load(lanes, T, i, j) * load(lanes, T, i, j)
-        square += of_noise
-        # A zero row needs no reflection.
-        reflect_row(lanes, size, i, n, wide, T, square, square != 0.0)
-        for j in range(i + 1):
-            store(lanes, S, i, j, load(lanes, wide, i, j))
+    triangularise(lanes, size, S, wide, T)
 
 
 @kernel(inlined=True, fused=True)

@@ -1,11 +1,7 @@
-"""Covariance recursions in square-root form, which stay accurate for covariances beyond 1e14.
-
-For ``P = S S'`` one orthogonal triangularisation of ``[[H S, root(R), 0], [F S, 0, root(Q)]]``
-gives the innovation's root, the gain and the root of the next covariance: nothing is subtracted, so
-nothing cancels after an outage, where covariance forms lose eps * P (Kailath, Sayed and Hassibi,
-Linear Estimation, section 12.3). ``reflect`` and ``reflect_row`` are the steps of the
-triangularisation, which other kernels use as well: Householder reflections of columns, that is from
-the right, which leave [A, B] [A, B]' as it is.
+"""Lower triangular roots S of covariances ``P = S S'``: nothing is subtracted, so that nothing
+cancels after an outage, where covariance forms lose eps * P (Kailath, Sayed and Hassibi, Linear
+Estimation, section 12.3). ``reflect`` and ``reflect_row`` are Householder reflections of columns,
+that is from the right, which leave [A, B] [A, B]' as it is.
 """
 
 from __future__ import annotations
@@ -19,6 +15,8 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, magnitude, root_of, select, spread, store
 from netkf.linalg.structs import Size
+
+TINY = 1e-300  # below any squared length of a row that counts, yet above underflow
 
 
 def lower_triangular(array: FloatArray) -> FloatArray:
@@ -116,44 +114,22 @@ def reflect_row(
             store(lanes, T, r, j, load(lanes, T, r, j) - share * load(lanes, T, i, j))
 
 
-@kernel
-def step_root(
-    roots: FloatArray,
-    chain: int,
-    m: int,
-    F: FloatArray,
-    root_Q: FloatArray,
-    H: FloatArray,
-    root_R: FloatArray,
-    rows: np.ndarray,
-    work: FloatArray,
-) -> None:
-    """Replace root ``chain`` of ``roots`` (K, n, n), lower triangular, by that of
-    ``f_m(P) = F P F' + Q - F P H_m' (H_m P H_m' + R_m)^-1 H_m P F'``, R (17) of paper R (Kar,
-    Sinopoli and Moura): update with reading ``m`` of M and predict.
-
-    F and ``root_Q`` are (n, n); H (M, p, n), ``root_R`` (M, p, p) and ``rows`` (M,) give the
-    readings, of which the first ``rows[m]`` rows count. ``work`` (>= p + n, >= 2 n + p) is scratch.
-    Axes: K chains.
+@kernel(inlined=True, fused=True)
+def triangularise(lanes: Lanes, size: Size, S: FloatArray, wide: FloatArray, T: FloatArray) -> None:
+    """Write the lower triangular root, with a nonnegative diagonal, of ``[wide, T] [wide, T]'``
+    into S, (n, n, L) each; T is lower triangular, and both are overwritten.
     """
-    n, p = len(F), rows[m]
-    # The pre-array [[H S, root_R, 0], [F S, 0, root_Q]].
-    for i in range(p + n):
-        for j in range(n):
-            total = 0.0
-            for k in range(j, n):
-                total += (H[m, i, k] if i < p else F[i - p, k]) * roots[chain, k, j]
-            work[i, j] = total
-        for j in range(p):
-            work[i, n + j] = root_R[m, i, j] if i < p else 0.0
-        for j in range(n):
-            work[i, n + p + j] = root_Q[i - p, j] if i >= p else 0.0
-    # Reflections of the columns make it lower triangular, row by row. Row i is zero right of column
-    # n + p + (i - p), because root_Q is lower triangular.
-    for i in range(p + n):
-        reflect(work, i, p + n, n + p + max(0, i - p + 1))
-    # The post-array is [[C, 0], [K C, S+]] with C C' = H P H' + R and the gain K of the predictor:
-    # its lower right block is the root of f_m(P).
+    n = len(size)
     for i in range(n):
+        # Two sums, neither of which waits for the other.
+        square = of_noise = spread(lanes, 0.0)
+        for j in range(i, n):
+            square += load(lanes, wide, i, j) * load(lanes, wide, i, j)
+        # T is lower triangular: its columns beyond i are 0 in row i.
         for j in range(i + 1):
-            roots[chain, i, j] = work[p + i, p + j]
+            of_noise += load(lanes, T, i, j) * load(lanes, T, i, j)
+        square += of_noise
+        # A zero row needs no reflection.
+        reflect_row(lanes, size, i, n, wide, T, square, square > TINY)
+        for j in range(i + 1):
+            store(lanes, S, i, j, load(lanes, wide, i, j))

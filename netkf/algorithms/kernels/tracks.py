@@ -15,8 +15,10 @@ import math
 
 import numpy as np
 
+from netkf.algorithms.kernels.root_flow import cholesky_in_lanes
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Struct
 
 NEGLIGIBLE = 1e-12
@@ -34,7 +36,7 @@ class TrackScratch(Struct):
     variance_scale, order : (k n,), sum of the variances of e_own and e_a for each entry of d, and
                             the order of pivots
     weights : (n, (k + 1) n), of the errors of all tracks in the error of the combination
-    work : (n, n)
+    work : (n (n + 1) / 2,)
     """
 
     difference_cov: FloatArray
@@ -50,21 +52,13 @@ class TrackScratch(Struct):
 def track_scratch(k: int, n: int) -> TrackScratch:
     """Return scratch for the combination of a track of n states with at most k others."""
     K = max(k, 1) * n
-    shapes = [(K, K), (K, K), (n, K), (n, K), (K,), (n, K + n), (n, n)]
-    difference_cov, factor, cross_cov, white_cov, variance_scale, weights, work = (
-        np.zeros(shape) for shape in shapes
-    )
-    order = np.zeros(K, dtype=np.int64)
-    return TrackScratch(
-        difference_cov=difference_cov,
-        factor=factor,
-        cross_cov=cross_cov,
-        white_cov=white_cov,
-        variance_scale=variance_scale,
-        order=order,
-        weights=weights,
-        work=work,
-    )
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(("difference_cov", "factor"), (K, K)),
+        **dict.fromkeys(("cross_cov", "white_cov"), (n, K)),
+        **{"variance_scale": (K,), "weights": (n, K + n), "work": (n * (n + 1) // 2,)},
+    }
+    arrays = {name: np.zeros(shape) for name, shape in shapes.items()}
+    return TrackScratch(**arrays, order=np.zeros(K, dtype=np.int64))
 
 
 @kernel
@@ -286,40 +280,21 @@ def write_combined_root(
     n, weights, P = len(root), scratch.weights, scratch.work
     for i in range(n):
         for j in range(n):
-            weights[i, j], P[i, j] = 1.0 if i == j else 0.0, 0.0
+            weights[i, j] = 1.0 if i == j else 0.0
             for a in range(count):
                 weights[i, (a + 1) * n + j] = gain[i, a * n + j]
                 weights[i, j] -= gain[i, a * n + j]
+    for c in range(len(P)):
+        P[c] = 0.0
     for a in range(count + 1):
         for j in range(n):
             for i in range(n):
                 # (W joint) for row i and error j of track a; then times W', into the lower
-                # triangle.
+                # triangle by rows.
                 total = 0.0
                 for b in range(count + 1):
                     for k in range(n):
                         total += weights[i, b * n + k] * joint[b, a, k, j]
                 for c in range(i + 1):
-                    P[i, c] += total * weights[c, a * n + j]
-    fill_cholesky(P, root)
-
-
-@kernel
-def fill_cholesky(P: FloatArray, root: FloatArray) -> None:
-    """Write the Cholesky ``root`` (n, n) of P, of which only the lower triangle is read; columns in
-    which P is singular become 0.
-    """
-    n = len(P)
-    for j in range(n):
-        square = P[j, j]
-        for k in range(j):
-            square -= root[j, k] * root[j, k]
-        # Nothing but rounding is left where P is singular.
-        pivot = math.sqrt(square) if square > 0.0 else 0.0
-        root[j, j] = pivot
-        for i in range(j + 1, n):
-            total = P[i, j]
-            for k in range(j):
-                total -= root[i, k] * root[j, k]
-            root[i, j] = total / pivot if pivot > 0.0 else 0.0
-            root[j, i] = 0.0
+                    P[i * (i + 1) // 2 + c] += total * weights[c, a * n + j]
+    cholesky_in_lanes(ONE, P[:n], root, P)

@@ -122,8 +122,8 @@ def is_positive(lanes: Lanes, work: FloatArray) -> Any:
     n, smallest_pivot = len(work), spread(lanes, math.inf)
     for k in range(n):
         pivot = load(lanes, work, k, k)
-        # A pivot that is not positive decides; the ones after it do not matter.
-        smallest_pivot = select(pivot < smallest_pivot, pivot, smallest_pivot)
+        # A pivot that is not positive decides, and so does nan, which all after it become too.
+        smallest_pivot = select(pivot >= smallest_pivot, smallest_pivot, pivot)
         for i in range(k + 1, n):
             factor = load(lanes, work, i, k) / pivot
             for j in range(k + 1, i + 1):

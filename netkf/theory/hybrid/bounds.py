@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.riccati import RiccatiTable, propagate_riccati, riccati_table
+from netkf.algorithms.kernels.riccati import RiccatiFlow, move_covariances, riccati_flow
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
@@ -122,16 +122,19 @@ def _covariance_scale(packed: PackedRiccati) -> float:
 def _solve_uncoupled(equations: CoupledRiccati, times: FloatArray) -> FloatArray:
     """Return P (T, N, n, n) at ``times`` of nodes that receive nothing."""
     P = np.empty((len(times), *equations.start.shape))
-    tables: dict[bytes, RiccatiTable] = {}
-    mean = np.zeros(len(equations.A))  # the kernel moves a mean along with P
-    with np.errstate(over="ignore", invalid="ignore"):
-        for i, (G, start) in enumerate(zip(equations.G, equations.start, strict=True)):
-            key = G.tobytes()  # nodes with equal sensors share a table
-            if key not in tables:
-                longest = max(float(times[-1]), 1e-9)
-                tables[key] = riccati_table(equations.A, equations.Q, G, longest)
-            for k, t in enumerate(times):
-                P[k, i] = propagate_riccati(tables[key], start, mean, float(t))[0] if t else start
+    # Nodes with equal sensors move together, and over equal gaps alike.
+    groups: dict[bytes, list[int]] = {}
+    for i, G in enumerate(equations.G):
+        groups.setdefault(G.tobytes(), []).append(i)
+    for nodes in groups.values():
+        flows: dict[float, RiccatiFlow] = {}
+        now, present = 0.0, equations.start[nodes]
+        for k, t in enumerate(times.tolist()):
+            gap = t - now
+            if gap not in flows:
+                flows[gap] = riccati_flow(equations.A, equations.Q, equations.G[nodes[0]], gap)
+            P[k, nodes] = present = move_covariances(flows[gap], present)
+            now = t
     return P
 
 

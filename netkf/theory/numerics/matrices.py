@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg
 
-from netkf.algorithms.kernels.riccati import propagate_riccati, riccati_table
+from netkf.algorithms.kernels.riccati import move_covariances
+from netkf.algorithms.kernels.riccati import riccati_flow as flow_over
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, is_semidefinite, square_root, symmetric
 from netkf.linalg.spectra import RATE, growth_rate, hidden_mode, outputs_of
@@ -79,9 +80,7 @@ def riccati_flow(P: ArrayLike, A: ArrayLike, Q: ArrayLike, G: ArrayLike, gap: fl
         raise TheoryError(f"gap must be finite and not negative, got {gap!r}")
     if gap == 0.0:
         return start
-    with np.errstate(over="ignore", invalid="ignore"):
-        table = riccati_table(drift, noise, information, float(gap))
-        end, _ = propagate_riccati(table, start, np.zeros(n), float(gap))
+    end = move_covariances(flow_over(drift, noise, information, float(gap)), start)
     if not np.isfinite(end).all():
         raise TheoryError(f"the solution overflows before {gap:g} s: an undetectable mode grows")
     return end
