@@ -442,7 +442,7 @@ class BeliefPropagation(Filter):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a scenario."""
+        """Its demands on a scenario."""
         return Needs(
             one_way=True,
             samples=True,

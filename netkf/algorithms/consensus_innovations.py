@@ -31,7 +31,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NetworkInfo, NodeInfo
 from netkf.algorithms.kernels.estimates import transform_mean
 from netkf.algorithms.kernels.run import absorb as nothing
-from netkf.algorithms.kernels.run import shift_vector
+from netkf.algorithms.kernels.run import shift_vector, write_innovation
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
@@ -46,43 +46,14 @@ CONVERGED = 1e-14
 """Relative change of covariances in a slot, of a few roundings, below which gains are constant."""
 
 
-class Design(NamedTuple):
-    """Everything that determines the gains of a network; hashable, as the key of a cache.
+class Gains(NamedTuple):
+    """The gains of one node in one slot; or of N nodes in K slots, with W directions by receiver
+    and sender.
 
-    n, nodes : numbers of states and of nodes
-    F, Q, cov : matrices (n, n) as bytes; ``cov`` is that of x(0)
-    information : H' R^-1 H (N, n, n) of the nodes, as bytes
-    heard : for each node the indices of the nodes that it hears
-    """
-
-    n: int
-    nodes: int
-    F: bytes
-    Q: bytes
-    cov: bytes
-    information: bytes
-    heard: tuple[tuple[int, ...], ...]
-
-
-class NodeGains(NamedTuple):
-    """The gains of one node in one slot.
-
-    B : (d, n, n) for the d nodes that it hears, in the order of their indices
-    M, K : (n, n), of the pseudo-observation in yhat, and of the pseudo-state in xhat
+    B : (d, n, n) for the d nodes that it hears, in the order of their indices; or (K, W, n, n)
+    M, K : (n, n), of the pseudo-observation in yhat, and of the pseudo-state in xhat; or
+           (K, N, n, n), as is ``root``
     root : lower triangular root (n, n) of the covariance of x - xhat at the end of the slot
-    """
-
-    B: FloatArray
-    M: FloatArray
-    K: FloatArray
-    root: FloatArray
-
-
-class SlotGains(NamedTuple):
-    """Gains of N nodes in K slots, see ``NodeGains``.
-
-    B : (K, W, n, n) of the W directions, by receiver and sender
-    M, K, root : (K, N, n, n)
     """
 
     B: FloatArray
@@ -130,33 +101,43 @@ class GainSequence:
     estimates lose no digits.
     """
 
-    def __init__(self, design: Design) -> None:
-        """Set the errors at the start of the network of a ``design``; no gain is computed yet."""
-        n, N = design.n, design.nodes
-        self._n = n
-        self._neighbours = design.heard
-        self._F = np.frombuffer(design.F).reshape(n, n)
-        self._information = np.frombuffer(design.information).reshape(N, n, n)
+    def __init__(
+        self,
+        matrices: tuple[FloatArray, FloatArray, FloatArray],
+        information: FloatArray,
+        heard: tuple[tuple[int, ...], ...],
+    ) -> None:
+        """Set the errors at the start of a network: ``matrices`` are F, Q and the covariance of
+        x(0), (n, n) each; ``information`` and ``heard`` are those of ``NetworkInfo``.
+        """
+        self._F, Q, cov = matrices
+        self._n, self._neighbours, self._information = len(cov), heard, information
+        n, N = self._n, len(heard)
         self._pseudo = pseudo_states(self._F, self._information.sum(axis=0))
         # Columns of zeros, as of nodes without a sensor, add no noise: leave them out.
-        self._noises = [without_zeros(square_root(matrix)) for matrix in self._information]
+        roots = map(square_root, self._information)
+        self._noises = [root[:, root.any(axis=0)] for root in roots]
         # x and w enter all errors of xhat by I, and all errors of yhat by G: (2 N n, n).
         stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(self._pseudo.G, (N, 1))])
         # All nodes start from the same mean: only x(0) - mean makes errors, as does w later.
-        self._errors = stacked @ square_root(np.frombuffer(design.cov).reshape(n, n))
-        self._driven = stacked @ square_root(np.frombuffer(design.Q).reshape(n, n))
-        self._gains: list[tuple[NodeGains, ...]] = []
+        self._errors = stacked @ square_root(cov)
+        self._driven = stacked @ square_root(Q)
+        self._gains: list[tuple[Gains, ...]] = []
         self._converged = False
 
-    def at(self, slot: int) -> tuple[NodeGains, ...]:
+    def at(self, slot: int) -> tuple[Gains, ...]:
         """Return the gains of each of N nodes in a ``slot``, counted from 1."""
         # Gains do not depend on readings: each slot is computed once.
         while len(self._gains) < slot and not self._converged:
             self._gains.append(self._advance_slot())
-            self._converged = len(self._gains) > 1 and self._has_converged(*self._gains[-2:])
+            if len(self._gains) > 1:
+                roots = (np.stack([one.root for one in gains]) for gains in self._gains[-2:])
+                former, present = (S @ np.swapaxes(S, 1, 2) for S in roots)
+                change = np.abs(present - former).max()
+                self._converged = bool(change <= CONVERGED * np.abs(present).max())
         return self._gains[min(slot, len(self._gains)) - 1]
 
-    def table(self, first: int, count: int, places: Sequence[int]) -> tuple[np.ndarray, SlotGains]:
+    def table(self, first: int, count: int, places: Sequence[int]) -> tuple[np.ndarray, Gains]:
         """Return the table rows (count,) of ``count`` slots from number ``first`` on, and the table
         of the gains of the nodes with the indices ``places``.
 
@@ -172,39 +153,24 @@ class GainSequence:
         K, N, n = len(slot_gains), len(places), self._n
         B, *other_gains = (
             np.concatenate([getattr(one, name).reshape(-1, n, n) for one in node_gains])
-            for name in SlotGains._fields
+            for name in Gains._fields
         )
-        table = SlotGains(
-            B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in other_gains)
-        )
+        table = Gains(B.reshape(K, -1, n, n), *(part.reshape(K, N, n, n) for part in other_gains))
         return slots - slots[0], table
 
-    @staticmethod
-    def _has_converged(before: tuple[NodeGains, ...], now: tuple[NodeGains, ...]) -> bool:
-        """Return True if no covariance has changed by more than rounding."""
-        roots = (np.stack([one.root for one in gains]) for gains in (before, now))
-        former, present = (S @ np.swapaxes(S, 1, 2) for S in roots)
-        return bool(np.abs(present - former).max() <= CONVERGED * np.abs(present).max())
-
-    def _advance_slot(self) -> tuple[NodeGains, ...]:
+    def _advance_slot(self) -> tuple[Gains, ...]:
         """Advance ``_errors`` by a slot."""
         nodes = range(len(self._neighbours))
-        self._errors = np.hstack([self._predict(), self._driven])
+        x, y = self._errors.reshape(2, len(nodes), self._n, -1)
+        predicted = np.stack([self._F @ x, self._pseudo.coupling @ x + self._pseudo.A @ y])
+        self._errors = np.hstack([predicted.reshape(self._errors.shape), self._driven])
         # The order of the filter: yhat from the exchange, then xhat from the new yhat.
         gains = self._correct_pseudo_states()
         K = [self._correct_state(i) for i in nodes]
         # Only products of rows matter: QR reduces the inputs to as many as there are rows.
         self._errors = np.asarray(np.linalg.qr(self._errors.T, mode="r")).T
-        return tuple(
-            NodeGains(B, M, K[i], self._covariance_root(i)) for i, (B, M) in enumerate(gains)
-        )
-
-    def _predict(self) -> FloatArray:
-        """Return the errors after F, (2 N n, inputs): those of all xhat, and then of all yhat."""
-        # e_x <- F e_x and e_y <- coupling e_x + A e_y, with the plant's noise added by the caller.
-        x, y = self._errors.reshape(2, len(self._neighbours), self._n, -1)
-        predicted = np.stack([self._F @ x, self._pseudo.coupling @ x + self._pseudo.A @ y])
-        return predicted.reshape(self._errors.shape)
+        roots = [lower_root(np.ascontiguousarray(self._state_error(i))) for i in nodes]
+        return tuple(Gains(B, M, K[i], roots[i]) for i, (B, M) in enumerate(gains))
 
     def _state_error(self, i: int) -> FloatArray:
         """Return the error (n, inputs) of the xhat of node ``i``: a view to write to."""
@@ -213,10 +179,6 @@ class GainSequence:
     def _pseudo_error(self, i: int) -> FloatArray:
         """Return the error (n, inputs) of the yhat of node ``i``, an index from 0."""
         return self._state_error(len(self._neighbours) + i)
-
-    def _covariance_root(self, i: int) -> FloatArray:
-        """Return the lower triangular root (n, n) of P of node ``i``, an index from 0."""
-        return lower_root(np.ascontiguousarray(self._state_error(i)))
 
     def _correct_pseudo_states(self) -> list[tuple[FloatArray, FloatArray]]:
         """Correct the errors of all yhat in ``_errors`` at once."""
@@ -254,13 +216,6 @@ class GainSequence:
         return K
 
 
-def without_zeros(matrix: FloatArray) -> FloatArray:
-    """Return the columns (n, k) of ``matrix`` (n, n) that are not zero: a root of the same matrix
-    with fewer inputs.
-    """
-    return np.asarray(matrix[:, matrix.any(axis=0)])
-
-
 def variances(errors: FloatArray) -> FloatArray:
     """Return the variances (k,) of k ``errors`` (k, inputs), given by their coefficients of
     independent inputs with variance 1.
@@ -289,25 +244,22 @@ def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatAr
     return np.asarray((e @ V.T * inverse) @ (U.T * scale))
 
 
+def gain_sequence(model: Any, network: NetworkInfo, cov: FloatArray) -> GainSequence:
+    """Return the gains of a ``network`` of nodes with F and Q of ``model`` that start with the
+    covariance ``cov`` (n, n); all of its nodes and runs share them.
+    """
+    # Bytes can be the key of a cache.
+    parts = (model.F, model.Q, cov, network.information)
+    entries = tuple(np.asarray(part, dtype=np.float64).tobytes() for part in parts)
+    return _shared_sequence(len(cov), entries, network.heard)
+
+
 @lru_cache(maxsize=8)
-def gain_sequence(design: Design) -> GainSequence:
-    """Return the gains of the network of a ``design``, which all of its nodes and runs share; they
-    are kept for 8 designs.
-    """
-    return GainSequence(design)
-
-
-def design_of(model: Any, network: NetworkInfo, cov: FloatArray) -> Design:
-    """Return the design of a ``network`` of nodes with F and Q of ``model`` that start with the
-    covariance ``cov`` (n, n).
-    """
-    # Bytes, so that the design can be the key of a cache that all nodes share.
-    F, Q, start, information = (
-        np.asarray(part, dtype=np.float64).tobytes()
-        for part in (model.F, model.Q, cov, network.information)
-    )
-    size = len(cov), len(network.information)
-    return Design(*size, F, Q, start, information, network.heard)
+def _shared_sequence(
+    n: int, entries: tuple[bytes, ...], heard: tuple[tuple[int, ...], ...]
+) -> GainSequence:
+    F, Q, cov, information = (np.frombuffer(part).reshape(-1, n, n) for part in entries)
+    return GainSequence((F[0], Q[0], cov[0]), information, heard)
 
 
 @kernel
@@ -335,29 +287,6 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 
 
 @kernel
-def write_innovation(record: Any, h: int, run: Any) -> None:
-    """Write the pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)`` of node ``h`` into
-    ``run.gains``.
-    """
-    lanes, n, state, z = run.lanes, len(run.size), run.row, run.gains
-    for i in range(n):
-        total = spread(lanes, 0.0)
-        for j in range(n):
-            total += record.inverse[i, j] * load(lanes, record.pseudo, h, j)
-        store(lanes, state, i, total)
-        store(lanes, z, i, 0.0)
-    first, matrix = run.first_y + run.reading, run.first_H + run.matrix[run.reading]
-    # Whitened rows have R = I, so that H' R^-1 is H'.
-    for k in range(run.rows[run.reading]):
-        innovation = load(lanes, run.y, first, k)
-        for j in range(n):
-            innovation -= load(lanes, run.H, matrix, k, j) * load(lanes, state, j)
-        for i in range(n):
-            entry = load(lanes, run.H, matrix, k, i) * innovation
-            store(lanes, z, i, load(lanes, z, i) + entry)
-
-
-@kernel
 def absorb(record: Any, h: int, run: Any) -> None:
     """Correct the estimate of the pseudo-state by messages and the own reading, and that of the
     state by it: ``yhat+ = yhat + sum_l B_l (yhat_l - yhat) + M z`` and
@@ -369,7 +298,13 @@ def absorb(record: Any, h: int, run: Any) -> None:
         run.moved_mean,
         run.row,
     )
-    write_innovation(record, h, run)
+    # The pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)``.
+    for i in range(n):
+        total = spread(lanes, 0.0)
+        for j in range(n):
+            total += record.inverse[i, j] * load(lanes, y, h, j)
+        store(lanes, run.row, i, total)
+    write_innovation(run, run.row, run.gains)
     for i in range(n):
         total = load(lanes, y, h, i)
         for j in range(n):
@@ -462,7 +397,7 @@ def prepare_consensus_innovations(
     if record.first_slot == first and len(record.table_row) == count:
         return
     start = np.ascontiguousarray(record.start[0, ..., 0])
-    sequence = gain_sequence(design_of(models[0], network, start))
+    sequence = gain_sequence(models[0], network, start)
     record.table_row, gains = sequence.table(first, count, [info.place for info in infos])
     record.B, record.M, record.K, record.roots = map(np.ascontiguousarray, gains)
     record.first_slot = first
@@ -498,7 +433,7 @@ class ConsensusInnovations(Filter):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a scenario."""
+        """Its demands on a scenario."""
         return Needs(
             one_way=True,
             fixed_sensors=True,

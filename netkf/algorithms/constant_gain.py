@@ -139,9 +139,10 @@ def constant_gain_record(
     for k, (info, L) in enumerate(zip(infos, gains, strict=True)):
         H, R = info.sampled
         if len(H):
-            settings["remaining"][k], settings["noise"][k] = sample_maps(L, H, R)
             # Readings come whitened, with the inverse of the root of R.
-            settings["gain"][k, :, : len(H)] = L @ np.linalg.cholesky(R)
+            white = np.asarray(L @ np.linalg.cholesky(R))
+            settings["gain"][k, :, : len(H)] = white
+            settings["remaining"][k], settings["noise"][k] = np.eye(n) - L @ H, lower_root(white)
     if isinstance(models[0], FlowModel):
         settings["loops"] = _closed_loops(models, gains)
     return Record(
@@ -187,7 +188,7 @@ class ConstantGain(Filter):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a scenario."""
+        """Its demands on a scenario."""
         return Needs(
             one_way=True, fixed_sensors=True, every_reading=True, check=self._check_scenario
         )
@@ -212,28 +213,21 @@ class ConstantGain(Filter):
             raise ScenarioError("filter.gain", rule, f"{len(self.gain)} matrices", "add or remove")
         for index, node in enumerate(nodes):
             placed = scenario.placed_sensors.get(node, ())
-            _check_kinds(scenario, node, placed)
+            kinds = [getattr(scenario.sensors[one.entry], "sampling", None) for one in placed]
+            if not scenario.slotted and len(placed) > 1 and any(kinds):
+                raise ScenarioError(
+                    "filter.gain",
+                    f"node {node} has several sensors, and one that takes samples must be its only "
+                    "one",
+                    None,
+                    "give it one sensor, or another filter",
+                )
             p = sum(len(scenario.sensors[placed_sensor.entry].H) for placed_sensor in placed)
             shape = self.gain_of(index).shape
             if p and shape != (n, p):
                 key = f"filter.gain[{index}]" if isinstance(self.gain, tuple) else "filter.gain"
                 rule = f"must be {n} x {p}, because node {node} has {p} rows of readings"
                 raise ScenarioError(key, rule, f"{shape[0]} x {shape[1]}", "one column per row")
-
-
-def _check_kinds(scenario: Any, node: int, placed: Sequence[Any]) -> None:
-    """Raise ScenarioError if ``node`` has readings at several times, for one gain."""
-    if scenario.slotted or len(placed) < 2:
-        return
-    if any(
-        getattr(scenario.sensors[placed_sensor.entry], "sampling", None) for placed_sensor in placed
-    ):
-        raise ScenarioError(
-            "filter.gain",
-            f"node {node} has several sensors, and one that takes samples must be its only one",
-            None,
-            "give it one sensor, or another filter",
-        )
 
 
 def _closed_loops(models: Sequence[FlowModel], gains: Sequence[FloatArray]) -> ClosedLoops:
@@ -247,7 +241,8 @@ def _closed_loops(models: Sequence[FlowModel], gains: Sequence[FloatArray]) -> C
         if len(model.H):
             loop = closed_loop(model, gain)
             L[k, :, : gain.shape[1]], H[k, : len(model.H)], closed[k] = gain, model.H, loop.A
-            rate[k], rows[k] = gain_rate(gain, model.H), len(tables)
+            # The rate at which increments move the estimate.
+            rate[k], rows[k] = np.linalg.norm(gain @ model.H), len(tables)
             tables.append(loop.flow)
     # Without closed loops any table will do, as no node uses it.
     table = stack_tables(tables or [models[0].unobserved_flow])
@@ -272,19 +267,3 @@ def closed_loop(model: FlowModel, gain: FloatArray) -> FlowModel:
     noise, nothing = model.Q + gain @ model.R @ gain.T, model.H[:0]
     closed = np.ascontiguousarray(model.A - gain @ model.H)
     return FlowModel(closed, noise, nothing, model.R[:0, :0], model.horizon, model.interval)
-
-
-def sample_maps(L: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ``I - L H`` (n, n) and the lower triangular root (n, n) of ``L R L'``, for a gain L
-    (n, p) and a sample with H (p, n) and R (p, p): the sample moves P to
-    ``(I - L H) P (I - L H)' + L R L'``.
-    """
-    closed = np.eye(len(L)) - L @ H
-    return closed, lower_root(np.asarray(L @ np.linalg.cholesky(R)))
-
-
-def gain_rate(L: FloatArray, H: FloatArray) -> float:
-    """Return the rate (1/s) at which increments move an estimate through the gain L (n, p): the
-    Frobenius norm of L H, with H (p, n). Increments of at most 1 / rate seconds are used at once.
-    """
-    return float(np.linalg.norm(L @ H))

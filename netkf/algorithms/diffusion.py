@@ -21,12 +21,11 @@ from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
-from netkf.algorithms.weights import METROPOLIS, check_columns
-from netkf.core.fields import either, field, has_depth, one_of, square
-from netkf.linalg.arrays import FloatArray
+from netkf.algorithms.traits import Analysis, Needs, Timing
+from netkf.algorithms.weights import WeightedFilter
+from netkf.core.fields import field, one_of
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import Lanes, any_lane, load, load_flags, select, spread
+from netkf.linalg.lanes import any_lane, load, load_flags, select, spread
 from netkf.linalg.local import local_lanes_pair
 
 
@@ -43,7 +42,15 @@ def absorb(record: Any, h: int, run: Any) -> None:
     """Combine the estimate with those heard by covariance intersection, paper D (8) and (9)."""
     lanes, payload = run.lanes, record.payload
     received = received_weight(run)
-    own, divisor = applied_weights(lanes, load(lanes, record.own, h), received, record.keep_own)
+    # The weights that are applied sum to 1, see ``DiffusionFilter.on_loss``.
+    own, remainder = load(lanes, record.own, h), 1.0 - received
+    # Rounding may bring the sum of the others above 1.
+    remainder = select(remainder > 0.0, remainder, 0.0)
+    # "keep-own", or weights that are all 0: the own weight is 1 minus the others.
+    total_weight = spread(lanes, 0.0) if record.keep_own == 1 else own + received
+    keeps = total_weight == 0.0
+    divisor = select(keeps, 1.0, total_weight)
+    own = select(keeps, remainder, own / divisor)
     # With own weight 1 the estimate stays to the last bit.
     if not any_lane(own != 1.0):
         return
@@ -66,23 +73,6 @@ def absorb(record: Any, h: int, run: Any) -> None:
             whiten(lanes, run.size, whitened, weight, payload.inverse, payload.xhat, m, x, h)
             merge_lanes(lanes, run.size, total, whitened)
     finish_lanes(lanes, run.size, root, x, h, x, total, whitened, own == 1.0)
-
-
-@kernel(inlined=True)
-def applied_weights(lanes: Lanes, own: Any, received: Any, keep_own: int) -> tuple[Any, Any]:
-    """Return the own weight (L,) that is applied and the divisor (L,) of the other weights, so that
-    all of them sum to 1, see ``DiffusionFilter.on_loss``: ``own`` (L,) is the nominal own weight,
-    ``received`` (L,) the sum of the weights of the messages that arrived.
-    """
-    total, remainder = own + received, 1.0 - received
-    # Rounding may bring the sum of the others above 1.
-    remainder = select(remainder > 0.0, remainder, 0.0)
-    # "keep-own", or weights that are all 0: the own weight is 1 minus the others.
-    keeps = total == 0.0
-    if keep_own == 1:
-        keeps = total == total  # noqa: PLR0124
-    divisor = select(keeps, spread(lanes, 1.0), total)
-    return select(keeps, remainder, own / divisor), divisor
 
 
 def diffusion_filter_record(
@@ -108,7 +98,7 @@ def begin_diffusion_filter(
 
 @built_in("diffusion")
 @dataclass(frozen=True, eq=False)
-class DiffusionFilter(Filter):
+class DiffusionFilter(WeightedFilter):
     """Xie, Gan and Liu, D Algorithm 1, (6)-(9), with any F in place of the identity; samples in
     slots are predictions.
 
@@ -126,9 +116,6 @@ class DiffusionFilter(Filter):
     heard nothing keeps its estimate.
     """
 
-    weights: str | FloatArray = field(
-        either(one_of(METROPOLIS), square, has_depth(1)), default=METROPOLIS
-    )
     on_loss: str = field(one_of("renormalise", "keep-own"), default="renormalise")
 
     analysis = Analysis(paper="diffusion", P_by_design=("larger", "larger"))
@@ -141,16 +128,5 @@ class DiffusionFilter(Filter):
     kernels = Kernels(
         emit=emit, absorb=absorb, record=diffusion_filter_record, begin=begin_diffusion_filter
     )
-
-    def __post_init__(self) -> None:
-        """Raise ScenarioError if a weight is negative or a column does not sum to 1."""
-        super().__post_init__()
-        if not isinstance(self.weights, str):
-            check_columns(self.weights)
-
-    @property
-    def link_weights(self) -> Weights:
-        """The matrix of weights, or Metropolis weights."""
-        return Weights(matrix=None if isinstance(self.weights, str) else self.weights)
 
     shift = Filter.shift  # affine: the weights sum to one

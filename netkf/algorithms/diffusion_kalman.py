@@ -16,10 +16,8 @@ from netkf.algorithms.kernels.estimates import copy_vector
 from netkf.algorithms.kernels.neighbours import use_readings_heard
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
-from netkf.algorithms.weights import METROPOLIS, check_columns
-from netkf.core.fields import either, field, has_depth, one_of, square
-from netkf.linalg.arrays import FloatArray
+from netkf.algorithms.traits import Analysis, Needs, Timing
+from netkf.algorithms.weights import WeightedFilter
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import load, load_flags, select, spread, store
 
@@ -66,7 +64,7 @@ def diffusion_kalman_record(_: Any, _infos: Sequence[NodeInfo], models: Sequence
 
 @built_in("diffusion-kalman")
 @dataclass(frozen=True, eq=False)
-class DiffusionKalman(Filter):
+class DiffusionKalman(WeightedFilter):
     """Update with the readings of the neighbourhood, then combine the neighbours' estimates.
 
     weights entry [l][i] is the weight c_{l,i} that node i gives to what node l sends, in the order
@@ -76,10 +74,6 @@ class DiffusionKalman(Filter):
     The weight of an estimate that does not come stays with the node itself. P counts the readings
     that a node has used; the combination leaves it as it is, so it is no bound on the error.
     """
-
-    weights: str | FloatArray = field(
-        either(one_of(METROPOLIS), square, has_depth(1)), default=METROPOLIS
-    )
 
     analysis = Analysis(
         paper="diffusion_kalman",
@@ -93,16 +87,5 @@ class DiffusionKalman(Filter):
     )
     needs = Needs(one_way=True)
     kernels = Kernels(emit=emit, absorb=absorb, sends_readings=True, record=diffusion_kalman_record)
-
-    def __post_init__(self) -> None:
-        """Raise ScenarioError if a weight is negative or a column does not sum to 1."""
-        super().__post_init__()
-        if not isinstance(self.weights, str):
-            check_columns(self.weights)
-
-    @property
-    def link_weights(self) -> Weights:
-        """The matrix of weights, or Metropolis weights."""
-        return Weights(matrix=None if isinstance(self.weights, str) else self.weights)
 
     shift = Filter.shift  # affine: the weights sum to one

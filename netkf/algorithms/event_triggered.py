@@ -28,7 +28,7 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs, Timing
+from netkf.algorithms.traits import Analysis, Needs, Timing, unless_all_arrive
 from netkf.core.fields import Rule, field, number, tuple_of
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import any_lane, load, load_flags, select, spread, store_flags
@@ -137,6 +137,7 @@ def event_triggered_ci_record(
     thresholds.
     """
     n, flag = len(models[0].information), ((), np.uint8)
+    alpha, delta = filtering.thresholds
     return Record(
         node={"sent_x": (n,), "sent_root": (n, n), "has_sent": flag, "inverse": (n, n)},
         link={
@@ -145,9 +146,10 @@ def event_triggered_ci_record(
         },
         payload={"xhat": (n,), "root": (n, n)},
         settings={
-            "alpha": float(filtering.thresholds[0]),
-            "ratio": 1.0 + filtering.thresholds[1],
-            "share": 1.0 / filtering.widening**2,
+            "alpha": float(alpha),
+            "ratio": 1.0 + delta,
+            # By which a silent neighbour's information shrinks.
+            "share": 1.0 / ((1.0 + math.sqrt(alpha)) ** 2 * (1.0 + delta)),
         },
     )
 
@@ -177,6 +179,14 @@ class EventTriggeredCi(Filter):
 
     analysis = Analysis(paper="event_triggered", P_by_design=("larger", ""))
     timing = Timing(clocks=())
+    needs = Needs(
+        one_way=True,
+        inverts=True,
+        notes=unless_all_arrive(
+            "event-triggered: messages may be lost, and a sender takes its neighbours to have what "
+            "it sent; P may then be too small"
+        ),
+    )
     kernels = Kernels(
         predict=predict,
         emit=emit,
@@ -185,29 +195,5 @@ class EventTriggeredCi(Filter):
         decides=True,
         record=event_triggered_ci_record,
     )
-
-    @property
-    def widening(self) -> float:
-        """The factor (1 + alpha^1/2) (1 + delta)^1/2 of the root of a silent neighbour's
-        covariance, which enlarges it as the class describes.
-        """
-        alpha, delta = self.thresholds
-        return (1.0 + math.sqrt(alpha)) * math.sqrt(1.0 + delta)
-
-    @property
-    def needs(self) -> Needs:
-        """What it needs of a scenario."""
-        return Needs(one_way=True, inverts=True, notes=self._scenario_notes)
-
-    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return a note for the user where messages of a ``netkf.Scenario`` may be lost or late,
-        which makes P too small; else nothing.
-        """
-        if scenario.delivers_all:
-            return ()
-        return (
-            "event-triggered: messages may be lost, and a sender takes its neighbours to have "
-            "what it sent; P may then be too small",
-        )
 
     shift = Filter.shift  # affine, given who sends

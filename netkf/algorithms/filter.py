@@ -212,7 +212,7 @@ class Filter(Component):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a scenario; by default nothing. A class may set it as a variable."""
+        """Its demands on a scenario; by default none. A class may set it as a variable."""
         return Needs()
 
     @property
@@ -222,7 +222,7 @@ class Filter(Component):
 
     @property
     def analysis(self) -> Analysis:
-        """What theory, checks and comparisons know of it; by default nothing."""
+        """Facts for theory, checks and comparisons; by default none."""
         return Analysis()
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> Any:
@@ -307,11 +307,7 @@ def interval_rule(algorithm: Filter) -> Callable[[Any], float]:
         return given
     if algorithm.kernels is not None:
         return single.interval
-    return _interval_of_model
-
-
-def _interval_of_model(state: Any) -> float:
-    return float(state.model.max_interval(state.root))
+    return lambda state: float(state.model.max_interval(state.root))
 
 
 def may_be_silent(algorithm: Filter) -> bool:

@@ -150,6 +150,7 @@ class InformationConsensus(Filter):
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)
 
+    needs = Needs(inverts=True, check=check_information, notes=information_notes)
     kernels = Kernels(
         update=begin_pairs,
         emit=emit_pairs,
@@ -162,22 +163,6 @@ class InformationConsensus(Filter):
     def timing(self) -> Timing:
         """In slots only, with ``steps`` steps of the only exchange."""
         return Timing(clocks=(), steps=lambda _: self.steps)
-
-    @property
-    def needs(self) -> Needs:
-        """What it needs of a scenario."""
-        return Needs(inverts=True, check=self._check_scenario, notes=self._scenario_notes)
-
-    def _check_scenario(self, scenario: Any) -> None:
-        """Raise ScenarioError if rounding of information would take the first covariance of a
-        ``netkf.Scenario`` in slots.
-        """
-        if scenario.slotted:
-            check_information(scenario)
-
-    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return a line on rounding of information in slots, if there is much."""
-        return information_notes(scenario) if scenario.slotted else ()
 
     @abstractmethod
     def recipe(self, nodes: int) -> Recipe:
@@ -249,15 +234,15 @@ class Hcmci(InformationConsensus):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a scenario."""
-        return replace(super().needs, one_way=True)
+        """Its demands on a scenario: those of its base, and settings that fit it."""
+        return replace(InformationConsensus.needs, one_way=True, check=self._check_scenario)
 
     def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if a ``netkf.Scenario`` has clocks and the variant is not
         "information", if a novelty weight is given to that variant, which does not use it, or if
         rounding of information would take the first covariance.
         """
-        super()._check_scenario(scenario)
+        check_information(scenario)
         if not scenario.slotted and self.consensus != INFORMATION:
             raise ScenarioError(
                 "filter.consensus",

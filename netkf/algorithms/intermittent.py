@@ -266,7 +266,7 @@ def intermittent_record(
     """
     if isinstance(models[0], SlotModel):
         return Record()
-    n = len(models[0].information)
+    n, max_delay = len(models[0].information), max(info.max_delay for info in infos)
     return Record(
         node={"time": (), "moves": (), "swept": ()},
         past={
@@ -274,7 +274,7 @@ def intermittent_record(
             **{"past_y": (n,), "past_H": (n, n), "past_x": (n,), "past_root": (n, n)},
         },
         payload={"moves": ()},
-        settings={"lag": filtering.history_span(max(info.max_delay for info in infos))},
+        settings={"lag": SLACK * min(filtering.timing.max_age, max_delay)},
     )
 
 
@@ -328,11 +328,5 @@ class Intermittent(Filter):
             max_age=0.0 if self.late == "drop" else window,
             sends=lambda _, has_sensor: has_sensor,
         )
-
-    def history_span(self, max_delay: float) -> float:
-        """Return the seconds of its past that a node must keep for late readings, if no message
-        takes longer than ``max_delay`` seconds.
-        """
-        return SLACK * min(self.timing.max_age, max_delay)
 
     shift = Filter.shift  # affine in the readings

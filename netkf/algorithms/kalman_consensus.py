@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.estimates import add_covariance_product
 from netkf.algorithms.kernels.run import (
     carry,
     copy_estimate,
@@ -83,17 +84,7 @@ def add_consensus_term(record: Any, h: int, run: Any) -> None:
             # An entry off the diagonal counts twice.
             square += entry * entry if i == j else 2.0 * entry * entry
     gain = record.epsilon / (1.0 + root_of(square))
-    # P d = S (S' d)
-    for j in range(n):
-        total = spread(lanes, 0.0)
-        for i in range(j, n):
-            total += load(lanes, S, h, i, j) * load(lanes, run.row, i)
-        store(lanes, run.gains, j, total)
-    for i in range(n):
-        total = spread(lanes, 0.0)
-        for j in range(i + 1):
-            total += load(lanes, S, h, i, j) * load(lanes, run.gains, j)
-        store(lanes, record.xhat, h, i, load(lanes, record.xhat, h, i) + gain * total)
+    add_covariance_product(lanes, run.size, record.xhat, h, gain, S, run.row, run.gains)
 
 
 @kernel

@@ -33,8 +33,13 @@ import numpy as np
 
 from netkf.algorithms import running_sums
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels.estimates import copy_vector, rotate, transform_mean
-from netkf.algorithms.kernels.run import predict_estimate, shift_vector
+from netkf.algorithms.kernels.estimates import (
+    add_covariance_product,
+    copy_vector,
+    rotate,
+    transform_mean,
+)
+from netkf.algorithms.kernels.run import predict_estimate, shift_vector, write_innovation
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.kernels.triggers import is_positive
 from netkf.algorithms.models import SlotModel
@@ -310,7 +315,10 @@ def update(record: Any, h: int, run: Any) -> None:
         scratch = run.moved, run.moved_mean, run.row, run.gains
         correct_root(lanes, run.size, record.root, h, record.information, scratch)
     if run.rows[r] > 0:
-        add_gain(record, h, run)
+        # ``x += N P H' R^-1 (y - H x)``, P (8)
+        x, number = record.xhat, load(lanes, record.number, h)
+        write_innovation(run, x[h], run.row)
+        add_covariance_product(lanes, run.size, x, h, number, record.root, run.row, run.gains)
 
 
 @kernel(inlined=True)
@@ -377,36 +385,6 @@ def largest_row(lanes: Lanes, remainder: FloatArray, v: FloatArray) -> Any:
         for j in range(n):
             store(lanes, v, j, select(larger, load(lanes, remainder, i, j), load(lanes, v, j)))
     return pivot
-
-
-@kernel(inlined=True)
-def add_gain(record: Any, h: int, run: Any) -> None:
-    """Correct the estimate of node h, P (8): ``x += N S S' H' (y - H x)`` with the root S."""
-    lanes, n, x, root = run.lanes, len(run.size), record.xhat, record.root
-    y, H, r = run.y, run.H, run.reading
-    first, matrix = run.first_y + r, run.first_H + run.matrix[r]
-    # H' (y - H x); the noise is white with variance 1, so no R^-1 appears.
-    for i in range(n):
-        store(lanes, run.row, i, 0.0)
-    for row in range(run.rows[r]):
-        innovation = load(lanes, y, first, row)
-        for i in range(n):
-            innovation -= load(lanes, H, matrix, row, i) * load(lanes, x, h, i)
-        for i in range(n):
-            part = load(lanes, run.row, i) + load(lanes, H, matrix, row, i) * innovation
-            store(lanes, run.row, i, part)
-    # P d = S (S' d): P itself is never formed.
-    for j in range(n):
-        total = spread(lanes, 0.0)
-        for i in range(j, n):
-            total += load(lanes, root, h, i, j) * load(lanes, run.row, i)
-        store(lanes, run.gains, j, total)
-    number = load(lanes, record.number, h)
-    for i in range(n):
-        total = spread(lanes, 0.0)
-        for j in range(i + 1):
-            total += load(lanes, root, h, i, j) * load(lanes, run.gains, j)
-        store(lanes, x, h, i, load(lanes, x, h, i) + number * total)
 
 
 @kernel
@@ -569,6 +547,7 @@ class PushSum(Filter):
     tolerance: float = field(number(low=0.0), default=1e-6)
     running_sums: bool = field(boolean, default=False)
 
+    # Until others hear of its samples, a node counts them as if all nodes had taken them.
     analysis = Analysis(
         paper="push_sum",
         P_by_design=("", "smaller"),
@@ -576,7 +555,6 @@ class PushSum(Filter):
         conserved=masses,
         stopped=has_frozen,
     )
-    # Until others hear of its samples, a node counts them as if all nodes had taken them.
 
     @property
     def kernels(self) -> Kernels:  # type: ignore[override]
@@ -603,7 +581,7 @@ class PushSum(Filter):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a scenario."""
+        """Its demands on a scenario."""
         return Needs(
             fixed_sensors=True,
             every_reading=True,
@@ -621,12 +599,25 @@ class PushSum(Filter):
         """
         if not scenario.slotted:
             return
-        self._check_leader(scenario)
+        nodes = scenario.nodes
+        if self.leader not in scenario.topology.index:
+            ids = ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
+            rule, remedy = "must be a node of the graph", f"node ids here are {ids}"
+            raise ScenarioError("filter.leader", rule, self.leader, remedy)
         for name in ("gamma", "delta"):
             if getattr(self, name) is None:
                 rule = "is missing for a plant in slots"
                 raise ScenarioError(f"filter.{name}", rule, None, f"add {name} = ...")
-        self._check_gain(scenario.topology.laplacian_radius)
+        # Averaging contracts if and only if all eigenvalues of I - L / delta but one lie inside
+        # (-1, 1).
+        radius = scenario.topology.laplacian_radius
+        if self.delta <= 0.5 * radius * (1.0 + 1e-12):
+            raise ScenarioError(
+                "filter.delta",
+                f"must be above rho(L) / 2 = {0.5 * radius:.6g}, or averaging does not contract",
+                self.delta,
+                f"give more than rho(L) = {radius:.6g}",
+            )
         if self.running_sums and self.stop != "never":
             rule = "must be never with running sums, which a node that stops would freeze"
             raise ScenarioError("filter.stop", rule, self.stop, 'write stop = "never"')
@@ -652,26 +643,6 @@ class PushSum(Filter):
                 "needs process noise: without it P_inf is 0, and so are all gains",
                 True,
                 "set it to false",
-            )
-
-    def _check_leader(self, scenario: Any) -> None:
-        """Raise ScenarioError unless the leader is a node of the graph."""
-        nodes = scenario.nodes
-        if self.leader not in scenario.topology.index:
-            ids = ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
-            rule, remedy = "must be a node of the graph", f"node ids here are {ids}"
-            raise ScenarioError("filter.leader", rule, self.leader, remedy)
-
-    def _check_gain(self, radius: float) -> None:
-        """Raise ScenarioError unless averaging with ``delta`` contracts."""
-        # Averaging contracts if and only if all eigenvalues of I - L / delta but one lie inside
-        # (-1, 1).
-        if self.delta <= 0.5 * radius * (1.0 + 1e-12):
-            raise ScenarioError(
-                "filter.delta",
-                f"must be above rho(L) / 2 = {0.5 * radius:.6g}, or averaging does not contract",
-                self.delta,
-                f"give more than rho(L) = {radius:.6g}",
             )
 
     def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:

@@ -38,8 +38,10 @@ import numpy as np
 
 from netkf.algorithms.filter import NodeInfo
 from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
-from netkf.algorithms.kernels.root_flow import transform_root
+from netkf.algorithms.kernels.estimates import add_covariance_product
+from netkf.algorithms.kernels.intersection import invert_lanes
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
+from netkf.algorithms.kernels.square_root import triangularise
 from netkf.algorithms.records import Kernels, Record
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -164,7 +166,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     # longer grows: then it keeps its mass, and sends the same total again.
     grown = (before + share) - before
     if abs(grown - share) <= MIN_ACCURACY * share:
-        add_share(record, h, receivers)
+        add_share(record, h, run, receivers)
         sent[h, 0] = before + share
         record.weight[h, 0] -= receivers * grown
     payload = record.payload
@@ -174,17 +176,12 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 
 
 @kernel
-def add_share(record: Any, h: int, receivers: int) -> None:
+def add_share(record: Any, h: int, run: Any, receivers: int) -> None:
     """Add a share of U = (w / N) P^-1 and of the parts of u = U xhat to what node h has sent."""
     inverse, U, part = record.work[0], record.work[1], record.work[2]
     sent, xhat, root, n = record.sent, record.xhat, record.root, record.xhat.shape[1]
     # P^-1 = S^-T S^-1.
-    for i in range(n):
-        for j in range(i + 1):
-            value = 1.0 if j == i else 0.0
-            for r in range(j, i):
-                value -= root[h, i, r, 0] * inverse[r, j]
-            inverse[i, j] = value / root[h, i, i, 0]
+    invert_lanes(ONE, run.size, record.work, 0, root, h)
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -268,7 +265,16 @@ def gain_mass(record: Any, h: int, run: Any, factor: float, share: float) -> Non
     # Invert it by eigenvalues: U is a difference of sums, and may be indefinite by rounding.
     diagonalise(inner, vectors)
     update_root_by_gain(root, h, run, inner, vectors)
-    move_by_gain(root, drop_lane(record.xhat), h, gain, share, record.work[3, 0])
+    # xhat += P N / w+ (u - U xhat) with the new P.
+    innovation, xhat = record.work[3, 0], record.xhat
+    for i in range(n):
+        total = 0.0
+        for k in range(1 + n * n + i, len(gain), n):
+            total += gain[k]
+        for j in range(n):
+            total -= gain[1 + i * n + j] * xhat[h, j, 0]
+        innovation[i] = total
+    add_covariance_product(ONE, run.size, xhat, h, share, record.root, innovation, innovation)
 
 
 @kernel
@@ -279,54 +285,16 @@ def update_root_by_gain(
     eigenvalues D on the diagonal of ``values`` (n, n), raised to at least 1, and eigenvectors V.
     """
     scratch, n = run.model.scratch, root.shape[1]
-    F, wide, noise = scratch.values, scratch.wide, scratch.T
-    # F = S V D^-1/2, a root that is not triangular yet.
+    # S V D^-1/2, a root that is not triangular yet.
     for i in range(n):
         for j in range(n):
             total = 0.0
             for r in range(i + 1):
                 total += root[h, i, r] * vectors[r, j]
             # Eigenvalues below 1 would add covariance: information cannot be negative.
-            F[i * n + j] = total / math.sqrt(max(values[j, j], 1.0))
-    # The new root is I times F, made triangular by Householder's reflections.
-    for i in range(n):
-        for j in range(i + 1):
-            root[h, i, j] = 1.0 if i == j else 0.0
-            noise[i, j] = 0.0
-    transform_root(ONE, scratch.size, root[h], F, 0, wide, noise)
-
-
-@kernel
-def move_by_gain(
-    root: FloatArray,
-    xhat: FloatArray,
-    h: int,
-    gain: FloatArray,
-    share: float,
-    innovation: FloatArray,
-) -> None:
-    """Correct the estimate of node h by the mass that it has heard: ``xhat += P share (u - U
-    xhat)`` with the new P; ``innovation`` (n,) is scratch.
-    """
-    n = root.shape[1]
-    # innovation = N / w+ (u - U xhat).
-    for i in range(n):
-        total = 0.0
-        for k in range(1 + n * n + i, len(gain), n):
-            total += gain[k]
-        for j in range(n):
-            total -= gain[1 + i * n + j] * xhat[h, j]
-        innovation[i] = share * total
-    # S' innovation in place: entry j is not read again.
-    for j in range(n):
-        total = 0.0
-        for i in range(j, n):
-            total += root[h, i, j] * innovation[i]
-        innovation[j] = total
-    # S (S' innovation) = P innovation.
-    for i in range(n):
-        for j in range(i + 1):
-            xhat[h, i] += root[h, i, j] * innovation[j]
+            scratch.wide[i, j] = total / math.sqrt(max(values[j, j], 1.0))
+            scratch.T[i, j] = 0.0
+    triangularise(ONE, scratch.size, root[h], scratch.wide, scratch.T)
 
 
 @kernel

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.gains import Gains, no_gains, stack_gains
+from netkf.algorithms.kernels.gains import stack_gains
 from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
     ALL,
@@ -157,7 +157,7 @@ class Surroundings:
         self.struct = cls(
             size=size,
             lanes=ONE,
-            model=_clock_tables(model, size) if self.clocked else slot_tables(model),
+            model=_tables_of(model, size),
             first=np.array([0, info.degree]),
             sender=np.arange(degree),
             opposite=np.full(degree, -1),
@@ -238,20 +238,13 @@ class Surroundings:
         run.uniform[0], run.sends[0] = exchange.uniform, 1
 
 
-def slot_tables(model: Any) -> SlotTables:
-    """Return the model of slots as kernels take it."""
-    return SlotTables(F=np.ascontiguousarray(model.F), root_Q=np.ascontiguousarray(model.root_Q))
-
-
-def _clock_tables(model: FlowModel, size: Size) -> ClockTables:
-    """Return the model of one node under clocks as kernels take it."""
+def _tables_of(model: Any, size: Size) -> SlotTables | ClockTables:
+    """Return the model of one node as kernels take it."""
+    if not isinstance(model, FlowModel):
+        F, root_Q = map(np.ascontiguousarray, (model.F, model.root_Q))
+        return SlotTables(F=F, root_Q=root_Q)
     table = stack_tables([model.flow, model.unobserved_flow])
-    return clock_tables(size, table, np.zeros(1, dtype=np.int64), _gains_of(model))
-
-
-def _gains_of(model: FlowModel) -> Gains:
-    """Return the gains of a model, without any if its node reads no increments."""
-    return stack_gains([model.gains if len(model.H) else no_gains(len(model.A))])
+    return clock_tables(size, table, np.zeros(1, dtype=np.int64), stack_gains([model.gains]))
 
 
 def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: Any) -> NodeState:
@@ -316,14 +309,16 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     surroundings.set_readings([new.reading or _NO_READING])
     # An addressed filter writes one for each node that it hears, and one more.
     count = surroundings.info.degree + 1 if state.kernels.addressed else 1
-    payload = _payload_struct(record, count)
+    cls = type(record.payload)
+    former = {name: getattr(record.payload, name) for name in cls.struct_fields}
+    payload = cls(**{k: np.zeros((count, *a.shape[1:]), a.dtype) for k, a in former.items()})
     record.payload = payload
     state.kernels.emit(record, 0, 0, run)
     has_reading = new.reading is not None
     silent = exchange.slot >= 0 and not surroundings.sends(exchange.phase, has_reading)
     if silent or not run.sends[0]:
         return new, None
-    fields = {name: getattr(payload, name) for name in type(payload).struct_fields}
+    fields = {name: getattr(payload, name) for name in cls.struct_fields}
     return new, Payload(fields, new.reading, new)
 
 
@@ -358,24 +353,19 @@ def shift(state: Any, offset: FloatArray) -> Any:
     """Return a state, or a payload under way, after the origin of coordinates moved by ``-offset``
     (n,), of a payload at its sending.
     """
-    if isinstance(state, Payload):
-        return _shift_payload(state, offset)
-    new, run = state.copied(events=1), state.run.struct
-    run.offset[:, 0] = offset
-    state.kernels.shift(new.record, 0, run)
-    return new
-
-
-def _shift_payload(payload: Payload, offset: FloatArray) -> Payload:
-    new = payload.sender.copied()
+    of_payload = isinstance(state, Payload)
+    new = state.sender.copied() if of_payload else state.copied(events=1)
     record, run = new.record, new.run.struct
     run.offset[:, 0] = offset
-    fields = {name: array.copy() for name, array in payload.fields.items()}
+    if not of_payload:
+        new.kernels.shift(record, 0, run)
+        return new
+    fields = {name: array.copy() for name, array in state.fields.items()}
     record.payload = type(record.payload)(**fields)
     for m in range(len(next(iter(fields.values())))):
         new.kernels.shift_payload(record, m, run)
     # A reading keeps the coordinates of its time.
-    return Payload(fields, payload.reading, payload.sender)
+    return Payload(fields, state.reading, state.sender)
 
 
 def _field(payload: Any, name: str, receiver: int) -> np.ndarray:
@@ -387,12 +377,3 @@ def _field(payload: Any, name: str, receiver: int) -> np.ndarray:
         k = min(payload.sender.run.links.get(receiver, last), last)
         return rows[k : k + 1]
     return np.asarray(getattr(payload, name), dtype=np.float64)[None, ..., None]
-
-
-def _payload_struct(record: Any, count: int) -> Any:
-    """Return room for so many messages of the kind of a record's payload."""
-    cls = type(record.payload)
-    shapes = {name: getattr(record.payload, name) for name in cls.struct_fields}
-    return cls(
-        **{name: np.zeros((count, *a.shape[1:]), dtype=a.dtype) for name, a in shapes.items()}
-    )

@@ -17,7 +17,7 @@ does, and beyond which nothing but rounding is left of the first covariance."""
 
 
 def check_information(scenario: Any) -> None:
-    """Raise ScenarioError if the filter of a ``netkf.Scenario`` in slots, which adds information
+    """Raise ScenarioError if the filter of a ``netkf.Scenario``, which in slots adds information
     matrices of readings to P^-1, would lose P^-1 in their rounding.
     """
     condition = _information_condition(scenario)
@@ -45,7 +45,9 @@ def information_notes(scenario: Any) -> tuple[str, ...]:
 
 
 def _information_condition(scenario: Any) -> float:
-    """Return the largest condition of ``I + S' G S`` over the nodes of a scenario."""
+    """Return the largest condition of ``I + S' G S`` over the nodes of a scenario in slots."""
+    if not scenario.slotted:
+        return 1.0
     F, Q = scenario.slot_belief
     try:
         pairs = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]

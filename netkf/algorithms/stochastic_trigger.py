@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -35,7 +36,7 @@ from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_rea
 from netkf.algorithms.kernels.triggers import NO_READING, silence_probability, weigh_news
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs, Timing
+from netkf.algorithms.traits import Analysis, Needs, Timing, unless_all_arrive
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -58,22 +59,6 @@ def trigger_matrix(Y: float | FloatArray, rows: int) -> FloatArray:
     return np.asarray(Y if isinstance(Y, np.ndarray) else Y * np.eye(rows))
 
 
-def entries_at(scenario: Any, node: int) -> list[int]:
-    """Return the indices, in the ``sensors`` of a ``netkf.Scenario``, of the sensors of the node
-    with the id ``node``.
-    """
-    return [placed_sensor.entry for placed_sensor in scenario.placed_sensors.get(node, ())]
-
-
-def whitened_trigger(Y: float | FloatArray, R: FloatArray) -> FloatArray:
-    """Return ``L' Y L`` (p, p) with ``L L' = R`` (p, p), the trigger for whitened readings; Y is
-    (p, p) or a number, that multiple of the identity.
-    """
-    # z' Y z for z = L u, where u is the whitened innovation.
-    root = np.linalg.cholesky(R)
-    return np.asarray(root.T @ trigger_matrix(Y, len(R)) @ root)
-
-
 def silence_noise(R: FloatArray, Y: float | FloatArray) -> FloatArray:
     """Return ``R + Y^-1`` (p, p), the noise covariance of the reading that silence is equivalent
     to, for R (p, p) and Y (p, p) or a number, that multiple of the identity.
@@ -81,23 +66,17 @@ def silence_noise(R: FloatArray, Y: float | FloatArray) -> FloatArray:
     return np.asarray(R + np.linalg.inv(trigger_matrix(Y, len(R))))
 
 
-def news_of(reading: Reading, xhat: FloatArray, Y: float | FloatArray) -> float:
-    """Return the news ``z' Y z`` of a reading with p > 0 rows, for its innovation
-    ``z = y - H xhat`` (p,); ``xhat`` is (n,), Y (p, p) or a number, that multiple of the identity.
-    """
-    z = reading.y - reading.H @ xhat
-    return max(0.0, float(z @ trigger_matrix(Y, len(z)) @ z))
-
-
 def whitened_triggers(models: Sequence[Any], p: int, Y: float | FloatArray) -> FloatArray:
-    """Return ``L' Y L`` (H, p, p) with ``L L' = R`` for the readings of H nodes with these
+    """Return ``L' Y L`` (H, p, p) with ``L L' = R`` for the whitened readings of H nodes with these
     ``models``, zeros beyond their rows, of which there are at most p.
     """
     weights = np.zeros((len(models), p, p))
     for k, model in enumerate(models):
         rows = len(model.R)
         if rows:
-            weights[k, :rows, :rows] = whitened_trigger(Y, model.R)
+            # z' Y z for z = L u, where u is the whitened innovation.
+            root = np.linalg.cholesky(model.R)
+            weights[k, :rows, :rows] = root.T @ trigger_matrix(Y, rows) @ root
     return weights
 
 
@@ -252,6 +231,16 @@ class ScheduledReadings(Filter):
         payload_numbers=lambda _, rows, __: rows,
     )
     timing = Timing(clocks=(), randomised=True)
+    needs = Needs(
+        one_way=True,
+        fixed_sensors=True,
+        every_reading=True,
+        reads_what_it_sends=True,
+        notes=unless_all_arrive(
+            "event-triggered: messages may be lost, and a node takes that for silence; P may then "
+            "be too small"
+        ),
+    )
     kernels = Kernels(
         predict=predict_prior,
         update=nothing,  # a reading is used in the exchange of its slot, if it is sent
@@ -265,28 +254,6 @@ class ScheduledReadings(Filter):
         begin=begin_scheduled_readings,
     )
 
-    @property
-    def needs(self) -> Needs:
-        """What it needs of a scenario."""
-        return Needs(
-            one_way=True,
-            fixed_sensors=True,
-            every_reading=True,
-            reads_what_it_sends=True,
-            notes=self._scenario_notes,
-        )
-
-    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
-        """Return a note for the user where messages of a ``netkf.Scenario`` may be lost, which
-        makes P too small; else nothing.
-        """
-        if scenario.delivers_all:
-            return ()
-        return (
-            "event-triggered: messages may be lost, and a node takes that for silence; P may then "
-            "be too small",
-        )
-
     shift = Filter.shift  # innovations do not depend on the origin
 
 
@@ -297,13 +264,9 @@ def forwarding(cls: F) -> F:
     """Make all that a filter says of itself, but for what ``cls`` defines, what the filter
     ``wrapped`` says.
     """
-
-    def forwarded(name: str) -> property:
-        return property(lambda self: getattr(self.wrapped, name))
-
     for name in vars(Filter).keys() - vars(cls).keys():
         if not name.startswith("_"):
-            setattr(cls, name, forwarded(name))
+            setattr(cls, name, property(attrgetter(f"wrapped.{name}")))
     return cls
 
 
@@ -480,7 +443,8 @@ class TriggeredMessages(Filter):
         news = NO_READING
         if len(reading.y):
             # Before the filter uses the reading: news is relative to the prediction.
-            news = news_of(reading, self.inner.estimate(state.inner)[0], self.Y)
+            z = reading.y - reading.H @ self.inner.estimate(state.inner)[0]
+            news = max(0.0, float(z @ trigger_matrix(self.Y, len(z)) @ z))
         # The field ``silent`` is None again, that is undecided.
         return WrappedState(self.inner.update(state.inner, reading), news, state.has_sent)
 
@@ -554,7 +518,7 @@ class StochasticTrigger(Filter):
 
     @property
     def needs(self) -> Needs:
-        """What it needs of a scenario."""
+        """Its demands on a scenario."""
         return replace(self.wrapped.needs, check=self._check_scenario)
 
     @property
@@ -585,7 +549,8 @@ class StochasticTrigger(Filter):
         if not isinstance(self.Y, np.ndarray):
             return
         for node in scenario.nodes:
-            sensors = [scenario.sensors[k] for k in entries_at(scenario, node)]
+            placed = scenario.placed_sensors.get(node, ())
+            sensors = [scenario.sensors[one.entry] for one in placed]
             rows = sum(len(sensor.R) for sensor in sensors)
             recorded = [isinstance(getattr(one, "path", None), SourceFile) for one in sensors]
             # One sensor lacks all of its rows or none: only with several may some be missing.

@@ -46,6 +46,11 @@ class Needs:
     notes: Callable[[Any], tuple[str, ...]] | None = None
 
 
+def unless_all_arrive(note: str) -> Callable[[Any], tuple[str, ...]]:
+    """Return ``Needs.notes`` that has a ``note`` where messages may be lost or late."""
+    return lambda scenario: () if scenario.delivers_all else (note,)
+
+
 def metropolis(degree: int, peer_degree: int) -> float:
     """Return the Metropolis weight of a message, ``1 / (1 + max degree)``: the node hears
     ``degree`` others, the sender ``peer_degree``.

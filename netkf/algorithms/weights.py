@@ -1,10 +1,15 @@
-"""The check of the weights that a scenario gives for pairs of nodes, for diffusion filters."""
+"""Weights that a scenario gives for pairs of nodes, for diffusion filters."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from netkf.algorithms.filter import Filter
+from netkf.algorithms.traits import Weights
 from netkf.core.errors import ScenarioError
+from netkf.core.fields import either, field, has_depth, one_of, square
 from netkf.linalg.arrays import FloatArray
 
 METROPOLIS = "metropolis"
@@ -12,7 +17,7 @@ METROPOLIS = "metropolis"
 """
 
 
-def check_columns(weights: FloatArray) -> None:
+def _check_columns(weights: FloatArray) -> None:
     """Raise ScenarioError unless the ``weights`` (N, N) of N nodes are not negative and each
     column sums to 1: entry [l, i] is the weight that node i gives to node l, itself included.
     """
@@ -34,3 +39,23 @@ def check_columns(weights: FloatArray) -> None:
             float(sums[wrong[0]]),
             "write the weights that a node gives below each other",
         )
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedFilter(Filter):
+    """A filter with a matrix of weights, or Metropolis weights."""
+
+    weights: str | FloatArray = field(
+        either(one_of(METROPOLIS), square, has_depth(1)), default=METROPOLIS
+    )
+
+    def __post_init__(self) -> None:
+        """Raise ScenarioError if a weight is negative or a column does not sum to 1."""
+        super().__post_init__()
+        if not isinstance(self.weights, str):
+            _check_columns(self.weights)
+
+    @property
+    def link_weights(self) -> Weights:
+        """The matrix of weights, or Metropolis weights."""
+        return Weights(matrix=None if isinstance(self.weights, str) else self.weights)

@@ -20,7 +20,7 @@ from numba.extending import (
 from numba.np.arrayobj import populate_array
 
 from netkf.linalg.generic import Generic, copy_arrays, copy_row, drop_lane, struct_like
-from netkf.linalg.struct_types import StructType, class_of, load_field
+from netkf.linalg.struct_types import StructType, class_of, load_field, struct_from_memory
 
 
 class GenericType(types.Callable, types.Opaque):
@@ -77,20 +77,9 @@ def _lower_drop_lane(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return made._getvalue()
 
 
-@intrinsic
-def _struct_like(_: Any, struct: StructType, memory: Any) -> Any:
-    """Type and emit the struct, of the type of ``struct``, at the first word of ``memory``."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        array = context.make_array(sig.args[1])(context, builder, args[1])
-        return builder.bitcast(array.data, cgutils.voidptr_t)
-
-    return struct(struct, memory), emit
-
-
 @overload(struct_like, inline="always")
 def _overload_struct_like(struct, memory):  # noqa: ANN001, ANN202, ARG001
-    return lambda struct, memory: _struct_like(struct, memory)  # noqa: PLW0108
+    return lambda struct, memory: struct_from_memory(memory, struct)
 
 
 def _arrays_of(context: Any, builder: Any, struct: StructType, address: Any) -> Any:

@@ -76,13 +76,15 @@ def _are_values(kinds: Any) -> bool:
 
 
 def _implement(
-    function: Any, result: Callable[..., Any], *signatures: Any
+    function: Any, result: Any, *signatures: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator of the function that emits a call of ``function``."""
+    """Return a decorator of the function that emits a call of ``function``; ``result`` is its type,
+    or a function of those of the arguments, None where they do not fit.
+    """
 
     class Typing(AbstractTemplate):
         def generic(self, args: Any, _kws: Any) -> Any:
-            kind = result(*args)
+            kind = result if isinstance(result, types.Type) else result(*args)
             return None if kind is None else signature(kind, *args)
 
     infer_global(function)(Typing)
@@ -98,14 +100,6 @@ def _implement(
 def _value_of_lanes(lanes: Any, *_: Any) -> Any:
     """Return the type of a value of as many lanes as the first argument, a tuple, has entries."""
     return value_type(len(lanes))
-
-
-def _flags_of_lanes(lanes: Any, *_: Any) -> Any:
-    return flags_type(len(lanes))
-
-
-def _nothing(*_: Any) -> Any:
-    return types.none
 
 
 def _broadcast(context: Any, builder: Any, value: Any, kind: Any, count: int) -> Any:
@@ -164,7 +158,7 @@ def _load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.load(_as_vector(builder, pointer, DOUBLE, len(sig.args[0])), align=8)
 
 
-@_implement(names.store, _nothing)
+@_implement(names.store, types.none)
 def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig.args[1:-1], args[1:-1])
@@ -173,14 +167,14 @@ def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_implement(names.load_flags, _flags_of_lanes)
+@_implement(names.load_flags, lambda lanes, *_: flags_type(len(lanes)))
 def _load_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     pointer = _pointer(context, builder, sig.args[1:], args[1:])
     flags = builder.load(_as_vector(builder, pointer, BYTE, len(sig.args[0])), align=1)
     return builder.icmp_unsigned("!=", flags, ir.Constant(flags.type, None))
 
 
-@_implement(names.store_flags, _nothing)
+@_implement(names.store_flags, types.none)
 def _store_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     count = len(sig.args[0])
     pointer = _pointer(context, builder, sig.args[1:-1], args[1:-1])
@@ -189,7 +183,7 @@ def _store_flags(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_implement(names.prefetch, _nothing)
+@_implement(names.prefetch, types.none)
 def _prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     pointer = builder.bitcast(_pointer(context, builder, sig.args, args), cgutils.voidptr_t)
     # LLVM's arguments: to be read (0), kept in all caches (3), data (1).
@@ -262,7 +256,7 @@ def _entries_of(builder: Any, kind: Any, array: Any, count: int) -> list[Any]:
     return [builder.load(entry_pointer(builder, kind, array, [I64(k)])) for k in range(count)]
 
 
-@_implement(names.turn, _nothing)
+@_implement(names.turn, types.none)
 def _turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     count = len(sig.args[0])
     rows, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
@@ -272,7 +266,7 @@ def _turn(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_implement(names.gather, _nothing)
+@_implement(names.gather, types.none)
 def _gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     count = len(sig.args[0])
     array, out = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 4))
@@ -285,7 +279,7 @@ def _gather(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_implement(names.scatter, _nothing)
+@_implement(names.scatter, types.none)
 def _scatter(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     count = len(sig.args[0])
     rows, array = (_Matrix(builder, sig.args[k], args[k]) for k in (1, 3))
@@ -327,29 +321,11 @@ def _select(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.select(args[0], *pair)
 
 
-def _boolean(*_: Any) -> Any:
-    return types.boolean
-
-
-@_implement(names.any_lane, _boolean)
+@_implement(names.any_lane, types.boolean)
 def _any_lane(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
     # The flags as one integer.
     bits = builder.bitcast(args[0], ir.IntType(_count(sig.args[0])))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
-
-
-def _same_flags(a: Any, b: Any) -> Any:
-    return a if isinstance(a, LaneFlags) and a == b else None
-
-
-@_implement(operator.and_, _same_flags, (LaneFlags, LaneFlags))
-def _and(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    return builder.and_(*args)
-
-
-@_implement(operator.or_, _same_flags, (LaneFlags, LaneFlags))
-def _or(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    return builder.or_(*args)
 
 
 # Arithmetic
@@ -368,12 +344,17 @@ def _flags_of_pair(*kinds: Any) -> Any:
     return None if kind is None else flags_type(kind.count)
 
 
-def _arithmetic(operation: Any, name: str) -> None:
+def _same_kind(*kinds: Any) -> Any:
+    return kinds[0] if isinstance(kinds[0], _Vector) and len(set(kinds)) == 1 else None
+
+
+def _arithmetic(operation: Any, name: str, result: Any, *signatures: Any) -> None:
     """Register an operator that is a method of LLVM's builder."""
 
-    @_implement(operation, _value_of_pair, *PAIRS)
+    @_implement(operation, result, *signatures)
     def _operate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, name)(*_alike(context, builder, sig, args))
+        alike = args if result is _same_kind else _alike(context, builder, sig, args)
+        return getattr(builder, name)(*alike)
 
 
 def _comparison(operation: Any, sign: str) -> None:
@@ -387,20 +368,14 @@ def _comparison(operation: Any, sign: str) -> None:
 
 
 for _name, _method in (("add", "fadd"), ("sub", "fsub"), ("mul", "fmul"), ("truediv", "fdiv")):
-    _arithmetic(getattr(operator, _name), _method)
-    _arithmetic(getattr(operator, f"i{_name}"), _method)
+    _arithmetic(getattr(operator, _name), _method, _value_of_pair, *PAIRS)
+    _arithmetic(getattr(operator, f"i{_name}"), _method, _value_of_pair, *PAIRS)
+_arithmetic(operator.neg, "fneg", _same_kind, (LaneValue,))
+_arithmetic(operator.and_, "and_", _same_kind, (LaneFlags, LaneFlags))
+_arithmetic(operator.or_, "or_", _same_kind, (LaneFlags, LaneFlags))
 SIGNS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="}
 for _name, _sign in SIGNS.items():
     _comparison(getattr(operator, _name), _sign)
-
-
-def _same_value(*kinds: Any) -> Any:
-    return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], LaneValue) else None
-
-
-@_implement(operator.neg, _same_value, (LaneValue,))
-def _negative(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-    return builder.fneg(args[0])
 
 
 def _widest(*kinds: Any) -> Any:

@@ -63,15 +63,6 @@ def with_reach(series: FloatArray, longest: float) -> FloatArray:
 
 
 @kernel
-def fill_polynomial(out: FloatArray, series: FloatArray, gap: float) -> None:
-    """Write the first len(out) entries of ``sum_k gap^k series[k]`` at ``gap`` (seconds) into
-    ``out`` (m,), from a table ``series`` (terms, size + 1) whose last column is the reach of each
-    term.
-    """
-    fill_series(out, len(out), series, series, series.shape[1] - 1, gap)
-
-
-@kernel
 def fill_series(
     out: FloatArray, width: int, series: FloatArray, reach: FloatArray, column: int, gap: float
 ) -> None:
@@ -179,6 +170,7 @@ def polynomial(series: FloatArray, gap: float) -> FloatArray:
     (terms, size + 1) from with_reach(), as a new array.
     """
     # The last column of the table is the reach, not a coefficient.
-    out = np.empty(series.shape[1] - 1)
-    fill_polynomial(out, series, gap)
+    size = series.shape[1] - 1
+    out = np.empty(size)
+    fill_series(out, size, series, series, size, gap)
     return out

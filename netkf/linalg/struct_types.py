@@ -185,17 +185,20 @@ def lower_class_constant(context: Any, *_: Any) -> Any:
 
 
 @intrinsic
-def _struct_from_memory(_: Any, memory: Any, cls: ClassType) -> Any:
-    """Type and emit the struct of a class at the first word of ``memory``."""
+def struct_from_memory(_: Any, memory: Any, kind: Any) -> Any:
+    """Type and emit the struct at the first word of ``memory``, of the class ``kind``, or of that
+    of the struct ``kind``.
+    """
+    struct = kind.struct if isinstance(kind, ClassType) else kind
 
     def take_address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         array = context.make_array(sig.args[0])(context, builder, args[0])
         return builder.bitcast(array.data, cgutils.voidptr_t)
 
-    return cls.struct(memory, cls), take_address
+    return struct(memory, kind), take_address
 
 
 @overload(struct_at, inline="always")
 def _struct_at(memory, cls):  # noqa: ANN001, ANN202, ARG001
     """Return the implementation of ``struct_at`` that numba compiles into a kernel in its place."""
-    return lambda memory, cls: _struct_from_memory(memory, cls)  # noqa: PLW0108 - of the same parameter names
+    return lambda memory, cls: struct_from_memory(memory, cls)  # noqa: PLW0108 - of the same parameter names

@@ -349,7 +349,7 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
     models = [scenario.pooled_model] if pooled else scenario.models
     distinct_models = {id(model): model for model in models if len(model.H)}.values()
     A, Q = scenario.belief
-    steps = (longest_interval(A, Q, model.H, model.R) for model in distinct_models)
+    steps = (longest_interval(A, Q, model.information) for model in distinct_models)
     longest = min(steps, default=period)
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
-from netkf.algorithms.kernels.gains import longest_interval_for
+from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import FlowModel, SlotModel
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
@@ -178,7 +178,7 @@ class DerivedScenario(ScenarioModel):
         informations = [np.asarray(H.T @ np.linalg.solve(R, H)) for H, R in stacks]
         weighted = (k * G for k, G in zip(counts.values(), informations, strict=True))
         total_information = sum(weighted, 0.0 * plant.A)
-        max_period = longest_interval_for(plant.A, plant.Q, total_information)
+        max_period = longest_interval(plant.A, plant.Q, total_information)
         period = default_sensing_period(plant, informations, max_period)
         return dataclasses.replace(plant, sensing_period=period).on_grid(self.time_grid)
 

@@ -5,7 +5,7 @@ import pytest
 
 import netkf
 from netkf import theory
-from netkf.algorithms.consensus_innovations import design_of, gain_sequence, optimal_gain
+from netkf.algorithms.consensus_innovations import gain_sequence, optimal_gain
 from netkf.algorithms.filter import Exchange, Reading
 from netkf.theory.errors import error_law
 from tests.algorithms.test_literature import (
@@ -245,7 +245,7 @@ def test_a_reading_of_which_a_row_is_missing_is_compared_with_the_rest(tmp_path)
     slot = Exchange(phase=0, step=0, slot=1)
     after = algorithm.absorb(algorithm.update(state, Reading(y, H, R)), [], slot)
     cov = scenario.initial_estimate(node)[1]
-    gains = gain_sequence(design_of(model, info.network, cov)).at(1)[node]
+    gains = gain_sequence(model, info.network, cov).at(1)[node]
     G = info.network.information.sum(axis=0)
     z = H.T @ np.linalg.inv(R) @ (y - H @ np.linalg.pinv(G, hermitian=True) @ state.pseudo)
     yhat = state.pseudo + gains.M @ z

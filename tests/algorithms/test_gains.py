@@ -66,7 +66,7 @@ def test_gains_are_the_projections_of_the_exact_weight(seed):
 @pytest.mark.parametrize(("n", "p"), [(1, 1), (2, 1), (4, 2), (6, 3)])
 def test_the_kernel_is_the_formula(seed, n, p):
     A, Q, H, R, P = system(seed, n, p)
-    gap = 0.5 * longest_interval(A, Q, H, R)
+    gap = 0.5 * longest_interval(A, Q, H.T @ np.linalg.solve(R, H))
     table = gain_table(A, Q, H, R, gap)
     values = reference.polynomial(table.series[:, :-1], gap)
     U, W, C = (part.reshape(-1, n) for part in np.split(values, 3))
@@ -105,7 +105,7 @@ def test_the_innovation_does_not_see_the_state():
 
 def test_an_interval_that_is_too_long_is_refused():
     A, Q, H, R, _ = system(2)
-    longest = longest_interval(A, Q, H, R)
+    longest = longest_interval(A, Q, H.T @ np.linalg.solve(R, H))
     gain_table(A, Q, H, R, longest)
     with pytest.raises(ValueError, match="too long"):
         gain_table(A, Q, H, R, 1.01 * longest)

@@ -79,17 +79,6 @@ def move_roots(
     return lows
 
 
-def trace_path(
-    root: FloatArray, sequence: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
-) -> FloatArray:
-    """Return the lower triangular roots (T, n, n) of one chain after each mode of its ``sequence``
-    (T,), indices in ``modes``, from ``root`` (n, n) on; F and ``root_Q`` are (n, n).
-
-    Axes: T slots.
-    """
-    return next(trace_paths(root[None], sequence[None], F, root_Q, modes))
-
-
 def trace_paths(
     roots: FloatArray, sequences: np.ndarray, F: FloatArray, root_Q: FloatArray, modes: ReadingModes
 ) -> Iterator[FloatArray]:

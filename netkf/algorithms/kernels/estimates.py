@@ -84,6 +84,33 @@ def rotate(
 
 
 @kernel(inlined=True)
+def add_covariance_product(
+    lanes: Lanes,
+    size: Size,
+    x: FloatArray,
+    h: int,
+    factor: Any,
+    root: FloatArray,
+    vector: FloatArray,
+    scratch: FloatArray,
+) -> None:
+    """Add ``factor P d`` to ``x[h]``, with P = S S' of S = ``root[h]`` and d = ``vector`` (n, L);
+    ``scratch`` (n, L) may be the vector itself.
+    """
+    # P d = S (S' d): P itself is never formed.
+    for j in range(len(size)):
+        total = spread(lanes, 0.0)
+        for i in range(j, len(size)):
+            total += load(lanes, root, h, i, j) * load(lanes, vector, i)
+        store(lanes, scratch, j, total)
+    for i in range(len(size)):
+        total = spread(lanes, 0.0)
+        for j in range(i + 1):
+            total += load(lanes, root, h, i, j) * load(lanes, scratch, j)
+        store(lanes, x, h, i, load(lanes, x, h, i) + factor * total)
+
+
+@kernel(inlined=True)
 def transform_mean(
     lanes: Lanes, size: Size, x: FloatArray, k: int, F: FloatArray, scratch: FloatArray
 ) -> None:

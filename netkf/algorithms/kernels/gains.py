@@ -59,11 +59,6 @@ class Gains(Struct):
     moments: IntArray
 
 
-def no_gains(n: int) -> GainTable:
-    """Return the table of a model without sensors, n states."""
-    return GainTable(n, 0, np.zeros((0, 1)))
-
-
 def stack_gains(gains: Sequence[GainTable]) -> Gains:
     """Return the tables of M models as one struct."""
     terms, width = np.max([gain.series.shape for gain in gains], axis=0)
@@ -80,11 +75,13 @@ def gain_table(
     A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray, longest: float
 ) -> GainTable:
     """Return the table of the gains of a plant with A and Q (n, n) and a sensor with H (p, n) and R
-    (p, p) for intervals up to ``longest`` seconds.
+    (p, p) for intervals up to ``longest`` seconds; p may be 0.
 
     Raises ValueError if that is above :func:`longest_interval`.
     """
     n, p = len(A), len(H)
+    if p == 0:
+        return GainTable(n, 0, np.zeros((0, 1)))
     # H' R^-1 (n, p).
     HR = np.linalg.solve(R, H).T
     M, scale = hamiltonian(A, Q, HR @ H)
@@ -116,14 +113,7 @@ def gain_table(
     return GainTable(n, MOMENTS * p, with_reach(series, longest))
 
 
-def longest_interval(A: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> float:
-    """Return the longest interval (seconds) whose reading the gains can use, for a plant with A and
-    Q (n, n) and a sensor with H (p, n) and R (p, p).
-    """
-    return longest_interval_for(A, Q, H.T @ np.linalg.solve(R, H))
-
-
-def longest_interval_for(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
+def longest_interval(A: FloatArray, Q: FloatArray, G: FloatArray) -> float:
     """Return the longest interval (seconds) whose reading the gains can use, for a plant with A and
     Q (n, n) and a sensor with the information rate ``G = H' R^-1 H`` (n, n).
     """

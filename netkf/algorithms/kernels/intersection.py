@@ -4,9 +4,6 @@
 the terms, ``merge_lanes`` adds them, and ``finish_lanes`` writes P and x. Information is carried as
 a root too, ``P^-1 = Z' Z``. Diffusion, consensus on information, event-triggered consensus and
 belief propagation use these kernels.
-
-``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
-and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations

@@ -2,17 +2,6 @@
 Kalman consensus filter (KCF), convex combinations of paper H (Tanwani 2021).
 
 Diffusion, KCF, intermittent, constant-gain and track-fusion filters share them.
-
-Filter ``h`` of a block has index ``[b, h]`` of stacks with lanes (``netkf.linalg.lanes``):
-estimates (B, H, n, L), lower triangular roots (B, H, n, n, L).
-
-In a slot, one time step, nodes read, exchange messages in E steps and predict, in the order of the
-filter. ``links`` lists the W directed links by receiver: those to filter h have the numbers
-``links.first[h]`` to ``links.first[h + 1]`` - 1; ``up`` (B, S, E, W, L) flags the messages that
-arrive.
-
-``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
-and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations

@@ -474,38 +474,33 @@ def propagate_root(
     gap: float,
     scratch: FlowScratch,
 ) -> None:
-    """Propagate ``root[k]`` (n, n) and the mean ``x[k]`` (n,), entry ``k`` of root (K, n, n) and x
-    (K, n), in place over ``gap`` seconds by model ``m`` of the table. The root counts the readings
-    of the gap, the mean does not: it moves by exp(A gap).
-
-    Axes: K estimates.
+    """Propagate estimate ``k`` in place over ``gap`` seconds: ``P <- F P (I + G_g P)^-1 F' + Q_g``
+    for any P, and the mean by exp(A gap), without the readings.
     """
     # The cells cover 2^octaves units (column 4 of sizes). Of a longer gap, first take whole steps
     # of the level of that length.
-    octaves = table.sizes[m, 4]
+    octaves, n, values = table.sizes[m, 4], len(scratch.size), scratch.values
     if gap >= table.unit[m] * (1 << octaves):
         gap = propagate_by_levels(table, m, octaves, root, x, k, gap, scratch)
     if not gap > 0.0:
         return
-    if is_narrow(table, m, gap, trace_of(scratch.size, table, m, root, k)):
-        propagate_narrow(table, m, root, x, k, gap, scratch)
+    # Without observation (no block of Gamma, column 1 of sizes) any P is narrow.
+    observed = table.sizes[m, 1] > 0
+    trace = trace_of_root(ONE, scratch.size, root[k]) if observed else 0.0
+    if is_narrow(table, m, gap, trace):
+        cell, since = cell_of(table.unit[m], gap)
+        width = width_of(n, observed)
+        fill_series(values, width, table.series[m, cell], table.reach[m, cell], 0, since)
+        propagate_by_series(table, m, root, x, k, True, scratch)
         return
-    # P is wide: take whole units by levels, and use the rest of the gap row by row of Gamma.
+    # P is wide: take whole units by levels, and use the rest of the gap row by row of Gamma, which
+    # replaces G_g.
     gap = propagate_by_levels(table, m, 0, root, x, k, gap, scratch)
     if gap > 0.0:
-        propagate_wide(table, m, root, x, k, gap, scratch)
-
-
-@kernel
-def trace_of(size: Size, table: FlowTable, m: int, root: FloatArray, k: int) -> float:
-    """Return ``trace(P)`` of the root of P in entry ``k`` of ``root`` (K, n, n), or 0 if model
-    ``m`` of the table observes nothing.
-
-    Axes: K estimates.
-    """
-    # Without observation (no block of Gamma, column 1 of sizes) G = 0, and any P is narrow: the
-    # trace need not be computed.
-    return 0.0 if table.sizes[m, 1] == 0 else float(trace_of_root(ONE, size, root[k]))
+        use_information(table, m, root, k, gap, scratch)
+        width = n * (n + 1) // 2 + 2 * n * n
+        fill_series(values, width, table.series[m, 0], table.reach[m, 0], 0, gap)
+        propagate_by_series(table, m, root, x, k, False, scratch)
 
 
 @kernel(inlined=True)
@@ -551,9 +546,8 @@ def propagate_by_levels(
     gap: float,
     scratch: FlowScratch,
 ) -> float:
-    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over the whole multiples of
-    ``unit 2^level`` seconds in a ``gap``, by model ``m`` of the table; return the rest of the gap,
-    seconds.
+    """Propagate estimate ``k`` in place over the whole multiples of ``unit 2^level`` seconds in a
+    ``gap``; return the rest of the gap, seconds.
     """
     length, levels = table.unit[m] * (1 << level), table.sizes[m, 3]
     steps = int(gap / length)
@@ -580,93 +574,33 @@ def propagate_level(
     k: int,
     scratch: FlowScratch,
 ) -> None:
-    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over ``unit 2^level`` seconds by
-    model ``m`` of the table, with the tabulated exp(A g), F, Gamma and T: ``P <- F P (I + Gamma'
-    Gamma P)^-1 F' + T T'`` and ``x <- exp(A g) x``. Gamma' Gamma is the information of the readings
-    of these g seconds, and T T' the noise.
+    """Propagate estimate ``k`` in place over ``unit 2^level`` seconds, with the tabulated exp(A g),
+    F, Gamma and T.
     """
     # Index in the third axis of levels: 0 exp(A g), 1 F, 2 Gamma, 3 T. Column 1 of sizes is 0 where
     # nothing is observed.
-    n, levels, T, observed = len(scratch.size), table.levels, scratch.T, scratch.observed
-    if table.sizes[m, 1] > 0:
-        # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
-        for r in range(n):
-            for j in range(n):
-                total = 0.0
-                for i in range(max(r, j), n):
-                    total += levels[m, level, 2, r, i] * root[k, i, j]
-                observed[0, j] = total
-            rotate(ONE, scratch.size, root, k, observed[0], scratch.gain[0])
-    # Without observation F = exp(A g).
-    flow = 0 if table.sizes[m, 1] == 0 else 1
-    # A copy, since transform_root() overwrites T.
+    size, n, levels, T = scratch.size, len(scratch.size), table.levels, scratch.T
+    values, row, observed = scratch.values, scratch.observed, table.sizes[m, 1] > 0
+    # Gamma_r S for each row r of Gamma, both triangular, as an observation of unit noise.
+    for r in range(n if observed else 0):
+        for j in range(n):
+            total = 0.0
+            for i in range(max(r, j), n):
+                total += levels[m, level, 2, r, i] * root[k, i, j]
+            row[0, j] = total
+        rotate(ONE, size, root, k, row[0], scratch.gain[0])
+    # exp(A g) and F where the series of a gap has them.
+    begin, flow = n * (n + 1) // 2, offset_of_F(n, observed)
     for i in range(n):
+        for j in range(n):
+            values[begin + i * n + j] = levels[m, level, 0, i, j]
+            if observed:
+                values[flow + i * n + j] = levels[m, level, 1, i, j]
+        # A copy, since transform_root() overwrites T.
         for j in range(i + 1):
             T[i, j] = levels[m, level, 3, i, j]
-        for j in range(n):
-            scratch.values[i * n + j] = levels[m, level, flow, i, j]
-    transform_root(ONE, scratch.size, root[k], scratch.values, 0, scratch.wide, T)
-    # The estimate moves by exp(A g), without readings: gain_root() adds these later.
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += levels[m, level, 0, i, j] * x[k, j]
-        scratch.gain[0, i] = total
-    for i in range(n):
-        x[k, i] = scratch.gain[0, i]
-
-
-@kernel
-def propagate_wide(
-    table: FlowTable,
-    m: int,
-    root: FloatArray,
-    x: FloatArray,
-    k: int,
-    gap: float,
-    scratch: FlowScratch,
-) -> None:
-    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over a ``gap`` below
-    ``table.unit[m]`` seconds by model ``m`` of the table, for any P, however large.
-
-    ``P_g = F P (I + G P)^-1 F' + Q_g``: first the information G of all readings of the gap, then
-    the transition F and the noise Q_g. The mean moves by exp(A gap), without the readings.
-    """
-    use_information(table, m, root, k, gap, scratch)
-    n = len(scratch.size)
-    # Q_g, exp(A g) and F only, not G_g: Gamma has replaced it.
-    width = n * (n + 1) // 2 + 2 * n * n
-    fill_series(scratch.values, width, table.series[m, 0], table.reach[m, 0], 0, gap)
-    propagate_by_series(table, m, root, x, k, False, scratch)
-
-
-@kernel
-def propagate_narrow(
-    table: FlowTable,
-    m: int,
-    root: FloatArray,
-    x: FloatArray,
-    k: int,
-    gap: float,
-    scratch: FlowScratch,
-) -> None:
-    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place over a ``gap`` in seconds inside a
-    cell of the table by its model ``m``, in one step, if P is small enough (``is_narrow``) or
-    nothing is observed.
-    """
-    fill_values(scratch.values, table, m, gap)
-    propagate_by_series(table, m, root, x, k, True, scratch)
-
-
-@kernel
-def fill_values(out: FloatArray, table: FlowTable, m: int, gap: float) -> None:
-    """Write Q_g (noise of the gap), exp(A g) and, if something is observed, F (transition) and G_g
-    (information of the readings) for a ``gap`` in seconds inside a cell into ``out`` (>= width,),
-    by model ``m`` of the table; symmetric matrices as lower triangles by rows.
-    """
-    cell, since = cell_of(table.unit[m], gap)
-    width = width_of(table.levels.shape[4], table.sizes[m, 1] > 0)
-    fill_series(out, width, table.series[m, cell], table.reach[m, cell], 0, since)
+    propagate_mean(ONE, size, x[k], values, scratch.moved)
+    transform_root(ONE, size, root[k], values, flow, scratch.wide, T)
 
 
 @kernel(inlined=True)
@@ -698,10 +632,9 @@ def propagate_by_series(
     reads: bool,
     scratch: FlowScratch,
 ) -> None:
-    """Propagate ``root[k]`` (n, n) and ``x[k]`` (n,) in place by model ``m`` of the table over the
-    gap for which ``scratch.values`` holds the noise Q_g, exp(A g), the transition F and the
-    information G_g of the readings (see ``fill_values``). ``reads``: use G_g first; otherwise the
-    caller has done so.
+    """Propagate estimate ``k`` in place over the gap of which ``scratch.values`` holds the noise
+    Q_g, exp(A g) and, if something is observed, F and G_g, symmetric matrices as lower triangles by
+    rows. ``reads``: use G_g first; otherwise the caller has done so.
     """
     # Work on copies that the compiler can keep in registers (local_matrix), and store them last.
     size, n, observed = scratch.size, len(scratch.size), table.sizes[m, 1] > 0
@@ -728,8 +661,8 @@ def propagate_by_series(
 
 @kernel(inlined=True)
 def offset_of_F(n: int, observed: bool) -> int:
-    """Return the index at which F begins in the values of a gap (``fill_values``), for n states:
-    behind exp(A g) if something is ``observed``, else at exp(A g), which F then equals.
+    """Return the index at which F begins in the values of a gap, for n states: behind exp(A g) if
+    something is ``observed``, else at exp(A g), which F then equals.
     """
     # Without sensors F = exp(A g), and the series holds it once.
     return n * (n + 1) // 2 + (n * n if observed else 0)
@@ -739,8 +672,8 @@ def offset_of_F(n: int, observed: bool) -> int:
 def propagate_mean(
     lanes: Lanes, size: Size, x: FloatArray, values: FloatArray, moved: FloatArray
 ) -> None:
-    """Compute ``x = exp(A g) x`` (n, L) in place in L lanes; ``values`` (>= width, L), as of
-    ``fill_values``, holds exp(A g) by rows behind Q_g, and ``moved`` (n, L) is scratch.
+    """Compute ``x = exp(A g) x`` (n, L) in place in L lanes; ``values`` (>= width, L)
+    holds exp(A g) by rows behind Q_g, and ``moved`` (n, L) is scratch.
     """
     n, begin = len(size), len(size) * (len(size) + 1) // 2
     for i in range(n):
@@ -758,8 +691,8 @@ def condition_root(
 ) -> None:
     """Replace S (n, n, L), a lower triangular root of P in each of L lanes, by one of
     ``P (I + G P)^-1``: the update with the information G of the readings of a gap. ``values``
-    (>= width, L), as of ``fill_values``, holds the lower triangle of G by rows, behind the noise,
-    exp(A g) and the transition of the gap; V (n, n, L) is scratch.
+    (>= width, L) holds the lower triangle of G by rows, behind Q_g, exp(A g) and F; V (n, n, L) is
+    scratch.
     """
     n = len(size)
     begin = n * (n + 1) // 2 + 2 * n * n
@@ -801,14 +734,9 @@ def condition_root(
 def use_information(
     table: FlowTable, m: int, root: FloatArray, k: int, gap: float, scratch: FlowScratch
 ) -> None:
-    """Update ``root[k]`` (n, n) of ``root`` (K, n, n), a lower triangular root of P, in place with
-    the information Gamma' Gamma that the readings of a ``gap`` give, by model ``m`` of the table:
-    row by row of Gamma, as observations of unit noise. The gap, in seconds, is shorter than one
-    cell of the table (``table.unit[m]``).
-
-    Gamma consists of blocks of q rows: block j is ``gap^(j + 1/2)`` times a power series in gap.
-    ``table.gamma[m, j]`` (terms, 1 + q n) has a row for each term of it: the longest gap for which
-    the terms so far are enough, then the coefficients. Axes: K estimates.
+    """Update root ``k`` in place with the information Gamma' Gamma of the readings of a ``gap``
+    below one unit, row by row of Gamma, as observations of unit noise. Block j of q rows is
+    ``gap^(j + 1/2)`` times a power series in gap.
     """
     n, q, rows, observed = len(scratch.size), table.sizes[m, 0], scratch.rows, scratch.observed
     gamma, width = table.gamma, q * n
@@ -847,8 +775,6 @@ def cholesky_in_lanes(lanes: Lanes, size: Size, T: FloatArray, packed: FloatArra
     """Write the lower triangular Cholesky factor T (n, n, L) of the symmetric matrices whose lower
     triangles are ``packed`` (>= n (n + 1) / 2, L) by rows; pivots at the level of rounding count as
     0.
-
-    Axes: L runs side by side.
     """
     n = len(size)
     for j in range(n):
@@ -895,8 +821,6 @@ def information_rate(lanes: Lanes, size: Size, whitened_H: FloatArray, S: FloatA
     """Return the rate of information ``trace(P G)`` (L,) in 1/s, of roots S (n, n, L) and of
     ``whitened_H`` (q, n, L) = R^-1/2 H. By it the compiled engine decides how long an interval may
     be whose readings are used at once.
-
-    Axes: L runs side by side.
     """
     # |R^-1/2 H S|_F^2 = trace(S' G S).
     n, rate = len(size), spread(lanes, 0.0)
@@ -929,7 +853,7 @@ def gain_root(
 
     U and W (n, 2 p) and C (2 p, n) are power series in the gap, the rows of ``series`` (terms, ...)
     of a GainTable; ``reach[:, column]`` (terms,) is the longest gap for which the terms so far
-    suffice. ``values`` (>= row length) is scratch. Axes: K estimates.
+    suffice. ``values`` (>= row length) is scratch.
     """
     fill_series(values, 3 * len(size) * len(moments), series, reach, column, gap)
     use_moments(ONE, size, root[k], x[k], values, moments)

@@ -363,6 +363,23 @@ def use_reading(run: Any, x: FloatArray, root: FloatArray, k: int, r: int, arriv
 
 
 @kernel(inlined=True)
+def write_innovation(run: Any, x: FloatArray, out: FloatArray) -> None:
+    """Write ``H' R^-1 (y - H x)`` of the reading of ``update`` into ``out`` (n, L); x is (n, L)."""
+    lanes, n, r = run.lanes, len(run.size), run.reading
+    first, matrix = run.first_y + r, run.first_H + run.matrix[r]
+    for i in range(n):
+        store(lanes, out, i, 0.0)
+    # Whitened rows have R = I.
+    for k in range(run.rows[r]):
+        innovation = load(lanes, run.y, first, k)
+        for j in range(n):
+            innovation -= load(lanes, run.H, matrix, k, j) * load(lanes, x, j)
+        for i in range(n):
+            entry = load(lanes, run.H, matrix, k, i) * innovation
+            store(lanes, out, i, load(lanes, out, i) + entry)
+
+
+@kernel(inlined=True)
 def copy_estimate(
     run: Any,
     x: FloatArray,

@@ -2,9 +2,6 @@
 stochastic trigger (Han et al. 2015), which sends a reading with much news, and ``is_near`` of
 event-triggered consensus (Battistelli, Chisci and Selvi 2018), which sends an estimate only when it
 is no longer near the copy of the last one that was sent, which sender and receivers both predict.
-
-``lanes`` is ONE for a single run or MANY for a block of L runs side by side: ``load``, ``store``
-and ``select`` handle the L numbers of an entry as one SIMD value (``netkf.linalg.lanes``).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.gains import Gains, no_gains, stack_gains
+from netkf.algorithms.kernels.gains import Gains, stack_gains
 from netkf.algorithms.kernels.root_flow import (
     FlowScratch,
     FlowTable,
@@ -361,12 +361,9 @@ def _roots_of(covariances: list[FloatArray]) -> FloatArray:
 
 def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
     """Return the tables of M models, with one without sensors at the end, and of gains."""
-    n = len(models[0].A)
-    # A model without sensors has no gains; its entry keeps the numbering.
-    gains = [model.gains if len(model.H) else no_gains(n) for model in models]
     # The last model of the stack has no sensors: it predicts messages under way.
     table = stack_tables([*(model.flow for model in models), models[0].unobserved_flow])
-    return table, stack_gains(gains)
+    return table, stack_gains([model.gains for model in models])
 
 
 @once_per_scenario

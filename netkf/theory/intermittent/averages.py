@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.kernels.chains import reading_modes, trace_path
+from netkf.algorithms.kernels.chains import reading_modes, trace_paths
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import ArrayLike, FloatArray, square_root, symmetric
 from netkf.rng.streams import Streams
@@ -89,7 +89,7 @@ def _evaluate(
     piece, values_of_pieces = max(1, MAX_ENTRIES // len(F) ** 2), []
     for first in range(0, len(arrived), piece):
         word = arrived[first : first + piece].astype(np.uint8)
-        roots = trace_path(root, word, F, root_Q, modes)
+        roots = next(trace_paths(root[None], word[None], F, root_Q, modes))
         # R (140) averages over P_0 .. P_{t-1}: each covariance before its own slot.
         roots_before = np.concatenate([root[None], roots[:-1]])
         P, root = roots_before @ np.swapaxes(roots_before, 1, 2), roots[-1]
