@@ -150,7 +150,6 @@ class InformationConsensus(Filter):
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=1)
 
-    needs = Needs(inverts=True, check=check_information, notes=information_notes)
     kernels = Kernels(
         update=begin_pairs,
         emit=emit_pairs,
@@ -235,7 +234,9 @@ class Hcmci(InformationConsensus):
     @property
     def needs(self) -> Needs:
         """Its demands on a scenario: those of its base, and settings that fit it."""
-        return replace(InformationConsensus.needs, one_way=True, check=self._check_scenario)
+        return Needs(
+            one_way=True, inverts=True, check=self._check_scenario, notes=information_notes
+        )
 
     def _check_scenario(self, scenario: Any) -> None:
         """Raise ScenarioError if a ``netkf.Scenario`` has clocks and the variant is not
@@ -268,6 +269,8 @@ class Icf(InformationConsensus):
 
     With the same weights of links it is HCMCI with novelty weight N, which sends twice as much.
     """
+
+    needs = Needs(inverts=True, check=check_information, notes=information_notes)
 
     def recipe(self, nodes: int) -> Recipe:
         """Return the recipe for a network of N ``nodes``: pairs ``V = P^-1 / N + H' R^-1 H``, of

@@ -15,10 +15,16 @@ from netkf.linalg.compiling import kernel
 @kernel(allocates=True)
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the product ``a b`` (r, c) of ``a`` (r, m) and ``b`` (m, c), as a new array."""
-    out = np.empty((a.shape[0], b.shape[1]))
-    for i in range(a.shape[0]):
-        for j in range(b.shape[1]):
-            total = 0.0
+    return add_matmul(np.zeros((a.shape[0], b.shape[1])), a, b)
+
+
+@kernel(allocates=True)
+def add_matmul(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return ``c + a b`` (r, s) of ``c`` (r, s), ``a`` (r, m) and ``b`` (m, s), as a new array."""
+    out = np.empty(c.shape)
+    for i in range(c.shape[0]):
+        for j in range(c.shape[1]):
+            total = c[i, j]
             for k in range(a.shape[1]):
                 total += a[i, k] * b[k, j]
             out[i, j] = total
@@ -78,6 +84,15 @@ def swap_rows(a: FloatArray, i: int, k: int, first: int, last: int) -> None:
     """
     for j in range(first, last):
         a[i, j], a[k, j] = a[k, j], a[i, j]
+
+
+@kernel(allocates=True)
+def solve(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return ``left^-1 right`` (n, c) of (n, n) and (n, c); nan if it is singular or overflows."""
+    # Copies, since the elimination overwrites both.
+    out = right.copy()
+    solve_inplace(left.copy(), out, len(left))
+    return out
 
 
 @kernel

@@ -19,23 +19,25 @@ def same(found, expected):
 
 @pytest.mark.parametrize(("seed", "n"), CASES)
 def test_products(seed, n):
-    a, b = drawn(seed, (n, n + 2), (n + 2, n + 1))
+    a, b, c = drawn(seed, (n, n + 2), (n + 2, n + 1), (n, n + 1))
     same(small.matmul(a, b), a @ b)
+    same(small.add_matmul(c, a, b), c + a @ b)
 
 
 @pytest.mark.parametrize(("seed", "n"), CASES)
 def test_solutions(seed, n):
     left, right = drawn(seed, (n, n), (n, 3))
-    expected = np.linalg.solve(left, right)
+    before = left.copy(), right.copy()
+    same(small.solve(left, right), np.linalg.solve(left, right))
+    assert np.array_equal(left, before[0])
+    assert np.array_equal(right, before[1])
     wide = np.concatenate([left, np.zeros((n, 2))], axis=1)
     small.solve_inplace(wide, right, n)
-    same(right, expected)
+    same(right, np.linalg.solve(*before))
 
 
 def test_a_singular_matrix_has_no_solution():
-    solution = np.eye(2)
-    small.solve_inplace(np.ones((2, 2)), solution, 2)
-    assert np.isnan(solution).all()
+    assert np.isnan(small.solve(np.ones((2, 2)), np.eye(2))).all()
 
 
 def test_copies():
