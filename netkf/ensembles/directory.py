@@ -185,10 +185,7 @@ def _write_files(
 
 
 class _DirectoryWriter:
-    """Writes the blocks of an ensemble to its directory as they complete, and updates the manifest.
-
-    ``simulated`` is the number of runs that this process has simulated.
-    """
+    """Writes the blocks of an ensemble to its directory, and updates the manifest."""
 
     def __init__(self, scenario: Scenario, directory: Path, plan: RunIdentity) -> None:
         self.scenario, self.directory, self.plan = scenario, directory, plan
@@ -214,12 +211,7 @@ class _DirectoryWriter:
         return {"full": self.plan.runs, "first": 1, "none": 0}[self.plan.trace]
 
     def begin(self, note: Callable[[str], None] | None) -> None:
-        """Write the manifest and the scenario, and find the stored blocks (files with the results
-        of some consecutive replicas) of a run that is resumed.
-
-        ``note``, if there is one, is called with a line for the user about those that are damaged
-        and simulated again.
-        """
+        """Write the manifest and the scenario, and find the stored blocks of a resumed run."""
         # The manifest comes first: if the process is killed, it states that the run is unfinished.
         self.note()
         write_scenario(self.directory, self.scenario)
@@ -233,9 +225,7 @@ class _DirectoryWriter:
     def simulate(
         self, task: Callable[..., RunStatistics], pool: Pool, progress: Progress | None
     ) -> RunStatistics:
-        """Return the statistics of all runs: stored blocks are read, the others simulated on
-        ``pool`` by ``task(scenario, seed, replicas)``, and stored.
-        """
+        """Return the statistics of all runs: stored blocks are read, others simulated."""
         finished_blocks = {number: partial(self.blocks.load, number) for number in self._known}
         blocks = NumberedBlocks(self.plan.block, finished_blocks, self.save_block)
         statistics: RunStatistics = replicate_blocks(
@@ -247,12 +237,7 @@ class _DirectoryWriter:
         return min(self.plan.block, self.plan.runs - number * self.plan.block)
 
     def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
-        """Store block ``number`` (the results of some consecutive replicas), from which a stopped
-        command can be resumed; called as each block completes.
-
-        Returns its statistics without the traces (events and samples of single runs), which would
-        fill the memory.
-        """
+        """Store block ``number``; return its statistics without traces, which fill the memory."""
         self.blocks.save(number, statistics, self.plan)
         self._done += self._runs_in_block(number)
         self.simulated += self._runs_in_block(number)
@@ -269,9 +254,7 @@ class _DirectoryWriter:
             self._last_note = time.monotonic()
 
     def stop(self, error: BaseException) -> BaseException:
-        """Write the status after an error or an interrupt to the manifest; return the exception to
-        raise in place of ``error``.
-        """
+        """Write the status after ``error`` to the manifest; return the exception to raise."""
         self.note("failed" if isinstance(error, Exception) else "interrupted", error)
         if isinstance(error, KeyboardInterrupt):
             return InterruptedRunError(
@@ -280,9 +263,7 @@ class _DirectoryWriter:
         return explain_failure(self.scenario, error, self.directory)
 
     def end(self, status: str, statistics: RunStatistics) -> None:
-        """Write the final manifest, with ``status`` ("complete" or "diverged") and the digests of
-        all other files, after which ``note`` writes nothing any more.
-        """
+        """Write the final manifest, after which ``note`` writes nothing any more."""
         entries = self._identity_entries(
             # totals: numbers of events and of diverged runs
             diverged=int(statistics.totals[1]),

@@ -70,11 +70,7 @@ class _Worker:
             sender.close()
 
     def send(self, task: _Task) -> None:
-        """Send a task (a block of replicas to simulate) to this idle worker; raises OSError if the
-        worker process is dead.
-
-        The scenario is left out if it is the one of the worker's last task.
-        """
+        """Send a task to this idle worker; raises OSError if the process is dead."""
         self.task, job = task, task.job
         if isinstance(job.scenario, PackedScenario):
             digest = job.scenario.digest
@@ -84,11 +80,7 @@ class _Worker:
         self._jobs.send_bytes(pickle.dumps(job, pickle.HIGHEST_PROTOCOL))
 
     def receive(self) -> Any:
-        """Wait for the answer of the worker, and return the result of its task.
-
-        Raises OSError or EOFError if the worker died, else what the task raised, with the worker's
-        traceback as its cause.
-        """
+        """Return the result of the task, or raise what it raised; OSError or EOFError if dead."""
         result, raised, traceback_text = pickle.loads(self.results.recv_bytes())
         if raised is None:
             return pickle.loads(result)

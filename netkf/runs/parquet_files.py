@@ -223,16 +223,9 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
 
 
 class _Table:
-    """A Parquet file that is being written; its first rows determine the schema.
-
-    It is NAME.part until it is complete and on the disk. If writing fails, this temporary file is
-    removed and WriteError is raised.
-    """
+    """A Parquet file that is being written: NAME.part until it is complete."""
 
     def __init__(self, path: Path, encoding: dict[str, Any] | None = None) -> None:
-        """Prepare the file ``path``, with options ``encoding`` of pyarrow's ParquetWriter; it is
-        created by the first rows.
-        """
         self._path, self._temporary = path, path.with_name(path.name + ".part")
         self._encoding = encoding or {}
         self._pending: list[Any] = []
@@ -241,9 +234,7 @@ class _Table:
         self._closed = False
 
     def collect(self, columns: dict[str, Any]) -> None:
-        """Append rows, which are written once they fill a row group (a part of the file that is
-        read as a whole).
-        """
+        """Append rows, which are written once they fill a row group; the first give the schema."""
         table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
         self._pending.append(table)
         if sum(map(len, self._pending)) >= ROW_GROUP_ROWS:
@@ -264,9 +255,7 @@ class _Table:
             self._writer.write_table(table)
 
     def close(self) -> None:
-        """Write what is left, finish the file and rename it from NAME.part; without any rows,
-        not even none, there is no file.
-        """
+        """Write what is left, and finish the file; without rows, not even none, there is none."""
         if self._closed:
             return
         self.flush()

@@ -163,11 +163,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class _Output:
-    """A run directory with the sinks that a run writes to.
-
-    ``links`` has one sink that counts the messages of each link if losses or delays are recorded,
-    and is empty otherwise.
-    """
+    """A run directory with its sinks; ``links`` is empty unless losses or delays are recorded."""
 
     directory: Path
     scenario: Scenario
@@ -193,12 +189,7 @@ class _Output:
         sums: dict[str, tuple[float, float]],
         status: str,
     ) -> dict[str, Any]:
-        """Write summary.json, averages over time and counts of messages, and return its contents.
-
-        ``promised`` are the traces of covariances that theory gives to compare with. ``count``
-        returns the number of events of a kind; ``sums`` has, by name, the exact value and the last
-        total of each sum over all nodes that exchanges should conserve. Raises WriteError.
-        """
+        """Write summary.json, and return its contents; raises WriteError."""
         messages = {
             "sent": count("send"),
             "delivered": count("deliver"),

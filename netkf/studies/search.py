@@ -269,12 +269,7 @@ class Search:
         return 1.1 * probe.runs * (width / distance) ** 2 if distance > 0.0 else math.inf
 
     def _advise(self, value: float | None, misses: float | None, grows: bool) -> str:
-        """Return advice on range and number of runs of a next search; empty if this one was
-        conclusive.
-
-        ``value`` is the last value of the key that reaches the target and ``misses`` the first that
-        does not, None if there is none.
-        """
+        """Return advice on a next search; empty if this one was conclusive."""
         by_value = sorted(self.probes)
         if value is not None and misses is None:
             end = by_value[-1] if grows else by_value[0]
