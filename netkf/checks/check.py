@@ -53,7 +53,7 @@ from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
-from netkf.runs.simulate import LOAD_REMEDY, choose_engine, simulate
+from netkf.runs.simulate import choose_engine, require_scenario, simulate
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
@@ -384,8 +384,7 @@ def check(
 
     Raises TheoryError if nothing is promised, ScenarioError for bad arguments.
     """
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "check takes a netkf.Scenario", scenario, LOAD_REMEDY)
+    require_scenario(scenario, "check")
     count = integer(low=MIN_RUNS)("runs", runs)
     confident = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)

@@ -9,23 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer
 from netkf.core.notebook import NotebookTable
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate_blocks
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
 from netkf.linalg.arrays import FloatArray, from_upper
-from netkf.runs.simulate import choose_engine
+from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import plot_by_name
 from netkf.trace.schema import ensemble_columns
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-LOAD = "load it first: netkf.monte_carlo(netkf.load(path), runs)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,8 +120,7 @@ def monte_carlo(
     Raises ScenarioError for wrong arguments, and EngineError if the engine cannot run the scenario,
     a plugged-in class fails, or workers die again and again.
     """
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "monte_carlo takes a netkf.Scenario", scenario, LOAD)
+    require_scenario(scenario, "monte_carlo", ", runs")
     chosen = choose_engine(engine, scenario)
     seed, count = scenario.seed if seed is None else seed, integer(low=1)("runs", runs)
     statistics = replicate_blocks(

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from netkf.ensembles.statistics import MESSAGES, RunStatistics
 from netkf.linalg.arrays import FloatArray
-from netkf.network.graphs import node_columns
-from netkf.runs.summary import CONFIDENCE, PromisedTraces, nees_bounds, summary_notes
+from netkf.runs.summary import (
+    CONFIDENCE,
+    PromisedTraces,
+    nees_bounds,
+    node_rows,
+    summary_notes,
+)
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.usage import record_usage
 
@@ -29,7 +33,7 @@ def summarise_ensemble(
     error = statistics.averages.standard_error().reshape(-1, 3)
     # JSON has no infinity: None if rounding blurs no errors.
     rounding_from = statistics.rounding_from if np.isfinite(statistics.rounding_from) else None
-    *nodes, overall = node_rows(scenario, mean, error, promised)
+    *nodes, overall = node_rows(scenario, mean, mean_bounds(scenario, promised), error)
     messages = statistics.messages.mean[0].tolist()
     messages_se = statistics.messages.standard_error()[0].tolist()
     summary: dict[str, Any] = {
@@ -70,36 +74,12 @@ def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, floa
     return {"n": n, "confidence": CONFIDENCE, "low": low, "high": high, "inside": share_inside}
 
 
-def node_rows(
-    scenario: Scenario, mean: FloatArray, error: FloatArray, promised: PromisedTraces
-) -> list[dict[str, Any]]:
-    """Return the rows of an ensemble's summary.json, N + 1: of each node, and of all together.
-
-    ``mean`` and ``error`` (N + 1, 3) are the mean square error, mean trace of P and mean NEES, with
-    standard errors.
+def mean_bounds(scenario: Scenario, promised: PromisedTraces) -> FloatArray | None:
+    """Return the averages (N + 1,) of the promised bound over the samples after time 0, of each
+    node and of all; None without a bound.
     """
-    bounds: list[float | None] = [None] * len(mean)
-    if promised.bound is not None:
-        after_start = promised.bound[scenario.times > 0.0]
-        of_nodes = (after_start if len(after_start) else promised.bound).mean(axis=0)
-        bounds = [*of_nodes.tolist(), float(of_nodes.mean())]
-    rows = []
-    for (square, trace, nees), errors, bound in zip(
-        mean.tolist(), error.tolist(), bounds, strict=True
-    ):
-        rms = math.sqrt(square) if square >= 0.0 else math.nan
-        rows.append(
-            {
-                "rms_error": rms,
-                "rms_error_se": 0.0 if rms == 0.0 else errors[0] / (2.0 * rms),
-                "mean_trace": trace,
-                "mean_trace_se": errors[1],
-                "bound": bound,
-                "ratio": None if bound is None else trace / bound,
-                "ratio_se": None if bound is None else errors[1] / bound,
-                "mean_nees": nees,
-                "mean_nees_se": errors[2],
-            }
-        )
-    columns = [node_columns(node) for node in scenario.nodes]
-    return [*map(dict.__or__, columns, rows), rows[-1]]
+    if promised.bound is None:
+        return None
+    after_start = promised.bound[scenario.times > 0.0]
+    nodes = (after_start if len(after_start) else promised.bound).mean(axis=0)
+    return np.append(nodes, nodes.mean())

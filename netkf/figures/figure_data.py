@@ -11,13 +11,14 @@ import numpy as np
 from netkf.checks.innovations import Innovations, compute_innovations
 from netkf.core.errors import ScenarioError
 from netkf.ensembles.monte_carlo import Ensemble
-from netkf.ensembles.summary import node_rows
+from netkf.ensembles.summary import mean_bounds
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.run import CompletedRun
 from netkf.runs.summary import (
     NO_COVARIANCE,
     PromisedTraces,
     SummarySink,
+    node_rows,
     promise_traces,
     select_averaged_samples,
     summarise,
@@ -269,7 +270,9 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
         sq_error=np.trace(ensemble.mean_error, axis1=2, axis2=3),
         trace=np.trace(ensemble.mean_P, axis1=2, axis2=3),
         nees=ensemble.mean_nees,
-        node_averages=node_rows(scenario, ensemble.average, ensemble.se_average, promised)[:-1],
+        node_averages=node_rows(
+            scenario, ensemble.average, mean_bounds(scenario, promised), ensemble.se_average
+        )[:-1],
         promised=promised,
         seed=ensemble.seed,
         # Only ensembles that were read from a directory have a status.

@@ -18,7 +18,6 @@ from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.run import Run
 from netkf.trace.schema import EVENT
 
-LOAD_REMEDY = "load it first: netkf.simulate(netkf.load(path))"
 ENGINES = ("auto", "simpy", "compiled")
 
 
@@ -51,6 +50,15 @@ def choose_engine(
     return engine
 
 
+def require_scenario(value: object, function: str, rest: str = "") -> None:
+    """Raise ScenarioError unless ``value`` is a scenario; the remedy shows a call of ``function``
+    with the ``rest`` of its arguments.
+    """
+    if not isinstance(value, Scenario):
+        remedy = f"load it first: netkf.{function}(netkf.load(path){rest})"
+        raise ScenarioError("", f"{function} takes a netkf.Scenario", value, remedy)
+
+
 def simulate(
     scenario: Scenario,
     seed: int | None = None,
@@ -66,8 +74,7 @@ def simulate(
 
     Raises EngineError if no engine can run the scenario, ScenarioError for bad arguments.
     """
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "simulate takes a netkf.Scenario", scenario, LOAD_REMEDY)
+    require_scenario(scenario, "simulate")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     replica = integer(low=0)("replica", replica)
     chosen_engine = choose_engine(engine, scenario)

@@ -186,7 +186,7 @@ def summarise(
     messages ``sent``, ``delivered`` and ``lost`` in the network. Averages are nan if there is no
     sample or no covariance.
     """
-    nodes, overall = _average_rows(scenario, sink, promised)
+    *nodes, overall = _average_rows(scenario, sink, promised)
     counts = sink.transmissions
     for row in nodes:
         row |= {"sent": counts.sent[row["node"]], "transmissions": counts.count_for(row["node"])}
@@ -208,24 +208,49 @@ def summarise(
 
 def _average_rows(
     scenario: Scenario, sink: SummarySink, promised: PromisedTraces
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+) -> list[dict[str, Any]]:
+    """Return a row of averages over time for each node, and last that of all nodes together."""
     rounding_from = np.inf if sink.rounding_from is None else sink.rounding_from
     indices = select_averaged_samples(np.array(sink.times), rounding_from, bool(sink.diverged))
     mean_square = _mean_or_nan(sink.sq_error, indices.errors, scenario)
     trace = _mean_or_nan(sink.trace, indices.covariances, scenario)
     nees = _mean_or_nan(sink.nees, indices.errors, scenario)
-    columns = [mean_square, trace, nees]
-    with np.errstate(all="ignore"):  # ratios to a bound of 0, and diverged runs
+    with np.errstate(all="ignore"):  # diverged runs
+        bound = None
         if promised.bound is not None:
-            columns.append(promised.bound[indices.covariances].mean(axis=0))
-        by_node = _averages(*columns)
-        overall = _averages(*(np.array([column.mean()]) for column in columns))
-    # by_node: for each name a list of N values; overall: of one.
-    nodes = [
-        node_columns(node) | {name: values[k] for name, values in by_node.items()}
-        for k, node in enumerate(scenario.nodes)
+            bound = promised.bound[indices.covariances].mean(axis=0)
+            bound = np.append(bound, bound.mean())
+        nodes = np.column_stack([mean_square, trace, nees])
+        return node_rows(scenario, np.vstack([nodes, nodes.mean(axis=0)]), bound)
+
+
+def node_rows(
+    scenario: Scenario,
+    mean: FloatArray,
+    bound: FloatArray | None,
+    error: FloatArray | None = None,
+) -> list[dict[str, Any]]:
+    """Return N + 1 rows of summary.json: of each node, and of all together.
+
+    ``mean`` (N + 1, 3) are the mean square error, mean trace of P and mean NEES, ``error`` their
+    standard errors, if any, and ``bound`` (N + 1,) the mean bound on the trace, if any.
+    """
+    with np.errstate(all="ignore"):  # ratios to a bound of 0
+        rms = np.sqrt(mean[:, 0])
+        columns = {"rms_error": rms, "mean_trace": mean[:, 1], "mean_nees": mean[:, 2]}
+        if error is not None:
+            columns["rms_error_se"] = np.where(rms == 0.0, 0.0, error[:, 0] / (2.0 * rms))
+            columns |= {"mean_trace_se": error[:, 1], "mean_nees_se": error[:, 2]}
+        if bound is not None:
+            columns |= {"bound": bound, "ratio": mean[:, 1] / bound}
+            columns |= {} if error is None else {"ratio_se": error[:, 1] / bound}
+    empty = dict.fromkeys(("bound", "ratio") if error is None else ("bound", "ratio", "ratio_se"))
+    rows = [
+        {**empty, **dict(zip(columns, values, strict=True))}
+        for values in zip(*(column.tolist() for column in columns.values()), strict=True)
     ]
-    return nodes, {name: value for name, (value,) in overall.items()}
+    nodes = zip(scenario.nodes, rows[:-1], strict=True)
+    return [*(node_columns(node) | row for node, row in nodes), rows[-1]]
 
 
 def _mean_or_nan(values: list[FloatArray], indices: np.ndarray, scenario: Scenario) -> FloatArray:
@@ -263,18 +288,4 @@ def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:
     return {
         name: {"exact": exact, "total": total, "drift": (total - exact) / exact}
         for name, (exact, total) in sums.items()
-    }
-
-
-def _averages(
-    mean_square: FloatArray, trace: FloatArray, nees: FloatArray, bound: FloatArray | None = None
-) -> dict[str, list[Any]]:
-    """Return the averages (N,) of summary.json by name, as lists; None without a ``bound``."""
-    missing = [None] * len(trace)
-    return {
-        "rms_error": np.sqrt(mean_square).tolist(),
-        "mean_trace": trace.tolist(),
-        "bound": missing if bound is None else bound.tolist(),
-        "ratio": missing if bound is None else (trace / bound).tolist(),
-        "mean_nees": nees.tolist(),
     }

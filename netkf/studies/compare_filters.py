@@ -23,7 +23,7 @@ from netkf.runs.failures import explain_failures
 from netkf.runs.files import check_sources, create_output_directory, write_scenario, write_text
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
-from netkf.runs.simulate import choose_engine
+from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.imports import offered_kinds
 from netkf.scenario.registry import list_kinds, name_of
 from netkf.scenario.scenario import Scenario
@@ -42,7 +42,6 @@ from netkf.studies.filter_values import (
 if TYPE_CHECKING:
     import pandas as pd
 
-LOAD = "load it first: netkf.compare_filters(netkf.load(path), ...)"
 CARRIED = ("mean", "cov", "model")
 """Keys of ``[filter]`` that every compared filter takes over from the scenario."""
 QUANTITIES = ("rms_error", "worst_instant", "nees_ratio")
@@ -167,8 +166,7 @@ def compare_filters(
 
     Raises ScenarioError if no filter can run, or if there is no such kind.
     """
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "compare_filters takes a netkf.Scenario", scenario, LOAD)
+    require_scenario(scenario, "compare_filters", ", ...")
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     count = integer(low=1)("runs", runs)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)

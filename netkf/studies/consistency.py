@@ -29,7 +29,7 @@ from netkf.ensembles.replicas import replicate
 from netkf.linalg.arrays import FloatArray, block_diagonal, is_definite
 from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias
-from netkf.runs.simulate import choose_engine, simulate
+from netkf.runs.simulate import choose_engine, require_scenario, simulate
 from netkf.runs.summary import NO_COVARIANCE, nees_bounds
 from netkf.scenario.scenario import Scenario
 from netkf.theory.errors import error_squares
@@ -39,7 +39,6 @@ from netkf.trace.run import Run, blurred_samples
 if TYPE_CHECKING:
     import pandas as pd
 
-LOAD = "load it first: netkf.consistency(netkf.load(path))"
 MIN_RUNS = 10
 MAX_ERRORS = 256
 """Largest number of errors N n of all nodes for which the exact covariance is computed. It takes
@@ -289,8 +288,7 @@ def consistency(
 
     Raises ScenarioError for bad arguments and if there is no truth.
     """
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "consistency takes a netkf.Scenario", scenario, LOAD)
+    require_scenario(scenario, "consistency")
     if not scenario.is_random:
         rule = "states or readings are recorded, so the law of the errors is unknown"
         raise ScenarioError("plant", rule, None, "simulate the plant and all readings")

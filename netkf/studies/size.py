@@ -12,7 +12,7 @@ from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number, one_of
 from netkf.ensembles.blocks import BlockTask, each_replica
 from netkf.ensembles.pools import PoolOptions, make_pool
-from netkf.runs.simulate import choose_engine
+from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
     block_metrics,
@@ -36,8 +36,6 @@ from netkf.studies.targets import (
     quantity_by_theory,
     theory_is_exact,
 )
-
-LOAD = "load it first: netkf.size(netkf.load(path), ...)"
 
 
 def size(
@@ -73,8 +71,7 @@ def size(
     ScenarioError for a wrong key, range or target, TheoryError with ``by="theory"`` if theory has
     no answer.
     """
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "size takes a netkf.Scenario", scenario, LOAD)
+    require_scenario(scenario, "size", ", ...")
     if by is not None:
         one_of("theory", "simulation")("--by", by)
     parsed = parse_target(target)

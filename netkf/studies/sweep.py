@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError, TheoryError
+from netkf.core.errors import TheoryError
 from netkf.core.fields import integer
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
 from netkf.ensembles.replicas import replicate_blocks
@@ -29,7 +29,7 @@ from netkf.runs.files import (
 )
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
-from netkf.runs.simulate import choose_engine
+from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
     MeanEstimate,
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SHOWN = 20  # instants at which truths are compared
-LOAD = "load it first: netkf.sweep(netkf.load(path), ...)"
 Row = dict[str, Any]
 Progress = Callable[[int, int], None]
 
@@ -112,8 +111,7 @@ def plan_sweep(
     engine: str = "auto",
 ) -> SweepPlan:
     """Return the plan of a sweep, all points of which can run; raises ScenarioError."""
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("", "sweep takes a netkf.Scenario", scenario, LOAD)
+    require_scenario(scenario, "sweep", ", ...")
     integer(low=1)("runs", runs)
     base = scenario if seed is None else scenario.replace({"seed": seed})
     points = expand_grid(base, vary)
