@@ -130,15 +130,7 @@ def _traced_run(
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)
     sink.finish(recorder, status)
     run = collect_run(scenario, memory, recorder, seed, replica, engine.name, status)
-    trace = Trace(
-        replica=replica,
-        log=run.log,
-        times=run.times,
-        x=run.x,
-        xhat=run.xhat,
-        P=run.P,
-        error=run.error,
-    )
+    trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
     return sink.batch(), (trace,)
 
 
@@ -181,24 +173,19 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
     copies, averages = nodes // batch.error.shape[2], reduced.averages
     if copies > 1:
         averages = np.repeat(averages, nodes, axis=1)
+    # accumulate() adds in order; sum() may add in another one, and would give other bits.
+    overall = np.add.accumulate(averages, axis=1)[:, -1:] / nodes
     return RunValues(
         pieces=slices,
         samples=reduced.samples,
         copies=copies,
-        averages=np.concatenate([averages, _mean_of_nodes(averages)], axis=1),
+        averages=np.concatenate([averages, overall], axis=1),
         messages=count_messages(batch.counts, scenario.slotted),
         events=batch.counts.sum(axis=1),
         diverged=batch.diverged,
         rounding_from=reduced.rounding_from,
         sums=dict(batch.sums),
     )
-
-
-def _mean_of_nodes(averages: FloatArray) -> FloatArray:
-    """Return the means (R, 1, 3) over the N nodes of the ``averages`` (R, N, 3) of R runs."""
-    # accumulate() adds in order; sum() may add in another one, and would give other bits.
-    total = np.add.accumulate(averages, axis=1)[:, -1:]
-    return np.asarray(total / averages.shape[1])
 
 
 def merge_runs(values: RunValues, piece: int) -> RunStatistics:
@@ -208,10 +195,7 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
     The fingerprint and the traces are empty; ``block_statistics`` adds them.
     """
     runs = values.pieces[piece]
-    samples = values.samples[piece]
-    averages = values.averages[runs]
-    messages = values.messages[runs]
-    count = len(messages)
+    samples, count = values.samples[piece], len(values.messages[runs])
     # One value per run: every run has size 1.
     sizes = np.ones((count, 1))
     # Moments of each conserved sum at the start and end, and its largest relative drift.
@@ -226,15 +210,11 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
         # All nodes have the estimate of one pooled filter.
         mean, M2 = (np.tile(moment, values.copies) for moment in (samples.mean, samples.M2))
         samples = Moments(samples.size, mean, M2)
-    # Averages and messages in one call: their columns are independent.
-    columns = np.concatenate([averages.reshape(count, -1), messages], axis=1)
-    size, mean, M2 = moments_of(columns[:, None], sizes)
-    of_averages = slice(0, -len(MESSAGES))
-    of_messages = slice(-len(MESSAGES), None)
+    averages, messages = values.averages[runs].reshape(count, 1, -1), values.messages[runs, None]
     return RunStatistics(
         samples=samples,
-        averages=Moments(size, mean[:, of_averages].copy(), M2[:, of_averages].copy()),
-        messages=Moments(size.copy(), mean[:, of_messages].copy(), M2[:, of_messages].copy()),
+        averages=moments_of(averages.copy(), sizes.copy()),
+        messages=moments_of(messages.copy(), sizes.copy()),
         totals=np.array([values.events[runs].sum(), values.diverged[runs].sum()]),
         conserved=conserved,
         rounding_from=float(values.rounding_from[runs].min()),
