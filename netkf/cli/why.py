@@ -14,7 +14,6 @@ from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 
 if TYPE_CHECKING:
-    from netkf.studies.explanation import Why
     from netkf.trace.run import Run
 
 
@@ -29,6 +28,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _explain(options: argparse.Namespace) -> int:
+    from netkf.runs.files import write_json, write_text
     from netkf.studies.why import why
 
     run: Run | Path = options.directory
@@ -50,7 +50,9 @@ def _explain(options: argparse.Namespace) -> int:
     print_notes(notes)
     try:
         if options.out is not None:
-            _write_explanation(explanation, options.out)
+            write_text(options.out / "why.txt", f"{explanation}\n")
+            write_json(options.out / "why.json", explanation.to_dict())
+            write_text(options.out / "why.csv", explanation.table.to_csv(index=False))
     finally:
         if options.json:
             print_json(explanation.to_dict())
@@ -76,13 +78,3 @@ def _find_worst_sample(options: argparse.Namespace) -> tuple[Run, int, float, st
         "the start-up; --node and --at choose another sample"
     )
     return source.run, worst.node, worst.time, note
-
-
-def _write_explanation(explanation: Why, directory: Path) -> None:
-    """Write why.txt, why.json and why.csv; raises WriteError if a file cannot be written."""
-    from netkf.runs.files import write_atomically, write_json, write_text
-
-    write_text(directory / "why.txt", f"{explanation}\n")
-    write_json(directory / "why.json", explanation.to_dict())
-    with write_atomically(directory / "why.csv") as temporary:
-        explanation.table.to_csv(temporary, index=False)

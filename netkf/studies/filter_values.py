@@ -13,6 +13,7 @@ from netkf.ensembles.statistics import run_values
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
+from netkf.studies.metrics import mean_over_runs
 from netkf.trace.batch import RunBatch
 from netkf.trace.schema import CODES
 
@@ -39,20 +40,15 @@ class FilterValues(NamedTuple):
 
 def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> FilterValues:
     """Simulate ``replicas`` of ``seed`` and return their values; for ``replicate_blocks``."""
-    batches = engine.run_many(scenario, seed, replicas)
-    return join_values(*(_batch_values(scenario, batch) for batch in batches))
-
-
-def _batch_values(scenario: Scenario, batch: RunBatch) -> FilterValues:
-    values = run_values(batch, scenario)
-    # (R, 3): squared error, trace of P and NEES, means over time and nodes.
-    all_nodes_mean = values.averages[:, -1]
-    largest = [
-        _largest_error(batch, r, float(end)) for r, end in enumerate(values.rounding_from.tolist())
-    ]
-    return FilterValues(
-        all_nodes_mean[:, 0], np.array(largest), all_nodes_mean[:, 2], values.diverged > 0
-    )
+    parts = []
+    for batch in engine.run_many(scenario, seed, replicas):
+        values = run_values(batch, scenario)
+        # (R,): squared error and NEES, means over time and nodes.
+        square, _, nees = values.averages[:, -1].T
+        ends = enumerate(values.rounding_from.tolist())
+        worst = np.array([_largest_error(batch, r, end) for r, end in ends])
+        parts.append(FilterValues(square, worst, nees, values.diverged > 0))
+    return join_values(*parts)
 
 
 def _largest_error(batch: RunBatch, r: int, blurred_from: float) -> float:
@@ -128,7 +124,7 @@ def estimate_quantities(
     base = _influences(first, n) if first is not None else {}
     for name, (value, influence) in _influences(values, n).items():
         runs = len(influence)
-        quantity = Quantity(value, _standard_error(influence))
+        quantity = Quantity(value, mean_over_runs(influence).error)
         if name in base and not (values.diverged.any() or first is None or first.diverged.any()):
             base_value, influence_difference = base[name][0], influence - base[name][1]
             width = _width(influence_difference, level)
@@ -157,18 +153,12 @@ def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArr
     }
 
 
-def _standard_error(values: FloatArray) -> float:
-    """Return the standard error of the mean of ``values`` (R,), nan for one value."""
-    return float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-
-
 def _width(values: FloatArray, level: float) -> float:
     """Return half of Student's interval for the mean of ``values`` (R,); nan for one value."""
     if len(values) < 2:
         return math.nan
-    return float(scipy.special.stdtrit(len(values) - 1, 1.0 - level / 2.0)) * _standard_error(
-        values
-    )
+    quantile = float(scipy.special.stdtrit(len(values) - 1, 1.0 - level / 2.0))
+    return quantile * mean_over_runs(values).error
 
 
 def credibility(values: FilterValues, n: int, level: float) -> str:

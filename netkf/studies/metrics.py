@@ -13,7 +13,7 @@ from netkf.algorithms.kernels.root_flow import whiten_observation
 from netkf.algorithms.models import SlotModel
 from netkf.core.errors import TheoryError
 from netkf.engines.base import Engine
-from netkf.ensembles.statistics import RunValues, count_messages, run_values
+from netkf.ensembles.statistics import count_messages, run_values
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
 from netkf.scenario.model import Filtering
@@ -46,19 +46,14 @@ class RunMetrics(NamedTuple):
 
 def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> RunMetrics:
     """Simulate ``replicas`` of ``seed`` and return their metrics; for ``replicate_blocks``."""
-    batches = engine.run_many(scenario, seed, replicas)
-    return join_metrics(*(_batch_metrics(run_values(batch, scenario)) for batch in batches))
-
-
-def _batch_metrics(values: RunValues) -> RunMetrics:
-    # averages (R, N + 1, 3): squared error, trace of P, NEES; the last row is of all nodes.
-    return RunMetrics(
-        mean_square=values.averages[:, :-1, 0],
-        trace=values.averages[:, :-1, 1],
-        messages=values.messages,
-        diverged=values.diverged[:, None],
-        rounding_from=values.rounding_from[:, None],
-    )
+    parts = []
+    for batch in engine.run_many(scenario, seed, replicas):
+        values = run_values(batch, scenario)
+        # averages (R, N + 1, 3): squared error, trace of P, NEES; the last row is of all nodes.
+        square, trace, _ = np.moveaxis(values.averages[:, :-1], 2, 0)
+        ends = values.diverged[:, None], values.rounding_from[:, None]
+        parts.append(RunMetrics(square, trace, values.messages, *ends))
+    return join_metrics(*parts)
 
 
 def join_metrics(*parts: RunMetrics) -> RunMetrics:
