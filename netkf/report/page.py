@@ -37,7 +37,6 @@ from netkf.runs.files import require_own, write_text
 from netkf.scenario.writing import toml_text
 from netkf.studies.compare import Comparison, compare, damage_named
 from netkf.studies.explanation import Why
-from netkf.studies.stored import StoredComparison
 from netkf.trace.messages import MESSAGE, join_messages
 from netkf.trace.schema import KINDS
 
@@ -402,18 +401,14 @@ def _source_command(source: ReportSource) -> str:
         verdict = source.verdict
         command += f" --runs {verdict['runs']} --confidence {verdict['confidence']:g}"
     if source.filters is not None:
-        command += f" --filters {shlex.quote(_filter_option(source.filters))}"
+        options = []
+        for row in source.filters.rows:
+            # The label of a filter is its kind, then its settings as key=value.
+            kind, *settings = row.filter.split(" ")
+            table = ", ".join([f'kind="{kind}"', *settings])
+            options.append(f"{{{table}}}" if settings else kind)
+        command += f" --filters {shlex.quote(','.join(options))}"
     return command
-
-
-def _filter_option(comparison: StoredComparison) -> str:
-    options = []
-    for row in comparison.rows:
-        # The label of a filter is its kind, then its settings as key=value.
-        kind, *settings = row.filter.split(" ")
-        table = ", ".join([f'kind="{kind}"', *settings])
-        options.append(f"{{{table}}}" if settings else kind)
-    return ",".join(options)
 
 
 @cache

@@ -78,8 +78,20 @@ def summary_table(
     if limit and not has_bound(summary):
         lines.append(f"bound: {summary['bound']}")
     lines += [f"note: {note}" for note in (*summary["notes"], *notes)]
-    lines += _limit_lines(summary, limit)
-    lines += _nees_lines(summary.get("nees", {}))
+    traces = {limit: summary["limit"], "centralised filter": summary["central"]}
+    limits = [
+        f"{label} {format_number(value)}"
+        for label, value in traces.items()
+        if value is not None and math.isfinite(value)
+    ]
+    lines += ["traces to compare: " + ", ".join(limits)] if limits else []
+    nees = summary.get("nees", {})
+    if math.isfinite(nees.get("inside", math.nan)):  # not for a single run
+        lines.append(
+            f"NEES of one sample, mean over the runs: {nees['confidence']:.0%} in "
+            f"{format_number(nees['low'])} .. {format_number(nees['high'])} where P is exact, here "
+            f"{nees['inside']:.0%}"
+        )
     if "conserved" in summary:
         lines.append("mass: " + _describe_conserved(summary["conserved"]))
     lines.append(_message_line(summary["messages"]))
@@ -124,27 +136,6 @@ def _node_table(summary: dict[str, Any]) -> Iterator[str]:
 def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[str]:
     """Return the cells of a row of averages that begins with ``name``."""
     return [name, *(format_with_error(row[key], row.get(f"{key}_se")) for key in columns)]
-
-
-def _limit_lines(summary: dict[str, Any], limit: str) -> list[str]:
-    traces = {limit: summary["limit"], "centralised filter": summary["central"]}
-    limits = [
-        f"{label} {format_number(value)}"
-        for label, value in traces.items()
-        if value is not None and math.isfinite(value)
-    ]
-    return ["traces to compare: " + ", ".join(limits)] if limits else []
-
-
-def _nees_lines(nees: dict[str, Any]) -> list[str]:
-    """Return the line on how many mean NEES lie in their interval; none for a single run."""
-    if not math.isfinite(nees.get("inside", math.nan)):
-        return []
-    return [
-        f"NEES of one sample, mean over the runs: {nees['confidence']:.0%} in "
-        f"{format_number(nees['low'])} .. {format_number(nees['high'])} where P is exact, here "
-        f"{nees['inside']:.0%}"
-    ]
 
 
 def _message_line(messages: dict[str, Any]) -> str:
