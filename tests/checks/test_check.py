@@ -202,15 +202,15 @@ def broken_promises(scenario, runs):
         # Its errors alone are too small a change for so few runs.
         ("LosesMass", {MASS, STEPS}, set(), 10),
         ("SendsTooMuch", {MASS, STEPS}, set(), 10),
-        ("NeverAverages", {ERRORS, "mean squares become the exact steady ones"}, {MASS, STEPS}, 15),
+        ("NeverAverages", {ERRORS, "mean squares become the exact steady ones"}, {MASS, STEPS}, 12),
         ("Overshoots", {ERRORS}, {MASS, STEPS}, 10),
-        ("ForgetsN", {ERRORS}, {MASS, STEPS}, 20),
+        ("ForgetsN", {ERRORS}, {MASS, STEPS}, 15),
     ],
 )
 def test_broken_push_sum_is_caught(kind, caught, not_seen, runs, tmp_path):
     filtering = {**PUSH_SUM["filter"], "kind": f"tests.checks.broken:{kind}"}
     # A gain that is too small shows once the start is forgotten.
-    horizon = 40.0 if kind == "ForgetsN" else 20.0
+    horizon = 30.0 if kind == "ForgetsN" else 16.0
     scenario = scenario_of(PUSH_SUM, tmp_path, filter=filtering, horizon=horizon)
     broken = broken_promises(scenario, runs)
     assert caught <= broken
