@@ -27,6 +27,11 @@ wide makes that 2e-5, and a run of few nodes a quarter faster.
 SPAN, BINS, ORDER = 1.0, 16, 4
 """Laws of a gap of at most SPAN seconds: a polynomial about the middle of each of BINS parts."""
 
+POISSON, GAMMA, LATTICE = range(3)
+"""Kinds of clocks."""
+RESET, SWAP, INTERSECT, SUMS = range(4)
+"""What nodes do with what they hear."""
+
 
 # Steps of a Kalman filter
 
@@ -444,7 +449,81 @@ def push_sum(size, random, probe, plant, start, H, rows, ends, delivery, steps, 
                 keep(size, truth, m, S, r, slot // probe, x, xhat, P)
 
 
-# The hybrid filter in continuous time
+# Clocks, losses and delays
+
+
+@kernel
+def sift(heap, owner, k):
+    """Move entry k of a binary heap of times (K,) and their owners towards the first."""
+    t, e = heap[k], owner[k]
+    while k > 0:
+        up = (k - 1) // 2
+        if heap[up] <= t:
+            break
+        heap[k], owner[k] = heap[up], owner[up]
+        k = up
+    heap[k], owner[k] = t, e
+
+
+@kernel
+def sink(heap, owner, count):
+    """Move the first of ``count`` entries of a heap to its place."""
+    t, e, k = heap[0], owner[0], 0
+    while True:
+        down = 2 * k + 1
+        if down >= count:
+            break
+        if down + 1 < count and heap[down + 1] < heap[down]:
+            down += 1
+        if heap[down] >= t:
+            break
+        heap[k], owner[k] = heap[down], owner[down]
+        k = down
+    heap[k], owner[k] = t, e
+
+
+@kernel
+def tick_after(random, clock, e, t, phase, number):
+    """When clock e ticks next after its tick at t. ``clock``: its kind and POISSON the mean gap;
+    GAMMA shape and scale of gaps; LATTICE the period, from ``phase[e]`` on, and the jitter.
+    """
+    kind, first, second = clock
+    if kind == POISSON:
+        return t + first * random.standard_exponential()
+    if kind == GAMMA:
+        return t + second * random.standard_gamma(first)
+    number[e] += 1
+    return phase[e] + (number[e] - 1) * first + second * random.random()
+
+
+@kernel
+def start_clock(random, clock, e, phase, number, heap, owner):
+    """Enter the first tick of clock e as entry e of the heap; phases are random."""
+    phase[e], number[e] = clock[1] * random.random() if clock[0] == LATTICE else 0.0, 0
+    heap[e], owner[e] = tick_after(random, clock, e, 0.0, phase, number), e
+    sift(heap, owner, e)
+
+
+@kernel
+def start_chains(random, loss, bad):
+    """Draw the state of each link's chain; ``loss``: probabilities of delivery (2, L) in a good and
+    a bad state, and of turning bad and good.
+    """
+    _, to_bad, to_good = loss
+    for link in range(len(bad)):
+        bad[link] = to_bad > 0.0 and random.random() * (to_bad + to_good) < to_bad
+
+
+@kernel
+def arrives(random, u, loss, bad, link):
+    """Whether the next message of a link does, u uniform."""
+    delivery, to_bad, to_good = loss
+    if to_bad > 0.0:
+        bad[link] = random.random() < (1.0 - to_good if bad[link] else to_bad)
+    return u < delivery[bad[link], link]
+
+
+# Pairs in continuous time: the hybrid filter, gossip and covariance intersection
 
 
 @kernel
@@ -645,119 +724,111 @@ def reset(size, epsilon, i, j, m, S):
 
 
 @kernel
-def hybrid(
-    size, both, random, times, step_law, table, start, sensor, rows, ends, clock, x, xhat, P
-):
-    """Kalman-Bucy filters whose pairs reset each other when their link ticks.
+def swap(size, i, j, m, S):
+    """Exchange entries i and j."""
+    n = len(size)
+    for a in range(n):
+        m[i, a], m[j, a] = m[j, a], m[i, a]
+        for b in range(n):
+            S[i, a, b], S[j, a, b] = S[j, a, b], S[i, a, b]
+
+
+@kernel
+def invert_entry(size, k, m, S, line):
+    """Entry k from xhat and P to P^-1 xhat and P^-1, or back."""
+    n = len(size)
+    invert(size, S, k)
+    for i in range(n):
+        line[i] = 0.0
+        for j in range(n):
+            line[i] += S[k, i, j] * m[k, j]
+    for i in range(n):
+        m[k, i] = line[i]
+
+
+@kernel
+def meet(size, rule, epsilon, i, j, m, S, line):
+    """What both ends of a link do when both hear each other."""
+    if rule == SWAP:
+        swap(size, i, j, m, S)
+    elif rule == RESET:
+        reset(size, epsilon, i, j, m, S)
+    else:
+        for k in (i, j):
+            invert_entry(size, k, m, S, line)
+        reset(size, epsilon, i, j, m, S)
+        for k in (i, j):
+            invert_entry(size, k, m, S, line)
+
+
+@kernel
+def pairs(
+    size, both, random, times, step_law, table, start, sensor, rows, ends, clock, loss, rule,
+    epsilon, x, xhat, P,
+):  # fmt: skip
+    """Kalman-Bucy filters whose pairs meet when their link ticks and nothing is lost.
 
     ``times`` (T,) are multiples of STEP; ``step_law`` of state and integrals over STEP; ``table``
     of ``flow``; ``start`` mean, covariance and its root; ``sensor`` H (p, n) and a root of the
-    noise intensity, of nodes whose ``rows`` is not 0; ``clock``: rate of a link, probability that
-    both messages arrive, epsilon; ``both`` has length q = 2 p. Returns the number of ticks.
+    noise intensity, of nodes whose ``rows`` is not 0; ``clock`` of ``tick_after``; ``loss`` of
+    ``arrives``, both messages at once; ``both`` has length q = 2 p. Returns the number of ticks.
     """
-    n, q, (runs, _, N, _) = len(size), len(both), xhat.shape
-    (rate, delivery, epsilon), (H, noise) = clock, sensor
+    n, q, (runs, _, N, _), (H, noise) = len(size), len(both), xhat.shape, sensor
     m, S, now, used = np.empty((N, n)), np.empty((N, n, n)), np.empty(N), np.empty((N, q))
     path = np.zeros((int(times[-1] / STEP + 0.5) + 1, 3 * n))
     E, work = np.empty((2 * q, max(n, q))), np.empty((n + 1 + q, n))
-    law, dy, d = np.empty(table.shape[2]), np.empty(q), np.empty(q)
-    mean_gap, ticks = 1.0 / (rate * len(ends)), 0
+    law, dy, d, ticks = np.empty(table.shape[2]), np.empty(q), np.empty(q), 0
+    L, t, link, u = len(ends), 0.0, 0, 0.0
+    heap, owner, phase = np.empty(L), np.empty(L, np.int64), np.empty(L)
+    number, bad = np.empty(L, np.int64), np.empty(L, np.int64)
+    together = clock[0] == POISSON  # all of them are one clock
     for r in range(runs):
         draw_state(size, random, start[0], start[2], path[0])
         integrals(size, random, step_law[0], step_law[1], path)
         start_filters(start[0], start[1], m, S)
+        start_chains(random, loss, bad)
         now[:], used[:], t = 0.0, 0.0, 0.0
+        if together:
+            t = clock[1] / L * random.standard_exponential()
+        else:
+            for e in range(L):
+                start_clock(random, clock, e, phase, number, heap, owner)
+            t = heap[0]
         for probe in range(len(times)):
-            while True:
-                t += mean_gap * random.standard_exponential()
-                if t > times[probe]:
-                    break
+            while t <= times[probe]:
                 ticks += 1
-                draw = random.random() * len(ends)
-                link = int(draw)
-                if draw - link < delivery:  # where messages are lost nothing happens
+                u = random.random()
+                if together:
+                    u *= L
+                    link = int(u)
+                    u -= link
+                else:
+                    link = owner[0]
+                if arrives(random, u, loss, bad, link):  # else nothing happens
                     i, j = ends[link, 0], ends[link, 1]
                     for k in (i, j):
                         advance(
-                            size,
-                            both,
-                            random,
-                            table,
-                            H,
-                            noise,
-                            path,
-                            t,
-                            k,
-                            rows,
-                            now,
-                            used,
-                            m,
-                            S,
-                            law,
-                            dy,
-                            E,
-                            d,
-                            work,
-                        )
-                    reset(size, epsilon, i, j, m, S)
-            t = times[probe]  # clocks have no memory
+                            size, both, random, table, H, noise, path, t, k, rows, now, used, m, S,
+                            law, dy, E, d, work,
+                        )  # fmt: skip
+                    meet(size, rule, epsilon, i, j, m, S, d)
+                if together:
+                    t += clock[1] / L * random.standard_exponential()
+                else:
+                    heap[0] = tick_after(random, clock, link, t, phase, number)
+                    sink(heap, owner, L)
+                    t = heap[0]
             for k in range(N):
                 advance(
-                    size,
-                    both,
-                    random,
-                    table,
-                    H,
-                    noise,
-                    path,
-                    t,
-                    k,
-                    rows,
-                    now,
-                    used,
-                    m,
-                    S,
-                    law,
-                    dy,
-                    E,
-                    d,
-                    work,
-                )
-            keep(size, path[int(t / STEP + 0.5)], m, S, r, probe, x, xhat, P)
+                    size, both, random, table, H, noise, path, times[probe], k, rows, now, used, m,
+                    S, law, dy, E, d, work,
+                )  # fmt: skip
+            keep(size, path[int(times[probe] / STEP + 0.5)], m, S, r, probe, x, xhat, P)
     return ticks
 
 
-# Covariance intersection under clocks of nodes, with sampled sensors and messages under way
-
-
-@kernel
-def sift(heap, owner, k):
-    """Move entry k of a binary heap of times (K,) and their owners towards the first."""
-    t, e = heap[k], owner[k]
-    while k > 0:
-        up = (k - 1) // 2
-        if heap[up] <= t:
-            break
-        heap[k], owner[k] = heap[up], owner[up]
-        k = up
-    heap[k], owner[k] = t, e
-
-
-@kernel
-def sink(heap, owner, count):
-    """Move the first of ``count`` entries of a heap to its place."""
-    t, e, k = heap[0], owner[0], 0
-    while True:
-        down = 2 * k + 1
-        if down >= count:
-            break
-        if down + 1 < count and heap[down + 1] < heap[down]:
-            down += 1
-        if heap[down] >= t:
-            break
-        heap[k], owner[k] = heap[down], owner[down]
-        k = down
-    heap[k], owner[k] = t, e
+# Broadcasts by clocks of nodes, with sampled sensors and messages under way: covariance
+# intersection, and push-sum by running sums
 
 
 @kernel
@@ -821,65 +892,152 @@ def intersect(size, epsilon, k, other, m, S):
 
 
 @kernel
-def intersection(
-    size, random, times, table, start, sensors, sampling, clock, links, delay, epsilon, x, xhat, P
-):
-    """Nodes broadcast at ticks of periodic clocks, and intersect with what arrives later.
+def fade(size, back, total, k, gap, law, work):
+    """Make entry k of ``total`` (K, 1 + n (n + 1) / 2 + n), a weight, the lower triangle of an
+    information U and U x, refer to x after a gap: U <- M' U M and U x <- e^(-r gap) M' U x;
+    ``back`` has the laws of M = e^(-r gap) e^(-A gap) and, after them, of e^(-r gap).
+    """
+    n = len(size)
+    first = 1 + n * (n + 1) // 2
+    while gap > 0.0:
+        laws(back, min(gap, SPAN), len(law), law)
+        for i in range(n):
+            for j in range(n):
+                s = 0.0
+                for c in range(n):
+                    a, b = max(i, c), min(i, c)
+                    s += total[k, 1 + a * (a + 1) // 2 + b] * law[c * n + j]
+                work[i, j] = s
+            work[n, i] = total[k, first + i]
+        for i in range(n):
+            for j in range(i + 1):
+                s = 0.0
+                for c in range(n):
+                    s += law[c * n + i] * work[c, j]
+                total[k, 1 + i * (i + 1) // 2 + j] = s
+            s = 0.0
+            for c in range(n):
+                s += law[c * n + i] * work[n, c]
+            total[k, first + i] = law[n * n] * s
+        gap -= SPAN
 
-    ``times`` (T,) of probes; ``table`` of laws F, Q; ``start`` mean, covariance and its root;
-    ``sensors`` H (S, 1, n), of variance 1, and their nodes (S,); ``sampling`` and ``clock``:
-    period and jitter, of random phases; ``links``: offsets (N + 1,), receivers and delivery
-    probabilities; ``delay``: uniform from its first to its second value. Returns the number of
-    ticks, samples and messages sent.
+
+@kernel
+def offer(size, e, degree, m, S, weight, sent, work):
+    """Node e adds a share for each of its receivers to what it ever sent; ``work`` (n + 1, n)."""
+    n, N = len(size), len(weight)
+    share = weight[e] / (degree + 1)
+    weight[e] -= degree * share
+    sent[e, 0] += share
+    for i in range(n):
+        for j in range(n):
+            work[i, j] = S[e, i, j]
+    S0 = work.reshape((1, n + 1, n))
+    invert(size, S0, 0)
+    for i in range(n):
+        s = 0.0
+        for j in range(n):
+            s += work[i, j] * m[e, j]
+        sent[e, 1 + n * (n + 1) // 2 + i] += share / N * s
+        for j in range(i + 1):
+            sent[e, 1 + i * (i + 1) // 2 + j] += share / N * work[i, j]
+
+
+@kernel
+def gain(size, k, link, slot, m, S, weight, heard, total, line):
+    """Node k gains what the total of a message has more than the last one heard on its link."""
+    n, N = len(size), len(weight)
+    invert_entry(size, k, m, S, line)
+    more = total[slot, 0] - heard[link, 0]
+    own, share = weight[k] / (weight[k] + more), N / (weight[k] + more)
+    weight[k] += more
+    for i in range(n):
+        e = 1 + n * (n + 1) // 2 + i
+        m[k, i] = own * m[k, i] + share * (total[slot, e] - heard[link, e])
+        for j in range(i + 1):
+            e = 1 + i * (i + 1) // 2 + j
+            S[k, i, j] = own * S[k, i, j] + share * (total[slot, e] - heard[link, e])
+            S[k, j, i] = S[k, i, j]
+    for e in range(total.shape[1]):
+        heard[link, e] = total[slot, e]
+    invert_entry(size, k, m, S, line)
+
+
+@kernel
+def broadcasts(
+    size, random, times, table, back, start, sensors, sampling, clock, links, loss, delay, rule,
+    epsilon, x, xhat, P,
+):  # fmt: skip
+    """Nodes broadcast at ticks of their clocks, and intersect with what arrives, or gain it.
+
+    ``times`` (T,) of probes; ``table`` of laws F, Q and ``back`` of ``fade``; ``start`` mean,
+    covariance and its root; ``sensors`` H (S, 1, n), of variance 1, and their nodes (S,);
+    ``sampling`` and ``clock`` of ``tick_after``; ``links``: offsets (N + 1,) and receivers (L,);
+    ``loss`` of ``arrives``; ``delay``: uniform from its first to its second value, or exponential
+    with its third as mean. Returns the number of ticks, samples and messages sent.
     """
     n, (runs, _, N, _) = len(size), xhat.shape
-    (H, owners), (first, receivers, delivery) = sensors, links
-    room = 64 * N
+    (H, owners), (first, receivers) = sensors, links
+    L, room, length = len(receivers), 64 * N, 1 + n * (n + 1) // 2 + n
     m, S = np.empty((N + room, n)), np.empty((N + room, n, n))
-    now, receiver, free = np.empty(N + room), np.empty(room, np.int64), np.empty(room, np.int64)
+    now, over, free = np.empty(N + room), np.empty(room, np.int64), np.empty(room, np.int64)
     entities = N + len(owners)
     heap, owner = np.empty(entities + room), np.empty(entities + room, np.int64)
-    phase, number = np.empty(entities), np.empty(entities, np.int64)
+    phase, number, bad = np.empty(entities), np.empty(entities, np.int64), np.empty(L, np.int64)
     law, work = np.empty(table.shape[2]), np.empty((n + 1, n))
-    root, gain, truth, events = np.zeros((n, n)), np.empty(n), np.empty((1, n)), 0
+    fading, scaled = np.empty(back.shape[2]), np.empty((1, 1, n))
+    root, line, truth, events = np.zeros((n, n)), np.empty(n), np.empty((1, n)), 0
+    total, weight = np.empty((room, length)), np.empty(N)
+    sent, sent_at, rounds = np.empty((N, length)), np.empty(N), np.empty(N, np.int64)
+    heard, heard_at, newest = np.empty((L, length)), np.empty(L), np.empty(L, np.int64)
+    numbered = np.empty(room, np.int64)
     for r in range(runs):
         draw_state(size, random, start[0], start[2], truth[0])
         start_filters(start[0], start[1], m[:N], S[:N])
-        now[:N], number[:], last, count, spare = 0.0, 0, 0.0, 0, room
+        start_chains(random, loss, bad)
+        weight[:], sent[:], sent_at[:], rounds[:] = 1.0, 0.0, 0.0, 0
+        heard[:], heard_at[:], newest[:] = 0.0, 0.0, 0
+        now[:N], last, spare, count = 0.0, 0.0, room, entities
         for k in range(room):
             free[k] = k
         for e in range(entities):
-            period, jitter = clock if e < N else sampling
-            phase[e] = period * random.random()
-            heap[count], owner[count] = phase[e] + jitter * random.random(), e
-            count += 1
-            sift(heap, owner, count - 1)
+            start_clock(random, clock if e < N else sampling, e, phase, number, heap, owner)
         for probe in range(len(times)):
             while heap[0] <= times[probe]:
                 t, e, events = heap[0], owner[0], events + 1
                 if e < entities:
-                    period, jitter = clock if e < N else sampling
-                    number[e] += 1
-                    heap[0] = phase[e] + number[e] * period + jitter * random.random()
-                    sink(heap, owner, count)
+                    heap[0] = tick_after(random, clock if e < N else sampling, e, t, phase, number)
                 else:
                     count -= 1
                     heap[0], owner[0] = heap[count], owner[count]
-                    sink(heap, owner, count)
+                sink(heap, owner, count)
                 if e < N:
                     move_to(size, table, t, e, now, m, S, law, work)
+                    if rule == SUMS:
+                        fade(size, back, sent, e, t - sent_at[e], fading, work)
+                        offer(size, e, first[e + 1] - first[e], m, S, weight, sent, work)
+                        sent_at[e] = t
+                        rounds[e] += 1
                     for k in range(first[e], first[e + 1]):
                         events += 1
-                        if random.random() < delivery[k]:
+                        if arrives(random, random.random(), loss, bad, k):
                             spare -= 1
                             slot = free[spare]
-                            receiver[slot], own = receivers[k], N + slot
+                            over[slot], own = k, N + slot
                             now[own] = t
-                            for i in range(n):
-                                m[own, i] = m[e, i]
-                                for j in range(n):
-                                    S[own, i, j] = S[e, i, j]
-                            arrival = t + delay[0] + (delay[1] - delay[0]) * random.random()
+                            if rule == SUMS:
+                                numbered[slot] = rounds[e]
+                                for i in range(length):
+                                    total[slot, i] = sent[e, i]
+                            else:
+                                for i in range(n):
+                                    m[own, i] = m[e, i]
+                                    for j in range(n):
+                                        S[own, i, j] = S[e, i, j]
+                            if delay[2] > 0.0:
+                                arrival = t + delay[2] * random.standard_exponential()
+                            else:
+                                arrival = t + delay[0] + (delay[1] - delay[0]) * random.random()
                             heap[count], owner[count] = arrival, entities + slot
                             count += 1
                             sift(heap, owner, count - 1)
@@ -888,13 +1046,28 @@ def intersection(
                     last, k = t, owners[e - N]
                     y = read(size, random, H, e - N, 0, truth[0])
                     move_to(size, table, t, k, now, m, S, law, work)
-                    update(size, y, H, e - N, 0, m, S, k, gain)
+                    if rule == SUMS:
+                        scale = np.sqrt(N / weight[k])
+                        for i in range(n):
+                            scaled[0, 0, i] = scale * H[e - N, 0, i]
+                        update(size, scale * y, scaled, 0, 0, m, S, k, line)
+                    else:
+                        update(size, y, H, e - N, 0, m, S, k, line)
                 else:
                     slot = e - entities
-                    k, own = receiver[slot], N + slot
-                    move_to(size, table, t, own, now, m, S, law, work)
-                    move_to(size, table, t, k, now, m, S, law, work)
-                    intersect(size, epsilon, k, own, m, S)
+                    link, own = over[slot], N + slot
+                    k = receivers[link]
+                    if rule != SUMS:
+                        move_to(size, table, t, own, now, m, S, law, work)
+                        move_to(size, table, t, k, now, m, S, law, work)
+                        intersect(size, epsilon, k, own, m, S)
+                    elif numbered[slot] > newest[link]:
+                        newest[link] = numbered[slot]
+                        move_to(size, table, t, k, now, m, S, law, work)
+                        fade(size, back, total, slot, t - now[own], fading, work)
+                        fade(size, back, heard, link, t - heard_at[link], fading, work)
+                        heard_at[link] = t
+                        gain(size, k, link, slot, m, S, weight, heard, total, line)
                     free[spare] = slot
                     spare += 1
             if times[probe] > last:

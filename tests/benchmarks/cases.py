@@ -43,6 +43,21 @@ def planar(nodes, horizon=10.0, degree=4):
     return hybrid(nodes, horizon, degree, **changes)
 
 
+BURSTS = {"kind": "gilbert-elliott", "mean_loss": 0.3, "mean_burst": 4.0}
+LATTICE = {"kind": "periodic", "period": 0.5, "phase": "random", "jitter": 0.1}
+ERLANG = {"kind": "renewal", "distribution": "gamma", "shape": 3.0, "mean": 0.5}
+"""Losses and clocks, in the mean those of poisson_ring."""
+
+
+def ring(loss=None, clock=None, **changes):
+    """poisson_ring with other losses, clocks or anything else."""
+    if loss is not None:
+        changes["network.channel.loss"] = loss
+    if clock is not None:
+        changes["network.activation"] = clock
+    return load("poisson_ring").replace(changes)
+
+
 def radio(nodes):
     """intel_lab_radio on a random graph, two sensors of each axis for 30 nodes."""
     load_radio = load("intel_lab_radio")

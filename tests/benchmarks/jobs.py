@@ -2,13 +2,28 @@
 that makes runs, and its results.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
+from netkf.network.channels import ExponentialDelay, GilbertElliott
+from netkf.network.clocks import Poisson, Renewal
 from tests.benchmarks import by_hand
-from tests.benchmarks.by_hand import BINS, ORDER, SPAN, STEP
+from tests.benchmarks.by_hand import (
+    BINS,
+    GAMMA,
+    INTERSECT,
+    LATTICE,
+    ORDER,
+    POISSON,
+    RESET,
+    SPAN,
+    STEP,
+    SUMS,
+    SWAP,
+)
 
 
 class Results(NamedTuple):
@@ -33,7 +48,8 @@ class Results(NamedTuple):
 def prepared(case, runs, seed=1):
     """A call that makes a number of runs, ``runs`` at once, and the results of the last ones."""
     results = Results.empty(case, runs)
-    kernel, before, after = JOBS[type(case.filter.algorithm).__name__](case)
+    jobs = SLOT_JOBS if case.slotted else CLOCK_JOBS
+    kernel, before, after = jobs[type(case.filter.algorithm).__name__](case)
     random = np.random.default_rng(seed)
     size = (0,) * case.plant.n
 
@@ -143,10 +159,16 @@ def diffusion(case):
     return by_hand.diffusion, (), (probe_slots(case), plant, model, *rest)
 
 
+def interpolated(entries):
+    """Coefficients (BINS, ORDER + 1, E) of E entries as polynomials in the gap."""
+    points = np.polynomial.chebyshev.chebpts1(ORDER + 1) * 0.5 * SPAN / BINS
+    middles = (np.arange(BINS) + 0.5) * SPAN / BINS
+    values = np.array([[entries(middle + point) for point in points] for middle in middles])
+    return np.linalg.solve(np.vander(points, increasing=True), values)
+
+
 def laws(A, B, H, V):
-    """Coefficients (BINS, ORDER + 1, E) of ``by_hand.flow``'s laws as polynomials in the gap, and
-    the law of state and both integrals over STEP.
-    """
+    """``interpolated`` laws of ``by_hand.flow``; law of state and both integrals over STEP."""
     n, chain, spread = len(A), *(np.zeros((3 * len(A),) * 2) for _ in range(2))
     chain[:n, :n], chain[n:, : 2 * n], spread[:n, :n] = A, np.eye(2 * n), B @ B.T
 
@@ -166,31 +188,55 @@ def laws(A, B, H, V):
         parts = F[:n, :n], Q[:n, :n][low], T @ F[n:, :n], Q[:n, n:] @ T.T, S0[low_S0]
         return np.concatenate([part.ravel() for part in parts])
 
-    # Interpolated between Chebyshev points.
-    points = np.polynomial.chebyshev.chebpts1(ORDER + 1) * 0.5 * SPAN / BINS
-    middles = (np.arange(BINS) + 0.5) * SPAN / BINS
-    values = np.array([[entries(middle + point) for point in points] for middle in middles])
-    table = np.linalg.solve(np.vander(points, increasing=True), values)
     F, Q = over(STEP)
-    return table, (F, root_of(Q))
+    return interpolated(entries), (F, root_of(Q))
 
 
-def hybrid(case):
+def clock_of(clock):
+    """Kind and parameters, of ``by_hand.tick_after``."""
+    if isinstance(clock, Poisson):
+        assert not clock.rates, "one rate"
+        return POISSON, 1.0 / clock.rate, 0.0
+    if isinstance(clock, Renewal):
+        assert clock.distribution == "gamma"
+        return GAMMA, clock.shape, clock.mean_gap / clock.shape
+    assert clock.phase == "random"
+    return LATTICE, clock.period, clock.jitter
+
+
+def loss_of(case, links):
+    """Deliveries (2, L) over these directed links in a good and a bad state, and the chances of
+    turning bad and good.
+    """
+    loss = case.network.channel.loss
+    table = np.array(
+        [
+            [
+                loss.delivery_probability(link, 0, bad, case.table_probability(link))
+                for link in links
+            ]
+            for bad in (False, True)
+        ]
+    )
+    return table, *(loss.transitions if isinstance(loss, GilbertElliott) else (0.0, 1.0))
+
+
+def pairs(case, rule):
     seen = {node: case.observation_matrices(node) for node in case.sensing_nodes}
     H, V = (np.array(part) for part in next(iter(seen.values())))
     assert all((h == H).all() and (R == V).all() for h, R in seen.values()), "one kind of sensor"
+    assert case.network.channel.symmetric
     table, step_law = laws(np.array(case.plant.A), np.array(case.plant.B), H, V)
     rows = np.array([len(H) * (node in seen) for node in case.nodes])
-    clock = case.network.activation.rate, delivery(case), case.filter.algorithm.epsilon
-    before = ((0,) * 2 * len(H),)
-    times = np.array(case.times)
-    sensor = H, np.linalg.cholesky(V)
-    after = times, step_law, table, started(case), sensor, rows, ends_of(case), clock
-    return by_hand.hybrid, before, after
+    sensor, ends = (H, np.linalg.cholesky(V)), ends_of(case)
+    clock, loss = clock_of(case.network.activation), loss_of(case, case.topology.links)
+    combination = clock, loss, rule, getattr(case.filter.algorithm, "epsilon", 0.0)
+    after = np.array(case.times), step_law, table, started(case), sensor, rows, ends, *combination
+    return by_hand.pairs, ((0,) * 2 * len(H),), after
 
 
 def gap_laws(A, B):
-    """Coefficients (BINS, ORDER + 1, E) of F and the lower triangle of Q, as in ``laws``."""
+    """``interpolated`` F and lower triangle of Q."""
     n = len(A)
     block = np.block([[-A, B @ B.T], [np.zeros_like(A), A.T]])
 
@@ -199,43 +245,65 @@ def gap_laws(A, B):
         F = M[n:, n:].T
         return np.concatenate([F.ravel(), (F @ M[:n, n:])[np.tril_indices(n)]])
 
-    points = np.polynomial.chebyshev.chebpts1(ORDER + 1) * 0.5 * SPAN / BINS
-    middles = (np.arange(BINS) + 0.5) * SPAN / BINS
-    values = np.array([[entries(middle + point) for point in points] for middle in middles])
-    return np.linalg.solve(np.vander(points, increasing=True), values)
+    return interpolated(entries)
 
 
-def intersection(case):
+def fading_laws(A):
+    """``interpolated`` e^(-r gap) e^(-A gap) and e^(-r gap), with r the rate of decay of A."""
+    rates = -np.linalg.eigvals(A).real
+    assert np.ptp(rates) < 1e-9, "one rate of decay"
+    r = max(rates[0], 0.0)
+
+    def entries(gap):
+        fading = np.exp(-r * gap)
+        return np.append(fading * scipy.linalg.expm(-A * gap), fading)
+
+    return interpolated(entries)
+
+
+def broadcasts(case, rule):
     places = {node: k for k, node in enumerate(case.nodes)}
     placed = [(node, sensor) for sensor in case.sensors for node in sensor.nodes if node in places]
     H = np.array([np.linalg.solve(np.linalg.cholesky(s.R), s.H) for _, s in placed])
     owners = np.array([places[node] for node, _ in placed])
-    sampling, clock = case.sensors[0].sampling, case.network.activation
-    sent = sorted(
-        (places[i], places[j], case.table_probability((i, j))) for i, j in case.topology.directions
-    )
-    senders, receivers, table = (np.array(column) for column in zip(*sent, strict=True))
-    links = np.searchsorted(senders, np.arange(len(places) + 1)), receivers, table * delivery(case)
-    delay = case.network.channel.delay
+    sent = sorted((places[i], places[j], (i, j)) for i, j in case.topology.directions)
+    senders, receivers, directions = zip(*sent, strict=True)
+    links = np.searchsorted(senders, np.arange(len(places) + 1)), np.array(receivers)
+    channel, A = case.network.channel, np.array(case.plant.A)
+    assert not channel.symmetric
+    exponential = isinstance(channel.delay, ExponentialDelay)
     after = (
         np.array(case.times),
-        gap_laws(np.array(case.plant.A), np.array(case.plant.B)),
+        gap_laws(A, np.array(case.plant.B)),
+        fading_laws(A) if rule == SUMS else np.empty((0, 0, 0)),
         started(case),
         (H, owners),
-        (sampling.period, sampling.jitter),
-        (clock.period, clock.jitter),
+        clock_of(case.sensors[0].sampling),
+        clock_of(case.network.activation),
         links,
-        (delay.low, delay.high),
-        case.filter.algorithm.epsilon,
+        loss_of(case, directions),
+        (0.0, 0.0, channel.delay.mean)
+        if exponential
+        else (channel.delay.low, channel.delay.high, 0.0),
+        rule,
+        getattr(case.filter.algorithm, "epsilon", 0.0),
     )
-    return by_hand.intersection, (), after
+    return by_hand.broadcasts, (), after
 
 
-JOBS = {
-    "CovarianceIntersection": intersection,
+def intersection(case):
+    return broadcasts(case, INTERSECT) if case.sampled_sensors else pairs(case, INTERSECT)
+
+
+SLOT_JOBS = {
     "Gossip": gossip,
     "Intermittent": intermittent,
     "PushSum": push_sum,
     "DiffusionFilter": diffusion,
-    "Hybrid": hybrid,
+}
+CLOCK_JOBS = {
+    "CovarianceIntersection": intersection,
+    "Gossip": partial(pairs, rule=SWAP),
+    "Hybrid": partial(pairs, rule=RESET),
+    "PushSum": partial(broadcasts, rule=SUMS),
 }

@@ -103,12 +103,20 @@ def simpy_alone():
     return Side(lambda _: bare_simpy.engine_run(case)), theirs
 
 
+INTERSECTION = {"kind": "covariance-intersection", "epsilon": 0.3}
+
 ROWS = [
     kernel("hybrid, ring of 6, n = 2", partial(cases.load, "poisson_ring"), 3.0),
     kernel("hybrid, 50 nodes, n = 4, 17 sensors", partial(cases.planar, 50), 2.0),
     kernel("hybrid, 1000 nodes, n = 4, 334 sensors", partial(cases.planar, 1000), 2.0),
     kernel("hybrid, 1000 nodes, n = 2, 2 sensors", partial(cases.hybrid, 1000), 2.0),
     kernel("hybrid, unstable plant, 2 nodes, n = 1", partial(cases.load, "threshold"), 3.0),
+    kernel("hybrid, ring of 6, bursts of loss", partial(cases.ring, cases.BURSTS), 3.0),
+    kernel("hybrid, ring of 6, periodic", partial(cases.ring, clock=cases.LATTICE), 3.0),
+    kernel("hybrid, ring of 6, Erlang", partial(cases.ring, clock=cases.ERLANG), 3.0),
+    kernel("gossip, ring of 6, clocks", partial(cases.ring, filter={"kind": "gossip"}), 3.0),
+    kernel("intersection, ring of 6, clocks", partial(cases.ring, filter=INTERSECTION), 3.0),
+    kernel("push-sum, 10 nodes, clocks", partial(cases.load, "push_sum_continuous"), 3.0),
     kernel("gossip, ring of 5, 400 slots", partial(cases.load, "gossip_ring"), 3.0),
     kernel("gossip, 100 nodes, degree 4, 400 slots", partial(cases.gossip, 100), 3.0),
     kernel("push-sum, 10 nodes, gamma 3", partial(cases.load, "push_sum_planar"), 3.0),

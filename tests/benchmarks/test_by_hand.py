@@ -18,7 +18,7 @@ from netkf.linalg.linking import linked_once
 from tests.benchmarks import by_hand, cases, jobs, peers
 
 STANDARD_ERRORS, SHARE = 4.5, 1e-5
-JOBS = "hybrid", "intersection", "gossip", "push_sum", "diffusion", "intermittent"
+JOBS = "pairs", "broadcasts", "gossip", "push_sum", "diffusion", "intermittent"
 CODE = Path(__file__).parent / "__pycache__" / "slower"
 """Where benchmarks do not find it."""
 
@@ -81,11 +81,40 @@ def intermittent():
 
 
 def intersection():
-    changes = {"probe": 0.5, "horizon": 4.0, "network.activation.period": 0.3}
+    losses = {
+        "network.channel.loss": {"kind": "gilbert-elliott", "mean_loss": 0.5, "mean_burst": 4}
+    }
+    changes = {"probe": 0.5, "horizon": 4.0, "network.activation.period": 0.3, **losses}
     return cases.radio(12).replace(changes), 100
 
 
-@pytest.mark.parametrize("make", [hybrid, intersection, gossip, push_sum, diffusion, intermittent])
+def pairs(**changes):
+    return cases.ring(**changes).replace({"horizon": 10.0, "probe": 1.0}), 400
+
+
+def bursts():
+    return pairs(loss=cases.BURSTS, clock=cases.LATTICE)
+
+
+def swaps():
+    return pairs(filter={"kind": "gossip"}, clock=cases.ERLANG)
+
+
+def intersecting_pairs():
+    return pairs(filter={"kind": "covariance-intersection", "epsilon": 0.3})
+
+
+def running_sums():
+    return cases.load("push_sum_continuous").replace({"horizon": 8.0}), 500
+
+
+MAKE = [
+    *(hybrid, bursts, swaps, intersecting_pairs, intersection, running_sums),
+    *(gossip, push_sum, diffusion, intermittent),
+]
+
+
+@pytest.mark.parametrize("make", MAKE)
 @pytest.mark.usefixtures("slower")
 def test_means_over_runs_agree(make):
     case, runs = make()
