@@ -39,6 +39,6 @@ class Gossip(Filter):
     timing = Timing(
         schedule=("exchange", "sense", "predict"), clocks=("links",), predicts=True, pairwise=True
     )
-    kernels = Kernels(absorb=swap)
+    kernels = Kernels(absorb=swap, unrolled=True)
 
     shift = Filter.shift  # affine in readings and messages

@@ -352,4 +352,5 @@ KERNELS = Kernels(
     decides=True,
     depends_on_data=False,
     counts_sends=True,
+    unrolled=True,
 )

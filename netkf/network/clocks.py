@@ -251,6 +251,17 @@ class Renewal(LinkClock):
             return self.scale * mean_of_unit_scale
         return self.mean if self.mean is not None else 1.0 / (self.rate or math.nan)
 
+    @property
+    def gamma_scale(self) -> tuple[float, float]:
+        """What a gamma number of scale 1 is divided by and then multiplied with: a gap, seconds."""
+        shape = self.shape or 1.0
+        return (shape * self.rate, 1.0) if self.rate else (1.0, self.mean_gap / shape)
+
+    @property
+    def weibull_scale(self) -> float:
+        """What a Weibull number of scale 1 is multiplied with: a gap, seconds."""
+        return self.mean_gap / math.gamma(1.0 + 1.0 / (self.shape or 1.0))
+
     def mean_rate(self, entity: Entity) -> float:
         """Return one over the mean gap, in ticks per second."""
         return 1.0 / self.mean_gap
@@ -284,11 +295,12 @@ class Renewal(LinkClock):
         # Gaps of unit scale, scaled to their mean.
         shape = self.shape or 1.0
         if self.distribution == "gamma":
-            gaps = random.standard_gamma(shape, count)
-            gaps = gaps / (shape * self.rate) if self.rate else gaps * (self.mean_gap / shape)
+            divisor, factor = self.gamma_scale
+            gaps = random.standard_gamma(shape, count) / divisor * factor
         elif self.distribution == "weibull":
-            scale = self.mean_gap / math.gamma(1.0 + 1.0 / shape)
-            gaps = random.standard_exponential(count) ** (1.0 / shape) * scale
+            # One by one: numpy's powers of arrays differ in the last bit from one CPU to another.
+            drawn = random.standard_exponential(count).tolist()
+            gaps = np.array([math.pow(gap, 1.0 / shape) for gap in drawn]) * self.weibull_scale
         elif self.distribution == "uniform":
             assert self.low is not None
             assert self.high is not None

@@ -16,6 +16,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.small import multiply_square
 
 TERMS = 18  # of the exponential series: enough for a norm of at most 1/2
+NEGLIGIBLE = 2.0**-60  # a bound of the norm of terms that change no digit
 
 
 @kernel
@@ -114,12 +115,15 @@ def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None
     halvings, step = 0, -gap
     while norm > 0.5:
         norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
-    for k in range(1, TERMS):
+    k, size = 1, norm
+    while size > NEGLIGIBLE:
         multiply_square(product, term, A)
         for i in range(n):
             for j in range(n):
                 term[i, j] = product[i, j] * step / k
                 out[i, j] += term[i, j]
+        k += 1
+        size *= norm / k
     for _ in range(halvings):
         multiply_square(product, out, out)
         for i in range(n):

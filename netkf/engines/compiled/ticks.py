@@ -32,6 +32,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
 from netkf.rng.draws import Ziggurat, fill_units, next_exponential, next_unit, ziggurat
+from netkf.rng.numbers import NormalZiggurat, next_gamma, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
@@ -40,19 +41,24 @@ TICKS, MIN_TICKS_PER_ENTITY = 1 << 15, 4
 MIN_TICKS_PER_ENTITY for each entity, since each has a fixed cost in a window; at most
 MAX_WINDOW_TICKS.
 """
-EXPONENTIAL_GAPS, UNIFORM_GAPS, LATTICE = range(3)
+EXPONENTIAL_GAPS, UNIFORM_GAPS, GAMMA_GAPS, WEIBULL_GAPS, LATTICE = range(5)
 """Kinds of clocks: random gaps, and times that follow from the number of the tick, but for a
 jitter.
 """
+CROWDING_SHAPE = 100.0
+"""Gaps of larger shapes are so regular that the ticks of all entities crowd."""
 
 
 class Clocks(NamedTuple):
     """The clocks of R runs, E entities in all; ``first`` and ``outgoing`` are those of a run.
 
-    kind : EXPONENTIAL_GAPS, UNIFORM_GAPS or LATTICE
+    kind : EXPONENTIAL_GAPS, ... or LATTICE
     next_tick, number : (E,), time of the next tick, seconds, not on the grid yet, and its number
-    scale : (E,), ticks per second of random gaps, or the time from which a lattice is counted
-    low, width : uniform gaps and jitters are ``low + width u``; ``low`` is the period of a lattice
+    scale : (E,), what draws of exponential or gamma gaps are divided by, or the time from which a
+            lattice is counted
+    low, width : uniform gaps and jitters are ``low + width u``; ``low`` is the period of a lattice,
+                 the shape of gamma gaps or one over that of Weibull gaps; ``width`` their factor
+    crowds : whether ticks may be unevenly spread over time
     streams : (E, WIDTH), states of the random streams
     first, outgoing : entity e of a run sends on the directions ``outgoing[first[e]:first[e + 1]]``
     per_second : ticks of the time grid in a second (core.instants)
@@ -64,6 +70,7 @@ class Clocks(NamedTuple):
     scale: FloatArray
     low: float
     width: float
+    crowds: bool
     streams: np.ndarray
     first: IntArray
     outgoing: IntArray
@@ -116,19 +123,27 @@ def draw_ticks(
             )
             m += 1
             # The next tick is drawn now: it may lie in the next window.
-            now = tick_after(clocks, k, now, channels.exponential)
+            now = tick_after(clocks, k, now, channels.exponential, channels.normal)
             instant = snapped(now, clocks.per_second)
         clocks.next_tick[k], counts[0] = now, m
     return True
 
 
 @kernel(inlined=True)
-def tick_after(clocks: Clocks, k: int, now: float, exponential: Ziggurat) -> float:
+def tick_after(
+    clocks: Clocks, k: int, now: float, exponential: Ziggurat, normal: NormalZiggurat
+) -> float:
     """Return the time of the tick of entity ``k`` after that at ``now`` (seconds), off the grid."""
     if clocks.kind == EXPONENTIAL_GAPS:
         return float(now + next_exponential(clocks.streams, k, exponential) / clocks.scale[k])
     if clocks.kind == UNIFORM_GAPS:
         return now + (clocks.low + clocks.width * next_unit(clocks.streams, k))
+    if clocks.kind == GAMMA_GAPS:
+        drawn = next_gamma(clocks.streams, k, clocks.low, exponential, normal)
+        return float(now + drawn / clocks.scale[k] * clocks.width)
+    if clocks.kind == WEIBULL_GAPS:
+        drawn = next_exponential(clocks.streams, k, exponential)
+        return now + math.pow(drawn, clocks.low) * clocks.width
     number = clocks.number[k]
     clocks.number[k] = number + 1
     time: float = clocks.scale[k] + clocks.low * number
@@ -138,10 +153,10 @@ def tick_after(clocks: Clocks, k: int, now: float, exponential: Ziggurat) -> flo
 
 
 @kernel
-def start_clocks(clocks: Clocks, exponential: Ziggurat) -> None:
+def start_clocks(clocks: Clocks, exponential: Ziggurat, normal: NormalZiggurat) -> None:
     """Draw the first tick of each entity."""
     for k in range(len(clocks.next_tick)):
-        clocks.next_tick[k] = tick_after(clocks, k, 0.0, exponential)
+        clocks.next_tick[k] = tick_after(clocks, k, 0.0, exponential, normal)
 
 
 class Sorting(NamedTuple):
@@ -290,7 +305,7 @@ def draw_all_ticks(
             ticks.first_outcome[first:last],
             buffer.delay,
         )
-        if clocks.kind == LATTICE:
+        if clocks.crowds:
             merge_in_time_order(counts[0], buffer, ordered, sorting)
         else:
             put_in_time_order(0.0, horizon, counts[0], buffer, ordered, sorting)
@@ -304,9 +319,7 @@ def draw_all_ticks(
 def is_kernel_clock(clock: object) -> bool:
     """Return True if kernels can draw the ticks of a clock."""
     # By exact type: a subclass may override the law.
-    if type(clock) is Renewal:
-        return clock.distribution in ("uniform", "constant")
-    return type(clock) in (Poisson, Periodic)
+    return type(clock) in (Poisson, Periodic, Renewal)
 
 
 def is_drawn_in_kernels(scenario: Scenario) -> bool:
@@ -326,7 +339,7 @@ def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Send
     assert isinstance(clock, LinkClock)
     count = len(entities) * runs
     kind, low, width, number = EXPONENTIAL_GAPS, 0.0, 0.0, np.zeros(count, dtype=np.int64)
-    scale = np.tile(_rates(scenario), runs)
+    scale, shape = np.tile(_rates(scenario), runs), getattr(clock, "shape", None) or 0.0
     if isinstance(clock, Periodic):
         kind, low, width = LATTICE, clock.period, clock.jitter
         if isinstance(clock.phase, str):
@@ -340,6 +353,11 @@ def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Send
         assert clock.low is not None
         assert clock.high is not None
         kind, low, width = UNIFORM_GAPS, clock.low, clock.high - clock.low
+    elif isinstance(clock, Renewal) and clock.distribution == "gamma":
+        divisor, width = clock.gamma_scale
+        kind, low, scale = GAMMA_GAPS, shape, np.full(count, divisor)
+    elif isinstance(clock, Renewal) and clock.distribution == "weibull":
+        kind, low, width = WEIBULL_GAPS, 1.0 / shape, clock.weibull_scale
     elif isinstance(clock, Renewal):
         kind, low, number, scale = LATTICE, clock.mean_gap, number + 1, np.zeros(count)
     return Clocks(
@@ -349,6 +367,7 @@ def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Send
         scale=scale,
         low=low,
         width=width,
+        crowds=kind == LATTICE or shape > CROWDING_SHAPE,
         streams=streams.states("clock", entities),
         first=senders.first,
         outgoing=senders.outgoing,
@@ -379,7 +398,7 @@ class KernelSchedules:
         senders = senders_of(scenario)
         self._clocks = _clocks(scenario, streams, senders)
         self._channels = channel_streams(scenario, streams, senders, bits)
-        start_clocks(self._clocks, ziggurat())
+        start_clocks(self._clocks, ziggurat(), normal_ziggurat())
         rates = _rates(scenario)
         self._runs, self._rate = streams.runs, float(rates.sum())
         # Mean number of messages for each tick.
@@ -454,7 +473,7 @@ class KernelSchedules:
             ticks, sends = 2 * ticks, 2 * sends
         count = int(counts[0])
         ordered = _empty_buffer(count, 0)._replace(delay=self._buffer.delay[: counts[1]].copy())
-        if self._clocks.kind == LATTICE:
+        if self._clocks.crowds:
             merge_in_time_order(count, self._buffer, ordered, _sorting(count))
         else:
             put_in_time_order(begin, last, count, self._buffer, ordered, _sorting(count))
