@@ -21,7 +21,7 @@ from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
 from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_samples
 from netkf.engines.compiled.per_scenario import once_per_scenario
-from netkf.engines.compiled.sample_tables import SampleTables
+from netkf.engines.compiled.sample_tables import no_instants
 from netkf.engines.compiled.schedule import Window
 from netkf.engines.compiled.state import Filters, PathBlock, Sensing
 from netkf.engines.compiled.ticks import all_ticks, window_of
@@ -237,8 +237,7 @@ class BatchDraws:
         # One block of noise reaches the horizon.
         noise.following()
         self.sensing = noise.sensing
-        # An empty table: increment sensors have no samples.
-        self.instants = SampleTables(scenario, Streams(seed, replicas.start), {}).instants
+        self.instants = no_instants(scenario)
         self.states: States = PathStates(scenario, self.paths.frame_times)
 
     def window(self) -> Window:

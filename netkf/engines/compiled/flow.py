@@ -29,7 +29,7 @@ from netkf.engines.compiled.events import (
     WANT_TICKS,
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
-from netkf.engines.compiled.sample_tables import SampleTables
+from netkf.engines.compiled.sample_tables import samples_of
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.schedule import ReadingsSchedule, Window
 from netkf.engines.compiled.senders import senders_of
@@ -56,7 +56,7 @@ from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import Streams
-from netkf.scenario.sampling import all_sample_times, uses_grid
+from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
 from netkf.trace import recorder as recording
 from netkf.trace import schema
@@ -121,9 +121,8 @@ class Source:
         it; without a sensing grid (no sensor reads increments) the states at all samples are drawn
         here at once.
         """
-        times = scenario.sample_times(streams)
-        self._samples = samples = SampleTables(scenario, streams, times)
-        self._sampled = sampled = all_sample_times(times)
+        self._samples = samples = samples_of(scenario, streams)
+        self._sampled = sampled = samples.sampled
         self.instants = samples.instants
         self._windows = _make_windows(scenario, streams, samples.instants)
         self._grid = uses_grid(scenario)

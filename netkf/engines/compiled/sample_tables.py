@@ -1,18 +1,31 @@
-"""Tables of all samples of a run: instants, sensors and values."""
+"""Tables of all samples of a run: instants, sensors and values.
+
+Those of linear sensors with built-in clocks are drawn in compiled code, others sensor by sensor in
+Python; the numbers are those that the SimPy engine draws.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from netkf.engines.compiled.own_sensors import is_own, read_many
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import Instants
-from netkf.linalg.arrays import FloatArray
-from netkf.plants.sampling import Samples
+from netkf.engines.compiled.ticks import clocks_of, draw_instants, is_kernel_clock
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.portable import cholesky
+from netkf.network.clocks import LinkClock
+from netkf.plants import sampling
+from netkf.plants.sensors import LinearSensor
+from netkf.rng.draws import ziggurat
+from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor
+from netkf.scenario.sampling import all_sample_times
 from netkf.scenario.scenario import Scenario
 
 
@@ -22,26 +35,158 @@ class SampledSensor(NamedTuple):
     """
 
     times: FloatArray
-    samples: Samples
+    samples: sampling.Samples
     indices: np.ndarray
     varying: bool
 
 
-class SampleTables:
-    """The samples of one run. Their values are filled in by ``read`` once the states are drawn,
-    which do not depend on estimates. ``times`` (K,) in seconds are the sample times of each sensor,
-    by (node id, number of the sensor at the node).
+class Samples(Protocol):
+    """The samples of one run, sorted by time into ``instants`` (each a time at which a node takes
+    samples and uses them in one update); ``sampled`` (T,) are all their times, in seconds.
     """
 
-    def __init__(
-        self, scenario: Scenario, streams: Streams, times: dict[tuple[int, int], FloatArray]
-    ) -> None:
-        """Sort the samples of all sensors by time into ``instants`` (each a time at which a node
-        takes samples and uses them in one update), without their values; ``times`` (K,) in seconds
-        are those of each sensor, by (node id, number of the sensor at the node).
+    instants: Instants
+    sampled: FloatArray
+
+    def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
+        """Fill in the values ``instants.y`` (and H, where it varies) of the samples taken in
+        (``after``, ``until``] seconds, from the states (T, n) at T ``times`` (T,), which contain
+        their times; they do not depend on estimates.
         """
+
+
+def samples_of(scenario: Scenario, streams: Streams) -> Samples:
+    """Return the samples of a run, drawn in compiled code if possible."""
+    cls = KernelSamples if _kernel_sensors(scenario) is not None else SampleTables
+    return cls(scenario, streams)
+
+
+class KernelSensors(NamedTuple):
+    """What is drawn of S linear sensors, in the order of ``_placed_sensors``: the ``clocks`` of
+    their entries, each with the indices of its sensors, the ``keys`` of their streams, the mean
+    number of samples of a run, and the Cholesky factors ``root`` (S, p, p) of the true R.
+    """
+
+    clocks: list[tuple[LinkClock, np.ndarray, list[tuple[int, int]], FloatArray]]
+    keys: list[tuple[int, int]]
+    expected: float
+    root: FloatArray
+
+
+@once_per_scenario
+def _kernel_sensors(scenario: Scenario) -> KernelSensors | None:
+    """Return what kernels need to draw the samples of a scenario; None if they cannot."""
+    placed, tables = _placed_sensors(scenario), _sensor_tables(scenario)
+    parts = [scenario.sensors[p.entry] for _, p in placed]
+    # By exact type: a subclass may override the law.
+    if not placed or any(
+        type(part) is not LinearSensor or not is_kernel_clock(part.sampling) for part in parts
+    ):
+        return None
+    keys, entries = [(node, p.ordinal) for node, p in placed], [p.entry for _, p in placed]
+    clocks, root, expected = [], np.zeros_like(tables.root), 0.0
+    for entry in dict.fromkeys(entries):
+        indices = np.flatnonzero(np.array(entries) == entry)
+        clock: Any = parts[indices[0]].sampling
+        own = [keys[k] for k in indices]
+        rates = np.array([clock.mean_rate(key) for key in own])
+        clocks.append((clock, indices, own, rates))
+        expected += scenario.horizon * float(rates.sum())
+        R = cholesky(parts[indices[0]].R)
+        root[indices, : len(R), : len(R)] = R
+    return KernelSensors(clocks, keys, expected, root)
+
+
+class KernelSamples:
+    """The samples of linear sensors with built-in clocks."""
+
+    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+        sensors = _kernel_sensors(scenario)
+        assert sensors is not None
+        self._tables, self._root = _sensor_tables(scenario), sensors.root
+        parts = [
+            self._times(scenario, streams, clock, own, rates, indices)
+            for clock, indices, own, rates in sensors.clocks
+        ]
+        t, sensor = (np.concatenate(column) for column in zip(*parts, strict=True))
+        order = np.lexsort((sensor, t))
+        self._t, sensor = t[order], sensor[order]
+        self.instants = _make_instants(scenario, self._t, sensor)
+        self.sampled = np.unique(self._t)
+        self._noise = streams.states("noise", sensors.keys)
+
+    @staticmethod
+    def _times(
+        scenario: Scenario,
+        streams: Streams,
+        clock: LinkClock,
+        own: list[tuple[int, int]],
+        rates: FloatArray,
+        indices: np.ndarray,
+    ) -> tuple[FloatArray, np.ndarray]:
+        """Return times (K,) and sensors (K,) of all samples of one entry."""
+        expected = scenario.horizon * float(rates.sum())
+        space = int(expected + 8.0 * math.sqrt(expected)) + len(own) + 8
+        purposes, per_second = ("sampling", "sampling phase"), scenario.time_grid.per_second
+        while True:
+            clocks = clocks_of(clock, own, rates, streams, purposes, per_second)
+            t, entity = np.empty(space), np.empty(space, dtype=np.int64)
+            tables = ziggurat(), normal_ziggurat()
+            count = draw_instants(clocks, scenario.horizon, *tables, t, entity)
+            if count >= 0:
+                return t[:count], indices[entity[:count]]
+            space *= 2
+
+    def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
+        """Fill in the values of the samples taken in (``after``, ``until``], see Samples."""
+        first, last = np.searchsorted(self._t, [after, until], side="right")
+        place = np.searchsorted(times, self._t[first:last])
+        tables, instants = self._tables, self.instants
+        draw_samples(
+            self._noise, normal_ziggurat(), first, instants.sensor, tables.rows, self._root,
+            tables.H, place, np.ascontiguousarray(states), instants.y,
+        )  # fmt: skip
+
+
+@kernel(allocates=True)
+def draw_samples(
+    noise: np.ndarray,
+    ziggurat: NormalZiggurat,
+    first: int,
+    sensor: IntArray,
+    rows: IntArray,
+    root: FloatArray,
+    H: FloatArray,
+    place: IntArray,
+    states: FloatArray,
+    y: FloatArray,
+) -> None:
+    """Write the samples ``y[first:]`` (K, p) of the next K = len(place) of all, taken by sensors
+    number ``sensor[first:]`` in the states ``states[place]``: H x + v, with v the ``root`` (S, p,
+    p) times the next normals of the sensor's stream ``noise`` (S, WIDTH).
+    """
+    z = np.empty(H.shape[1])
+    for k in range(len(place)):
+        s, x = sensor[first + k], states[place[k]]
+        for i in range(rows[s]):
+            z[i] = next_normal(noise, s, ziggurat)
+        for i in range(rows[s]):
+            value, drawn = 0.0, 0.0
+            for j in range(len(x)):
+                value += H[s, i, j] * x[j]
+            for j in range(rows[s]):
+                drawn += root[s, i, j] * z[j]
+            y[first + k, i] = value + drawn
+
+
+class SampleTables:
+    """The samples of any sensors, see Samples."""
+
+    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+        times = scenario.sample_times(streams)
+        self.sampled = all_sample_times(times)
         if not scenario.sampled_sensors:
-            self._sensors, self.instants = [], _no_instants(scenario)
+            self._sensors, self.instants = [], no_instants(scenario)
             return
         placed = _placed_sensors(scenario)
         counts = [len(times[node, placed_sensor.ordinal]) for node, placed_sensor in placed]
@@ -72,10 +217,7 @@ class SampleTables:
                 _add_noises(self.instants, sampled.samples, sampled.indices, R)
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
-        """Fill in the values ``instants.y`` (and H, where it varies) of the samples taken in
-        (``after``, ``until``] seconds, from the states (T, n) at T ``times`` (T,), which contain
-        their times.
-        """
+        """Fill in the values of the samples taken in (``after``, ``until``], see Samples."""
         instants = self.instants
         for sensor in self._sensors:
             # (after, until]: a time at the border of two blocks is read once.
@@ -107,7 +249,7 @@ def _add_noises(instants: Instants, samples: Any, indices: np.ndarray, R: FloatA
 
 
 @once_per_scenario
-def _no_instants(scenario: Scenario) -> Instants:
+def no_instants(scenario: Scenario) -> Instants:
     """Return the instants of all runs of a scenario without sampled sensors: none."""
     return _make_instants(scenario, np.empty(0), np.empty(0, dtype=np.int64))
 

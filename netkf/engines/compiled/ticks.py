@@ -9,6 +9,7 @@ lattices may crowd, and are merged.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from netkf.engines.compiled.schedule import (
     Window,
     all_windows,
 )
-from netkf.engines.compiled.senders import Senders, senders_of
+from netkf.engines.compiled.senders import senders_of
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
@@ -47,6 +48,9 @@ jitter.
 """
 CROWDING_SHAPE = 100.0
 """Gaps of larger shapes are so regular that the ticks of all entities crowd."""
+
+
+NOTHING_SENT: IntArray = np.zeros(0, dtype=np.int64)
 
 
 class Clocks(NamedTuple):
@@ -333,17 +337,25 @@ def is_drawn_in_kernels(scenario: Scenario) -> bool:
     )
 
 
-def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders) -> Clocks:
-    """Return the clocks of all runs, before their first ticks."""
-    clock, runs, entities = scenario.network.activation, streams.runs, senders.entities
-    assert isinstance(clock, LinkClock)
-    count = len(entities) * runs
+def clocks_of(
+    clock: LinkClock,
+    entities: Sequence[tuple[int, ...]],
+    rates: FloatArray,
+    streams: Streams | ReplicaStreams,
+    purposes: tuple[str, str],
+    per_second: float,
+) -> Clocks:
+    """Return the clocks of E ``entities`` in all runs, before their first ticks, which send on
+    nothing; ``rates`` (E,) are their ticks per second, ``purposes`` of their streams for ticks and
+    for phases.
+    """
+    count = len(entities) * streams.runs
     kind, low, width, number = EXPONENTIAL_GAPS, 0.0, 0.0, np.zeros(count, dtype=np.int64)
-    scale, shape = np.tile(_rates(scenario), runs), getattr(clock, "shape", None) or 0.0
+    scale, shape = np.tile(rates, streams.runs), getattr(clock, "shape", None) or 0.0
     if isinstance(clock, Periodic):
         kind, low, width = LATTICE, clock.period, clock.jitter
         if isinstance(clock.phase, str):
-            fill_units(streams.states("phase", entities), scale)
+            fill_units(streams.states(purposes[1], entities), scale)
             scale *= clock.period
         else:
             scale = np.full(count, clock.phase)
@@ -368,11 +380,37 @@ def _clocks(scenario: Scenario, streams: Streams | ReplicaStreams, senders: Send
         low=low,
         width=width,
         crowds=kind == LATTICE or shape > CROWDING_SHAPE,
-        streams=streams.states("clock", entities),
-        first=senders.first,
-        outgoing=senders.outgoing,
-        per_second=scenario.time_grid.per_second,
+        streams=streams.states(purposes[0], entities),
+        first=NOTHING_SENT,
+        outgoing=NOTHING_SENT,
+        per_second=per_second,
     )
+
+
+@kernel
+def draw_instants(
+    clocks: Clocks,
+    horizon: float,
+    exponential: Ziggurat,
+    normal: NormalZiggurat,
+    t: FloatArray,
+    entity: IntArray,
+) -> int:
+    """Write the ticks of all clocks before the ``horizon`` (seconds), clock by clock, into ``t``
+    (K,), and their indices into ``entity``; return their number, -1 if there is no space for them.
+    """
+    count = 0
+    for k in range(len(clocks.next_tick)):
+        now = tick_after(clocks, k, 0.0, exponential, normal)
+        instant = snapped(now, clocks.per_second)
+        while instant < horizon:
+            if count == len(t):
+                return -1
+            t[count], entity[count] = instant, k
+            count += 1
+            now = tick_after(clocks, k, now, exponential, normal)
+            instant = snapped(now, clocks.per_second)
+    return count
 
 
 @once_per_scenario
@@ -396,7 +434,16 @@ class KernelSchedules:
         its messages, 1 if it arrives, instead of a delay for each; only if no message takes time.
         """
         senders = senders_of(scenario)
-        self._clocks = _clocks(scenario, streams, senders)
+        clock = scenario.network.activation
+        assert isinstance(clock, LinkClock)
+        self._clocks = clocks_of(
+            clock,
+            senders.entities,
+            _rates(scenario),
+            streams,
+            ("clock", "phase"),
+            scenario.time_grid.per_second,
+        )._replace(first=senders.first, outgoing=senders.outgoing)
         self._channels = channel_streams(scenario, streams, senders, bits)
         start_clocks(self._clocks, ziggurat(), normal_ziggurat())
         rates = _rates(scenario)
