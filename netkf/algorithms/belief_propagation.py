@@ -128,7 +128,7 @@ def fill_transition(record: Any, generator: FloatArray, gap: float) -> None:
     clocks that of ``-generator`` (n, n).
     """
     if record.clocked == 1:
-        fill_inverse_transition(generator, gap, record.maps)
+        fill_inverse_transition(generator, generator, gap, record.maps)
     else:
         copy_matrix(record.maps[0], generator)
 
@@ -165,7 +165,7 @@ def predict(record: Any, h: int, run: Any) -> None:
     if record.growing < n:
         read_frame(record, h)
         fill_transition(record, record.forward, run.gap)
-        multiply_square(record.maps[1], record.W, record.maps[0])
+        multiply_square(record.W, record.maps[1], record.W, record.maps[0])
         for i in range(n):
             for j in range(n):
                 store(lanes, record.frame, h, i, j, record.maps[1, i, j])

@@ -48,6 +48,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane
 from netkf.linalg.jacobi import diagonalise
 from netkf.linalg.lanes import ONE
+from netkf.linalg.structs import Size
 
 MIN_ACCURACY = 1e-4
 """Relative accuracy with which a total must grow by a share in floating point; otherwise the node
@@ -114,14 +115,14 @@ def update(record: Any, h: int, run: Any) -> None:
 
 
 @kernel
-def predict_total(record: Any, total: FloatArray, gap: float) -> None:
+def predict_total(record: Any, size: Size, total: FloatArray, gap: float) -> None:
     """Make a ``total`` (1 + n n + G n,) refer to the state ``gap`` seconds later, in place."""
     if not gap > 0.0:
         return
     # Information moves by the transpose of M from the left and by M from the right.
-    fill_inverse_transition(record.kept, gap, record.work)
+    fill_inverse_transition(size, record.kept, gap, record.work)
     inverse, half, predicted = record.work[0], record.work[1], record.work[2]
-    n = len(inverse)
+    n = len(size)
     for i in range(n):
         for j in range(n):
             entry = 0.0
@@ -157,7 +158,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
         return
     sent, now = drop_lane(record.sent), record.elapsed[h, 0]
     # Predict the total to now before it grows.
-    predict_total(record, sent[h], now - record.sent_at[h, 0])
+    predict_total(record, run.size, sent[h], now - record.sent_at[h, 0])
     record.sent_at[h, 0] = now
     record.rounds[h, 0] += 1
     before, share = sent[h, 0], record.weight[h, 0] / (receivers + 1)
@@ -179,7 +180,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 def add_share(record: Any, h: int, run: Any, receivers: int) -> None:
     """Add a share of U = (w / N) P^-1 and of the parts of u = U xhat to what node h has sent."""
     inverse, U, part = record.work[0], record.work[1], record.work[2]
-    sent, xhat, root, n = record.sent, record.xhat, record.root, record.xhat.shape[1]
+    sent, xhat, root, n = record.sent, record.xhat, record.root, len(run.size)
     # P^-1 = S^-T S^-1.
     invert_lanes(ONE, run.size, record.work, 0, root, h)
     for i in range(n):
@@ -217,8 +218,8 @@ def absorb(record: Any, h: int, run: Any) -> None:
         m, w = run.message[k], run.link[k]
         if payload.number[m, 0] > record.number[w, 0]:
             # Predict both totals to now before they are compared.
-            predict_total(record, totals[m], run.age[k])
-            predict_total(record, heard[w], now - record.heard_at[w, 0])
+            predict_total(record, run.size, totals[m], run.age[k])
+            predict_total(record, run.size, heard[w], now - record.heard_at[w, 0])
             record.heard_at[w, 0] = now
             for j in range(len(gain)):
                 gain[j] += totals[m, j] - heard[w, j]
@@ -243,7 +244,7 @@ def gain_mass(record: Any, h: int, run: Any, factor: float, share: float) -> Non
     """Add the mass ``record.gain`` to the estimate of node h: ``P^-1 <- (w P^-1 + N U) / w+`` with
     the new weight w+, and the estimate likewise; ``factor`` is (w+ / w)^1/2, ``share`` is N / w+.
     """
-    root, gain, n = drop_lane(record.root), record.gain, record.xhat.shape[1]
+    root, gain, n = drop_lane(record.root), record.gain, len(run.size)
     inner, half, vectors = record.work[0], record.work[1], record.work[2]
     # S sqrt(w+ / w): the root of P with P^-1 scaled by w / w+.
     for i in range(n):
@@ -284,7 +285,7 @@ def update_root_by_gain(
     """Replace the root S of node h by the lower triangular root of ``S V D^-1 V' S'``, with the
     eigenvalues D on the diagonal of ``values`` (n, n), raised to at least 1, and eigenvectors V.
     """
-    scratch, n = run.model.scratch, root.shape[1]
+    scratch, n = run.model.scratch, len(run.size)
     # S V D^-1/2, a root that is not triangular yet.
     for i in range(n):
         for j in range(n):
@@ -317,11 +318,11 @@ def shift(record: Any, h: int, run: Any) -> None:
     shift_vector(run, record.xhat, h)
     # Predicted forward: back to a time long ago an offset would grow with the modes that decay.
     sent, heard, now = drop_lane(record.sent), drop_lane(record.heard), record.elapsed[h, 0]
-    predict_total(record, sent[h], now - record.sent_at[h, 0])
+    predict_total(record, run.size, sent[h], now - record.sent_at[h, 0])
     record.sent_at[h, 0] = now
     shift_total(record, sent[h], run)
     for w in range(run.first[h], run.first[h + 1]):
-        predict_total(record, heard[w], now - record.heard_at[w, 0])
+        predict_total(record, run.size, heard[w], now - record.heard_at[w, 0])
         record.heard_at[w, 0] = now
         shift_total(record, heard[w], run)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.structs import Size
 
 
 @kernel(allocates=True)
@@ -105,9 +106,9 @@ def copy_matrix(target: FloatArray, source: FloatArray) -> None:
 
 
 @kernel
-def multiply_square(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
-    """Write ``a b`` into another array ``out``, all (n, n)."""
-    n = len(a)
+def multiply_square(size: Size, out: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """Write ``a b`` into another array ``out``, all (n, n); ``size`` has length n."""
+    n = len(size)
     for i in range(n):
         for j in range(n):
             total = 0.0

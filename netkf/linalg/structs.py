@@ -112,11 +112,23 @@ class Struct(metaclass=StructClass):
         # The first instance determines the types of the fields.
         if not cls.struct_offsets:
             cls._lay_out(values)
-        object.__setattr__(self, "memory", np.zeros(cls.struct_size(), dtype=np.int64))
-        object.__setattr__(self, "address", address_of(self.memory))
-        _structs[self.address] = self
+        # All words at once: a run makes some structs of 50 fields.
+        words, floats = [0] * cls.struct_size(), []
         for name, value in values.items():
-            setattr(self, name, value)
+            word, kind = cls.struct_offsets[name], cls.struct_kinds[name]
+            if kind is np.int64:
+                words[word] = int(value)
+            elif kind is np.float64:
+                floats.append((word, value))
+            else:
+                for k, part in enumerate(self._kept(name, value, kind), word):
+                    words[k] = part
+        memory = np.array(words, dtype=np.int64)
+        numbers = memory.view(np.float64)
+        for word, value in floats:
+            numbers[word] = value
+        self.__dict__.update(memory=memory, address=address_of(memory))
+        _structs[self.address] = self
 
     @classmethod
     def from_memory(cls, memory: np.ndarray) -> Any:
@@ -179,27 +191,28 @@ class Struct(metaclass=StructClass):
         address of a struct. Raises TypeError for another type than the field had at first.
         """
         word, kind = self.struct_offsets[name], self.struct_kinds[name]
+        if kind is np.int64 or kind is np.float64:
+            # Integers and floats share the words, seen as one or the other type.
+            self.memory.view(kind)[word] = value
+        else:
+            for k, part in enumerate(self._kept(name, value, kind), word):
+                self.memory[k] = part
+
+    def _kept(self, name: str, value: Any, kind: Any) -> tuple[int, ...]:
+        """Keep an array, a struct or a sized tuple alive, and return its words."""
         if isinstance(kind, tuple):
             # Compiled code assumes the type and computes strides itself: anything else would read
             # wrong memory.
             if (value.dtype, value.ndim) != kind or not value.flags.c_contiguous:
                 raise TypeError(f"{type(self).__name__}.{name} is a C-contiguous array {kind}")
-            self.memory[word] = address_of(value)
-            self.memory[word + 1 : word + 1 + value.ndim] = value.shape
             # The dictionary keeps the array alive, since the memory holds its address only.
             self.__dict__[name] = with_fields(value) if is_plain() else value
-        elif kind is np.int64 or kind is np.float64:
-            # Integers and floats share the words, seen as one or the other type.
-            self.memory.view(kind)[word] = value
-        elif isinstance(kind, int):
-            # A tuple, ``size``: only its length matters, which is part of the numba type.
-            self.__dict__[name] = value
-        else:
-            # A struct: the dictionary keeps it alive too.
-            if type(value) is not kind:
-                raise TypeError(f"{type(self).__name__}.{name} is a {kind.__name__}")
-            self.memory[word] = value.address
-            self.__dict__[name] = value
+            return address_of(value), *value.shape
+        # Of a tuple, ``size``, only its length matters, which is part of the numba type.
+        if not isinstance(kind, int) and type(value) is not kind:
+            raise TypeError(f"{type(self).__name__}.{name} is a {kind.__name__}")
+        self.__dict__[name] = value
+        return () if isinstance(kind, int) else (value.address,)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what pickle needs to make the struct again: its class, n and fields."""

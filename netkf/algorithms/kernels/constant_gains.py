@@ -14,6 +14,7 @@ from __future__ import annotations
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.small import multiply_square
+from netkf.linalg.structs import Size
 
 TERMS = 18  # of the exponential series: enough for a norm of at most 1/2
 NEGLIGIBLE = 2.0**-60  # a bound of the norm of terms that change no digit
@@ -64,7 +65,7 @@ def fill_exponential_integrals(
             J_1[i, j], J_2[i, j] = step * identity, 0.5 * step * step * identity
     # ``term`` is (N s)^k / k!; the integrals of its power u^k add it to J_1 and J_2.
     for k in range(1, TERMS):
-        multiply_square(product, term, M)
+        multiply_square(M, product, term, M)
         for i in range(n):
             for j in range(n):
                 term[i, j] = sign * product[i, j] * step / k
@@ -82,28 +83,28 @@ def double_gap(step: float, J_1: FloatArray, work: FloatArray) -> None:
     # int_0^2s = int_0^s + int_s^2s, and in the second one e^{M u} = E e^{M (u - s)}. In J_2 the
     # first part has the factor 2 s - u = s + (s - u). J_2 goes first, since it needs the old J_1.
     n, E, product, J_2 = len(J_1), work[0], work[2], work[3]
-    multiply_square(product, E, J_2)
+    multiply_square(E, product, E, J_2)
     for i in range(n):
         for j in range(n):
             J_2[i, j] += step * J_1[i, j] + product[i, j]
-    multiply_square(product, E, J_1)
+    multiply_square(E, product, E, J_1)
     for i in range(n):
         for j in range(n):
             J_1[i, j] += product[i, j]
-    multiply_square(product, E, E)
+    multiply_square(E, product, E, E)
     for i in range(n):
         for j in range(n):
             E[i, j] = product[i, j]
 
 
 @kernel
-def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None:
+def fill_inverse_transition(size: Size, A: FloatArray, gap: float, maps: FloatArray) -> None:
     """Write the inverse transition ``e^{-A g}`` (n, n), by which information is predicted over a
     ``gap`` of g seconds, into the first of ``maps`` (>= 3, n, n), by scaling and squaring; the
-    second and third are scratch. A is (n, n).
+    second and third are scratch. A is (n, n), ``size`` has length n.
     """
     out, term, product = maps[0], maps[1], maps[2]
-    n, norm = len(A), 0.0
+    n, norm = len(size), 0.0
     for i in range(n):
         # The largest row sum of |A| gap bounds the norm of A gap.
         row = 0.0
@@ -115,17 +116,17 @@ def fill_inverse_transition(A: FloatArray, gap: float, maps: FloatArray) -> None
     halvings, step = 0, -gap
     while norm > 0.5:
         norm, step, halvings = 0.5 * norm, 0.5 * step, halvings + 1
-    k, size = 1, norm
-    while size > NEGLIGIBLE:
-        multiply_square(product, term, A)
+    k, bound = 1, norm
+    while bound > NEGLIGIBLE:
+        multiply_square(size, product, term, A)
         for i in range(n):
             for j in range(n):
                 term[i, j] = product[i, j] * step / k
                 out[i, j] += term[i, j]
         k += 1
-        size *= norm / k
+        bound *= norm / k
     for _ in range(halvings):
-        multiply_square(product, out, out)
+        multiply_square(size, product, out, out)
         for i in range(n):
             for j in range(n):
                 out[i, j] = product[i, j]

@@ -5,6 +5,7 @@ grid, for one run or for several together.
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -139,10 +140,11 @@ class Paths:
         )
 
 
+@cache
 def no_path(n: int) -> PathBlock:
     """Return a path of one piece without an end, with (1, 1, n) states that are 0, for runs in
     which nothing senses increments: the loop then asks for no path, but its kernels need the
-    arrays.
+    arrays. It is the same for all runs, which do not write to it.
     """
     rows = {name: np.zeros((1, 1, n)) for name in ("x_start", "x_stop")}
     return PathBlock(
@@ -191,6 +193,12 @@ def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tupl
         "node": np.array(list(scenario.increment_sensors), dtype=np.int64),
     }
     return shared, [(node, placed_sensor.ordinal) for node, placed_sensor in placed]
+
+
+@once_per_scenario
+def no_sensing(scenario: Scenario) -> Sensing:
+    """Return the sensors of all runs of a scenario in which none reads increments."""
+    return Noise(scenario, Streams(0), 0).sensing
 
 
 class Noise:

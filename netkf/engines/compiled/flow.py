@@ -18,7 +18,7 @@ from netkf.core.interrupts import defer_signals
 from netkf.engines.base import Progress
 from netkf.engines.compiled.agenda import advance_alone, is_immediate
 from netkf.engines.compiled.clock_filters import ClockFilters
-from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path
+from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path, no_sensing
 from netkf.engines.compiled.events import (
     DONE,
     WANT_MESSAGES,
@@ -126,16 +126,16 @@ class Source:
         self.instants = samples.instants
         self._windows = _make_windows(scenario, streams, samples.instants)
         self._grid = uses_grid(scenario)
-        # Without a grid there are no steps.
-        blocks = blocks_at_once(scenario) if self._grid else 0
-        self._noise = Noise(scenario, streams, blocks * BLOCK)
-        self.sensing = self._noise.sensing
         self._read_until, self._n = -math.inf, scenario.plant.n
         if self._grid:
+            blocks = blocks_at_once(scenario)
+            self._noise = Noise(scenario, streams, blocks * BLOCK)
+            self.sensing = self._noise.sensing
             # Cut the path where a state is sampled: it is drawn there from its own stream.
             self._paths = Paths(scenario, streams, blocks, sampled)
             self.states = PathStates(scenario, self._paths.frame_times)
         else:
+            self.sensing = no_sensing(scenario)
             self.states = states = CompleteStates(scenario, streams, sampled)
             # The truth is complete, so that all samples are read at once.
             samples.read(states.truth.states(sampled)[0], sampled, -math.inf, math.inf)
