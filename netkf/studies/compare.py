@@ -27,7 +27,10 @@ from netkf.runs.documents import (
     NUMBER,
     TEXTS,
     DamagedError,
+    add_file_name,
     check_files,
+    read_document,
+    require_form,
 )
 from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.runs.stored import AVERAGES_FORM, MANIFEST_FORM, SUMMARY_FORM, read_checked_document
@@ -157,10 +160,13 @@ def read_directory(directory: Path) -> RunDirectory:
     if not directory.is_dir():
         raise ScenarioError(where, "is not a directory", None, "name run directories")
     with damage_named(directory):
-        manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
+        with add_file_name("manifest.json"):
+            manifest = read_document(directory / "manifest.json")
+            require_form(manifest, MANIFEST_FORM)
         if manifest["status"] not in FINAL_STATUSES:
             rule = f"holds a run that did not finish ({shorten(manifest['status'], 30)})"
             raise ScenarioError(where, rule, None, "finish it with netkf run --resume")
+        read_checked_document(directory, "manifest.json", MANIFEST_FORM)  # its seal
         summary = read_checked_document(directory, "summary.json", SUMMARY)
         name_rows(summary["nodes"])
         check_files(directory, manifest, ["scenario.toml", "summary.json"])
