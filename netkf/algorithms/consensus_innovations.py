@@ -293,11 +293,7 @@ def absorb(record: Any, h: int, run: Any) -> None:
     ``xhat+ = xhat + K (yhat+ - G xhat)``. A lost message takes its gain with it.
     """
     lanes, n, x, y = run.lanes, len(run.size), record.xhat, record.pseudo
-    t, corrected, difference = (
-        record.table_row[run.slot - record.first_slot],
-        run.moved_mean,
-        run.row,
-    )
+    t, corrected = record.table_row[run.slot - record.first_slot], run.moved_mean
     # The pseudo-innovation ``H' R^-1 (reading - H G^+ yhat)``.
     for i in range(n):
         total = spread(lanes, 0.0)
@@ -324,11 +320,11 @@ def absorb(record: Any, h: int, run: Any) -> None:
         store(lanes, y, h, i, total)
         for j in range(n):
             total -= record.G[i, j] * load(lanes, x, h, j)
-        store(lanes, difference, i, total)
+        store(lanes, run.row, i, total)
     for i in range(n):
         total = load(lanes, x, h, i)
         for j in range(n):
-            total += record.K[t, h, i, j] * load(lanes, difference, j)
+            total += record.K[t, h, i, j] * load(lanes, run.row, j)
             if j <= i:
                 store(lanes, record.root, h, i, j, record.roots[t, h, i, j])
         store(lanes, x, h, i, total)
@@ -414,10 +410,7 @@ class ConsensusInnovations(Filter):
     out, and P is then too small.
     """
 
-    analysis = Analysis(
-        paper="consensus_innovations",
-        payload_numbers=lambda n, *_: n,
-    )
+    analysis = Analysis(paper="consensus_innovations", payload_numbers=lambda n, *_: n)
     timing = Timing(clocks=())
     kernels = Kernels(
         predict=predict,

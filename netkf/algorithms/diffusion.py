@@ -11,12 +11,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels.intersection import (
-    finish_lanes,
-    invert_lanes,
-    merge_lanes,
-    whiten,
-)
+from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
 from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.kernels.run import carry, copy_estimate
 from netkf.algorithms.records import Kernels, Record

@@ -19,12 +19,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.information_consensus import INFORMATION, Hcmci
 from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
-from netkf.algorithms.kernels.run import (
-    copy_estimate,
-    predict_copy,
-    predict_estimate,
-    shift_vector,
-)
+from netkf.algorithms.kernels.run import copy_estimate, predict_copy, predict_estimate, shift_vector
 from netkf.algorithms.kernels.triggers import is_near
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in

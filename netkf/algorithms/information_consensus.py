@@ -29,11 +29,7 @@ import numpy as np
 
 from netkf.algorithms.diffusion import DiffusionFilter, diffusion_filter_record
 from netkf.algorithms.filter import Filter, NodeInfo
-from netkf.algorithms.kernels.information import (
-    add_reading_pair,
-    copy_part,
-    weigh_part,
-)
+from netkf.algorithms.kernels.information import add_reading_pair, copy_part, weigh_part
 from netkf.algorithms.kernels.intersection import finish_lanes, invert_lanes, merge_lanes, whiten
 from netkf.algorithms.kernels.neighbours import received_weight
 from netkf.algorithms.models import SlotModel
@@ -172,10 +168,7 @@ class InformationConsensus(Filter):
     @property
     def analysis(self) -> Analysis:
         """Its paper, and the size of a message."""
-        return Analysis(
-            paper="information_consensus",
-            payload_numbers=self._message_size,
-        )
+        return Analysis(paper="information_consensus", payload_numbers=self._message_size)
 
     def _message_size(self, n: int, rows: int, phase: int) -> int:
         """Return the size of a message in numbers of 64 bits: K pairs (Omega, q) of n states in

@@ -24,12 +24,7 @@ from netkf.algorithms.kernels.estimates import update_by_row
 from netkf.algorithms.kernels.information import clear_part
 from netkf.algorithms.kernels.intersection import merge_lanes
 from netkf.algorithms.kernels.neighbours import use_readings_heard
-from netkf.algorithms.kernels.run import (
-    copy_estimate,
-    predict_estimate,
-    shift_vector,
-    use_reading,
-)
+from netkf.algorithms.kernels.run import copy_estimate, predict_estimate, shift_vector, use_reading
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in

@@ -19,7 +19,6 @@ from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import usable
 from netkf.algorithms.kernels.square_root import lower_root
-from netkf.algorithms.modes import RateGroups, rate_groups
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE
@@ -85,11 +84,6 @@ class FlowModel:
         """
         nothing = np.zeros((0, len(self.A)))
         return _shared_flow_table(self.A, self.Q, nothing, np.zeros((0, 0)), self.horizon)
-
-    @cached_property
-    def groups(self) -> RateGroups:
-        """Parts of the state that decay at one rate each."""
-        return rate_groups(self.A)
 
     def predict(
         self, xhat: FloatArray, root: FloatArray, gap: float

@@ -110,9 +110,7 @@ def use_bit(record: Any, h: int, run: Any, sign: Any, r: int, k: int, arrived: A
 def one_bit_record(_: Any, infos: Sequence[NodeInfo], _models: Sequence[Any]) -> Record:
     """Return the turns of nodes, and signs in messages."""
     return Record(
-        node={"turn": ()},
-        payload={"signs": (infos[0].rows,)},
-        settings={"nodes": infos[0].nodes},
+        node={"turn": ()}, payload={"signs": (infos[0].rows,)}, settings={"nodes": infos[0].nodes}
     )
 
 

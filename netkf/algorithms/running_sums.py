@@ -42,6 +42,7 @@ from netkf.algorithms.kernels.estimates import add_covariance_product
 from netkf.algorithms.kernels.intersection import invert_lanes
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
 from netkf.algorithms.kernels.square_root import triangularise
+from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.records import Kernels, Record
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -62,7 +63,7 @@ def record(infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
     total heard from each sender; ``sent_at`` and ``heard_at`` are the times of the node's own clock
     ``elapsed`` that they refer to, ``rounds`` and ``number`` count broadcasts.
     """
-    groups, n = models[0].groups, len(models[0].A)
+    groups, n = rate_groups(models[0].A), len(models[0].A)
     m = 1 + n * n + n * len(groups.rates)
     return Record(
         node={

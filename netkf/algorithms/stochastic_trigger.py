@@ -21,14 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from netkf.algorithms.filter import (
-    Exchange,
-    Filter,
-    Message,
-    NodeInfo,
-    Reading,
-    compiled_kernels,
-)
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, Reading, compiled_kernels
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kernels.estimates import update_by_row
 from netkf.algorithms.kernels.run import absorb as nothing
@@ -226,10 +219,7 @@ class ScheduledReadings(Filter):
 
     Y: float | FloatArray
 
-    analysis = Analysis(
-        paper="stochastic_trigger",
-        payload_numbers=lambda _, rows, __: rows,
-    )
+    analysis = Analysis(paper="stochastic_trigger", payload_numbers=lambda _, rows, __: rows)
     timing = Timing(clocks=(), randomised=True)
     needs = Needs(
         one_way=True,

@@ -16,8 +16,8 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, cached_property, update_wrapper
 from importlib import import_module
 from pathlib import Path
@@ -67,10 +67,7 @@ def kernel(function: Function) -> Function: ...
 
 @overload
 def kernel(
-    *,
-    allocates: bool = False,
-    inlined: bool = False,
-    fused: bool = False,
+    *, allocates: bool = False, inlined: bool = False, fused: bool = False
 ) -> Callable[[Function], Function]: ...
 
 
@@ -244,7 +241,7 @@ def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
 
     def compile_linked(*args: Any, **kwargs: Any) -> Any:
         try:
-            with linked_once(), _without_collection():
+            with linked_once():
                 return compile_for(*args, **kwargs)
         except Exception:
             # The lock that the failed attempt holds would block this one. Where numba's own way
@@ -256,13 +253,17 @@ def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
 
     def compile_with_settings(*args: Any, **kwargs: Any) -> Any:
         """Numba calls it for a kernel that has no code for the types of its arguments yet."""
-        before, started = config.OPT, time.perf_counter()
+        before, collects, started = config.OPT, gc.isenabled(), time.perf_counter()
+        # Visiting what the compiler makes is a tenth of its time.
+        gc.disable()
         config.OPT = level(2)
         set_option("netkf", f"-unroll-threshold={UNROLLED}")
         try:
             return compile_linked(*args, **kwargs)
         finally:
             config.OPT = before
+            if collects:
+                gc.enable()
             # LLVM options cannot be unset: this is the value that numba's own level implies.
             set_option("netkf", f"-unroll-threshold={UNROLLED_BY_NUMBA}")
             # Other processes wait at the lock for this code.
@@ -270,18 +271,6 @@ def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
             _compile_times.append(time.perf_counter() - started)
 
     dispatcher._compile_for_args = compile_with_settings
-
-
-@contextmanager
-def _without_collection() -> Iterator[None]:
-    """Disable the garbage collector: visiting what the compiler makes is a tenth of its time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def seconds_spent() -> float:

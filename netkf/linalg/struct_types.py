@@ -138,10 +138,8 @@ def load_field(context: Any, builder: Any, struct: StructType, address: Any, nam
     # Numbers are loaded; a struct inside a struct is the address that is stored.
     if not isinstance(kind, types.Array):
         return builder.load(_field_pointer(builder, address, offset, context.get_value_type(kind)))
-    array, itemsize = (
-        context.get_value_type(kind),
-        context.get_abi_sizeof(context.get_data_type(kind.dtype)),
-    )
+    array = context.get_value_type(kind)
+    itemsize = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     data = builder.load(_field_pointer(builder, address, offset, array.elements[DATA]))
     first = _field_pointer(builder, address, offset + WORD, I64)
     shape = [builder.load(builder.gep(first, [ir.Constant(I64, k)])) for k in range(kind.ndim)]

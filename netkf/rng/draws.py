@@ -75,14 +75,8 @@ def refill(states: np.ndarray, k: int) -> None:
     """Compute the next block of four words of stream ``k`` of the ``states`` (K, WIDTH)."""
     # The other words of the counter name the stream: no run draws 2^64 blocks.
     states[k, 0] += ONE
-    a, b, c, d, key, other = (
-        states[k, 0],
-        states[k, 1],
-        states[k, 2],
-        states[k, 3],
-        states[k, 4],
-        states[k, 5],
-    )
+    a, b, c, d = states[k, 0], states[k, 1], states[k, 2], states[k, 3]
+    key, other = states[k, 4], states[k, 5]
     states[k, 6], states[k, 7], states[k, 8], states[k, 9] = philox(a, b, c, d, key, other)
 
 

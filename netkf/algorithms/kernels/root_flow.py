@@ -41,7 +41,6 @@ and for Python, one node at a time, ``flow_root(table, root, x, gap)`` and
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -49,19 +48,14 @@ import numpy as np
 
 from netkf.algorithms.kernels.estimates import rotate
 from netkf.algorithms.kernels.gains import GainTable
-from netkf.algorithms.kernels.riccati import (
-    WIDE,
-    flow_triple,
-    hamiltonian,
-    wide_exponential,
-)
+from netkf.algorithms.kernels.riccati import WIDE, flow_triple, hamiltonian, wide_exponential
 from netkf.algorithms.kernels.square_root import triangularise
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, ONE, Lanes, aligned, load, root_of, select, spread, store
 from netkf.linalg.local import local_matrix, local_vector
 from netkf.linalg.series import fill_series, with_reach
-from netkf.linalg.structs import Size, Struct, sized, struct_at
+from netkf.linalg.structs import Size, Struct, sized
 
 CELLS, CELL_BYTES = 32, 1 << 18  # of one model at most: the tables should fit a processor's cache
 NARROW = 64.0  # trace(P) trace(G) of a gap up to which rounding of G is harmless: P is narrow
@@ -643,11 +637,8 @@ def propagate_by_series(
         mean[i] = x[k, i]
         for j in range(i + 1):
             S[i, j] = root[k, i, j]
-    V, T, moved = (
-        local_matrix(size, scratch.wide),
-        local_matrix(size, scratch.T),
-        local_vector(size, scratch.moved),
-    )
+    V, T = local_matrix(size, scratch.wide), local_matrix(size, scratch.T)
+    moved = local_vector(size, scratch.moved)
     if observed and reads:
         condition_root(ONE, size, S, scratch.values, V)
     propagate_mean(ONE, size, mean, scratch.values, moved)
@@ -861,12 +852,7 @@ def gain_root(
 
 @kernel(inlined=True, fused=True)
 def use_moments(
-    lanes: Lanes,
-    size: Size,
-    S: FloatArray,
-    x: FloatArray,
-    values: FloatArray,
-    moments: FloatArray,
+    lanes: Lanes, size: Size, S: FloatArray, x: FloatArray, values: FloatArray, moments: FloatArray
 ) -> None:
     """Correct the predictions x (n, L) of L lanes in place by the Legendre ``moments`` (q, L) of
     their readings (gains.py), which are overwritten with the innovations ``moments - C x``:
@@ -907,37 +893,6 @@ def use_moments(
 # For Python.
 
 
-@kernel
-def propagate_one(
-    table: IntArray, scratch: IntArray, root: FloatArray, x: FloatArray, gap: float
-) -> None:
-    """Propagate ``root`` (1, n, n) and ``x`` (1, n) of one node in place over ``gap`` seconds by a
-    table of one model. ``table`` and ``scratch`` are the memory of a FlowTable and a FlowScratch,
-    since numba takes long to determine the type of a struct that Python passes.
-    """
-    propagate_root(struct_at(table, FlowTable), 0, root, x, 0, gap, struct_at(scratch, FlowScratch))
-
-
-class _Scratches(threading.local):
-    """Scratch arrays of each thread, by the sizes that they depend on."""
-
-    def __init__(self) -> None:
-        self.scratches: dict[tuple[int, ...], FlowScratch] = {}
-
-    def of(self, table: FlowTable) -> FlowScratch:
-        """Return scratch arrays of the sizes that ``table`` needs, shared by its thread's calls and
-        not cleared.
-        """
-        # Scratch holds no results, so tables of equal shapes may share it.
-        sizes = table.series.shape[3], *table.whitened_H.shape[1:]
-        if sizes not in self.scratches:
-            self.scratches[sizes] = flow_scratch(table)
-        return self.scratches[sizes]
-
-
-_scratches = _Scratches()
-
-
 def flow_root(
     table: FlowTable, root: FloatArray, x: FloatArray, gap: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -947,7 +902,7 @@ def flow_root(
     n = len(x)
     roots, means = root.reshape(1, n, n).copy(), x.reshape(1, n).copy()
     if gap > 0.0:
-        propagate_one(table.memory, _scratches.of(table).memory, roots, means, gap)
+        propagate_root(table, 0, roots, means, 0, gap, flow_scratch(table))
     return roots[0], means[0]
 
 

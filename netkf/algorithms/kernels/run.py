@@ -249,12 +249,7 @@ def predict_slot(model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k
 @predict_estimate.register(SlotTables)
 @kernel(inlined=True)
 def _predict_in_slot(
-    model: SlotTables,
-    run: Any,
-    x: FloatArray,
-    root: FloatArray,
-    k: int,
-    _h: int,
+    model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
     predict_slot(model, run, x, root, k)
 
@@ -292,12 +287,7 @@ def _carry_mean_over_age(model: ClockTables, _run: Any, x: FloatArray, m: int, a
 @update_estimate.register(SlotTables)
 @kernel(inlined=True)
 def _update_in_slot(
-    _model: SlotTables,
-    run: Any,
-    x: FloatArray,
-    root: FloatArray,
-    k: int,
-    _h: int,
+    _model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
     use_reading(run, x, root, k, run.reading, True)
 
@@ -322,12 +312,7 @@ def _predict_copy_over_gap(
 @carry.register(ClockTables)
 @kernel
 def _carry_over_age(
-    model: ClockTables,
-    _run: Any,
-    x: FloatArray,
-    root: FloatArray,
-    m: int,
-    age: float,
+    model: ClockTables, _run: Any, x: FloatArray, root: FloatArray, m: int, age: float
 ) -> None:
     if age > 0.0:
         last = len(model.table.unit) - 1

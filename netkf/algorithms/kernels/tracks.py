@@ -113,28 +113,17 @@ def update_joint(
     for k in range(len(joint)):
         i, j = pairs[k, 0], pairs[k, 1]
         if i == j:
-            close_track(joint[k], H[i], rows[i], closed[i], work)
+            for a in range(len(work)):
+                for b in range(len(work)):
+                    closed[i, a, b] = 1.0 if a == b else 0.0
+            for r in range(rows[i]):
+                close_row(joint[k], H[i, r], closed[i], work[0])
     for k in range(len(joint)):
         i, j = pairs[k, 0], pairs[k, 1]
         # e_i <- C_i e_i - K_i v_i: noises v_i of different nodes are independent and add nothing.
         # Without rows C_i = I.
         if i != j and rows[i] + rows[j] > 0:
             multiply_both(closed[i], joint[k], closed[j], work)
-
-
-@kernel
-def close_track(
-    P: FloatArray, H: FloatArray, rows: int, closed: FloatArray, work: FloatArray
-) -> None:
-    """Update P (n, n) in place by a reading with ``rows`` whitened rows H (p, n); write
-    ``I - K H``, with the gain K of all rows, into ``closed`` (n, n). ``work`` (n, n) is scratch.
-    """
-    n = len(P)
-    for i in range(n):
-        for j in range(n):
-            closed[i, j] = 1.0 if i == j else 0.0
-    for r in range(rows):
-        close_row(P, H[r], closed, work[0])
 
 
 @kernel

@@ -26,13 +26,7 @@ def silence_probability(news: float) -> float:
 
 @kernel
 def weigh_news(
-    run: Any,
-    x: FloatArray,
-    h: int,
-    Y: FloatArray,
-    z: FloatArray,
-    news: FloatArray,
-    k: int,
+    run: Any, x: FloatArray, h: int, Y: FloatArray, z: FloatArray, news: FloatArray, k: int
 ) -> None:
     """Write the news ``z' Y z`` of the whitened reading of node ``h``, for its innovation
     z = y - H x[h], into ``news[k]`` (L,); NO_READING in lanes without a reading.
