@@ -51,9 +51,7 @@ Progress = Callable[[float], None]
 
 
 def silent(time: float) -> None:
-    """Ignore the progress of a run, the simulated ``time`` in seconds: a Progress that does
-    nothing.
-    """
+    """Ignore the progress of a run: a Progress that does nothing."""
 
 
 class Engine(ABC):
@@ -101,9 +99,7 @@ class Engine(ABC):
 
 
 def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
-    """Return a sink, which a recorder passes samples to, that collects those of the runs numbered
-    ``replicas`` of a scenario in one RunBatch.
-    """
+    """Return a sink that collects the samples of the runs ``replicas`` in one RunBatch."""
     # A pooled filter is sampled once, not once for each node.
     filters = 1 if scenario.node_filter.timing.pooled else len(scenario.nodes)
     return BatchSink(replicas, scenario.times, (filters, scenario.plant.n))
@@ -116,10 +112,9 @@ def broken(
     error: FloatArray,
     without: np.ndarray | None = None,
 ) -> list[int]:
-    """Return the ids of the nodes whose estimates end a run as diverged: the estimate (row of
-    ``xhat`` (N, n)), the square of the ``error`` (N, n), if the truth is known, or the covariance
-    (``P`` (N, n, n)) is not finite, or the covariance not positive semidefinite. ``without``: mask
-    (N,) of nodes that have no covariance, whose P is ignored.
+    """Return the ids of the nodes whose estimates end a run as diverged, see ``sound_mask``: those
+    of ``xhat`` (N, n), ``P`` (N, n, n) and, if the truth is known, ``error`` (N, n). ``without``:
+    mask (N,) of nodes that have no covariance.
     """
     # False broadcasts: every node then has a covariance to be looked at.
     known_error = error if scenario.plant.truth_known else None

@@ -15,10 +15,8 @@ BoolArray = NDArray[np.bool_]
 def stack_estimates(
     pairs: Sequence[tuple[FloatArray, FloatArray | None]],
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Stack ``pairs``, the results (xhat (n,), P (n, n) or None) of ``estimate`` of N filters.
-
-    Returns xhat (N, n), P (N, n, n), nan for a filter without covariance, and a mask (N,) of these
-    filters.
+    """Stack the results (xhat (n,), P (n, n) or None) of N filters: xhat (N, n), P (N, n, n), nan
+    for a filter without covariance, and a mask (N,) of these filters.
     """
     xhat = np.array([mean for mean, _ in pairs])
     without = np.array([cov is None for _, cov in pairs])
@@ -56,7 +54,6 @@ def sound_mask(
 
 
 def _semidefinite(P: FloatArray) -> BoolArray:
-    """Return a mask of the matrices ``P`` that are positive semidefinite but for rounding."""
     # A Cholesky factor of P plus a little is much cheaper than its eigenvalues, and nearly always
     # exists.
     size = np.abs(np.diagonal(P, axis1=-2, axis2=-1)).max(axis=-1, initial=0.0)
@@ -122,6 +119,5 @@ def _describe_break(xhat: FloatArray, P: FloatArray, without: bool) -> str:
 
 
 def _fill_in(reason: str, nodes: Sequence[int]) -> str:
-    """Return the ``reason`` with the ``nodes`` (ids) in place of {}."""
     listed = ", ".join(map(str, nodes[:MAX_NAMED])) + (", ..." if len(nodes) > MAX_NAMED else "")
     return reason.format(f"node{'s' if len(nodes) > 1 else ''} {listed}")

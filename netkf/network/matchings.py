@@ -328,3 +328,26 @@ class RecordedSlots(SlotActivation):
         for (*_, link), line in zip(*self._rows, strict=True):
             first_line.setdefault(link, line)
         demand_links(self.path, first_line, topology)
+
+
+def used_links(
+    activation: object,
+    topology: Topology,
+    random: np.random.Generator,
+    step: tuple[int, int, int],
+    pairwise: bool,
+) -> tuple[list[Link], set[Link] | None]:
+    """Return the links used in a ``step``, (slot, phase, repeat), and those directions of them that
+    are up (None: all). Matchings are drawn from ``random``, one stream for the whole network;
+    ``pairwise``: nodes swap with a peer, instead of absorbing broadcasts.
+    """
+    if isinstance(activation, Matching):
+        return activation.draw(topology, random), None
+    if not isinstance(activation, RecordedSlots):
+        return list(topology.links), None
+    listed = activation.pairs(*step)
+    if pairwise:
+        return listed, None
+    # A recorded list names links once: in an undirected graph both directions are up.
+    up = set(listed)
+    return list(topology.links), up if topology.directed else up | {(j, i) for i, j in listed}

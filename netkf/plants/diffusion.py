@@ -21,7 +21,7 @@ from netkf.core.fields import field, matrix, of_time, positive, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import eigenvalues
 from netkf.plants.laws import GridLaws
-from netkf.plants.paths import Cuts, DiffusionPath, DiffusionPaths
+from netkf.plants.paths import DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
 from netkf.plants.transitions import Transitions, decimal_below, frame_period
 from netkf.plants.tree import Tree
@@ -83,12 +83,8 @@ class Diffusion(Plant):
         horizon: float = 0.0,
         frames: bool = False,
     ) -> DiffusionPath:
-        """Return the path of one run, with states on the sensing grid and at the times ``sampled``
-        (K,) and ``probe_times`` (P,), increasing, in seconds.
-
-        ``random`` draws x(0) and the steps, ``sampling`` only the states at times ``sampled`` off
-        the grid, ``probing`` only those at probe times off both. With ``frames`` states are
-        relative to the origin of their frame; frames begin before the ``horizon`` (seconds).
+        """Return the path of one run, see ``paths``: ``random``, ``probing`` and ``sampling`` draw
+        what ``normals`` and the others draw there; frames begin before the ``horizon`` (seconds).
         """
         steps, probes = GeneratorNormals([random]), GeneratorNormals([probing])
         samples = GeneratorNormals([] if sampling is None else [sampling])
@@ -112,9 +108,9 @@ class Diffusion(Plant):
         probe times off both. With ``frames`` states are relative to the origin of their frame.
         """
         start = self.starts(normals)
-        cuts = [] if sampling is None or not len(sampled) else [Cuts(sampled, sampling)]
+        cuts = [] if sampling is None or not len(sampled) else [(sampled, sampling)]
         steps = self.frame_steps if frames else None
-        return DiffusionPaths(self.laws, start, normals, [*cuts, Cuts(probe_times, probing)], steps)
+        return DiffusionPaths(self.laws, start, normals, [*cuts, (probe_times, probing)], steps)
 
     def start(self, random: np.random.Generator) -> FloatArray:
         """Return x(0) (n,), drawn from ``random``."""
@@ -131,10 +127,9 @@ class Diffusion(Plant):
         self, random: np.random.Generator, times: FloatArray, horizon: float, frames: bool = False
     ) -> SampledTruth:
         """Return a path without a sensing grid, which has states at ``times`` (K,) in seconds, all
-        below the ``horizon``, and at frame times. A state depends on its time only, whatever other
-        times are asked for: ``random``, a generator of ``rng.streams``, draws x(0), and names the
-        streams of all else. With ``frames`` states are relative to the origin of their frame. Used
-        if all sensors take samples, so that nothing needs the grid.
+        below the ``horizon``, and at frame times. A state depends on its time only: ``random``
+        draws x(0), and names the streams of all else. With ``frames`` states are relative to the
+        origin of their frame.
         """
         stream, tree = state_of(random), self._tree(horizon)
         start = self.start(random)
@@ -149,7 +144,6 @@ class Diffusion(Plant):
 
     @cached_property
     def _trees(self) -> dict[float, Tree]:
-        """Trees by their horizon."""
         return {}
 
 

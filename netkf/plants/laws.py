@@ -18,19 +18,17 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES
 from netkf.linalg.legendre import forward_coefficients
 from netkf.linalg.portable import (
-    apply,
     gauss_legendre,
-    norm,
     product,
     pseudo_inverse,
     symmetric_root,
 )
 from netkf.linalg.series import exponential_terms, polynomial, with_reach
 from netkf.linalg.small import matmul
+from netkf.plants.transitions import noise_factors
 
 MAX_LAWS = 256  # cached laws of states inside a step
 MAX_GRIDS = 256  # cached parts of the sensing grid
-DEPENDENT = 1e-9  # a remainder below this share of the row's norm is rounding
 _NODES, _WEIGHTS = gauss_legendre(20)  # on [0, 1]
 
 
@@ -53,22 +51,19 @@ class GridLaws:
     def __init__(
         self, A: FloatArray, B: FloatArray, period: float, time_grid: TimeGrid = STANDARD
     ) -> None:
-        """Compute the laws of one step of ``period`` seconds of ``dx = A x dt + B dw``, with ``A``
-        (n, n) and ``B`` (n, m).
-        """
         self.n, self.period, self.time_grid = len(A), period, time_grid
         self.A, self.B = A, B
         self.to_end, self.to_moments = _response_series(A, period)
         self.course_table = course_table(self.to_end, self.n, period)
         self.response = self.responses(period)
-        self.noise_factor = _nonnegative_factor(self._impulse_responses(period))
+        noise = np.empty((3 * self.n, len(_NODES) * B.shape[1]))
+        self._fill_impulses(noise, 0, period, _NODES * period, _WEIGHTS * period)
+        self.noise_factor = noise_factors(noise[None])[0][0]
         self._conditional_laws: dict[tuple[float, float], tuple[FloatArray, FloatArray]] = {}
         self._grids: dict[tuple[int, int], FloatArray] = {}
 
     def grid(self, first: int, count: int) -> FloatArray:
-        """Return the points ``first`` .. ``first + count - 1`` of the sensing grid in seconds,
-        (count,).
-        """
+        """Return the points ``first`` .. ``first + count - 1`` of the grid in seconds, (count,)."""
         times = self._grids.get((first, count))
         if times is None:
             times = self.time_grid.snap(self.period * np.arange(first, first + count))
@@ -77,31 +72,20 @@ class GridLaws:
         return times
 
     def responses(self, gap: float) -> FloatArray:
-        """Return the matrices (3, n, n) that map a state to the state ``gap`` seconds later and to
-        the two moments.
-        """
+        """Return the maps (3, n, n) from a state to that ``gap`` seconds later and both moments."""
         values = [polynomial(series, gap) for series in (self.to_end, self.to_moments)]
         return np.concatenate(values).reshape(3, self.n, self.n)
-
-    def _impulse_responses(self, gap: float) -> FloatArray:
-        """Return responses (3 n, 20 m) of end and moments of a step to noise at the nodes."""
-        out = np.empty((3 * self.n, len(_NODES) * self.B.shape[1]))
-        self._fill_impulses(out, 0, gap, _NODES * gap, _WEIGHTS * gap)
-        return out
 
     def _fill_impulses(
         self, out: FloatArray, row: int, end: float, instants: FloatArray, weights: FloatArray
     ) -> None:
-        """Write responses of x(end) and two moments to noise at K ``instants`` into ``out``."""
         tables = self.to_end, self.to_moments, self.B
         fill_impulses(out, row, *tables, end, instants, weights)
 
     def conditional_law(self, length: float, before: float) -> tuple[FloatArray, FloatArray]:
-        """Return the law of state and moments ``before`` seconds after the start of a piece, given
-        the end and moments of the whole piece of ``length`` seconds.
-
-        The result is the gain of the conditional mean and a square root of the conditional
-        covariance, both (3 n, 3 n).
+        """Return the gain of the conditional mean and a root of the conditional covariance, both (3
+        n, 3 n), of state and moments ``before`` seconds after the start of a piece, given its end
+        and moments over ``length`` seconds.
         """
         key = self.time_grid.instant(length), self.time_grid.instant(before)
         law = self._conditional_laws.get(key)
@@ -112,7 +96,6 @@ class GridLaws:
         return law
 
     def _conditional(self, length: float, before: float) -> tuple[FloatArray, FloatArray]:
-        """Compute gain and root (3 n, 3 n) of state and moments in a piece, given its end."""
         size, after = 3 * self.n, length - before
         instants = np.concatenate([_NODES * before, before + _NODES * after])
         weights = np.concatenate([_WEIGHTS * before, _WEIGHTS * after])
@@ -140,11 +123,8 @@ def fill_impulses(
 ) -> None:
     """Write the response of x(end) and of the moments over [0, end] to an impulse of the noise at
     each of K ``instants`` (K,), in seconds, times the root of its ``weights`` (K,), into 3 n rows
-    of ``out`` (., K m) from ``row`` on.
-
-    By Gauss quadrature ``out out'`` is the covariance of end and moments. Noise after ``end`` has
-    no effect. ``B`` is (n, m); ``to_end`` (terms, n n + 1) and ``to_moments`` (terms, 2 n n + 1)
-    are the power series of GridLaws, of exp(A g) and of its two moments over a gap g.
+    of ``out`` (., K m) from ``row`` on. By Gauss quadrature ``out out'`` is the covariance of end
+    and moments.
     """
     n, m = B.shape
     for k in range(len(instants)):
@@ -186,9 +166,7 @@ def _response_series(A: FloatArray, longest: float) -> tuple[FloatArray, FloatAr
 
 
 def course_width(n: int) -> int:
-    """Return the number of columns W of ``course_table``: 2 n (two integrals of n states), rounded
-    up to a multiple of LANES, the numbers that one instruction of ``paths.fill_course`` handles.
-    """
+    """Return the number of columns W of ``course_table``: 2 n, rounded up to whole lanes."""
     return -(-2 * n // LANES) * LANES
 
 
@@ -215,22 +193,3 @@ def course_table(to_end: FloatArray, n: int, longest: float) -> FloatArray:
     for d in range(1, 4):
         table[d, n:, :n], table[d, n:, n : 2 * n] = of_x[d] * np.eye(n), of_xu[d] * np.eye(n)
     return table
-
-
-def _nonnegative_factor(noise: FloatArray) -> FloatArray:
-    """Return the lower triangular S (r, r) with ``S S' = noise noise'`` for ``noise`` (r, c)."""
-    # Gram-Schmidt, each row twice, which suffices (Kahan and Parlett). Householder reflections
-    # would give a dependent row a direction made of rounding errors, and later rows a share in it.
-    size = len(noise)
-    S, directions = np.zeros((size, size)), np.zeros_like(noise)
-    for k, row in enumerate(noise):
-        remainder = row.copy()
-        for _ in range(2):
-            components = apply(directions[:k], remainder)
-            S[k, :k] += components
-            remainder -= apply(directions[:k].T, components)
-        length = float(norm(remainder))
-        if length > DEPENDENT * float(norm(row)):
-            S[k, k] = length
-            directions[k] = remainder / length
-    return S

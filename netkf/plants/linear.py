@@ -18,9 +18,8 @@ import numpy as np
 
 from netkf.core.fields import covariance, field, seconds, square
 from netkf.linalg.arrays import FloatArray
-from netkf.linalg.portable import apply, cholesky, noise_root, product
+from netkf.linalg.portable import apply, cholesky, noise_root
 from netkf.plants.plant import Plant
-from netkf.plants.recursion import Recursion
 from netkf.plants.transitions import frame_slots
 
 BLOCK = 64  # slots drawn at once
@@ -58,22 +57,15 @@ class LinearPlant(Plant):
         return self.slot_time(slot) >= self.time_grid.instant(horizon)
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
-        """Return the true states of one run, drawn from ``random``; with ``frames`` those of an
-        unstable plant can be read relative to the origin of their frame.
-        """
+        """Return the true states of one run, drawn from ``random``, with ``frames`` or without."""
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
-        return LinearPath(self._steps, self.noise_root, start, random, slots)
+        return LinearPath(self.F, self.noise_root, start, random, slots)
 
     @cached_property
     def noise_root(self) -> FloatArray:
         """A root S (n, n) of ``Q = S S'``, by which standard normals are multiplied."""
         return noise_root(self.Q)
-
-    @cached_property
-    def _steps(self) -> Recursion:
-        """The recursion of the plant, with its cached powers of F."""
-        return Recursion(self.F)
 
 
 class Truth(Protocol):
@@ -93,14 +85,11 @@ class Truth(Protocol):
         """Return x (n,) in slot number ``slot``, in the plant's coordinates."""
 
     def state(self, slot: int) -> FloatArray:
-        """Return x (n,) in slot number ``slot``, in the plant's coordinates, as ``absolute``
-        does.
-        """
+        """Return x (n,) in slot number ``slot``, as ``absolute`` does."""
 
     def rebase(self, slot: int) -> FloatArray:
         """Return the local state (n,) of a slot that begins a frame, and make it zero from now on;
-        the engine subtracts the same vector from all estimates. The engine calls this once for each
-        such slot, when that slot's state has been recorded.
+        called once for each such slot, when its state has been recorded.
         """
 
 
@@ -117,99 +106,58 @@ class Readings(Protocol):
         """Return the reading (p,) in slot number ``slot``, whose state is x (n,)."""
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings (S, p) and matrices (S, p, n) of S increasing ``slots``, whose states are
-        x (S, n).
-        """
+        """Return readings (S, p) and H (S, p, n) of increasing ``slots`` with x (S, n)."""
 
 
 class LinearPath:
     """The path ``x[k+1] = F x[k] + root z[k]`` of one run from x[0] = ``start`` (n,) on.
 
-    ``steps`` is the recursion with F, ``root`` is (n, q) and z[k] are standard normals of
-    ``random``. With ``frame_slots``, a frame begins every ``frame_slots`` slots.
+    ``F`` is (n, n), ``root`` (n, q), and z[k] are standard normals of ``random``. With
+    ``frame_slots``, a frame begins every ``frame_slots`` slots. Slots must be asked for in order.
     """
 
     def __init__(
         self,
-        steps: Recursion,
+        F: FloatArray,
         root: FloatArray,
         start: FloatArray,
         random: np.random.Generator,
         frame_slots: int | None = None,
     ) -> None:
-        """Begin at slot 0 with the state ``start`` (n,); ``root`` (n, q) is the factor of the noise
-        that ``random`` draws, ``frame_slots`` the slots of a frame.
-        """
-        self._steps, self._root, self._random = steps, root, random
+        self._F, self._root, self._noise = F, root, Blocks(random, root.shape[1])
         self.frame_slots = frame_slots
-        # Local states (S, n) of the slots from ``_first`` on, each before a rebase, and, with
-        # frames, the state after a rebase from which the recursion goes on.
-        self._first, self._x, self._last = 0, start[None], start
+        # The present slot, its local state and the origin of that, both before a rebase.
+        self._slot, self._x, self._origin = 0, start, np.zeros(len(start))
         self._rebased = 0  # slot of the last rebase
-        # Absolute position of the origin of each frame, by the slot at which the frame begins.
-        self._origins = {0: np.zeros(len(start))}
+
+    def _move_to(self, slot: int) -> None:
+        # States beyond the horizon may overflow.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(self._slot, slot):
+                # The origin moves to the state where a frame begins.
+                if self.frame_slots and k and k % self.frame_slots == 0:
+                    self._origin, self._x = self._origin + self._x, np.zeros(len(self._x))
+                self._x = apply(self._F, self._x) + apply(self._root, self._noise.draw())
+                # An origin at 0 stays there.
+                if self._origin.any():
+                    self._origin = apply(self._F, self._origin)
+        self._slot = slot
 
     def local(self, slot: int) -> FloatArray:
-        """Return x (n,) of slot number ``slot``, not before the last one asked for, relative to the
-        origin of the present frame.
-        """
-        x = self._state_at(slot)
-        return np.zeros(len(x)) if slot == self._rebased > 0 else x
-
-    def _state_at(self, slot: int) -> FloatArray:
-        """Return the local state (n,) of slot number ``slot``, before a rebase."""
-        while slot >= self._first + len(self._x):
-            normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
-            noise = product(normals, self._root.T)
-            self._first += len(self._x) - 1
-            self._x = self._next_states(noise)
-        return np.asarray(self._x[slot - self._first])
-
-    def _next_states(self, noise: FloatArray) -> FloatArray:
-        """Return the next local states (BLOCK + 1, n), and note the origins of new frames."""
-        frame, first = self.frame_slots, self._first
-        if frame is None:
-            return np.asarray(self._steps.states(self._x[-1:], noise[None, None])[0])
-        frame_start = max(slot for slot in self._origins if slot <= first)
-        # Origins before the previous frame are not asked for again.
-        self._origins = {
-            slot: x for slot, x in self._origins.items() if slot >= frame_start - frame
-        }
-        parts, start = [self._x[-1:]], 0
-        # The recursion is interrupted at each rebase.
-        for end in [*range(frame - first % frame, len(noise), frame), len(noise)]:
-            x = self._steps.states(self._last[None], noise[None, None, start:end])[0]
-            parts.append(x[1:])
-            self._last, start = x[-1], end
-            if (first + end) % frame == 0:
-                self._origins[first + end] = self._origin_at(first + end) + x[-1]
-                self._last = np.zeros(len(x[-1]))
-        return np.concatenate(parts)
-
-    def _origin_at(self, slot: int) -> FloatArray:
-        """Return the origin (n,) at ``slot``, the old one where a frame begins."""
-        assert self.frame_slots is not None
-        # Slots 1 .. frame_slots belong to the origin of slot 0, and so on.
-        frame_start = max(slot - 1, 0) // self.frame_slots * self.frame_slots
-        x = self._origins[frame_start]
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(slot - frame_start if x.any() else 0):
-                x = apply(self._steps.F, x)
-        return np.asarray(x)
+        """Return x (n,) of slot number ``slot``, relative to the origin of the present frame."""
+        self._move_to(slot)
+        return np.zeros(len(self._x)) if slot == self._rebased > 0 else self._x
 
     def rebase(self, slot: int) -> FloatArray:
-        """Return the local state (n,) of slot number ``slot``, which begins a frame; it is zero
-        from now on.
-        """
+        """Return the local state (n,) of ``slot``, which begins a frame; it is zero from now on."""
+        self._move_to(slot)
         self._rebased = slot
-        return self._state_at(slot)
+        return self._x
 
     def absolute(self, slot: int) -> FloatArray:
-        """Return x (n,) of slot number ``slot``, not before the last one asked for, in the plant's
-        coordinates.
-        """
-        x = self._state_at(slot)
-        return x if self.frame_slots is None else self._origin_at(slot) + x
+        """Return x (n,) of slot number ``slot`` in the plant's coordinates."""
+        self._move_to(slot)
+        return self._x if self.frame_slots is None else self._origin + self._x
 
     state = absolute
 
@@ -230,9 +178,7 @@ class SlotReadings:
         return self._H
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return ``H x + v`` (p,) in slot number ``slot``, not before the last one asked for, where
-        the state is x (n,).
-        """
+        """Return ``H x + v`` (p,) in slot number ``slot``, see Readings."""
         return apply(self.matrix(slot), x) + self.noise(slot)
 
     def noise(self, slot: int) -> FloatArray:
@@ -247,9 +193,7 @@ class SlotReadings:
         return np.broadcast_to(self._H, (len(slots), *self._H.shape))
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings ``H x + v`` (S, p) and H (S, p, n) of S increasing ``slots`` whose states
-        are x (S, n).
-        """
+        """Return readings (S, p) and H (S, p, n) of S increasing ``slots``, see Readings."""
         H = self.matrices(slots)
         offsets = np.array(slots) - self._slot - 1
         # ``apply`` handles the vectors one by one: readings have the same bits however many slots

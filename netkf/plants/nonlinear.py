@@ -40,7 +40,7 @@ from netkf.plants.readings import (
     RecordedSamples,
     take_from_record,
 )
-from netkf.plants.sampling import Samples, sampling
+from netkf.plants.sampling import DrawnSamples, Samples, sampling
 from netkf.plants.sensors import Sensor, sampling_ticks
 
 GRAPH = "graph"
@@ -48,15 +48,13 @@ GRAPH = "graph"
 
 class Linearised:
     """A function that linearises the readings of a sensor at one of its nodes. Filters are given it
-    in the place of H, and call it with a reading and their own estimate.
+    in the place of H, and call it with a reading and their own estimate. ``present`` (p,) flags the
+    values that are there.
     """
 
     def __init__(
         self, sensor: NonlinearSensor, node: int, present: np.ndarray | None = None
     ) -> None:
-        """Take the ``sensor``, the ``node`` (id) that it measures from, and, where values of a
-        reading are missing, flags (p,) of those that are ``present``.
-        """
         self._sensor, self._node = sensor, node
         self._present = np.ones(len(sensor.R), dtype=bool) if present is None else present
 
@@ -98,7 +96,6 @@ class NonlinearSensor(Sensor):
     linear: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Check the fields and the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         if self.record is None:
             return
@@ -118,7 +115,6 @@ class NonlinearSensor(Sensor):
         return ReadingTable(self.path, self._count(given), given, linear=False)
 
     def _count(self, R: FloatArray | None) -> int:
-        """Return the number p of the values of a reading, with the ``R`` (p, p) that is given."""
         return 0 if R is None else len(R)
 
     @property
@@ -133,15 +129,11 @@ class NonlinearSensor(Sensor):
 
     @abstractmethod
     def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the reading (p,) without noise of the sensor on ``node`` (id) when the state is x
-        (n,).
-        """
+        """Return the reading (p,) without noise on ``node`` (id) when the state is x (n,)."""
 
     @abstractmethod
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (p, n) of ``h`` at the state x (n,), for the sensor on ``node``
-        (id).
-        """
+        """Return the Jacobian (p, n) of ``h`` at the state x (n,), on ``node`` (id)."""
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
         """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
@@ -168,9 +160,7 @@ class NonlinearSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> Any:
-        """Return the readings of the sensor on ``node`` (id) in one run in slots of ``period``
-        seconds, recorded or with noise from the stream "noise" that ``generator`` returns.
-        """
+        """Return the readings of the sensor on ``node`` (id) in one run, see Sensor."""
         if self.record is None:
             return NonlinearReadings(self, node, generator("noise"))
         slots = self.record.slots(node, period)
@@ -191,10 +181,7 @@ class NonlinearSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """Return the sample times (K,) in seconds, below the ``horizon``, of the sensor on ``node``
-        (id) with the number ``ordinal`` there, those of its table or drawn from its streams
-        "sampling" and "sampling phase" that ``generator`` returns.
-        """
+        """Return the times (K,) of its table, or of the ticks of ``sampling``, see Sensor."""
         if self.record is not None:
             return self.record.times(node, horizon)
         # Only sensors with a clock are asked.
@@ -204,9 +191,7 @@ class NonlinearSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> Samples:
-        """Return the samples of the sensor on ``node`` (id) in one run, with noise from the stream
-        "noise" that ``generator`` returns, or recorded; they do not depend on the ``horizon``.
-        """
+        """Return the samples of the sensor on ``node`` (id) in one run, see Sensor."""
         if self.record is not None:
             return RecordedSamples(self.record.rows(node), self._row_functions(node))
         return NonlinearSamples(self, node, generator("noise"))
@@ -223,39 +208,26 @@ class NonlinearReadings(SlotReadings):
         self._sensor, self._node = sensor, node
 
     def matrix(self, slot: int) -> Any:
-        """Return the function that linearises a reading of this sensor at an estimate; it is the
-        same in every ``slot``.
-        """
+        """Return the function that linearises a reading at an estimate, in every ``slot``."""
         return Linearised(self._sensor, self._node)
 
     def reading(self, slot: int, x: FloatArray) -> FloatArray:
-        """Return the reading ``h(x) + v`` (p,) of slot number ``slot``, not before the last one
-        asked for, where the state is x (n,).
-        """
+        """Return the reading ``h(x) + v`` (p,) of slot number ``slot``, see Readings."""
         noise = self.noise(slot)
         y: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64) + noise
         return y
 
 
-class NonlinearSamples:
+class NonlinearSamples(DrawnSamples):
     """The samples of a nonlinear sensor at one node (id) in continuous time, with noise from
-    ``random``.
+    ``random``; a function that linearises the reading takes the place of H.
     """
 
     def __init__(self, sensor: NonlinearSensor, node: int, random: np.random.Generator) -> None:
         self._readings = NonlinearReadings(sensor, node, random)
 
-    def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, Any]:
-        """Return ``y`` (p,) of sample number ``k``, at which the state is x (n,), and the function
-        that linearises it at an estimate.
-        """
-        return self._readings.reading(k, x), self._readings.matrix(k)
-
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Raise TypeError: without an estimate there is no H (S, p, n) of samples ``ks``.
-
-        Callers, which compute readings ahead of the filters, must use it for linear sensors only.
-        """
+        """Raise TypeError: without an estimate there is no H of samples ``ks``."""
         raise TypeError("readings of nonlinear sensors have no H before an estimate")
 
 
@@ -275,12 +247,11 @@ class PositionedSensor(NonlinearSensor):
     states: tuple[int, ...] = field(list_of(integer(low=0), "numbers of states"), default=(0, 1))
 
     rows: ClassVar[int] = 0
-    """Number p of the values of a reading, which subclasses set."""
+    """Number p of the values of a reading, distance and angle, which subclasses set."""
     turns: ClassVar[bool] = False
     """Whether the last of these values is an angle."""
 
     def __post_init__(self) -> None:
-        """Check the fields and the table; raises ScenarioError for a mistake in either."""
         if self.path is None:
             for name in ("nodes", "R"):
                 if getattr(self, name) is None:
@@ -288,12 +259,11 @@ class PositionedSensor(NonlinearSensor):
         super().__post_init__()
 
     def _count(self, R: FloatArray | None) -> int:
-        """Return the number p of the values of a reading, whatever ``R``."""
         return self.rows
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
-        """Return the sensor with its nodes at the ``positions`` of the graph, coordinates by node
-        id; raises ScenarioError if the graph has none (None).
+        """Return the sensor with its nodes at the ``positions`` of the graph; raises ScenarioError
+        if it has none (None).
         """
         if not isinstance(self.positions, str):
             return self
@@ -331,24 +301,33 @@ class PositionedSensor(NonlinearSensor):
             raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id), d =
-        len(states).
-        """
+        """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id)."""
         positions = np.asarray(self.positions, dtype=np.float64)
         return np.asarray(x[list(self.states)] - positions[self.places.index(node)])
 
-    def placed_columns(self, derivatives: FloatArray, n: int) -> FloatArray:
-        """Return the Jacobian (p, n) by the state, of n components, from ``derivatives`` (p, d) by
-        the target's position: zeros in the columns of other components.
+    def h(self, x: FloatArray, node: int) -> FloatArray:
+        """Return distance or angle (radians, in (-pi, pi]) or both (p,) of the target in the state
+        x (n,) from ``node`` (id).
         """
-        jacobian = np.zeros((len(derivatives), n))
-        jacobian[:, list(self.states)] = derivatives
+        d = self.offset(x, node)
+        angle = [math.atan2(d[1], d[0])] if self.turns else []
+        return np.array([math.hypot(*d)] * (self.rows - self.turns) + angle)
+
+    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
+        """Return the Jacobian (p, n) at the state x (n,): the unit vector ``d / |d|`` along the
+        offset d of the target from ``node`` (id), and ``[-d_2, d_1] / |d|^2``, or one of them; 0
+        where d is 0, and in the columns of other components.
+        """
+        d, jacobian = self.offset(x, node), np.zeros((self.rows, len(x)))
+        length = math.hypot(*d)
+        if length > 0.0:
+            angle = [np.array([-d[1], d[0]]) / length / length] if self.turns else []
+            rows = [d / length] * (self.rows - self.turns) + angle
+            jacobian[:, list(self.states)] = rows
         return jacobian
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
-        """Return ``y - expected`` (p,) of a reading y (p,) and the ``expected`` one (p,), with an
-        angle, the last value if the class ``turns``, wrapped to [-pi, pi).
-        """
+        """Return ``y - expected`` (p,), with an angle wrapped to [-pi, pi)."""
         innovation = y - expected
         if self.turns:
             innovation[-1] = (innovation[-1] + math.pi) % (2.0 * math.pi) - math.pi
@@ -364,16 +343,6 @@ class RangeSensor(PositionedSensor):
 
     rows: ClassVar[int] = 1
 
-    def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the distance (1,) of the target in the state x (n,) from ``node`` (id)."""
-        return np.array([math.hypot(*self.offset(x, node))])
-
-    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (1, n) at the state x (n,): the unit vector from ``node`` (id) to the
-        target.
-        """
-        return self.placed_columns(toward(self.offset(x, node))[None], len(x))
-
 
 @dataclass(frozen=True, eq=False)
 class BearingSensor(PositionedSensor):
@@ -384,19 +353,6 @@ class BearingSensor(PositionedSensor):
     rows: ClassVar[int] = 1
     turns: ClassVar[bool] = True
 
-    def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the angle (1,) in (-pi, pi], radians, of the direction from ``node`` (id) to the
-        target in the state x (n,).
-        """
-        first, second = self.offset(x, node).tolist()
-        return np.array([math.atan2(second, first)])
-
-    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (1, n) at the state x (n,): ``[-d_2, d_1] / |d|^2`` for the offset d
-        of the target from ``node`` (id).
-        """
-        return self.placed_columns(across(self.offset(x, node))[None], len(x))
-
 
 @dataclass(frozen=True, eq=False)
 class RangeBearingSensor(PositionedSensor):
@@ -404,31 +360,3 @@ class RangeBearingSensor(PositionedSensor):
 
     rows: ClassVar[int] = 2
     turns: ClassVar[bool] = True
-
-    def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return distance and angle (radians) (2,) of the target in the state x (n,) from ``node``
-        (id).
-        """
-        first, second = self.offset(x, node).tolist()
-        return np.array([math.hypot(first, second), math.atan2(second, first)])
-
-    def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (2, n) at the state x (n,): the row of the distance from ``node``
-        (id), then that of the angle.
-        """
-        d = self.offset(x, node)
-        return self.placed_columns(np.stack([toward(d), across(d)]), len(x))
-
-
-def toward(d: FloatArray) -> FloatArray:
-    """Return the unit vector (d,) along an offset ``d`` (d,), zeros where that is 0."""
-    length = math.hypot(*d)
-    return d / length if length > 0.0 else np.zeros_like(d)
-
-
-def across(d: FloatArray) -> FloatArray:
-    """Return the derivatives (2,) of the angle of an offset ``d`` (2,) by its components, in
-    radians per unit of length; zeros where it is 0.
-    """
-    square = float(d @ d)
-    return np.array([-d[1], d[0]]) / square if square > 0.0 else np.zeros(2)

@@ -22,19 +22,18 @@ known when they are compiled.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, ONE, Lanes, load, spread, store
-from netkf.linalg.portable import apply
 from netkf.linalg.structs import Size
 from netkf.plants.laws import GridLaws
 from netkf.plants.transitions import Transitions
+from netkf.plants.truth import absolute_states
 from netkf.rng.normals import Normals
 
 BLOCK = 64  # steps drawn at once, or a multiple of it
@@ -78,9 +77,7 @@ class Block(NamedTuple):
     ends: FloatArray
 
     def of(self, k: int) -> Block:
-        """Return the block of path ``k`` alone: ``x_start``, ``x_end``, ``moments`` and ``cubic``
-        lose their first axis, which counts the B paths; the times and ``step`` are those of all.
-        """
+        """Return the block of path ``k`` alone, without the axis of the B paths."""
         return self._replace(
             x_start=self.x_start[k],
             x_end=self.x_end[k],
@@ -93,20 +90,12 @@ class Block(NamedTuple):
         return PathStep(*(array[k] for array in self[: len(PathStep._fields)]))
 
 
-class Cuts(NamedTuple):
-    """Increasing ``times`` (T,), in seconds, at which steps are cut, and the streams of standard
-    normals, one for each run, that draw the states there.
-    """
-
-    times: FloatArray
-    normals: Normals
-
-
 class DiffusionPaths:
     """The paths of B runs from x(0) = ``start`` (B, n), drawn with the ``normals`` of each run.
 
-    All are cut at the same times: those of the first of ``cuts``, then those of the second given
-    the first. ``start`` is overwritten: it holds the state at the end of the last step drawn.
+    All are cut at the same times, (T,) and increasing: those of the first of ``cuts``, then those
+    of the second given the first, with streams of normals for the states there. ``start`` is
+    overwritten: it holds the state at the end of the last step drawn.
 
     With ``frame_steps`` states are local: they restart from zero after every ``frame_steps`` steps,
     so that a piece may end at a state from which the next one does not start.
@@ -119,20 +108,15 @@ class DiffusionPaths:
         laws: GridLaws,
         start: FloatArray,
         normals: Normals,
-        cuts: Sequence[Cuts],
+        cuts: Sequence[tuple[FloatArray, Normals]],
         frame_steps: int | None = None,
     ) -> None:
-        """Begin B paths at time 0 in the states ``start`` (B, n); ``laws`` are those of the plant's
-        steps, the other arguments are explained at the class.
-        """
         self.laws, self._normals, self._cuts = laws, normals, cuts
         self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
 
     def frame_times(self, horizon: float) -> FloatArray:
-        """Return the times (F,) in seconds, below the ``horizon``, at which a new frame begins:
-        every ``frame_steps`` steps, at points of the sensing grid.
-        """
+        """Return the times (F,) in seconds, below the ``horizon``, at which a frame begins."""
         steps, period = self.frame_steps, self.laws.period
         if steps is None:
             return np.empty(0)
@@ -141,9 +125,7 @@ class DiffusionPaths:
         return np.asarray(times[times < horizon])
 
     def following(self, blocks: int = 1, most: int | None = None) -> Block:
-        """Return the next S steps of the sensing grid, drawn now and cut at the sample and probe
-        times within: ``blocks`` times BLOCK of them, but at most ``most``.
-        """
+        """Return the next ``blocks`` times BLOCK steps, at most ``most``, with their cuts."""
         laws, (paths, n) = self.laws, self._x.shape
         total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
         x_start, x_end = (np.empty((paths, total, n)) for _ in range(2))
@@ -174,13 +156,13 @@ class DiffusionPaths:
             ends=times[1:],
         )
         # One kind of cuts after the other: probed states are drawn given those that were sampled.
-        for cuts in self._cuts:
-            first, last = np.searchsorted(cuts.times, times[[0, -1]], side="right")
-            block_times = cuts.times[first:last]
+        for cut_times, cut_normals in self._cuts:
+            first, last = np.searchsorted(cut_times, times[[0, -1]], side="right")
+            block_times = cut_times[first:last]
             # A time at the end of a piece needs no cut.
             inside = block_times[block.end[np.searchsorted(block.end, block_times)] != block_times]
             if len(inside):
-                block = self._cut(block, inside, cuts.normals)
+                block = self._cut(block, inside, cut_normals)
         return block
 
     def _cut(self, block: Block, times: FloatArray, source: Normals) -> Block:
@@ -190,9 +172,6 @@ class DiffusionPaths:
         normals = source.draw((len(times), 3 * self.laws.n))
         # A piece with m cuts becomes m + 1 rows of the arrays, copies of it at first.
         counts = 1 + np.bincount(owners, minlength=len(block.end))
-        # A piece with several cuts is cut at the first time, then its remainder at the second, ...:
-        # ``turn`` numbers the cuts of a piece from 0.
-        turn = np.arange(len(times)) - np.searchsorted(owners, owners)
         parents = np.repeat(np.arange(len(block.end)), counts)
         pieces = Block(
             start=block.start[parents],
@@ -204,41 +183,20 @@ class DiffusionPaths:
             step=block.step[parents],
             ends=block.ends,
         )
-        # Row of the piece to cut at each time, and the row after the last copy of that piece.
-        firsts = np.cumsum(counts) - counts
-        rows, stops = firsts[owners] + turn, (firsts + counts)[owners]
-        # The k-th cuts of all pieces at once.
-        for k in range(int(turn.max()) + 1):
-            cuts = np.flatnonzero(turn == k)
-            # The conditional law depends only on the length and on the position of the cut: cuts
-            # with the same law are drawn together.
-            starts, snap = pieces.start[rows[cuts]], self.laws.time_grid.snap
-            lengths = snap(pieces.end[rows[cuts]] - starts).tolist()
-            positions = snap(times[cuts] - starts).tolist()
-            groups = defaultdict[tuple[float, float], list[int]](list)
-            for cut, length, position in zip(cuts.tolist(), lengths, positions, strict=True):
-                groups[length, position].append(cut)
-            for group in map(np.array, groups.values()):
-                self._split(
-                    pieces, rows[group], stops[group], times[group], np.take(normals, group, axis=1)
-                )
+        # A piece with several cuts is cut at the first time, then its remainder at the second, ...
+        stops = np.cumsum(counts)[owners].tolist()
+        for cut, (owner, stop) in enumerate(zip(owners.tolist(), stops, strict=True)):
+            row, time = owner + cut, float(times[cut])
+            self._split(pieces, row, stop, time, np.ascontiguousarray(normals[:, cut]))
         return pieces
 
-    def _split(
-        self,
-        pieces: Block,
-        rows: np.ndarray,
-        stops: np.ndarray,
-        times: FloatArray,
-        normals: FloatArray,
-    ) -> None:
-        """Cut the C pieces in ``rows`` (C,) of B paths at ``times`` (C,), all at one position."""
-        laws = self.laws
-        length = float(pieces.end[rows[0]] - pieces.start[rows[0]])
-        before = float(times[0] - pieces.start[rows[0]])
-        split_pieces(
-            rows,
-            stops,
+    def _split(self, pieces: Block, row: int, stop: int, time: float, normals: FloatArray) -> None:
+        """Cut the piece in ``row`` of B paths at ``time``."""
+        laws, start = self.laws, float(pieces.start[row])
+        length, before = float(pieces.end[row]) - start, time - start
+        split_piece(
+            row,
+            stop,
             normals,
             *laws.conditional_law(length, before),
             np.stack([laws.responses(gap) for gap in (length, before, length - before)]),
@@ -246,15 +204,13 @@ class DiffusionPaths:
             np.empty((4, 3 * laws.n)),
             (pieces.x_start, pieces.x_end, pieces.moments, pieces.cubic),
         )
-        pieces.end[rows] = times
-        for row, stop, time in zip(rows.tolist(), stops.tolist(), times.tolist(), strict=True):
-            pieces.start[row + 1 : stop] = time
+        pieces.end[row] = pieces.start[row + 1 : stop] = time
 
 
 @kernel
-def split_pieces(
-    rows: IntArray,
-    stops: IntArray,
+def split_piece(
+    row: int,
+    stop: int,
     normals: FloatArray,
     gain: FloatArray,
     factor: FloatArray,
@@ -263,18 +219,15 @@ def split_pieces(
     work: FloatArray,
     pieces: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
 ) -> None:
-    """Cut the pieces in ``rows`` (K,) of B paths in place, given their ends and moments.
+    """Cut the piece in ``row`` of B paths in place, given its end and moments. The row becomes the
+    part before the cut, and the rows after it up to ``stop`` the part after it.
 
-    All have the same length and are cut at the same position. A row becomes the part before the
-    cut, and the rows after it up to its ``stops`` (K,) the part after it.
-
-    normals   (B, K, 3 n) standard normal numbers
+    normals   (B, 3 n) standard normal numbers
     gain      (3 n, 3 n) and ``factor`` (3 n, 3 n): GridLaws.conditional_law
     responses (3, 3, n, n) GridLaws.responses over the whole piece and the parts before and after
     lengths   (2,) seconds of the whole piece and of the part before the cut
     work      (4, 3 n) scratch
-    pieces    of K' >= K rows: states at the starts and ends (B, K', n), moments (B, K', 2, n) and
-              cubics (B, K', 3, n)
+    pieces    the first arrays of a Block but its times
 
     Vectors of 3 n numbers hold a state x and its plain and tilted moments, one after the other.
     """
@@ -283,40 +236,38 @@ def split_pieces(
     whole, noise, cut_noise, cut = work[0], work[1], work[2], work[3]
     share = before / length
     for run in range(len(normals)):
-        for k in range(len(rows)):
-            row = rows[k]
-            # whole = (end, moments) of the piece
+        # whole = (end, moments) of the piece
+        for i in range(n):
+            whole[i] = x_end[run, row, i]
+            whole[n + i], whole[2 * n + i] = moments[run, row, 0, i], moments[run, row, 1, i]
+        # noise = whole - response to the start: the contribution of the noise
+        add_response(noise, whole, -1.0, responses, 0, x_start, run, row)
+        # cut_noise = gain noise + factor z: that contribution to (state, moments) at the cut, drawn
+        # from its conditional law
+        for e in range(3 * n):
+            mean = deviation = 0.0
+            for c in range(3 * n):
+                mean += noise[c] * gain[e, c]
+                deviation += normals[run, c] * factor[e, c]
+            cut_noise[e] = mean + deviation
+        # cut = cut_noise + response to the start: state at the cut and moments before it
+        add_response(cut, cut_noise, 1.0, responses, 1, x_start, run, row)
+        set_part(pieces, run, row, before, cut, cut_noise)
+        # Moments after the cut, written to ``whole``. P_1 of the whole piece is (share - 1) + share
+        # P_1 on the part before and share + (1 - share) P_1 on the part after, which is solved for
+        # the moments after.
+        for i in range(n):
+            x_end[run, row, i] = cut[i]
+            plain_before, tilted_before = cut[n + i], cut[2 * n + i]
+            plain = whole[n + i] - plain_before
+            tilted = whole[2 * n + i] - (share - 1.0) * plain_before - share * tilted_before
+            whole[n + i], whole[2 * n + i] = plain, (tilted - share * plain) / (1.0 - share)
+        # noise = whole - response to the state at the cut, where the part after starts
+        add_response(noise, whole, -1.0, responses, 2, x_end, run, row)
+        for after in range(row + 1, stop):
             for i in range(n):
-                whole[i] = x_end[run, row, i]
-                whole[n + i], whole[2 * n + i] = moments[run, row, 0, i], moments[run, row, 1, i]
-            # noise = whole - response to the start: the contribution of the noise
-            add_response(noise, whole, -1.0, responses, 0, x_start, run, row)
-            # cut_noise = gain noise + factor z: that contribution to (state, moments) at the cut,
-            # drawn from its conditional law
-            for e in range(3 * n):
-                mean = deviation = 0.0
-                for c in range(3 * n):
-                    mean += noise[c] * gain[e, c]
-                    deviation += normals[run, k, c] * factor[e, c]
-                cut_noise[e] = mean + deviation
-            # cut = cut_noise + response to the start: state at the cut and moments before it
-            add_response(cut, cut_noise, 1.0, responses, 1, x_start, run, row)
-            set_part(pieces, run, row, before, cut, cut_noise)
-            # Moments after the cut, written to ``whole``. P_1 of the whole piece is
-            # (share - 1) + share P_1 on the part before and share + (1 - share) P_1 on the part
-            # after, which is solved for the moments after.
-            for i in range(n):
-                x_end[run, row, i] = cut[i]
-                plain_before, tilted_before = cut[n + i], cut[2 * n + i]
-                plain = whole[n + i] - plain_before
-                tilted = whole[2 * n + i] - (share - 1.0) * plain_before - share * tilted_before
-                whole[n + i], whole[2 * n + i] = plain, (tilted - share * plain) / (1.0 - share)
-            # noise = whole - response to the state at the cut, where the part after starts
-            add_response(noise, whole, -1.0, responses, 2, x_end, run, row)
-            for after in range(row + 1, stops[k]):
-                for i in range(n):
-                    x_start[run, after, i] = cut[i]
-                set_part(pieces, run, after, length - before, whole, noise)
+                x_start[run, after, i] = cut[i]
+            set_part(pieces, run, after, length - before, whole, noise)
 
 
 @kernel
@@ -331,10 +282,7 @@ def add_response(
     row: int,
 ) -> None:
     """Write ``out`` = ``values`` + ``sign`` R x[run, row], both (3 n,), where R (3 n, n) is
-    ``responses[which]`` (3, n, n): the response of end state and moments to the state at the start.
-    ``responses`` is (W, 3, n, n), for W intervals; ``x`` (B, K, n) has the states of B paths at K
-    pieces. ``split_pieces`` removes the response from a piece (sign -1) to get what the noise
-    contributed, and adds it to the parts (sign 1).
+    ``responses[which]``: the response of end state and moments to the state at the start.
     """
     n = x.shape[2]
     for m in range(3):
@@ -354,12 +302,8 @@ def set_part(
     values: FloatArray,
     noise: FloatArray,
 ) -> None:
-    """Set moments and cubic of the piece ``row`` of ``length`` seconds in path ``run``, in
-    ``pieces``: states at the starts and ends (B, K, n), moments (B, K, 2, n) and cubics
-    (B, K, 3, n) of B paths of K pieces.
-
-    ``values`` (3 n,) are its end state and moments, ``noise`` (3 n,) the contribution of the noise
-    to them, which the cubic interpolates.
+    """Set moments and cubic of the piece ``row`` of ``length`` seconds from its end state and
+    moments, ``values`` (3 n,), and the contribution of the noise to them, ``noise`` (3 n,).
     """
     _, _, moments, cubic = pieces
     n = moments.shape[3]
@@ -379,12 +323,9 @@ def fill_cubic(
     plain: float,
     tilted: float,
 ) -> None:
-    """Set ``cubic[run, row, :, i]`` of ``cubic`` (B, K, 3, n), for component i of the state in
-    piece ``row`` (0 to K - 1) of path ``run`` (0 to B - 1): the coefficients, times ``length``, of
-    u, u^2 and u^3 of the cubic on 0 <= u <= 1 that is 0 at u = 0 and ``end`` at u = 1.
-
-    Over ``length`` seconds its integral is ``plain`` and that of its product with P_1 ``tilted``:
-    it stands for what the noise contributed to x, of which just these three numbers are drawn.
+    """Set ``cubic[run, row, :, i]``: the coefficients, times ``length``, of u, u^2 and u^3 of the
+    cubic that is 0 at u = 0 and ``end`` at u = 1, and has the moments ``plain`` and ``tilted``:
+    what the noise contributed to x.
     """
     # With e = length end, M_0 = plain and S_1 = 3 tilted these conditions give the coefficients
     # 6 M_0 - 10 S_1 + 3 e, 30 S_1 - 6 M_0 - 12 e and 10 e - 20 S_1.
@@ -454,14 +395,11 @@ class DiffusionPath:
     """
 
     def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
-        """Begin the path of one run, the first of ``paths``, at time 0; ``horizon`` (seconds) is
-        the end of the run.
-        """
         self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
         self.frame_times = paths.frame_times(horizon)
         self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
-        # Number of the present frame, and absolute position of its origin at its start.
-        self._frame, self._origin = 0, np.zeros(self.laws.n)
+        # The local states just before the frames so far began.
+        self._offsets: list[FloatArray] = []
         self._block: Block | None = None
         # Indices of the first piece of the present step, and of the piece last asked for; that
         # piece, of which there is none yet, and the end of its step.
@@ -492,9 +430,7 @@ class DiffusionPath:
         return self._step_end
 
     def moments(self, start: float, end: float) -> FloatArray:
-        """Return the two moments (2, n) of x over [start, end] seconds, its integrals with P_0 = 1
-        and P_1 of that interval, inside one sensing step: the one last asked for or a later one.
-        """
+        """Return the two moments (2, n) of x over [start, end] seconds, inside one sensing step."""
         step = self._at(end)
         if start >= step.start:
             return state_moments(self.laws, step, start, end)
@@ -519,8 +455,8 @@ class DiffusionPath:
             k -= 1
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) in the present frame at a grid, sample or probe ``time`` (seconds), not
-        before the last one asked for; 0 at a frame time.
+        """Return x (n,) in the present frame at a grid, sample or probe ``time``; 0 at frame
+        times.
         """
         step = self._at(time)
         assert time in (step.start, step.end), f"{time} is neither on the grid nor probed"
@@ -530,47 +466,29 @@ class DiffusionPath:
         return step.x_end if time == step.end else step.x_start
 
     def _begins_frame(self, time: float) -> bool:
-        """Return True if a frame begins at ``time`` (seconds)."""
         k = int(np.searchsorted(self.frame_times, time))
         return k < len(self.frame_times) and bool(self.frame_times[k] == time)
 
     def rebase(self, k: int) -> FloatArray:
-        """Return the shift (n,) to subtract from estimates at ``frame_times[k]``, k = 0, 1, ...:
-        the local state just before.
-        """
-        time = float(self.frame_times[k])
-        step = self._at(time)
-        start = 0.0 if k == 0 else float(self.frame_times[k - 1])
-        with np.errstate(over="ignore", invalid="ignore"):
-            # New origin = e^{A g} (previous origin) + local state.
-            self._origin = self._origin_after(time - start) + step.x_end
-        self._frame = k + 1
-        return step.x_end
-
-    def _origin_after(self, gap: float) -> FloatArray:
-        """Return the origin (n,) of the present frame ``gap`` seconds after it began."""
-        # An origin at 0 stays there; the product would be nan where the transition overflows.
-        if self._moves is None or not self._origin.any():
-            return self._origin
-        return apply(self._moves.transitions(np.array([gap]))[0], self._origin)
+        """Return the local state (n,) just before ``frame_times[k]``, the new origin."""
+        x = self._at(float(self.frame_times[k])).x_end
+        self._offsets.append(x)
+        return x
 
     def absolute(self, time: float) -> FloatArray:
-        """Return x (n,) in the plant's coordinates at a ``time`` (seconds) that ``local`` takes;
-        ``rebase`` must have been called for all frame times so far.
-        """
+        """Return x (n,) in the plant's coordinates at a ``time`` that ``local`` takes."""
         x = self.local(time)
-        if not self._frame:
+        if self._moves is None or not self._offsets:
             return x
-        with np.errstate(over="ignore", invalid="ignore"):
-            return x + self._origin_after(time - float(self.frame_times[self._frame - 1]))
+        begun, offsets = self.frame_times[: len(self._offsets)], np.stack(self._offsets)
+        at = np.array([time])
+        return np.asarray(absolute_states(self._moves, begun, offsets, at, x[None])[0])
 
     state = absolute
 
 
 def state_moments(laws: GridLaws, step: PathStep, start: float, end: float) -> FloatArray:
-    """Return the two moments (2, n) of x over [start, end] seconds inside a piece ``step`` of the
-    path: its integrals with the Legendre polynomials P_0 = 1 and P_1 of that interval.
-    """
+    """Return the two moments (2, n) of x over [start, end] seconds inside a piece ``step``."""
     n = len(step.x_start)
     # The moments of a whole piece were drawn from their exact law; those of a part are approximated
     # by the cubic.
@@ -634,12 +552,9 @@ def fill_state_moments(
     length: float,
     scratch: FloatArray,
 ) -> None:
-    """Write the two moments of the state x over an interval of ``gap`` seconds into ``out`` (2, n):
-    its integrals with the Legendre polynomials P_0 = 1 and P_1 of the interval, which begins
-    ``since`` seconds after the start of a piece of ``length`` seconds. ``size`` has length n.
-
-    ``course`` (D, W), D of W polynomials, are the coefficients that ``fill_course`` wrote for the
-    piece, ``scratch`` (2 W,).
+    """Write the two moments of x over ``gap`` seconds, which begin ``since`` seconds after the
+    start of a piece of ``length`` seconds, into ``out`` (2, n), from its ``course`` (D, W).
+    ``scratch`` (2 W,).
     """
     first, share = since / length, gap / length
     fill_integrals(scratch, course, first, first + share)
@@ -648,9 +563,8 @@ def fill_state_moments(
 
 @kernel(inlined=True, fused=True)
 def fill_integrals(out: FloatArray, course: FloatArray, first: float, last: float) -> None:
-    """Write the values of the W polynomials ``u sum_d u^d course[d]`` of a ``course`` (D, W), the D
-    coefficients that ``fill_course`` wrote, at u = ``first`` into ``out[:W]`` and at u = ``last``
-    into ``out[W : 2 W]``; ``fill_moments_between`` makes moments of them.
+    """Write the values of the W polynomials of a ``course`` at u = ``first`` and at u = ``last``
+    into both halves of ``out`` (2 W,).
     """
     width, top = course.shape[1], len(course) - 1
     # Horner's rule at both points in one loop: each product waits for the one before it, so two
@@ -675,12 +589,8 @@ def fill_moments_between(
     first: Any,
     share: Any,
 ) -> None:
-    """Write the two moments of x over u in [first, first + share] of a piece into ``out``
-    (2, n, L), where u is the share of the piece that has passed, in L lanes (runs side by side, or
-    one) with ``first`` and ``share`` (L,) each; ``size`` has length n.
-
-    ``integrals`` (2 W, L), W = ``width``, are those that ``fill_integrals`` wrote for both ends.
-    ``lanes`` is a tuple of length L.
+    """Write the two moments of x over u in [first, first + share] of a piece into ``out`` (2, n,
+    L), from the ``integrals`` (2 W, L) that ``fill_integrals`` wrote; W = ``width``.
     """
     n, last = len(size), first + share
     # P_1 of the interval is (u - middle) scale. Row 0: int x. Row 1: int x P_1. The second integral

@@ -54,9 +54,7 @@ class Plant(Component, OnGrid):
         return noise_root(self.start_cov)
 
     def starts(self, normals: Normals) -> FloatArray:
-        """Return x(0) = mean + root z of B runs, (B, n), with z drawn from ``normals``, which has
-        one stream for each run.
-        """
+        """Return x(0) (B, n) of B runs, with a stream of ``normals`` for each."""
         # A product for each run: its state has the same bits whatever the other runs are.
         deviations = product(normals.draw((1, self.n)), self.start_root.T)
         return np.asarray(self.start_mean + deviations[:, 0])

@@ -47,8 +47,8 @@ class NodeRows(NamedTuple):
     anchors: np.ndarray
 
     def covariance(self, k: int, R: FloatArray) -> FloatArray:
-        """Return the noise covariance (p', p') of the p' values of reading k: its own, else the
-        part of the sensor's R (p, p).
+        """Return the covariance (p', p') of the values of reading k: its own, else from R (p,
+        p).
         """
         present = np.flatnonzero(np.isfinite(self.y[k]))
         own = self.R[k] if len(self.R) else R
@@ -126,7 +126,6 @@ class ReadingTable:
         return np.isfinite(self._stack([f"y{k}" for k in range(self.p)]))
 
     def _stack(self, names: Sequence[str]) -> FloatArray:
-        """Return the named columns side by side (K, len(names))."""
         columns = [self.columns[name] for name in names]
         return np.stack(columns, axis=1) if columns else np.empty((len(self.columns.lines), 0))
 
@@ -177,9 +176,7 @@ class ReadingTable:
             raise ScenarioError("path", rule, value, "variances are positive; correct the row")
 
     def first_covariance(self) -> FloatArray | None:
-        """Return the noise covariance (p, p) of the first row that brings a whole one, or None: it
-        stands for R where the sensor has none.
-        """
+        """Return the noise covariance (p, p) of the first row that brings a whole one, or None."""
         whole = np.flatnonzero(np.isfinite(self._covariances).all(axis=(1, 2)))
         return readonly_array(self._covariances[whole[0]]) if whole.size else None
 
@@ -194,11 +191,9 @@ class ReadingTable:
 
     @cached_property
     def _rows(self) -> dict[int, NodeRows]:
-        """Cache of ``rows``."""
         return {}
 
     def _make_rows(self, node: int) -> NodeRows:
-        """Return the readings of ``node`` (id), see ``rows``."""
         columns, own = self.columns, self.columns["node"] == node
         for name in self._surplus:
             entries = columns[name]
@@ -237,21 +232,16 @@ class ReadingTable:
 
     @cached_property
     def _slots(self) -> dict[tuple[int, float], dict[int, list[int]]]:
-        """Cache of ``slots``."""
         return {}
 
     def times(self, node: int, horizon: float) -> FloatArray:
-        """Return the times (K,) in seconds, below the ``horizon``, of the readings of ``node``
-        (id); equal ones are used together.
-        """
+        """Return the times (K,) in seconds, below the ``horizon``, of the rows of ``node``."""
         t = self.rows(node).t
         return t[: int(np.searchsorted(t, horizon))]
 
     @cached_property
     def row_times(self) -> list[tuple[int, float]]:
-        """Node id and time (seconds) of every row, in the order of the file; nan where no value is
-        there, so that it is no reading.
-        """
+        """Node id and time (seconds) of every row, in file order; nan without a value."""
         t, half_digits = self.columns["t"], self.columns.half_digits
         times = np.where((t < 0.0) & (t >= -half_digits), 0.0, t)
         times[~self.present.any(axis=1)] = np.nan
@@ -259,9 +249,7 @@ class ReadingTable:
 
 
 def number_of(name: str, letter: str = "y") -> int:
-    """Return the number in the ``name`` of a column, 3 for "y3" with ``letter`` "y"; -1 for names
-    of another form.
-    """
+    """Return the number in the ``name`` of a column, 3 for "y3"; -1 for other names."""
     number = name.removeprefix(letter)
     return int(number) if name.startswith(letter) and number.isdecimal() else -1
 
@@ -301,9 +289,7 @@ class RecordedSamples:
         self._rows, self._matrix, self._is_uniform = rows, matrix, rows.is_uniform
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, Any]:
-        """Return ``y`` (p',) and ``H`` (p', n), or a function that linearises the reading, of
-        sample number ``k``, for the p' values that are there; the state x (n,) is not used.
-        """
+        """Return ``y`` (p',) and ``H`` (p', n), or a function, of the values of sample ``k``."""
         present = np.isfinite(self._rows.y[k])
         return self._rows.y[k][present], self._matrix(k, present)
 
@@ -312,9 +298,7 @@ class RecordedSamples:
         return self._rows.covariance(k, R)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the numbers ``ks``, with
-        zeros behind the values that are there; the states x (S, n) are not used.
-        """
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of samples ``ks``; zeros for missing values."""
         rows, p = self._rows, self._rows.y.shape[1]
         if self._is_uniform and rows.phi.shape[1]:
             return rows.y[list(ks)], rows.phi[list(ks), None]
@@ -343,9 +327,7 @@ class RecordedReadings:
         self._whitened: list[tuple[FloatArray, FloatArray]] | None = None
 
     def matrix(self, slot: int) -> Any:
-        """Return H (p', n) in slot number ``slot``, or a function that linearises its reading, for
-        the p' values that are there.
-        """
+        """Return H (p', n) of the values of a slot, or a function that linearises them."""
         parts = [self._matrix(k, np.isfinite(self._rows.y[k])) for k in self._slots.get(slot, ())]
         if not self._n:
             return Stacked(parts)
@@ -357,15 +339,11 @@ class RecordedReadings:
         return y[np.isfinite(y)]
 
     def covariance(self, slot: int, R: FloatArray) -> FloatArray:
-        """Return the noise covariance (p', p') in slot number ``slot`` of a sensor with R
-        (p, p).
-        """
+        """Return the noise covariance (p', p') in slot number ``slot``, from R (p, p)."""
         return block_diagonal([self._rows.covariance(k, R) for k in self._slots.get(slot, ())])
 
     def several(self, slots: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings (S, p) and matrices (S, p, n) of S ``slots`` as they are without noises
-        of their own; zeros, which carry no information, for what is missing.
-        """
+        """Return readings (S, p) and matrices (S, p, n) of ``slots``; zeros for missing values."""
         p = max([self._rows.y.shape[1], *(len(self.reading(slot, x)) for slot in slots)])
         y, H = np.zeros((len(slots), p)), np.zeros((len(slots), p, self._n))
         for index, slot in enumerate(slots):
@@ -394,9 +372,7 @@ class RecordedReadings:
         return y, H
 
     def _whiten(self, R: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-        """Return each row, y (p',) and H (p', n), times the inverse Cholesky factor of its noise
-        covariance, where a sensor has R (p, p).
-        """
+        """Return each row, y (p',) and H (p', n), times the inverse root of its covariance."""
         rows, pairs = self._rows, []
         uniform = cholesky(R) if rows.is_uniform else None
         for k, y in enumerate(rows.y):
@@ -423,9 +399,7 @@ class Stacked:
 
 
 def take_from_record(sensor: Any, record: ReadingTable) -> None:
-    """Give a ``sensor`` the nodes and the R of its table where it has none; raises ScenarioError if
-    the table lists no node, or has no R either.
-    """
+    """Give a ``sensor`` nodes and R of its table where it has none; may raise ScenarioError."""
     if sensor.nodes is None:
         object.__setattr__(sensor, "nodes", record.listed)
     if not sensor.nodes:
@@ -437,8 +411,6 @@ def take_from_record(sensor: Any, record: ReadingTable) -> None:
 
 
 def covariance_of(path: Any, k: int, R: FloatArray) -> FloatArray:
-    """Return the noise covariance of reading number ``k`` (a sample, or a slot) of a ``path``: that
-    of its values if they are recorded, else the R (p, p) of the sensor.
-    """
+    """Return the covariance of reading number ``k``: its own, or the R (p, p) of the sensor."""
     covariance = getattr(path, "covariance", None)
     return R if covariance is None else np.asarray(covariance(k, R))

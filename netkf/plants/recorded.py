@@ -58,9 +58,7 @@ class UnknownPlant(LinearPlant):
     truth_known: ClassVar[bool] = False
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return a path of nan (n,) in all slots, without ``frames``; nothing is drawn from
-        ``random``.
-        """
+        """Return a path of nan (n,) in all slots; nothing is drawn from ``random``."""
         return RecordedPath({}, np.full(self.n, math.nan))
 
 
@@ -79,7 +77,6 @@ class RecordedPlant(LinearPlant):
     interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
 
     def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self.table  # a mistake in the file is found on construction
 
@@ -96,7 +93,6 @@ class RecordedPlant(LinearPlant):
 
     @cached_property
     def _states(self) -> tuple[Columns, FloatArray]:
-        """The columns of the file and the states (K, n) of its rows."""
         return _read_states(self.path, self.n)
 
     @cached_property
@@ -136,9 +132,7 @@ class RecordedPlant(LinearPlant):
             raise ScenarioError("path", rule, None, remedy)
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return the states of the table, nan in slots without one; nothing is drawn from
-        ``random``, and a recorded path has no ``frames``.
-        """
+        """Return the states of the table, nan in slots without one; ``random`` is not used."""
         return RecordedPath(self.table, np.full(self.n, math.nan))
 
 
@@ -155,7 +149,6 @@ class InterpolatedStates:
         return self._truth.rows_at(slot * self._period)
 
     def __contains__(self, slot: int) -> bool:
-        """Return True if the state of a slot is known."""
         return bool(self.rows_at(slot))
 
     def get(self, slot: int, otherwise: FloatArray) -> FloatArray:
@@ -194,20 +187,16 @@ class RecordedDiffusion(Diffusion):
     interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
 
     def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self.recorded_truth  # a mistake in the file is found on construction
 
     @cached_property
     def recorded_truth(self) -> RecordedTruth:
-        """The true state of a run as engines read it, nan where it is unknown; raises ScenarioError
-        for two states at one time.
-        """
+        """The true state as engines read it; raises ScenarioError for two states at one time."""
         return _recorded_truth(*self._states, self.n, self.interpolate)
 
     @cached_property
     def _states(self) -> tuple[Columns, FloatArray]:
-        """The columns of the file and the states (K, n) of its rows."""
         return _read_states(self.path, self.n)
 
     @property
@@ -225,10 +214,7 @@ class RecordedDiffusion(Diffusion):
         return {key for time in times.tolist() for key in self.recorded_truth.rows_at(time)}
 
     def require_times(self, times: FloatArray, what: str) -> None:
-        """Raise ScenarioError if the table has no state at one of the ``times`` (K,), in seconds.
-
-        ``what`` names the use of the states in the message.
-        """
+        """Raise ScenarioError if a state is missing at ``times`` (K,), for the use ``what``."""
         demand_states(self.path, self.recorded_truth, times, what)
 
 
@@ -305,9 +291,6 @@ class RecordedSensor(Sensor):
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"), default=None)
 
     def __post_init__(self) -> None:
-        """Take nodes, H and R from the table where they are not given; raise ScenarioError if H or
-        R is missing or the file has a mistake.
-        """
         super().__post_init__()
         take_from_record(self, self.record)
         record, H = self.record, self.H
@@ -351,25 +334,19 @@ class RecordedSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """Return the times (K,) in seconds of the table's rows of ``node`` (id), below the
-        ``horizon``, whatever its ``ordinal``; nothing is drawn from ``generator``.
-        """
+        """Return the times (K,) in seconds, below the ``horizon``, of the rows of ``node`` (id)."""
         return self.record.times(node, horizon)
 
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> RecordedSamples:
-        """Return the samples of the table's rows of ``node`` (id), also those beyond the
-        ``horizon``; nothing is drawn from ``generator``.
-        """
+        """Return the samples of the table's rows of ``node`` (id); nothing is drawn."""
         return RecordedSamples(self.record.rows(node), self._matrix_function(node))
 
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RecordedReadings:
-        """Return the readings of the table's rows of ``node`` (id) in slots of ``period`` seconds;
-        nothing is drawn from ``generator``.
-        """
+        """Return the readings of the table's rows of ``node`` (id) in slots; nothing is drawn."""
         record = self.record
         rows, slots, n = record.rows(node), record.slots(node, period), self.H.shape[1]
         return RecordedReadings(rows, slots, self._matrix_function(node), n)

@@ -16,7 +16,6 @@ from netkf.core.fields import covariance, definite_covariance, field, matrix, sq
 from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.linalg.portable import apply, noise_root, product
 from netkf.plants.linear import LinearPath, SlotReadings
-from netkf.plants.recursion import Recursion
 from netkf.plants.sensors import Sensor
 
 
@@ -47,11 +46,6 @@ class RegressorSensor(Sensor):
         return readonly_array(apply(self.C, self.start)[None])
 
     @cached_property
-    def steps(self) -> Recursion:
-        """The recursion of the regressor's state ``s``."""
-        return Recursion(self.A)
-
-    @cached_property
     def drive(self) -> FloatArray:
         """The matrix B S (m, q) that maps standard normals to ``B xi_k``, with xi_cov = S S'."""
         return product(self.B, noise_root(self.xi_cov))
@@ -59,9 +53,7 @@ class RegressorSensor(Sensor):
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> RegressorReadings:
-        """Return the readings of the sensor on ``node`` (id) in one run in slots, drawn from the
-        streams "noise" and "regressor" that ``generator`` returns; ``period`` is not used.
-        """
+        """Return the readings of the sensor on ``node`` (id) in one run, see Sensor."""
         return RegressorReadings(self, generator("noise"), generator("regressor"))
 
 
@@ -76,12 +68,10 @@ class RegressorReadings(SlotReadings):
     ) -> None:
         """Draw the noise of readings from ``random`` and the regressor's state from ``driving``."""
         super().__init__(sensor.H, sensor.R, random)
-        self._C, self._s = sensor.C, LinearPath(sensor.steps, sensor.drive, sensor.start, driving)
+        self._C, self._s = sensor.C, LinearPath(sensor.A, sensor.drive, sensor.start, driving)
 
     def matrix(self, slot: int) -> FloatArray:
-        """Return H = ``phi_k'`` (1, n) of slot number ``slot``, not before the last one asked
-        for.
-        """
+        """Return H = ``phi_k'`` (1, n) of slot number ``slot``, not before the last one."""
         return apply(self._C, self._s.state(slot))[None]
 
     def matrices(self, slots: Sequence[int]) -> FloatArray:

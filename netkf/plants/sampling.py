@@ -42,15 +42,11 @@ class DrawnSamples:
         self._readings = SlotReadings(H, R, random)
 
     def reading(self, k: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``, at which the state is x
-        (n,).
-        """
+        """Return ``y`` (p,) and ``H`` (p, n) of sample number ``k``, see Samples."""
         return self._readings.reading(k, x), self._readings.matrix(k)
 
     def several(self, ks: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples with the increasing numbers
-        ``ks``, at which the states are x (S, n).
-        """
+        """Return ``y`` (S, p) and ``H`` (S, p, n) of the S samples ``ks``, see Samples."""
         return self._readings.several(ks, x)
 
 
@@ -63,15 +59,12 @@ class RecordedSampling(Clock):
     path: SourceFile = field(source_file)
 
     def __post_init__(self) -> None:
-        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
         _ = self._times  # a mistake in the file is found on construction
 
     @cached_property
     def row_times(self) -> list[tuple[int, float]]:
-        """Node id and time (seconds) of every row, in the order of the file; equal ones are one
-        sample.
-        """
+        """Node id and time (seconds) of every row, in the order of the file."""
         table = read_columns(self.path, ("t", "node"))
         nodes = table.integers("node")
         early = np.flatnonzero(table["t"] <= 0.0)
@@ -105,8 +98,8 @@ class RecordedSampling(Clock):
         random: np.random.Generator,
         count: int,
     ) -> FloatArray:
-        """Return up to ``count`` recorded times (<= count,) in seconds of the node ``entity[0]``,
-        from number ``index`` on; nothing is drawn, and ``origin`` and ``now`` are not used.
+        """Return up to ``count`` recorded times of the node ``entity[0]``, from number ``index``
+        on.
         """
         return self._times.get(entity[0], np.empty(0))[index : index + count]
 

@@ -34,8 +34,8 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, Lanes, load, root_of, spread, store
 from netkf.linalg.portable import cholesky
 from netkf.linalg.structs import Size
-from netkf.plants.linear import Readings, SlotReadings
-from netkf.plants.paths import BLOCK, DiffusionPath
+from netkf.plants.linear import Blocks, Readings, SlotReadings
+from netkf.plants.paths import DiffusionPath
 from netkf.plants.readings import ReadingTable
 from netkf.plants.sampling import DrawnSamples, Samples, sampling
 
@@ -114,12 +114,9 @@ def sampling_ticks(
     generator: Callable[[str], np.random.Generator],
     horizon: float,
 ) -> FloatArray:
-    """Return the times (K,) in seconds, below the ``horizon``, at which the ``clock`` of a sensor
-    ticks, so that it samples.
-
-    ``entity`` is the node and the number of the sensor among those of that node. ``generator``
-    returns the sensor's random streams for the purposes "sampling" and, for the phase of a periodic
-    clock, "sampling phase".
+    """Return the times (K,) in seconds, below the ``horizon``, at which the ``clock`` of a sensor,
+    ``entity`` = (node, ordinal), ticks. ``generator`` returns its streams for the purposes
+    "sampling" and "sampling phase".
     """
     phase = partial(generator, "sampling phase")
     return generate_ticks(clock, entity, phase, generator("sampling"), horizon, "sampling")
@@ -145,10 +142,7 @@ class LinearSensor(Sensor):
         generator: Callable[[str], np.random.Generator],
         horizon: float,
     ) -> FloatArray:
-        """Return the sample times (K,) in seconds, below the ``horizon``, of the sensor on ``node``
-        (id) with the number ``ordinal`` there, drawn from its streams "sampling" and "sampling
-        phase" that ``generator`` returns.
-        """
+        """Return the times (K,) of the ticks of ``sampling``, see Sensor."""
         # Only sensors with a clock are asked.
         assert self.sampling is not None
         return sampling_ticks(self.sampling, (node, ordinal), generator, horizon)
@@ -156,24 +150,19 @@ class LinearSensor(Sensor):
     def samples(
         self, node: int, generator: Callable[[str], np.random.Generator], horizon: float
     ) -> DrawnSamples:
-        """Return the samples of the sensor on ``node`` (id) in one run, with noise from the stream
-        "noise" that ``generator`` returns; they do not depend on the ``horizon``.
-        """
+        """Return the samples of the sensor on ``node`` (id) in one run, see Sensor."""
         return DrawnSamples(self.H, self.R, generator("noise"))
 
     def path(self, random: np.random.Generator, cutting: np.random.Generator) -> SensorPath:
-        """Return the increments that the sensor on one node reads in one run.
-
-        ``random`` draws the noise on the sensing grid, ``cutting`` that of parts of steps.
+        """Return the increments of one run: ``random`` draws noise on the grid, ``cutting`` inside
+        it.
         """
         return SensorPath(self.H, self.R, random, cutting)
 
     def slot_path(
         self, node: int, period: float, generator: Callable[[str], np.random.Generator]
     ) -> SlotReadings:
-        """Return the readings of the sensor on ``node`` (id) in one run in slots, with noise from
-        the stream "noise" that ``generator`` returns; ``period`` is not used.
-        """
+        """Return the readings of the sensor on ``node`` (id) in slots, see Sensor."""
         return SlotReadings(self.H, self.R, generator("noise"))
 
 
@@ -189,34 +178,27 @@ class SensorPath:
         random: np.random.Generator,
         cutting: np.random.Generator,
     ) -> None:
-        """Begin at time 0: H (p, n), R (p, p) with cov(dv) = R dt, generators ``random`` of the
-        noise in steps of the sensing grid and ``cutting`` of that in parts of a step, which is cut
-        at events of the node inside it.
-        """
         self.H = H
         # The noise is drawn with unit intensity and multiplied by the Cholesky factor of R.
         self._root = cholesky(R)
-        self._random, self._cutting = random, cutting
-        # Normals of the next steps, how many of these are used, and the end of the present step.
-        self._drawn = np.empty((0, 2, len(R)))
-        self._used = 0
-        self._end = 0.0
+        self._cutting = cutting
+        # Normals of the steps, and the end of the present one.
+        self._normals, self._end = Blocks(random, 2 * len(R)), 0.0
         # Noise moments of the part of the present step that has not been read yet.
         self._unread = np.zeros((2, len(R)))
 
     def moments(
         self, truth: DiffusionPath, x_moments: FloatArray, start: float, end: float
     ) -> FloatArray:
-        """Return the two moments (2, p) of dy over [start, end] seconds, its integrals with P_0 = 1
-        and P_1, inside the step of the sensing grid that ``truth`` was last asked for.
-
-        ``x_moments`` (2, n) are those of x over the same interval; ``start`` is the end of the
-        interval of the previous call.
+        """Return the two moments (2, p) of dy over [start, end] seconds, inside the step that
+        ``truth`` was last asked for; ``start`` is the ``end`` of the last call. ``x_moments`` (2,
+        n).
         """
         step_end = truth.step_end()
         # A new step: the previous one has been read to its end.
         if step_end != self._end:
-            self._unread, self._end = self._draw(truth.period), step_end
+            normals = self._normals.draw().reshape(self._unread.shape)
+            self._unread, self._end = step_noise(normals, truth.period), step_end
         if end < step_end:
             # Normals for cuts come from a second stream, so that the noise on the grid does not
             # depend on the times of events.
@@ -226,16 +208,6 @@ class SensorPath:
         else:
             noise = self._unread
         return reading(x_moments, self.H, noise, self._root)
-
-    def _draw(self, period: float) -> FloatArray:
-        """Return the noise moments (2, p) of the next step of ``period`` seconds."""
-        # One call of the generator draws the normals of many steps.
-        if self._used == len(self._drawn):
-            self._drawn = self._random.standard_normal((BLOCK, *self._drawn.shape[1:]))
-            self._used = 0
-        normals = self._drawn[self._used]
-        self._used += 1
-        return step_noise(normals, period)
 
 
 def step_noise(normals: FloatArray, period: float) -> FloatArray:
@@ -249,12 +221,8 @@ def step_noise(normals: FloatArray, period: float) -> FloatArray:
 def reading(
     x_moments: FloatArray, H: FloatArray, noise: FloatArray, root: FloatArray
 ) -> FloatArray:
-    """Return the two moments (2, p) of the reading dy = H x dt + root dw over an interval.
-
-    The moments of a signal are its integrals over the interval with the Legendre polynomials
-    P_0 = 1 and P_1 of it. ``x_moments`` (2, n) are those of x, ``noise`` (2, p) those of unit white
-    noise dw; H is (p, n), ``root`` (p, p) the lower triangular root of the covariance of the noise
-    per second.
+    """Return the two moments (2, p) of dy = H x dt + root dw over an interval, from those of x,
+    ``x_moments`` (2, n), and of unit white noise, ``noise`` (2, p); ``root`` (p, p).
     """
     out = np.empty(2 * len(H))
     fill_reading(ONE, H[0], out, 0, len(H), x_moments, H[None], noise, root[None], 0)
@@ -275,11 +243,9 @@ def fill_reading(
     s: int,
 ) -> None:
     """Write the two moments of dy of sensor ``s``, which has ``rows`` rows, in L lanes into ``out``
-    (2 q, L), where the sensors of one filter have q rows together; ``size`` has length n.
-
-    Its first moments begin at ``out[row]``, its second moments at ``out[q + row]``. ``x_moments``
-    (2, n, L) are those of x, ``noise`` (2, p, L) those of unit white noise; H of S sensors is
-    (S, p, n, L), root (S, p, p, L) and lower triangular. ``lanes`` is a tuple of length L.
+    (2 q, L), where the sensors of one filter have q rows together: the first from ``row`` on, the
+    second q later. ``x_moments`` (2, n, L), ``noise`` (2, p, L); H of S sensors is (S, p, n, L),
+    root (S, p, p, L).
     """
     # First moments of the rows of all sensors come before the second ones, as filters expect.
     half = len(out) // 2
@@ -298,11 +264,8 @@ def cut(
     whole: FloatArray, normals: FloatArray, u: float, length: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the noise moments (2, p) of the first part of an interval, a share ``u`` of its
-    ``length`` in seconds, and those (2, p) of the remaining part, drawn given those of the
-    ``whole`` (2, p).
-
-    The moments of white noise are its integrals with the Legendre polynomials P_0 and P_1 of the
-    interval. ``normals`` (2, p) are the standard normal numbers to draw from; see ``divide``.
+    ``length`` in seconds, and of the rest, drawn with ``normals`` (2, p) given the ``whole`` (2,
+    p).
     """
     first, remaining = np.empty(whole.shape), whole.copy()
     divide(ONE, first, remaining, normals, u, length)
@@ -313,16 +276,11 @@ def cut(
 def divide(
     lanes: Lanes, first: FloatArray, rest: FloatArray, normals: FloatArray, u: Any, length: Any
 ) -> None:
-    """Divide an interval of ``length`` seconds in two, and with it the two moments ``rest``
-    (2, p, L) of the measurement noise v: its integrals with the Legendre polynomials P_0 = 1 and
-    P_1 (-1 .. 1 over the interval), for p readings in each of L lanes (runs side by side).
-
-    Those of its first part, a share ``u`` of the length, are written to ``first`` (2, p, L), those
-    of the remaining part replace ``rest``. ``normals`` (2, p, L) are standard normal.
-
-    The four moments of the parts are independent, with variances g and g / 3 for a part of g
-    seconds; they are drawn from their exact law given the two moments of the whole. The formulas
-    avoid cancellation when a part is short. ``lanes`` is a tuple of length L.
+    """Divide the two moments ``rest`` (2, p, L) of white noise over ``length`` seconds, in L lanes:
+    those of the first part, a share ``u``, are written to ``first`` (2, p, L), those of the
+    remaining part replace ``rest``. ``normals`` (2, p, L) are standard normal. The four moments of
+    the parts are independent, with variances g and g / 3 for a part of g seconds; they are drawn
+    from their exact law given the whole, without cancellation where a part is short.
     """
     # Parts with the shares u and w and the moments m_0, m_1 and r_0, r_1, and the whole:
     #   whole = m_0 + r_0,    tilted = u m_1 - w m_0 + w r_1 + u r_0

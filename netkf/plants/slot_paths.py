@@ -47,11 +47,8 @@ def draw_normals(
     normals: FloatArray,
     count: int,
 ) -> None:
-    """Fill ``normals`` (>= count, L) with the next ``count`` standard normals of L streams.
-
-    Lane q takes them from row ``first + q * stride`` of the ``states`` (K, WIDTH) of K streams if q
-    < ``runs``, the number of runs left; idle lanes keep their values. Steps these states. ``lanes``
-    is a tuple of length L.
+    """Fill ``normals`` (>= count, L) with the next ``count`` standard normals of L streams: lane q,
+    below the number ``runs`` of runs left, takes row ``first + q * stride`` of ``states``.
     """
     # Lanes in the inner loop: numbers of different streams do not wait for each other.
     for j in range(count):
@@ -69,10 +66,8 @@ def draw_starts(
     scratch: FloatArray,
     x: FloatArray,
 ) -> None:
-    """Write the states x(0) = mean + root z of R runs into ``x`` (B, n, L), B blocks of L runs,
-    where z (q,) are the next standard normals of the stream of each run, ``states`` (R, WIDTH).
-
-    ``mean`` (n,), ``root`` (n, q); ``scratch`` (q, L). ``lanes`` is a tuple of length L.
+    """Write x(0) = mean + root z of R runs into ``x`` (B, n, L), z from ``states`` (R, WIDTH);
+    ``mean`` (n,), ``root`` (n, q), ``scratch`` (q, L).
     """
     for b in range(len(x)):
         first, count = b * len(lanes), root.shape[1]
@@ -96,13 +91,9 @@ def move_path(
     absolute: FloatArray,
     moved: FloatArray,
 ) -> None:
-    """Write the states of the L runs of block ``b`` in slot number ``slot`` and move ``path`` to
-    the next slot; ``s`` is the index of the slot in the arrays.
-
-    ``local[b, s]`` (n, L) gets the state in the frame before a rebase in this slot; with frames
-    ``absolute[b, s]`` (n, L) gets the state in the plant's coordinates; both are (B, S, n, L), for
-    B blocks and S slots. ``normals`` (q, L) drive the step; ``moved`` (n, L) is scratch. ``lanes``
-    is a tuple of length L.
+    """Write the states of block ``b`` in slot number ``slot`` into ``local[b, s]``, in the frame
+    before a rebase, and, with frames, ``absolute[b, s]``; move ``path`` to the next slot.
+    ``normals`` (q, L) drive the step; ``moved`` (n, L) is scratch.
     """
     n = len(path.F)
     # Before a rebase: the errors of this slot are still in coordinates of the old frame.
@@ -149,12 +140,9 @@ def draw_paths(
     local: FloatArray,
     absolute: FloatArray,
 ) -> None:
-    """Write the states of R runs in S slots from number ``slot`` on into ``local``, relative to the
-    present frame, and, with frames, ``absolute``, both (B, S, n, L) for B blocks of L runs; move
-    ``path`` behind these slots.
-
-    Each run draws from its own stream, ``states`` (R, WIDTH); ``scratch`` (2, max(n, q), L).
-    ``lanes`` is a tuple of length L.
+    """Write the states of R runs in S slots from number ``slot`` on into ``local`` and, with
+    frames, ``absolute``, both (B, S, n, L); move ``path`` behind these slots. ``states`` (R,
+    WIDTH), ``scratch`` (2, max(n, q), L).
     """
     for b in range(local.shape[0]):
         first = b * len(lanes)
@@ -208,12 +196,9 @@ def draw_readings(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Write the readings ``y`` (B, S, N, p, L) of all M sensors in S slots of R runs (B blocks of
-    L), for N filters, and ``H`` (B, S, N, p, n, L) where it is random.
-
-    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
-    components. Run r draws the noise of sensor m from row r M + m of ``states`` (R M, WIDTH);
-    ``scratch`` (p, L). ``lanes`` is a tuple of length L.
+    """Write the readings ``y`` (B, S, N, p, L) of all M sensors, and ``H`` (B, S, N, p, n, L) where
+    it is random, at the states ``x`` (B, S, n, L) and ``regressors`` (D, B, S, k, L). Run r draws
+    the noise of sensor m from row r M + m of ``states``; ``scratch`` (p, L).
     """
     count = len(sensors.estimator)
     for b in range(x.shape[0] if count > 0 else 0):
@@ -244,13 +229,8 @@ def read_row(
     y: FloatArray,
     H: FloatArray,
 ) -> None:
-    """Write row ``i`` of the reading of sensor ``m`` in slot ``s`` (index) of the L runs of block
-    ``b`` into ``y`` (B, S, N, p, L), for N filters, and the observation row into ``H``
-    (B, S, N, p, n, L) if it is random.
-
-    x (B, S, n, L) are the states, ``regressors`` (D, B, S, k, L) those of D regressors of k
-    components, for B blocks and S slots, ``normals`` (p, L) the standard normals of the reading.
-    ``lanes`` is a tuple of length L.
+    """Write row ``i`` of the reading of sensor ``m`` in slot ``s`` of block ``b``, see
+    ``draw_readings``; ``normals`` (p, L) are those of the reading.
     """
     estimator, row, d = sensors.estimator[m], sensors.row[m] + i, sensors.driven[m]
     # total = (noise factor) z, row i

@@ -27,9 +27,6 @@ class Transitions:
     """
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
-        """Compute the terms of the power series of exp(A g) and exp(A g) B for short gaps g, with
-        ``A`` (n, n) and ``B`` (n, m).
-        """
         self.n = len(A)
         self._norm = float(np.abs(A).sum(axis=0).max())
         powers = [np.eye(self.n)]
@@ -94,12 +91,10 @@ class Transitions:
 
 
 def noise_factors(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ``S`` (K, n, n), lower triangular, and ``D`` (K, n, c) with ``S D = noise`` (K, n, c),
-    for K matrices of c columns.
-
-    The rows of D are orthonormal; where a row of ``noise`` depends on those before it, its row of D
-    and its column of S are zero. Gram-Schmidt, each row twice (Kahan and Parlett): Householder
-    reflections would give a dependent row a direction made of rounding errors.
+    """Return ``S`` (K, n, n), lower triangular, and ``D`` (K, n, c) with orthonormal rows and ``S D
+    = noise`` (K, n, c); where a row of ``noise`` depends on those before it, its row of D and
+    column of S are zero. Gram-Schmidt, each row twice (Kahan and Parlett): Householder reflections
+    would give such a row a direction made of rounding errors.
     """
     count, n, columns = noise.shape
     S, D = np.zeros((count, n, n)), np.zeros((count, n, columns))
@@ -137,19 +132,16 @@ interval after which states are taken relative to a new origin, so that errors k
 
 
 def frame_period(A: FloatArray) -> float | None:
-    """Return the seconds g after which the states of ``dx = A x dt``, ``A`` (n, n) in 1/s, are
-    taken relative to a new origin: the length of a frame, 1, 2 or 5 times a power of ten.
-
-    The growth e^{a g} is at most 2^10 for the spectral abscissa a of A; None if a <= 0 up to
-    rounding.
+    """Return the length of a frame in seconds, 1, 2 or 5 times a power of ten, in which states of
+    ``dx = A x dt``, ``A`` (n, n) in 1/s, grow at most 2^10-fold; None if they do not grow.
     """
     rate = growth_rate(A)
     return decimal_below(GROWTH / rate) if rate > 0.0 else None
 
 
 def decimal_below(bound: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten that is at most ``bound``, up to rounding:
-    it does not depend on the last bits of an eigenvalue, which differ between machines.
+    """Return the largest 1, 2 or 5 times a power of ten that is at most ``bound``, up to
+    rounding.
     """
     power = 10.0 ** math.floor(math.log10(bound))
     digit = next(d for d in (5.0, 2.0, 1.0) if d * power <= bound * (1.0 + 1e-9))
@@ -158,17 +150,13 @@ def decimal_below(bound: float) -> float:
 
 
 def _round_seconds(seconds: float) -> float:
-    """Return the time ``seconds`` rounded to 9 significant digits."""
     # Frames must not depend on the last bits of an eigenvalue, which differ between machines.
     return float(f"{seconds:.9g}")
 
 
 def frame_slots(F: FloatArray) -> int | None:
-    """Return the number k of slots after which the states of ``x[k+1] = F x[k]``, F (n, n), are
-    taken relative to a new origin: the length of a frame.
-
-    The growth r^k of the spectral radius r of F is at most 2^10, or k = 1; None if r <= 1 up to
-    rounding.
+    """Return the length of a frame in slots, in which states of ``x[k+1] = F x[k]``, F (n, n), grow
+    at most 2^10-fold, or 1; None if they do not grow.
     """
     factor = growth_factor(F)
     return max(1, int(_round_seconds(GROWTH / math.log(factor)))) if factor > 1.0 else None

@@ -53,8 +53,8 @@ class ContinuousTruth(Protocol):
 
 
 def multiples(period: float | None, horizon: float, grid: TimeGrid) -> FloatArray:
-    """Return the multiples (K,) of ``period`` in (0, horizon), seconds, on the ``grid``; empty
-    without a period.
+    """Return the multiples (K,) of ``period`` (None: none) in (0, horizon), seconds, on the
+    ``grid``.
     """
     if period is None or period >= horizon:
         return np.empty(0)
@@ -62,43 +62,30 @@ def multiples(period: float | None, horizon: float, grid: TimeGrid) -> FloatArra
     return np.asarray(times[times < horizon])
 
 
-def origins(Phi: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return the position (F + 1, n), in the plant's coordinates, of the origin of each of F + 1
-    frames at the start of the frame.
-
-    The first is 0, then ``c[k+1] = Phi[k] c[k] + offsets[k]``: ``Phi`` (F, n, n) are the
-    transitions over the F frames that end by a rebase, ``offsets`` (F, n) the local states before
-    it.
-    """
-    positions = np.zeros((len(offsets) + 1, offsets.shape[1]))
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k, offset in enumerate(offsets):
-            # An origin at 0 stays there; the product would be nan if Phi has overflowed.
-            if positions[k].any():
-                positions[k + 1] = apply(Phi[k], positions[k]) + offset
-            else:
-                positions[k + 1] = offset
-    return positions
-
-
 def absolute_states(
     moves: Transitions, frame_times: FloatArray, offsets: FloatArray, t: FloatArray, x: FloatArray
 ) -> FloatArray:
-    """Return the states (K, n) in the plant's coordinates at K times ``t`` (K,) in seconds, from
-    local states ``x`` (K, n).
+    """Return the states (..., K, n) in the plant's coordinates at K times ``t`` (K,) in seconds,
+    from local states ``x`` (..., K, n).
 
-    A frame begins at 0 and at each of ``frame_times`` (F,), in seconds; ``offsets`` (F, n) are the
-    local states just before these rebases. At a frame time ``x`` is local to the new frame.
+    A frame begins at 0 and at each of ``frame_times`` (F,), in seconds; ``offsets`` (..., F, n) are
+    the local states just before these rebases. At a frame time ``x`` is local to the new frame.
     ``moves`` gives the transitions of the plant.
     """
     starts = np.concatenate([[0.0], frame_times])
-    at_start = origins(moves.transitions(np.diff(starts)), offsets)
-    frame = np.searchsorted(frame_times, t, side="right")
+    frame, Phi = np.searchsorted(frame_times, t, side="right"), moves.transitions(np.diff(starts))
+    # The position of the origin of each frame at its start: 0, then c[k+1] = Phi[k] c[k] + offset.
+    origin = np.zeros((*x.shape[:-2], len(starts), x.shape[-1]))
     with np.errstate(over="ignore", invalid="ignore"):
-        shift = apply(moves.transitions(t - starts[frame]), at_start[frame])
-        # An origin at 0 stays there; the product is nan where a transition has overflowed.
-        shift[~at_start[frame].any(axis=1)] = 0.0
+        for k in range(len(frame_times)):
+            origin[..., k + 1, :] = _moved(Phi[k], origin[..., k, :]) + offsets[..., k, :]
+        shift = _moved(moves.transitions(t - starts[frame]), origin[..., frame, :])
         return np.asarray(x + shift)
+
+
+def _moved(Phi: FloatArray, x: FloatArray) -> FloatArray:
+    # An origin at 0 stays there; the product is nan where a transition has overflowed.
+    return np.where(x.any(axis=-1, keepdims=True), apply(Phi, x), 0.0)
 
 
 class SampledTruth:
@@ -116,11 +103,9 @@ class SampledTruth:
         frame_times: FloatArray,
         frames: bool,
     ) -> None:
-        """Draw the path from ``start`` (n,) on at ``times`` (K,) in seconds, any but below 0.
-
-        ``moves`` are the transitions of the plant, ``stream`` (1, WIDTH) is the state of its random
-        stream, and ``frame_times`` (F,) are those of the tree up to the last of ``times``. Without
-        ``frames`` the path is the same, and its origin does not move.
+        """Draw the path from ``start`` (n,) on at ``times`` (K,) in seconds. ``stream`` (1, WIDTH)
+        is the state of its random stream, ``frame_times`` (F,) are those of the tree up to the last
+        time. Without ``frames`` the path is the same, and its origin does not move.
         """
         self._times = np.unique(np.concatenate([[0.0], times, frame_times]))
         self._local, self.offsets = tree.states(self._times, start, stream, len(frame_times))
@@ -133,7 +118,6 @@ class SampledTruth:
             self.frame_times, self._local = np.empty(0), self._absolute
 
     def _index_of(self, time: float) -> int:
-        """Return the index of ``time`` (seconds) among those of the path."""
         k = int(np.searchsorted(self._times, time))
         assert k < len(self._times), f"{time} is no sample, probe or frame time"
         assert self._times[k] == time, f"{time} is no sample, probe or frame time"
@@ -152,8 +136,8 @@ class SampledTruth:
         return np.asarray(self.offsets[k])
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (K, n) each at ``times`` (K,) of the path in seconds, in
-        any order.
+        """Return local and absolute states (K, n) each at ``times`` (K,) of the path, in any
+        order.
         """
         indices = np.searchsorted(self._times, times)
         return self._local[indices], self._absolute[indices]
@@ -200,17 +184,15 @@ class RecordedTruth:
         raise IndexError(k)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (K, n) each, which are equal, at ``times`` (K,) in
-        seconds, in any order.
+        """Return local and absolute states (K, n), which are equal, at ``times`` (K,), in any
+        order.
         """
         x = np.array([self.local(time) for time in times.tolist()]).reshape(-1, len(self._missing))
         return x, x
 
 
 def nearest_row(times: FloatArray, time: float) -> int | None:
-    """Return the index in increasing ``times`` (K,) of the one within 1e-9 s of ``time``, else
-    None; both in seconds.
-    """
+    """Return the index in ``times`` (K,), increasing, of the one within 1e-9 s of ``time``."""
     k = int(np.searchsorted(times, time - TOLERANCE))
     return k if k < len(times) and times[k] <= time + TOLERANCE else None
 

@@ -20,9 +20,8 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import LANES, blocks_of
 from netkf.linalg.words import high_word
-from netkf.rng.streams import BLOCK_WORDS, BUFFER, USED, WIDTH
+from netkf.rng.streams import BLOCK_WORDS, BUFFER, USED
 
 _U = np.uint64
 # Multipliers and Weyl constants of Philox4x64, see Random123 and numpy/random/src/philox.
@@ -127,13 +126,3 @@ def fill_units(states: np.ndarray, out: FloatArray) -> None:
     """
     for k in range(len(out)):
         out[k] = next_unit(states, k)
-
-
-def states_in_lanes(states: np.ndarray, runs: int) -> np.ndarray:
-    """Return the ``states`` (R K, WIDTH) of the K streams of each of R = ``runs`` runs as
-    (B, K, L, WIDTH): runs side by side in B blocks of L lanes. Streams of idle lanes are 0.
-    """
-    count, blocks = len(states) // runs, blocks_of(runs)
-    by_lane = np.zeros((blocks * LANES, count, WIDTH), dtype=np.uint64)
-    by_lane[:runs] = states.reshape(runs, count, WIDTH)
-    return np.ascontiguousarray(np.swapaxes(by_lane.reshape(blocks, LANES, count, WIDTH), 1, 2))

@@ -5,11 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from netkf.engines.compiled import schedule as schedule_module
 from netkf.engines.compiled import ticks as ticks_module
-from netkf.engines.compiled.outcomes import PythonOutcomes, outcomes_of
-from netkf.engines.compiled.schedule import Schedule, all_windows
-from netkf.engines.compiled.ticks import KernelSchedules, is_drawn_in_kernels, schedule
+from netkf.engines.compiled.ticks import LISTED, Schedule
 from netkf.rng.streams import ReplicaStreams, Streams
 
 CHANNELS = {
@@ -44,10 +41,17 @@ CLOCKS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _outcomes_in_python(monkeypatch):
-    """What a Schedule draws is drawn by the channels themselves."""
-    monkeypatch.setattr(schedule_module, "outcomes_of", PythonOutcomes)
+@pytest.fixture
+def in_python(monkeypatch):
+    """Make a schedule whose ticks and outcomes are drawn by the clocks and channels themselves."""
+
+    def make(case, streams, names=("is_kernel_clock", "is_kernel_channel")):
+        with monkeypatch.context() as patch:
+            for name in names:
+                patch.setattr(ticks_module, name, lambda part: False)
+            return Schedule(case, streams)
+
+    return make
 
 
 def all_of(windows):
@@ -80,22 +84,32 @@ def busy(ring):
     )
 
 
-@pytest.mark.parametrize("name", CHANNELS)
-def test_ticks_and_fates_are_those_drawn_link_by_link(busy, monkeypatch, name):
-    case = busy(CHANNELS[name])
-    assert is_drawn_in_kernels(case)
-    monkeypatch.setattr(ticks_module, "TICKS", 40)
-    parts, made = all_of(schedule(case, Streams(3)))
-    _, plain = all_of(Schedule(case, Streams(3)))
-    assert len(parts) > 5
-    assert len(made[0]) > 500
+def of_run(ticks, run):
+    """What ``ticks_of`` returns, of one run of several."""
+    own, delays = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
+    window = ticks._replace(delay=ticks.delay[delays], first_outcome=ticks.first_outcome[own])
+    return ticks_of(window._replace(t=ticks.t[own], entity=ticks.entity[own]))
+
+
+def assert_same(made, plain):
     for one, other in zip(made, plain, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("name", CHANNELS)
+def test_ticks_and_fates_are_those_drawn_link_by_link(busy, monkeypatch, in_python, name):
+    case = busy(CHANNELS[name])
+    monkeypatch.setattr(ticks_module, "TICKS", 40)
+    parts, made = all_of(Schedule(case, Streams(3)))
+    _, plain = all_of(in_python(case, Streams(3)))
+    assert len(parts) > 5
+    assert len(made[0]) > 500
+    assert_same(made, plain)
+
+
 @pytest.mark.parametrize("channel", ["shared", "bursts", "shared bursts", "lognormal"])
 @pytest.mark.parametrize("clock", CLOCKS)
-def test_all_clocks_and_channels(ring, monkeypatch, clock, channel):
+def test_all_clocks_and_channels(ring, monkeypatch, in_python, clock, channel):
     case = ring.replace(
         {
             "horizon": 20.0,
@@ -103,54 +117,48 @@ def test_all_clocks_and_channels(ring, monkeypatch, clock, channel):
             "network.channel": CHANNELS[channel],
         }
     )
-    assert is_drawn_in_kernels(case)
     monkeypatch.setattr(ticks_module, "TICKS", 40)
-    (_, made), (_, plain) = all_of(schedule(case, Streams(3))), all_of(Schedule(case, Streams(3)))
+    schedule = Schedule(case, Streams(3))
+    assert schedule._clocks.kind != LISTED
+    (_, made), (_, plain) = all_of(schedule), all_of(in_python(case, Streams(3)))
     assert len(made[0]) > 300
-    for one, other in zip(made, plain, strict=True):
-        np.testing.assert_array_equal(one, other)
-    batch = KernelSchedules(case, ReplicaStreams(2, 1, 2)).all()
-    for run, window in enumerate(all_windows(case, ReplicaStreams(2, 1, 2))):
-        for one, other in zip(
-            ticks_of(ticks_module.window_of(batch, run)), ticks_of(window), strict=True
-        ):
-            np.testing.assert_array_equal(one, other)
+    assert_same(made, plain)
+    batch = Schedule(case, ReplicaStreams(2, 1, 2)).all()
+    listed = in_python(case, ReplicaStreams(2, 1, 2)).all()
+    for run in range(2):
+        plain = all_of(in_python(case, Streams(2, 1 + run)))[1]
+        assert_same(of_run(batch, run), plain)
+        assert_same(of_run(listed, run), plain)
 
 
 @pytest.mark.parametrize("at", ["links", "nodes"])
 @pytest.mark.parametrize("channel", ["shared", "bursts", "shared bursts", "lognormal"])
-def test_outcomes_after_ticks_of_other_clocks(ring, monkeypatch, channel, at):
+def test_outcomes_after_ticks_of_other_clocks(ring, in_python, channel, at):
     gamma = {"kind": "renewal", "distribution": "gamma", "mean": 0.3, "shape": 2.0, "at": at}
     changes = {"network.activation": gamma, "network.channel": CHANNELS[channel]}
     case = ring.replace({"horizon": 20.0, **changes})
-    _, plain = all_of(Schedule(case, Streams(3)))
-    monkeypatch.setattr(schedule_module, "outcomes_of", outcomes_of)
-    monkeypatch.setattr(ticks_module, "is_kernel_clock", lambda _: False)
-    _, made = all_of(schedule(case, Streams(3)))
-    for one, other in zip(made, plain, strict=True):
-        np.testing.assert_array_equal(one, other)
+    schedule = in_python(case, Streams(3), ("is_kernel_clock",))
+    assert schedule._clocks.kind == LISTED
+    assert_same(all_of(schedule)[1], all_of(in_python(case, Streams(3)))[1])
 
 
-def test_room_grows_where_there_are_more_ticks_than_expected(busy):
+def test_room_grows_where_there_are_more_ticks_than_expected(busy, in_python):
     case = busy(CHANNELS["each way"])
-    windows = KernelSchedules(case, Streams(3))
+    windows = Schedule(case, Streams(3))
     windows._rate *= 1e-3
-    _, made = all_of(windows)
-    _, plain = all_of(Schedule(case, Streams(3)))
-    for one, other in zip(made, plain, strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same(all_of(windows)[1], all_of(in_python(case, Streams(3)))[1])
 
 
-def test_several_runs_are_what_each_is_alone(busy):
+@pytest.mark.parametrize("user", [(), ("is_kernel_channel",)])
+def test_several_runs_are_what_each_is_alone(busy, in_python, user):
     case = busy(CHANNELS["shared"])
-    few = KernelSchedules(case, ReplicaStreams(3, 5, 3))
+    few = in_python(case, ReplicaStreams(3, 5, 3), user)
     few._rate *= 1e-3  # many more ticks than expected: the arrays grow
-    for schedules in (few, KernelSchedules(case, ReplicaStreams(3, 5, 3))):
+    for schedules in (few, in_python(case, ReplicaStreams(3, 5, 3), user)):
         ticks = schedules.all()
-        for run, plain in enumerate(all_windows(case, ReplicaStreams(3, 5, 3))):
-            found = ticks_of(ticks_module.window_of(ticks, run))
-            for one, other in zip(found, ticks_of(plain), strict=True):
-                np.testing.assert_array_equal(one, other)
+        for run in range(3):
+            plain = all_of(in_python(case, Streams(3, 5 + run)))[1]
+            assert_same(of_run(ticks, run), plain)
 
 
 def test_ticks_that_crowd_are_put_in_order():
@@ -166,5 +174,6 @@ def test_ticks_that_crowd_are_put_in_order():
         np.testing.assert_array_equal(one, other[order])
 
 
-def test_others_are_drawn_as_before(ring):
-    assert not is_drawn_in_kernels(ring.replace({"filter": {"kind": "local"}}))
+def test_a_filter_that_sends_nothing_has_no_ticks(ring):
+    windows = Schedule(ring.replace({"filter": {"kind": "local"}}), Streams(3))
+    assert [len(column) for column in all_of(windows)[1]] == [0, 0, 0]

@@ -47,9 +47,7 @@ class BatchArrays(Struct):
 
 @cache
 def no_batch() -> BatchArrays:
-    """Return a batch of R = 0 runs, which a kernel for batches takes in place of one when it
-    simulates a run on its own, so that one compiled kernel serves both.
-    """
+    """Return a batch of no runs, for a kernel that serves batches and single runs."""
     no_runs = np.zeros(0, dtype=np.int64)
     return BatchArrays(
         nodes=np.zeros(0, dtype=NODE),
@@ -69,9 +67,8 @@ def no_batch() -> BatchArrays:
 
 @kernel
 def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Set ``state`` to time 0 of run number ``run`` of a batch: the indices (``..._at``, ``piece``,
-    ``row``) of its next tick, sample, piece of the path and so on, the event counts 0, and no
-    polynomial of its path cached. ``reset_filters`` resets the estimates.
+    """Set the indices of ``state`` to time 0 of run number ``run`` of a batch, its counts to 0, and
+    forget the polynomials of its path.
     """
     # ``path.known`` (G, C) belongs to the G runs that are simulated together: take this run's row.
     state.run, cached = run, run - state.first_run
@@ -88,10 +85,7 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 @kernel
 def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
-    """Reset the filters of a run to time 0: copy ``nodes``, ``xhat`` (N, n) and ``root`` (N, n, n)
-    of ``batch`` into ``state``, to the rows from ``first`` on of ``state.xhat`` and ``root``, and
-    set ``state.now`` to 0 there.
-    """
+    """Reset the filters of a run to time 0: the rows of ``state`` from ``first`` on."""
     n = batch.xhat.shape[1]
     for h in range(len(batch.nodes)):
         state.nodes[h] = batch.nodes[h]
@@ -105,9 +99,7 @@ def reset_filters(state: Simulation, batch: BatchArrays, first: int) -> None:
 
 @kernel
 def reset_messages(state: Simulation) -> None:
-    """Remove all messages of ``state``: nothing is under way or in an inbox, and the whole pool is
-    free; directed links number their messages from 0 again.
-    """
+    """Remove all messages of ``state``, and number those to come from 0."""
     for w in range(len(state.directions)):
         state.directions[w].messages = 0
     # Chain the whole pool into the list of free messages.
@@ -120,9 +112,8 @@ def reset_messages(state: Simulation) -> None:
 
 @kernel
 def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
-    """Store the results of run number ``run`` in ``batch``: the errors of all its samples, and
-    whether it has ``diverged``, that is, has a sample that is not finite. Its number of samples
-    ``lengths`` and its events ``counts`` are those up to the first such sample, or to the end.
+    """Store the results of run number ``run`` in ``batch``: up to its first sample that is not
+    finite, if it has ``diverged``, or to the end.
     """
     buffer = state.buffer
     fill_errors(batch, buffer.xhat, run, state.samples)
@@ -143,9 +134,7 @@ def finish(state: Simulation, batch: BatchArrays, run: int) -> None:
 
 @kernel
 def fill_errors(batch: BatchArrays, xhat: FloatArray, run: int, samples: int) -> None:
-    """Write x - xhat of the first ``samples`` samples of run number ``run`` into ``batch.error``,
-    from its states ``batch.x`` and the estimates ``xhat`` (R, T, N, n) of all R runs.
-    """
+    """Write x - xhat of the first ``samples`` samples of a run into ``batch.error``."""
     # No origin moves in these runs: local and absolute states are the same.
     x, error = batch.x, batch.error
     for k in range(samples):
@@ -156,9 +145,7 @@ def fill_errors(batch: BatchArrays, xhat: FloatArray, run: int, samples: int) ->
 
 @kernel
 def count_diverged_filters(state: Simulation, batch: BatchArrays, run: int, k: int) -> int:
-    """Return how many of the N filters have an estimate, a covariance or the square of an error
-    that is not finite in sample ``k`` of run number ``run``; such a run ends with that sample.
-    """
+    """Return how many filters are not finite in sample ``k`` of a run, see ``sound_mask``."""
     xhat, P, n, diverged = state.buffer.xhat, state.buffer.P, len(state.size), 0
     # Where the truth is unknown it is nan from the beginning.
     truth_known = not np.isnan(batch.x[run, 0, 0])

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -19,16 +18,13 @@ from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
 from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
-from netkf.engines.compiled.flow import Draws, FlowRun, Source, Workspace, empty_samples
+from netkf.engines.compiled.flow import FlowRun, Source, Workspace, empty_samples
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.sample_tables import no_instants
-from netkf.engines.compiled.schedule import Window
-from netkf.engines.compiled.state import Filters, PathBlock, Sensing
-from netkf.engines.compiled.ticks import all_ticks, window_of
-from netkf.engines.compiled.truth import PathStates, States
-from netkf.linalg.arrays import FloatArray
+from netkf.engines.compiled.state import Filters, PathBlock, TickArrays
+from netkf.engines.compiled.ticks import Schedule
+from netkf.engines.compiled.truth import PathStates
 from netkf.linalg.lanes import LANES
-from netkf.linalg.portable import apply
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -48,9 +44,8 @@ MAX_BATCH_BYTES = 1 << 25
 def flow_batches(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> Iterator[RunBatch]:
-    """Yield the results of consecutive replicas (numbers of runs) in continuous time, as many runs
-    at a time as memory allows; ``seed`` is that of all their random numbers. With ``fingerprint``,
-    the first batch is the first run alone, and has the fingerprint of its events.
+    """Yield the results of consecutive replicas in continuous time, as many runs at a time as
+    memory allows. With ``fingerprint``, the first batch is the first run alone.
     """
     keep_freed_memory()
     size, start, workspace = batch_size(scenario), replicas.start, _workspace(scenario)
@@ -65,7 +60,6 @@ _thread = threading.local()
 
 
 def _workspace(scenario: Scenario) -> Workspace:
-    """Return the workspace of this thread, reused for all blocks of runs of a scenario."""
     # Identity, not equality: the tables belong to this very scenario object.
     cached_scenario, workspace = getattr(_thread, "last", (None, None))
     if workspace is None or cached_scenario is not scenario:
@@ -77,39 +71,40 @@ def _workspace(scenario: Scenario) -> Workspace:
 def _simulate(
     scenario: Scenario, workspace: Workspace, seed: int, replicas: range, rows: bool = False
 ) -> RunBatch:
-    """Draw and simulate the runs ``replicas``; with ``rows`` also fingerprint the first."""
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
-        # Runs that are drawn together write no rows.
-        if rows or not drawn_together(scenario):
-            sources = (Source(scenario, Streams(seed, replica)) for replica in replicas)
-            return _run_by_run(scenario, workspace, sources, replicas, rows)
-        draws = BatchDraws(scenario, seed, replicas)
-        # Conserved sums, longer pasts and moves of the origin need Python, run by run.
-        clocked = workspace.clocked
-        if clocked is not None and (clocked.needs_python or len(draws.paths.frame_times)):
-            return _run_by_run(scenario, workspace, draws.runs(), replicas)
-        return _all_at_once(scenario, workspace, draws)
+        # Runs that are drawn together write no rows. Conserved sums, longer pasts and moves of the
+        # origin of filters with messages under way need Python, run by run.
+        together, clocked = drawn_together(scenario) and not rows, workspace.clocked
+        if together and clocked is not None:
+            together = not (clocked.needs_python or _has_frames(scenario))
+        batch = _all_at_once(scenario, workspace, seed, replicas) if together else None
+        if batch is None:
+            batch = _run_by_run(scenario, workspace, seed, replicas, rows)
+        return batch
+
+
+def _has_frames(scenario: Scenario) -> bool:
+    return scenario.exact_errors and scenario.diffusion.frame_steps is not None
 
 
 def _run_by_run(
-    scenario: Scenario,
-    workspace: Workspace,
-    draws: Iterable[Draws],
-    replicas: range,
-    rows: bool = False,
+    scenario: Scenario, workspace: Workspace, seed: int, replicas: range, rows: bool
 ) -> RunBatch:
-    """Simulate runs that need Python one after the other, and return their results."""
     sink = batch_sink(scenario, replicas)
-    for run_draws in draws:
+    for replica in replicas:
         recorder = Recorder([sink], counts_only=not rows)
-        run = FlowRun(scenario, workspace, run_draws, recorder, silent)
+        source = Source(scenario, Streams(seed, replica))
+        run = FlowRun(scenario, workspace, source, recorder, silent)
         sink.finish(recorder, run.to_the_end())
     return sink.batch()
 
 
-def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) -> RunBatch:
-    """Simulate the R runs of ``draws`` in one call of a kernel, and return their results."""
-    start, runs = workspace.filters, len(draws.replicas)
+def _all_at_once(
+    scenario: Scenario, workspace: Workspace, seed: int, replicas: range
+) -> RunBatch | None:
+    """Simulate the runs in one call of a kernel; return None if the states of one overflow."""
+    draws = BatchDraws(scenario, seed, replicas)
+    start, runs = workspace.filters, len(replicas)
     # np.empty: runs that diverge go on to the end, so that all samples are written.
     buffer = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
     arrays = _batch_arrays(scenario, start, draws)
@@ -121,16 +116,18 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
     else:
         assert workspace.clocked is not None
         workspace.clocked.simulate(workspace.begin(draws, traced=False, buffer=buffer), arrays)
-    if len(draws.paths.frame_times):
-        local = arrays.x.copy()
-        arrays.x += draws.origins(scenario.times)
+    if len(draws.states.frame_times):
+        for k in range(len(draws.states.frame_times)):
+            draws.states.rebase(k)
+        local, absolute = draws.states.of_runs(scenario.times)
+        arrays.x[:] = absolute
         # As in a run alone, to the last bit.
-        buffer.xhat += (arrays.x - local)[:, :, None]
-        if not np.isfinite(arrays.x).all():
-            # A run ends where its states overflow.
-            return _run_by_run(scenario, workspace, draws.runs(), draws.replicas)
+        buffer.xhat += (absolute - local)[:, :, None]
+        # A run ends where its states overflow.
+        if not np.isfinite(absolute).all():
+            return None
     return RunBatch(
-        replicas=draws.replicas,
+        replicas=replicas,
         times=scenario.times,
         x=arrays.x,
         xhat=buffer.xhat,
@@ -144,8 +141,8 @@ def _all_at_once(scenario: Scenario, workspace: Workspace, draws: BatchDraws) ->
 
 
 def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> BatchArrays:
-    """Return where each run of a batch begins, and space for the results of all."""
-    runs, x = len(draws.replicas), draws.sampled_states(scenario.times)
+    x = draws.states.local(scenario.times)
+    runs = len(x)
     return BatchArrays(
         nodes=start.nodes,
         xhat=start.xhat,
@@ -163,17 +160,13 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
 
 
 def drawn_together(scenario: Scenario) -> bool:
-    """Return True if the runs of a batch can be drawn together: paths are drawn on the sensing
-    grid, and no sensor takes samples.
-    """
+    """Return True if runs are drawn together: on the sensing grid, without samples."""
     return uses_grid(scenario) and not scenario.sampled_sensors
 
 
 @once_per_scenario
 def batch_size(scenario: Scenario) -> int:
-    """Return the number of runs of a batch, at least 1: as many as fit MAX_BATCH_BYTES with their
-    random numbers and samples.
-    """
+    """Return the number of runs of a batch: as many as fit MAX_BATCH_BYTES."""
     n = scenario.plant.n
     filters = 1 if scenario.node_filter.timing.pooled else len(scenario.nodes)
     sample_floats = len(scenario.times) * filters * n * (n + 2)
@@ -197,9 +190,7 @@ def batch_size(scenario: Scenario) -> int:
 
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
-    """Return the number of runs, a power of two, that take some thirty milliseconds together: a
-    batch of fewer would spend too large a part of its time on preparations.
-    """
+    """Return the number of runs, a power of two, that take some thirty milliseconds."""
     if not (drawn_together(scenario) and is_immediate(scenario)):
         return 1
     steps, nodes = steps_to_the_end(scenario), len(scenario.nodes)
@@ -219,111 +210,34 @@ def _expected_ticks(scenario: Scenario) -> float:
 
 
 class BatchDraws:
-    """All random numbers of a batch of runs, drawn up to the horizon. ``replicas`` are the numbers
-    of its R runs and ``seed`` is that of all their streams.
-    """
+    """All random numbers of the R runs ``replicas``, drawn up to the horizon from ``seed``."""
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
-        """Draw ticks, paths and noise of the R runs ``replicas`` (their numbers) up to the horizon,
-        from streams of ``seed``.
-        """
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
-        self._scenario, self.replicas, blocks = scenario, replicas, blocks_to_the_end(scenario)
-        self.paths = Paths(scenario, streams, blocks)
-        self.ticks = all_ticks(scenario, streams, is_immediate(scenario))
+        self._paths = Paths(scenario, streams, blocks_to_the_end(scenario))
+        self.ticks = Schedule(scenario, streams, is_immediate(scenario)).all()
         steps = steps_to_the_end(scenario)
-        self._block = self.paths.following(steps)
+        self._block = self._paths.following(steps)
         noise = Noise(scenario, streams, steps)
         # One block of noise reaches the horizon.
         noise.following()
         self.sensing = noise.sensing
         self.instants = no_instants(scenario)
-        self.states: States = PathStates(scenario, self.paths.frame_times)
+        self.states = PathStates(scenario, self._paths.frame_times, self.path())
 
-    def window(self) -> Window:
-        """Return the ticks of all R runs, one run after the other in each array, in the form that a
-        single run has its ticks in.
-        """
+    def window(self) -> TickArrays:
+        """Return the ticks of all R runs, one run after the other in each array."""
         ticks = self.ticks
-        return Window(
+        return TickArrays(
             end=math.inf,
             t=ticks.t,
             entity=ticks.entity,
             first_outcome=ticks.first_outcome,
             delay=ticks.delay,
             # The same array holds the indices of outcomes or, if no message takes time, the bits.
-            arrival_bits=ticks.first_outcome if ticks.bits else None,
+            arrival_bits=ticks.first_outcome if ticks.bits else np.zeros_like(ticks.entity),
         )
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return all steps of the paths of all R runs, for an event loop that simulates
-        ``together`` runs at a time.
-        """
-        return self.paths.block(self._block, together)
-
-    def runs(self) -> Iterator[RunDraws]:
-        """Yield the draws of each of the R runs, for runs that are simulated one by one."""
-        return (RunDraws(self, self._scenario, run) for run in range(len(self.replicas)))
-
-    def path_of(self, run: int) -> PathBlock:
-        """Return all steps of the path of the true state in run number ``run`` (0 to R - 1)."""
-        block, one = self._block, slice(run, run + 1)
-        names = ("x_start", "x_end", "moments", "cubic")
-        own: dict[str, Any] = {name: getattr(block, name)[one] for name in names}
-        return self.paths.block(block._replace(**own))
-
-    def sampled_states(self, times: FloatArray) -> FloatArray:
-        """Return the states (R, T, n) of all R runs at the T sample ``times`` (T,) in seconds,
-        relative to the origin of their frame.
-        """
-        block = self._block
-        # Times of samples are ends of pieces or, at time 0, the start of the first.
-        pieces = np.searchsorted(block.end, times)
-        x, starts = block.x_end.take(pieces, axis=1), times != block.end[pieces]
-        x[:, starts] = block.x_start[:, pieces[starts]]
-        # The origin has moved to the state where a frame begins.
-        x[:, np.isin(times, self.paths.frame_times)] = 0.0
-        return x
-
-    def origins(self, times: FloatArray) -> FloatArray:
-        """Return the origins (R, T, n) to which the states of ``sampled_states`` are relative."""
-        frame_times, moves = self.paths.frame_times, self._scenario.diffusion.moves
-        starts = np.concatenate([[0.0], frame_times])
-        offsets = self._block.x_end[:, np.searchsorted(self._block.end, frame_times)]
-        origin = np.zeros(offsets[:, :1].shape)
-        positions, Phi = [origin[:, 0]], moves.transitions(np.diff(starts))
-        for k in range(len(frame_times)):
-            # The first origin is 0, and its transition may overflow.
-            moved = apply(Phi[k], positions[k]) if k else positions[k]
-            positions.append(moved + offsets[:, k])
-        frame = np.searchsorted(frame_times, times, side="right")
-        shift = apply(
-            moves.transitions(times - starts[frame]), np.stack(positions, axis=1)[:, frame]
-        )
-        shift[:, frame == 0] = 0.0
-        return shift
-
-
-class RunDraws:
-    """The draws of one run of a batch. ``run`` is its number in the batch, from 0."""
-
-    def __init__(self, batch: BatchDraws, scenario: Scenario, run: int) -> None:
-        """Take views of the draws of run number ``run`` (0 to R - 1) of a batch, for the event loop
-        of a single run.
-        """
-        self._batch, self._run, self.instants = batch, run, batch.instants
-        self.states: States = PathStates(scenario, batch.paths.frame_times)
-        shared, count = batch.sensing, len(batch.sensing.rows)
-        fields = {name: getattr(shared, name) for name in Sensing.struct_fields}
-        # Streams are in the order of the runs.
-        fields["cuts"] = shared.cuts[run * count :][:count]
-        fields["noise"] = shared.noise[run * count * shared.steps :][: count * shared.steps]
-        self.sensing = Sensing(**fields)
-
-    def window(self) -> Window:
-        """Return all ticks of the run."""
-        return window_of(self._batch.ticks, self._run)
-
-    def path(self, together: int = 1) -> PathBlock:
-        """Return all steps of the path of this run; ``together`` is not used."""
-        return self._batch.path_of(self._run)
+        """Return all steps of the paths of all R runs, of which ``together`` run at a time."""
+        return self._paths.block(self._block, together)

@@ -107,9 +107,7 @@ class ClockFilters:
         return bool(self._at_start) or self.kernels.remembers
 
     def sums(self) -> dict[str, tuple[float, float]]:
-        """Return by name the sums over all nodes that exchanges conserve, at the start and at the
-        last sample.
-        """
+        """Return by name the sums that exchanges conserve, at the start and at the last sample."""
         now = self.records.arrays.get("conserved")
         if now is None:
             return {}
@@ -119,7 +117,6 @@ class ClockFilters:
         }
 
     def _inbox(self, messages: int, n: int) -> dict[str, np.ndarray]:
-        """Return an inbox for so many messages, and room for their readings and the own one."""
         readings = 1 + messages if self.kernels.sends_readings else 1
         return {
             "y": np.zeros((readings, self._p, 1)),
@@ -139,8 +136,8 @@ class ClockFilters:
         return int(self._loop(state, self.record, self.run))
 
     def simulate(self, state: Simulation, batch: BatchArrays) -> None:
-        """Simulate all runs of a batch up to the horizon, or until an estimate is not finite; the
-        results are in ``batch``, the samples in ``state.buffer``.
+        """Simulate all runs of a batch; the results are in ``batch``, samples in
+        ``state.buffer``.
         """
         simulate, run, resumed = batch_loop(self.kernels), 0, False
         while run < len(batch.lengths):
@@ -165,9 +162,7 @@ class ClockFilters:
             double_past(record, self.records.past)
 
     def shift(self, scenario: Scenario, state: Simulation, offset: FloatArray) -> None:
-        """Move all nodes and messages under way by ``offset`` (n,): the origin of coordinates has
-        moved by its negative.
-        """
+        """Move all nodes and messages under way by ``offset`` (n,), as the origin has moved."""
         if self.kernels.remembers and self.record.kept.max() == self.record.room:
             self.grow_past()
         run, now = self.run, float(state.frames[state.frame_at])
@@ -180,7 +175,6 @@ class ClockFilters:
 
 
 def _links_by_receiver(scenario: Scenario) -> dict[str, Any]:
-    """Return the directed links sorted by receiver and sender, as fields of a run."""
     index = scenario.topology.index
     directions = scenario.topology.directions if scenario.node_filter.timing.talks else ()
     ends = sorted((index[receiver], index[sender]) for sender, receiver in directions)

@@ -34,16 +34,12 @@ times of the nodes differ by few pieces, and all courses would not fit the proce
 
 
 def blocks_to_the_end(scenario: Scenario) -> int:
-    """Return the number of blocks, of BLOCK steps of the sensing grid each, that reach the
-    horizon.
-    """
+    """Return the number of blocks of BLOCK steps that reach the horizon."""
     return -(-steps_to_the_end(scenario) // BLOCK)
 
 
 def steps_to_the_end(scenario: Scenario) -> int:
-    """Return the number of steps of the sensing grid, the times at which increment sensors are
-    read, that reach the horizon.
-    """
+    """Return the number of steps of the sensing grid that reach the horizon."""
     period = scenario.diffusion.sensing_period
     assert period is not None
     # A first guess from below; the loop counts the rest.
@@ -54,17 +50,13 @@ def steps_to_the_end(scenario: Scenario) -> int:
 
 
 def increments(scenario: Scenario) -> list[tuple[int, PlacedSensor]]:
-    """Return all increment sensors, which read integrals of the state between grid times, as pairs
-    (id of its node, sensor), in the order of nodes.
-    """
+    """Return all increment sensors as pairs (id of the node, sensor), in the order of nodes."""
     by_node = scenario.increment_sensors.items()
     return [(node, sensor) for node, placed in by_node for sensor in placed]
 
 
 def blocks_at_once(scenario: Scenario) -> int:
-    """Return the number of blocks, of BLOCK steps of the sensing grid each, that a run draws at
-    once: few if many sensors need noise, so that memory stays small.
-    """
+    """Return the number of blocks that a run draws at once: few if many sensors need noise."""
     rows = [
         len(scenario.sensors[placed_sensor.entry].R) for _, placed_sensor in increments(scenario)
     ]
@@ -85,11 +77,6 @@ class Paths:
         blocks: int,
         sampled: FloatArray = NO_TIMES,
     ) -> None:
-        """Make the random streams of the R runs, and ``frame_times`` (F,) in seconds, at which a
-        frame begins: the origin of all states moves to the present one then, so that those of an
-        unstable plant keep their digits. Nothing is drawn but initial states. ``blocks`` and
-        ``sampled`` (T,): see the class.
-        """
         self._blocks = blocks
         # Separate streams for the path, for the states at probes and for those at samples, so that
         # none depends on how many numbers the others take.
@@ -109,14 +96,12 @@ class Paths:
         self.frame_times = self._paths.frame_times(scenario.horizon)
 
     def following(self, max_steps: int | None = None) -> Block:
-        """Return the next steps of all runs together, at most ``max_steps``; the last ones reach
-        the horizon or beyond.
-        """
+        """Return the next steps of all runs, at most ``max_steps``; the last reach the horizon."""
         return self._paths.following(self._blocks, max_steps)
 
     def block(self, block: Block, together: int = 1) -> PathBlock:
-        """Return a block of steps of all R runs as arrays for the event loop, which simulates
-        ``together`` runs at a time: the block has a cache of path polynomials for so many.
+        """Return a block of steps as arrays for the event loop, which simulates ``together`` runs
+        at a time.
         """
         ends, laws = block.ends, self._paths.laws
         n = laws.n
@@ -142,9 +127,8 @@ class Paths:
 
 @cache
 def no_path(n: int) -> PathBlock:
-    """Return a path of one piece without an end, with (1, 1, n) states that are 0, for runs in
-    which nothing senses increments: the loop then asks for no path, but its kernels need the
-    arrays. It is the same for all runs, which do not write to it.
+    """Return a path of one piece without an end, with states that are 0, for runs without increment
+    sensors.
     """
     rows = {name: np.zeros((1, 1, n)) for name in ("x_start", "x_stop")}
     return PathBlock(
@@ -165,7 +149,7 @@ def no_path(n: int) -> PathBlock:
 
 @once_per_scenario
 def _sensor_fields(scenario: Scenario) -> tuple[dict[str, np.ndarray], list[tuple[int, int]]]:
-    """Return the fields of a Sensing (increment sensors as arrays) that all runs share."""
+    """Return the fields of a Sensing that all runs share, and the keys of the sensors."""
     placed = increments(scenario)
     # Many nodes may have the same sensor: its R is factored once.
     entries = {placed_sensor.entry for _, placed_sensor in placed}
@@ -207,9 +191,6 @@ class Noise:
     """
 
     def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams, steps: int) -> None:
-        """Make the random streams of all S sensors in R runs, and ``sensing`` with space for the
-        noise of ``steps`` steps.
-        """
         shared, keys = _sensor_fields(scenario)
         self._noise = streams.states("noise", keys)
         # Without increment sensors the period is not used; it only must not be None.
@@ -227,9 +208,7 @@ class Noise:
         )
 
     def following(self) -> None:
-        """Draw the noise of the next block of steps of all R runs and S sensors, two moments for
-        each row and step, into ``sensing.noise`` (R S steps, 2, p).
-        """
+        """Draw the noise of the next block of steps of all runs and sensors into ``sensing``."""
         sensing = self.sensing
         # Streams of all runs and sensors, run by run.
         shape = len(sensing.cuts), sensing.steps, *sensing.noise.shape[1:]
@@ -247,10 +226,9 @@ def fill_noise(
     scales: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Draw the noise of increment sensors over C steps, two moments for each row: write normals
-    with the standard deviations ``scales`` (2,) of the two moments into ``out`` (K, C, 2, >= p).
-    They are the next numbers of each stream k of the K = R S ``states`` (K, WIDTH) of R runs, which
-    belongs to sensor k modulo S with ``rows`` (S,) p. Advances ``states``.
+    """Write the noise moments of C steps, with standard deviations ``scales`` (2,), into ``out``
+    (K, C, 2, >= p): the next numbers of each of the K = R S streams, that of sensor k modulo S with
+    ``rows`` (S,).
     """
     for k in range(len(out)):
         # Streams are numbered run by run, so the sensor is the remainder.

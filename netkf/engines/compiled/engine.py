@@ -91,10 +91,7 @@ class CompiledEngine(Engine):
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
-        """Simulate a scenario up to the horizon with the random numbers of ``streams``, and pass
-        its events and samples to ``recorder``; ``progress`` is called with the simulated seconds
-        from time to time. Return "complete" or "diverged".
-        """
+        """Simulate a scenario, see ``Engine.run``."""
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             if scenario.slotted:
                 return run_slots(scenario, streams, recorder, progress)
@@ -102,9 +99,7 @@ class CompiledEngine(Engine):
             return FlowRun(scenario, workspace, draws, recorder, progress).to_the_end()
 
     def together(self, scenario: Scenario) -> int:
-        """Return the number of runs that are worth simulating together: they take little longer
-        than one.
-        """
+        """Return the number of runs that take little longer together than one."""
         if not scenario.slotted:
             return quick_runs(scenario)
         return slot_setup(scenario).quick_runs() if slot_setup(scenario).is_drawn else 1
@@ -112,10 +107,7 @@ class CompiledEngine(Engine):
     def run_many(
         self, scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
     ) -> Iterator[RunBatch]:
-        """Yield the runs of consecutive ``replicas`` in order, many in each RunBatch, with random
-        numbers from ``seed``. With ``fingerprint``, the first batch has that of the events of its
-        first run.
-        """
+        """Yield the runs of ``replicas``, many in each batch, see ``Engine.run_many``."""
         alone = partial(super().run_many, scenario, seed)
         if not scenario.slotted:
             yield from flow_batches(scenario, seed, replicas, fingerprint)

@@ -37,18 +37,14 @@ NEVER = math.inf
 
 @kernel
 def seek_piece(state: Simulation, now: float) -> None:
-    """Move ``state.piece`` on to the piece of the path in which ``now``, the time of the next event
-    in seconds, lies.
-    """
+    """Move ``state.piece`` on to the piece of the path in which ``now`` (seconds) lies."""
     while state.path.stop[state.piece] < now:
         state.piece += 1
 
 
 @kernel
 def find_shortage(state: Simulation, now: float) -> int:
-    """Return the request for what an event at ``now`` (seconds) needs and lacks (WANT_...,
-    DONE), or GO_ON if the event can happen; nothing is changed.
-    """
+    """Return the request for what an event at ``now`` (seconds) lacks, or GO_ON."""
     # Space for the worst case of one event, so that no handler has to stop half-way.
     request = GO_ON
     if state.traced and state.row + state.most_rows > len(state.rows):
@@ -68,9 +64,8 @@ def find_shortage(state: Simulation, now: float) -> int:
 
 @kernel
 def next_event(state: Simulation) -> tuple[int, float]:
-    """Return the next event (ON_...) of the run ``state`` and its time in seconds, NEVER if none is
-    left. Events of one instant happen in the order of these kinds: moves of the origin, readings of
-    increments, samples of sensors, ticks, deliveries, absorptions, stored samples.
+    """Return the next event (ON_...) and its time in seconds, NEVER if none is left. Those of one
+    instant happen in the order of these constants.
     """
     # ``<`` keeps the earlier event of the list at equal times: the order of ranks.
     event, now = ON_REBASE, next_of(state.frames, state.frame_at)
@@ -111,9 +106,7 @@ def next_of(times: FloatArray, k: int) -> float:
 
 @kernel
 def count_participants(state: Simulation, event: int) -> int:
-    """Return the number of nodes that are predicted to the time of an ``event`` (ON_...) before it
-    happens: none, one, both ends of a link, or all. ``participant`` says which.
-    """
+    """Return the number of nodes that are predicted before an ``event`` (ON_...) happens."""
     count = 1
     # Samples and moves of the origin concern the states of all nodes at one time.
     if event in (ON_REBASE, ON_PROBE):
@@ -129,9 +122,8 @@ def count_participants(state: Simulation, event: int) -> int:
 
 @kernel
 def participant(state: Simulation, event: int, k: int) -> int:
-    """Return the index in ``state.nodes`` of participant number ``k`` (from 0) of the next event,
-    of kind ``event`` (ON_...): a node that is predicted to the event's time before it happens. For
-    the first ON_ABSORB of an instant sorts ``state.waiting``.
+    """Return the index of participant number ``k`` of the next event, of kind ``event`` (ON_...).
+    For the first ON_ABSORB of an instant sorts ``state.waiting``.
     """
     if event == ON_TICK:
         entity = state.entities[state.ticks.entity[state.tick_at]]
@@ -152,9 +144,7 @@ def participant(state: Simulation, event: int, k: int) -> int:
 
 @kernel
 def max_readings(state: Simulation, event: int) -> int:
-    """Return the largest number of readings that the next event, of kind ``event`` (ON_...), uses:
-    so many free entries the past of a node needs before it.
-    """
+    """Return the largest number of readings that the next event, of kind ``event``, uses."""
     if event == ON_SAMPLE:
         return 1
     count = 0
@@ -170,11 +160,7 @@ def max_readings(state: Simulation, event: int) -> int:
 def record_event(
     state: Simulation, t: float, kind: int, node: int, peer: int, message: int
 ) -> None:
-    """Record an event of kind number ``kind`` (trace.schema.CODES) at ``t`` (seconds), whose age is
-    nan: append a row to ``state.rows``, or, if rows are not ``traced``, count it in
-    ``state.counts``. ``node`` and ``peer`` are ids of nodes, ``message`` a number on its link; -1:
-    none.
-    """
+    """Record an event without an age, as ``record_event_with_age``."""
     record_event_with_age(state, t, kind, node, peer, message, np.nan)
 
 
@@ -182,10 +168,8 @@ def record_event(
 def record_event_with_age(
     state: Simulation, t: float, kind: int, node: int, peer: int, message: int, age: float
 ) -> None:
-    """Record an event of kind number ``kind`` (trace.schema.CODES) at ``t`` (seconds): append a row
-    to ``state.rows``, or, if rows are not ``traced``, count it in ``state.counts``. ``node`` and
-    ``peer`` are ids of nodes, ``message`` a number on its link (-1: none), ``age`` seconds since it
-    was sent.
+    """Record an event of kind number ``kind`` at ``t`` (seconds) as a row, or count it if rows are
+    not ``traced``. ``node`` and ``peer`` are ids, ``message`` a number on its link (-1: none).
     """
     if not state.traced:
         state.counts[kind] += 1
@@ -199,9 +183,8 @@ def record_event_with_age(
 
 @kernel
 def on_sense(state: Simulation, now: float) -> None:
-    """Record that the next node with increment sensors has used its increments up to ``now``
-    (seconds), a point of the sensing grid at which all such nodes read; the caller has predicted
-    it. Advances ``state.wake_at``, and after the last node ``state.grid_at``.
+    """Record that the next node with increment sensors has used its increments up to ``now``, a
+    point of the sensing grid.
     """
     sensing = state.sensing
     record_event(state, now, SENSE, sensing.node[state.wake_at], -1, -1)
@@ -214,9 +197,7 @@ def on_sense(state: Simulation, now: float) -> None:
 
 @kernel
 def is_lost(state: Simulation) -> bool:
-    """Return True if all messages of the next tick (number ``state.tick_at``) are lost: then nodes
-    without increment sensors need no prediction for it.
-    """
+    """Return True if all messages of the next tick are lost."""
     ticks = state.ticks
     entity = state.entities[ticks.entity[state.tick_at]]
     first = state.first_delay + ticks.first_outcome[state.tick_at]
@@ -228,18 +209,14 @@ def is_lost(state: Simulation) -> bool:
 
 @kernel
 def ends_instant(state: Simulation, now: float) -> bool:
-    """Return True if no tick or delivery at ``now`` (seconds) is left, so that absorptions come
-    next.
-    """
+    """Return True if no tick or delivery at ``now`` (seconds) is left."""
     arriving = state.in_flight > 0 and state.pool[state.heap[0]].arrival <= now
     return not arriving and next_tick(state) > now
 
 
 @kernel
 def on_deliver(state: Simulation, now: float) -> None:
-    """Take the message that arrives next, at ``now`` (seconds), from the heap and put it into the
-    inbox of its receiver, or drop it if it is too old.
-    """
+    """Take the message that arrives next, at ``now`` (seconds), from the heap."""
     m = pop(state.pool, state.heap, state.in_flight)
     state.in_flight -= 1
     arrive(state, m, now)
@@ -247,9 +224,8 @@ def on_deliver(state: Simulation, now: float) -> None:
 
 @kernel
 def arrive(state: Simulation, m: int, now: float) -> None:
-    """Put message ``m`` (index in ``state.pool``), which arrives at ``now`` (seconds), into the
-    inbox of its receiver and list that in ``state.waiting``; or drop it if it is older than
-    ``state.age_limit``.
+    """Put message ``m``, which arrives at ``now`` (seconds), into the inbox of its receiver, or
+    drop it if it is older than ``state.age_limit``.
     """
     message = state.pool[m]
     direction = state.directions[message.direction]
@@ -271,9 +247,8 @@ def arrive(state: Simulation, m: int, now: float) -> None:
 
 @kernel
 def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
-    """Store the estimates and covariances ``P = S S'`` of the N nodes of a run, which are in the
-    rows ``first`` to ``first`` + N - 1 of ``state.xhat`` and ``root`` (S), as sample ``k`` of run
-    number ``run``, in ``buffer.xhat[run, k]`` (N, n) and ``buffer.P[run, k]`` (N, n, n).
+    """Store the estimates and covariances ``P = S S'`` of the nodes in the rows from ``first`` on
+    as sample ``k`` of run number ``run``.
     """
     xhat, P, root, n = state.buffer.xhat, state.buffer.P, state.root, len(state.size)
     for h in range(len(state.nodes)):
@@ -290,15 +265,12 @@ def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
 
 @kernel
 def count_sample(state: Simulation) -> bool:
-    """Count the sample just stored: write to ``state.buffer`` the numbers of events so far, the
-    next row and the piece of the path that the sample lies in, and advance ``probe_at`` and
-    ``samples``. Return False if there is no space for another one.
-    """
+    """Count the sample just stored; return False if there is no space for another one."""
     # A run that diverges at this sample ends with these counts and rows.
     buffer, run, k = state.buffer, state.run, state.samples
     for kind in range(len(state.counts)):
         buffer.counts[run, k, kind] = state.counts[kind]
-    buffer.rows[run, k], buffer.piece[run, k] = state.row, state.piece
+    buffer.rows[run, k] = state.row
     state.probe_at += 1
     state.samples += 1
     return bool(state.samples < buffer.rows.shape[1])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from netkf.engines.compiled.events import (
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.sample_tables import samples_of
 from netkf.engines.compiled.samples import record_samples
-from netkf.engines.compiled.schedule import ReadingsSchedule, Window
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
     CLOCKS,
@@ -40,7 +39,6 @@ from netkf.engines.compiled.state import (
     PathBlock,
     SampleBuffer,
     Scratch,
-    Sensing,
     Simulation,
     TickArrays,
     add_messages,
@@ -49,8 +47,8 @@ from netkf.engines.compiled.state import (
     filters_at_start,
     scratch_arrays,
 )
-from netkf.engines.compiled.ticks import schedule
-from netkf.engines.compiled.truth import CompleteStates, PathStates, States
+from netkf.engines.compiled.ticks import Schedule
+from netkf.engines.compiled.truth import PathStates
 from netkf.engines.compiled.visits import Visits, empty_visits
 from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
@@ -69,122 +67,66 @@ FIRST_MESSAGES, FIRST_ROWS = 64, 4096
 # Most samples in the buffer of a run, and most float64 in their covariances together.
 MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS = 256, 1 << 18
 AT_START = (
-    *(
-        "run",
-        "first_run",
-        "first_delay",
-        "frame_at",
-        "piece",
-        "grid_at",
-        "wake_at",
-        "instant_at",
-        "tick_at",
-        "probe_at",
-        "row",
-    ),
-    *("first_free", "in_flight", "order", "receivers", "absorbing", "samples"),
+    *("run", "first_run", "first_delay", "frame_at", "piece", "grid_at", "wake_at", "instant_at"),
+    *("tick_at", "probe_at", "row", "first_free", "in_flight", "order", "receivers", "absorbing"),
+    "samples",
 )
 """Integer fields of a Simulation that are 0 when a run begins."""
 
 
-class Windows(Protocol):
-    """A source of ticks, window by window."""
-
-    def following(self) -> Window:
-        """Return the next window; the last one ends at infinity."""
-
-
-class Draws(Protocol):
-    """Random numbers of one run, in blocks as the run needs them."""
-
-    sensing: Sensing
-    instants: Instants
-    states: States
-
-    def window(self) -> Window:
-        """Return the next window of ticks."""
-
-    def path(self, together: int = 1) -> PathBlock:
-        """Return the next steps of the path for ``together`` runs; fill in the noise of these steps
-        in ``sensing``, and the values of the samples taken during them in ``instants``.
-        """
-
-
 class Source:
-    """The random numbers of a run that is simulated alone, drawn on demand."""
+    """The random numbers of a run that is simulated alone. The path is drawn block by block on the
+    sensing grid, with the samples on it; without a grid (no sensor reads increments) the states at
+    all samples are drawn at once. ``states`` is a PathStates, or a truth of ``plants.truth``.
+    """
 
-    states: States
+    states: Any
 
     def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        """Draw the sample times of all sensors, and make the sources of ticks, noise and the path
-        of the true state. The path is drawn block by block on the sensing grid, with the samples on
-        it; without a sensing grid (no sensor reads increments) the states at all samples are drawn
-        here at once.
-        """
         self._samples = samples = samples_of(scenario, streams)
         self._sampled = sampled = samples.sampled
         self.instants = samples.instants
-        self._windows = _make_windows(scenario, streams, samples.instants)
+        self._ticks = Schedule(scenario, streams, instants=samples.instants)
         self._grid = uses_grid(scenario)
-        self._read_until, self._n = -math.inf, scenario.plant.n
+        self._read_until, no_block = -math.inf, no_path(scenario.plant.n)
         if self._grid:
             blocks = blocks_at_once(scenario)
             self._noise = Noise(scenario, streams, blocks * BLOCK)
             self.sensing = self._noise.sensing
             # Cut the path where a state is sampled: it is drawn there from its own stream.
             self._paths = Paths(scenario, streams, blocks, sampled)
-            self.states = PathStates(scenario, self._paths.frame_times)
+            self.states = PathStates(scenario, self._paths.frame_times, no_block)
         else:
-            self.sensing = no_sensing(scenario)
-            self.states = states = CompleteStates(scenario, streams, sampled)
+            self.sensing, self._no_block = no_sensing(scenario), no_block
+            self.states = scenario.continuous_truth(streams, sampled=sampled)
             # The truth is complete, so that all samples are read at once.
-            samples.read(states.truth.states(sampled)[0], sampled, -math.inf, math.inf)
+            samples.read(self.states.states(sampled)[0], sampled, -math.inf, math.inf)
 
-    def window(self) -> Window:
-        """Return the next window: some ticks of each entity with a clock."""
-        return self._windows.following()
+    def window(self) -> TickArrays:
+        """Return the next window of ticks."""
+        return self._ticks.following()
 
     def path(self, together: int = 1) -> PathBlock:
-        """Return the next block of steps of the path of the true state. If no sensor reads
-        increments it is one piece that lasts for the whole run, since the state is needed at
-        samples only then.
-
-        Draws the noise of these steps into ``sensing``, and reads the samples taken during them
-        into ``instants``. The event loop simulates ``together`` runs side by side: the block has a
-        cache of path polynomials for each of them.
-        """
+        """Return the next steps of the path; without a sensing grid one piece for the whole run."""
         if not self._grid:
-            return no_path(self._n)
+            return self._no_block
         # Noise and path advance together, a block of steps at a time.
         self._noise.following()
         path = self._paths.block(self._paths.following(), together)
+        self.states.path = path
         # Samples in (read_until, end]: a time at the border of two blocks is read once.
         first, last = np.searchsorted(self._sampled, [self._read_until, path.end], side="right")
         if first < last:
             times = self._sampled[first:last]
-            pieces = np.searchsorted(path.stop, times)
-            assert isinstance(self.states, PathStates)
-            x = self.states.local(times, path, pieces)
-            self._samples.read(x, times, self._read_until, path.end)
+            self._samples.read(self.states.local(times)[0], times, self._read_until, path.end)
         self._read_until = path.end
         return path
-
-
-def _make_windows(scenario: Scenario, streams: Streams, instants: Instants) -> Windows:
-    """Return the source of ticks in windows of time, or of transmissions after readings."""
-    senders = senders_of(scenario)
-    if senders.at == "readings":
-        return ReadingsSchedule(scenario, streams, senders, instants.t, instants.index)
-    return schedule(scenario, streams)
 
 
 class Workspace:
     """The tables of a scenario and the arrays of a run, reused for one run after another."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Compute the filters at time 0 and the tables of a scenario, and allocate the arrays of a
-        run.
-        """
         self._scenario, self._senders = scenario, senders_of(scenario)
         self._start, (entities, directions) = filters_at_start(scenario), entity_records(scenario)
         # A copy, since directed links count the messages of a run.
@@ -214,10 +156,7 @@ class Workspace:
         return self._start
 
     def visits(self, together: int = 1) -> Visits:
-        """Return an empty queue of visits (predictions of nodes that wait to be computed side by
-        side), with space for all nodes of ``together`` runs; it is reused from earlier runs if it
-        is large enough.
-        """
+        """Return an empty queue of visits, with space for all nodes of ``together`` runs."""
         capacity = together * len(self._start.nodes)
         if self._visits is None or len(self._visits.level) < capacity:
             series, weights = series_of_lanes(self._scenario), self._records[1]["weight"]
@@ -225,11 +164,10 @@ class Workspace:
         return self._visits
 
     def begin(
-        self, draws: Draws, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
+        self, draws: Any, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
-        """Return the state at time 0 of one run, or of ``together`` runs that write their samples
-        into ``buffer`` (None: the workspace's own), with the random numbers of ``draws``;
-        ``traced``: rows of events are written, not only counted.
+        """Return the state at time 0 of ``together`` runs with the random numbers of ``draws``,
+        which write samples into ``buffer`` (None: the workspace's own), and rows if ``traced``.
         """
         start, instants, window = self._start, draws.instants, draws.window()
         entities, directions = self._records
@@ -268,7 +206,7 @@ class Workspace:
             instants=instants,
             sensing=draws.sensing,
             path=path,
-            ticks=ticks_of(window),
+            ticks=window,
             ticks_stop=len(window.t),
             frames=draws.states.frame_times,
             probes=self._probes,
@@ -285,7 +223,6 @@ class Workspace:
         return state
 
     def _scalar_fields(self, instants: Instants) -> dict[str, Any]:
-        """Return those numbers of a Simulation that are not 0 at the start of a run, by name."""
         algorithm = self._scenario.node_filter
         max_messages = int(np.diff(self._senders.first).max(initial=0))
         return {
@@ -304,29 +241,16 @@ class Workspace:
         }
 
 
-def ticks_of(window: Window) -> TickArrays:
-    """Return the K ticks of a window as a struct for kernels. Arrival bits (bit m is 1 if message m
-    of a tick arrives) are 0 if the window has none yet.
-    """
-    bits = window.arrival_bits
-    if bits is None:
-        bits = np.zeros(len(window.t), dtype=np.int64)
-    return TickArrays(**window._replace(arrival_bits=bits)._asdict())
-
-
 def empty_samples(
     shape: tuple[int, int, int, int], make: Callable[..., Any] = np.zeros
 ) -> SampleBuffer:
-    """Return space for B samples of N filters in R runs of n states, ``shape`` being (R, B, N, n).
-    ``make`` (np.zeros or np.empty) creates the arrays of estimates and covariances.
-    """
+    """Return space for samples of ``shape`` (R, B, N, n), in arrays from ``make``."""
     runs, count, _, n = shape
     return SampleBuffer(
         xhat=make(shape),
         P=make((*shape, n)),
         rows=np.zeros((runs, count), dtype=np.int64),
         counts=np.zeros((runs, count, len(schema.KINDS)), dtype=np.int64),
-        piece=np.zeros((runs, count), dtype=np.int64),
     )
 
 
@@ -339,13 +263,10 @@ class FlowRun:
         self,
         scenario: Scenario,
         workspace: Workspace,
-        draws: Draws,
+        draws: Source,
         recorder: Recorder,
         progress: Progress,
     ) -> None:
-        """Set up the state of a run at time 0 from its random numbers ``draws``, in the arrays of
-        ``workspace``; ``progress`` is called with the simulated seconds.
-        """
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
         recorder.exact_errors = scenario.exact_errors
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
@@ -353,8 +274,8 @@ class FlowRun:
         self._clocked = workspace.clocked
 
     def to_the_end(self) -> str:
-        """Simulate up to the horizon, or until an estimate is no longer finite, and record events
-        and samples; return "complete" or "diverged".
+        """Simulate and record up to the horizon, or to an estimate that is not finite; return the
+        status.
         """
         try:
             # Any value but DONE.
@@ -376,19 +297,16 @@ class FlowRun:
         return "complete"
 
     def _advance(self) -> int:
-        """Run the loop that fits the filter until it wants something, and return its request."""
         if self._clocked is not None:
             return self._clocked.advance(self._state)
         assert self._visits is not None
         return advance_alone(self._state, self._visits)
 
     def _fulfil(self, request: int) -> None:
-        """Fulfil a ``request`` (WANT_...) of the event loop, before the loop goes on."""
         state = self._state
         if request == WANT_TICKS:
-            window = self._draws.window()
-            state.ticks, state.tick_at = ticks_of(window), 0
-            state.ticks_stop = len(window.t)
+            state.ticks, state.tick_at = self._draws.window(), 0
+            state.ticks_stop = len(state.ticks.t)
         elif request == WANT_STEPS:
             state.path = self._draws.path()
             # Positions are relative to the new block.
@@ -404,9 +322,8 @@ class FlowRun:
             self._rebase()
 
     def _rebase(self) -> None:
-        """Make the present state of the plant the origin of all states and messages."""
         state, k = self._state, self._state.frame_at
-        offset = -self._draws.states.offset(k, state.path, state.piece)
+        offset = -self._draws.states.rebase(k)
         if self._clocked is not None:
             self._clocked.shift(self._scenario, state, offset)
         else:
@@ -415,19 +332,16 @@ class FlowRun:
         state.frame_at = k + 1
 
     def _enlarge_pool(self) -> None:
-        """Enlarge the pool of messages and all that has an entry for each of them."""
         add_messages(self._state, self._state.most_messages)
         if self._clocked is not None:
             self._clocked.grow(len(self._state.pool))
 
     def _enlarge_rows(self) -> None:
-        """Make the buffer of event rows long enough for one more event."""
         length = max(recording.BLOCK, 2 * self._state.most_rows)
         if len(self._state.rows) < length:
             self._state.rows = np.empty(length, dtype=EVENT)
 
     def _record_rows(self, count: int, counts: np.ndarray) -> None:
-        """Pass ``count`` rows on to the recorder, or ``counts`` in a run without rows."""
         state, recorder = self._state, self._recorder
         if not state.traced:
             recorder.add_counts(counts)
@@ -447,15 +361,12 @@ class FlowRun:
         if not count:
             return True
         times = state.probes[state.probe_at - count : state.probe_at].copy()
-        local, x = self._draws.states.states_at(times, state.path, buffer.piece[0, :count])
+        local, x = self._draws.states.states(times)
         # Index of the last sample that counts: the last one, or the first that is not finite. A
         # list, so that the function below can set it.
         last = [count - 1]
 
         def pass_rows_on(k: int) -> None:
-            """Record the rows before sample number ``k`` of the buffer, the first one that is not
-            finite.
-            """
             last[0] = k
             self._record_rows(int(buffer.rows[0, k]), buffer.counts[0, k])
 

@@ -19,11 +19,10 @@ from netkf.rng.numbers import NormalZiggurat, next_normal
 def read_increments(
     state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Compute the increments that node ``h`` (index) of run number ``run`` reads over [now, end]
-    (seconds), as two moments of each row: write them into ``out`` (2 p,), first moments of all p
-    rows before the second ones. The interval lies in the step of ``piece`` (index of a piece of the
-    path); ``scratch.state_moments`` has the moments of x over it. Noise that is used is taken away
-    from ``sensing.noise``.
+    """Write the two moments of what node ``h`` reads over [now, end] (seconds), in the step of
+    ``piece``, into ``out`` (2 p,), of all rows the first moment before the second;
+    ``scratch.state_moments`` has those of x. Noise that is used is taken away from
+    ``sensing.noise``.
     """
     sensing, early = state.sensing, state.scratch.early
     x, H, root, row = state.scratch.state_moments, sensing.H, sensing.root, 0
@@ -42,18 +41,13 @@ def read_increments(
 
 @kernel(inlined=True)
 def noise_index(sensing: Sensing, run: int, s: int, step: int) -> int:
-    """Return the index in ``sensing.noise`` of the noise of sensor ``s`` (0 to S - 1) in step
-    number ``step`` of the present block, in run number ``run``.
-    """
+    """Return the index in ``sensing.noise`` of sensor ``s`` in a ``step`` of the present block."""
     return (run * len(sensing.rows) + s) * sensing.steps + step
 
 
 @kernel
 def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
-    """Draw what divides the noise of sensor ``s`` (0 to S - 1) of run number ``run`` when a reading
-    ends inside a step: standard ``normals`` (2, p) for the two noise moments of the step, from that
-    sensor's stream in ``sensing.cuts``, which advances.
-    """
+    """Draw the ``normals`` (2, p) that divide the noise of sensor ``s`` inside a step."""
     ziggurat = NormalZiggurat(sensing.height, sensing.width, sensing.inside)
     states, stream = sensing.cuts, run * len(sensing.rows) + s
     for half in range(2):
@@ -63,10 +57,8 @@ def draw_cut(sensing: Sensing, run: int, s: int, normals: FloatArray) -> None:
 
 @kernel(inlined=True)
 def find_course(state: Simulation, run: int, piece: int) -> int:
-    """Return the index c of the polynomial of x in a ``piece`` of the path (index), from which the
-    moments of any part of the piece are computed: ``path.course[run - state.first_run, c]`` (D, W),
-    D coefficients of W integrals. It is computed once for all nodes that read in the piece, and
-    cached in ``path.course`` and ``path.known``.
+    """Return the index in ``path.course`` of the polynomial of x in a ``piece``, which is computed
+    once for all nodes that read in the piece.
     """
     path, k = state.path, run - state.first_run
     # The cache has 2^m entries: the index is the number of the piece modulo 2^m.
@@ -81,9 +73,8 @@ def find_course(state: Simulation, run: int, piece: int) -> int:
 
 @kernel
 def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
-    """Write the two moments (2, n) of x over [now, end] (seconds), inside one ``piece`` of the path
-    (index) of run number ``run``, into ``scratch.state_moments``: the integrals of x and of x times
-    the Legendre polynomial P_1 of the interval.
+    """Write the two moments of x over [now, end] (seconds), inside one ``piece``, into
+    ``scratch.state_moments``.
     """
     path, scratch = state.path, state.scratch
     start, stop = path.start[piece], path.stop[piece]
@@ -99,9 +90,7 @@ def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, e
 
 @kernel(inlined=True)
 def piece_of(path: PathBlock, piece: int, end: float) -> int:
-    """Return the index of the piece of the path (a step of the sensing grid, or a part of one that
-    samples cut) that contains ``end`` (seconds), searched backwards from the index ``piece``.
-    """
+    """Return the index of the piece that contains ``end`` (seconds), not after ``piece``."""
     # Back from the present piece: a node may be behind it.
     while piece > 0 and path.stop[piece - 1] >= end:
         piece -= 1
@@ -110,10 +99,8 @@ def piece_of(path: PathBlock, piece: int, end: float) -> int:
 
 @kernel
 def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float) -> None:
-    """Write the two moments (2, n) of x over [now, end] (seconds) in run number ``run`` into
-    ``scratch.state_moments``: the integrals of x and of x times the Legendre polynomial P_1. The
-    interval lies inside one step, which samples of other nodes may cut into pieces; ``end`` is not
-    after ``piece`` (index of a piece of the path).
+    """Write the two moments of x over [now, end] (seconds), inside one step and not after
+    ``piece``, into ``scratch.state_moments``.
     """
     path = state.path
     k = piece_of(path, piece, end)
@@ -144,9 +131,8 @@ def fill_moments(state: Simulation, run: int, piece: int, now: float, end: float
 def fill_readings(
     state: Simulation, run: int, h: int, piece: int, now: float, end: float, out: FloatArray
 ) -> None:
-    """Write the two moments of the readings of node ``h`` (index) of run number ``run`` over [now,
-    end] (seconds) into ``out`` (2 p,), first moments of all p rows before the second ones; ``end``
-    is not after ``piece`` (index of a piece of the path), and in its step.
+    """Write the two moments of the readings of node ``h`` over [now, end] (seconds), as
+    ``read_increments``.
     """
     fill_moments(state, run, piece, now, end)
     read_increments(state, run, h, piece, now, end, out)
@@ -154,10 +140,9 @@ def fill_readings(
 
 @kernel(inlined=True)
 def next_interval(rate: float, now: float, time: float, least: float) -> tuple[float, float]:
-    """Return where the next measurement interval ends (seconds), over which readings are used in
-    one update: from ``now`` to at most ``time``, short against the ``rate`` of information trace(P
-    G) in 1/s. The second result is the least length in seconds of the following interval, which the
-    next call takes as ``least`` (first 0).
+    """Return where the next measurement interval from ``now`` to at most ``time`` (seconds) ends,
+    short against the ``rate`` trace(P G) in 1/s, and the least length of the interval after it, at
+    first 0.
     """
     end, interval = time, usable(rate)
     if interval < time - now:
@@ -173,10 +158,8 @@ def next_interval(rate: float, now: float, time: float, least: float) -> tuple[f
 def advance_over_interval(
     state: Simulation, run: int, h: int, k: int, piece: int, now: float, end: float
 ) -> None:
-    """Predict node ``h`` (index in ``state.nodes``) of run number ``run`` from ``now`` to ``end``
-    (seconds) and use all increments between them in one update. Changes row ``k`` of ``state.xhat``
-    and ``state.root``, where the node's estimate is; ``piece`` is the index of a piece of the path
-    in the step that ``end`` lies in.
+    """Predict node ``h`` of run number ``run``, whose estimate is in row ``k``, from ``now`` to
+    ``end`` (seconds), in the step of ``piece``, and use all increments between them in one update.
     """
     table, m, scratch, gap = state.table, state.nodes[h].model, state.scratch, end - now
     xhat, root, readings = state.xhat, state.root, scratch.moments[: state.gains.moments[m]]

@@ -10,10 +10,7 @@ from netkf.linalg.compiling import kernel
 
 @kernel
 def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
-    """Return True if message ``a`` arrives before message ``b`` (indices in ``pool`` (C,), C
-    MESSAGE records): by time, then by directed link, then by order sent. It orders the heap of
-    messages under way.
-    """
+    """Return True if message ``a`` of the ``pool`` arrives before message ``b``."""
     # Ties must not depend on the order of insertion: the order is that of the SimPy engine.
     first, second = pool[a], pool[b]
     if first.arrival != second.arrival:
@@ -25,10 +22,7 @@ def arrives_first(pool: np.ndarray, a: int, b: int) -> bool:
 
 @kernel
 def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
-    """Insert ``message`` (index in ``pool`` (C,), C MESSAGE records) in place into the binary
-    ``heap`` (C,) of indices, which holds ``size`` messages ordered by arrival; the caller counts
-    them.
-    """
+    """Insert ``message`` into the ``heap`` of ``size`` messages ordered by arrival."""
     # A binary heap of indices in the pool: sift up. heapq would need Python objects.
     k = size
     while k > 0 and arrives_first(pool, message, heap[(k - 1) // 2]):
@@ -39,9 +33,7 @@ def push(pool: np.ndarray, heap: np.ndarray, size: int, message: int) -> None:
 
 @kernel
 def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
-    """Remove and return the message (index in ``pool`` (C,), C MESSAGE records) that arrives next
-    from the binary ``heap`` (C,) of indices, which holds ``size`` messages; the caller counts them.
-    """
+    """Remove and return the message that arrives next from the ``heap`` of ``size`` messages."""
     # Sift the last entry down from the top.
     top, last, k = heap[0], heap[size - 1], 0
     while 2 * k + 1 < size - 1:
@@ -58,9 +50,7 @@ def pop(pool: np.ndarray, heap: np.ndarray, size: int) -> int:
 
 @kernel
 def take(state: Simulation) -> int:
-    """Remove a free message from ``state.pool`` and return its index; counts it in
-    ``free_count``.
-    """
+    """Remove a free message from the pool and return its index."""
     # The free messages are a linked list: a stack, so that recently used memory comes first.
     message = state.first_free
     state.first_free = state.pool[message].next
@@ -78,10 +68,8 @@ def release(state: Simulation, message: int) -> None:
 
 @kernel
 def put(state: Simulation, h: int, message: int) -> None:
-    """Insert ``message`` (index in ``state.pool``) into the inbox of node ``h`` (index in
-    ``state.nodes``), a linked list sorted by sender. Of several messages of one sender the newest
-    replaces the others; readings (READINGS) all stay, in the order of arrival. Changes the links
-    ``inbox``, ``last`` and ``next``; a message that is replaced becomes free.
+    """Insert ``message`` into the inbox of node ``h``, a linked list sorted by sender. Of several
+    messages of one sender the newest replaces the others, or all stay in the order of arrival.
     """
     nodes, directions, pool = state.nodes, state.directions, state.pool
     newest_only = state.newest_only == 1
@@ -118,9 +106,7 @@ def put(state: Simulation, h: int, message: int) -> None:
 
 @kernel
 def sort_indices(indices: np.ndarray, count: int) -> None:
-    """Sort the first ``count`` entries of ``indices`` (K >= count,) in place, in ascending order
-    (Shell's sort: a few lines to compile).
-    """
+    """Sort the first ``count`` entries of ``indices`` (Shell's sort: quick to compile)."""
     gap = count // 2
     while gap > 0:
         for k in range(gap, count):

@@ -13,15 +13,12 @@ Result = TypeVar("Result")
 
 
 def once_per_scenario(function: Callable[[Scenario], Result]) -> Callable[[Scenario], Result]:
-    """Cache the results of a function as long as their scenarios live; callers must not change
-    them.
-    """
+    """Cache the results of a function as long as their scenarios live."""
     # Keyed by identity, since comparing scenarios field by field takes longer.
     results: dict[int, tuple[ref[Scenario], Result]] = {}
 
     @wraps(function)
     def cached(scenario: Scenario) -> Result:
-        """Return the cached result for this scenario, computed at the first call."""
         key = id(scenario)
         entry = results.get(key)
         if entry is None or entry[0]() is not scenario:

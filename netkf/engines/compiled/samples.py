@@ -23,14 +23,9 @@ def record_samples(
     samples: StateSamples,
     pass_rows_on: Callable[[int], None],
 ) -> bool:
-    """Record K samples (times (K,), x (K, n), xhat (K, F, n), ... of F filters) up to the first one
-    that is not sound, at which the run ends as diverged: an estimate or the square of an error is
-    not finite, or a covariance not positive semidefinite. Return True if all are sound.
-
-    ``pass_rows_on`` is called with the index of the first sample that is not sound, to record the
-    events before it; later ones are dropped. If filters are pooled, ``samples`` have one estimator
-    for all nodes (F = 1), and are recorded for each of them. ``progress`` is called with the
-    simulated seconds reached.
+    """Record K samples of F filters, of one for all nodes if filters are pooled, up to the first
+    that is not sound (``sound_mask``), at which the run ends as diverged. Return True if all are
+    sound. ``pass_rows_on`` is called with the index of that sample, to record the events before it.
     """
     times, x, xhat, P, error = samples
     # The loop may stop for other reasons than samples.

@@ -34,24 +34,17 @@ class Senders(NamedTuple):
     sources: tuple[Link, ...]
     source: np.ndarray
 
-    @property
-    def shared(self) -> bool:
-        """Return True if both directions of a link share outcomes."""
-        return len(self.sources) < len(self.directions)
-
 
 @once_per_scenario
 def senders_of(scenario: Scenario) -> Senders:
-    """Return the senders of a scenario, which say what has a clock (links, directed links or nodes)
-    and on which directed links each tick sends; none if the filter sends no messages.
-    """
+    """Return the senders of a scenario; none if the filter sends no messages."""
     topology, clock = scenario.topology, scenario.network.activation
     # In slots there is no link clock.
     if not scenario.node_filter.timing.talks or not isinstance(clock, LinkClock):
         no_links = np.zeros(0, dtype=np.int64)
         return Senders("links", (), (), np.zeros(1, dtype=np.int64), no_links, (), no_links)
     if clock.at == "links":
-        return _link_senders(topology.links, topology.directed, scenario.network.channel.symmetric)
+        return link_senders(topology.links, topology.directed, scenario.network.channel.symmetric)
     directions = topology.directions
     indices = np.arange(len(directions))
     # Each direction has a clock, and sends on itself only.
@@ -68,8 +61,10 @@ def senders_of(scenario: Scenario) -> Senders:
     return Senders(clock.at, entities, directions, first, outgoing, directions, indices)
 
 
-def _link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
-    """Return the senders where links have clocks: both ends send at each tick."""
+def link_senders(links: tuple[Link, ...], directed: bool, symmetric: bool) -> Senders:
+    """Return the senders where both ends of a link send at a time, or, if links are ``directed``,
+    the first one. ``symmetric``: both share a stream.
+    """
     if directed:
         indices = np.arange(len(links))
         return Senders("links", links, links, np.arange(len(links) + 1), indices, links, indices)

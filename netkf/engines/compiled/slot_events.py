@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
@@ -27,47 +28,25 @@ from netkf.engines.compiled.slot_messages import (
     TICK,
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
-from netkf.network.channels import ChannelSampler, checked_delay, checked_delivery_probability
+from netkf.network.channels import ChannelDraw, ChannelSampler, transit_time
 from netkf.network.graphs import Link
-from netkf.network.matchings import Matching, RecordedSlots
+from netkf.network.matchings import used_links
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN
 from netkf.trace.schema import CODES, EVENT
 
 LATE = CODES["late"]
-DRAWN_TOGETHER = (
-    64  # draws of a channel at once, since a call of numpy costs as much as ten of them
-)
-Draw = tuple[float, bool, float]
 Row = tuple[float, int, int, int, int, int, float]
 Decide = Callable[[int, np.ndarray], np.ndarray]
 
 
-class DirectionDraws:
-    """A directed link: its ends and index, its number of messages so far, and the draws
-    for them.
-    """
+class Direction:
+    """A directed link: its ends and index, and its number of messages so far."""
 
-    def __init__(self, scenario: Scenario, streams: Streams, ends: Link, index: int) -> None:
-        """Make the sampler of the directed link with the node ids ``ends`` (sender, receiver) and
-        this ``index``.
-        """
+    def __init__(self, scenario: Scenario, ends: Link, index: int) -> None:
         self.ends, self.index, self.messages = ends, index, 0
         self.probability = scenario.table_probability(ends)
-        self._sampler = ChannelSampler(
-            scenario.network.channel, lambda purpose: streams.generator(purpose, *ends)
-        )
-
-    def draws(self) -> Iterator[Draw]:
-        """Yield the draws of the channel for the activations of this link, one after the other: a
-        uniform number that decides about loss, whether the channel is in its bad state, and a delay
-        in seconds.
-        """
-        while True:
-            # Drawn in blocks for speed; the numbers do not depend on the length of a block.
-            columns = self._sampler.draws(DRAWN_TOGETHER)
-            yield from zip(*(column.tolist() for column in columns), strict=True)
 
 
 class Step(NamedTuple):
@@ -95,31 +74,30 @@ class SlotEvents:
     """Makes the messages and events of one run, slot after slot."""
 
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
-        """Make the streams of matchings (which pairs of nodes exchange) and of all directed links
-        of one run; no slot has been made yet.
-        """
         self._scenario, self._setup, self._timing = scenario, setup, scenario.node_filter.timing
         self._instant = scenario.time_grid.instant
         self._random = streams.generator("matching")
-        self._directions = [
-            DirectionDraws(scenario, streams, ends, k) for k, ends in enumerate(setup.directions)
-        ]
-        each, count = setup.directions_per_link, setup.streams_per_link
-        # Directions of a link are neighbours; a directed graph has one of them.
-        pairs = [direction.ends for direction in self._directions[::each]]
+        self._directions = [Direction(scenario, ends, k) for k, ends in enumerate(setup.directions)]
+        each, channel = setup.directions_per_link, scenario.network.channel
+        # Directions of a link are neighbours; a directed graph has one of them. With a symmetric
+        # channel only the first has streams.
         self._by_link = {
-            link: self._directions[k * each : (k + 1) * each] for k, link in enumerate(pairs)
+            one.ends: self._directions[k : k + each]
+            for k, one in enumerate(self._directions)
+            if k % each == 0
         }
-        # With a symmetric channel only the first direction of a link has a stream.
-        self._draws = {
-            link: [direction.draws() for direction in both[:count]]
+        self._samplers = {
+            link: [
+                ChannelSampler(channel, partial(_stream, streams, one.ends))
+                for one in (both[:1] if channel.symmetric else both)
+            ]
             for link, both in self._by_link.items()
         }
         # The last draws of each link, for steps in which links keep them.
-        self._last: dict[Link, list[Draw]] = {}
+        self._last: dict[Link, list[ChannelDraw]] = {}
         # A heap by (arrival, index of the direction, order); then direction, number, time of
         # sending, phase and exchange of each message.
-        self._in_flight: list[tuple[float, int, int, DirectionDraws, int, float, int, int]] = []
+        self._in_flight: list[tuple[float, int, int, Direction, int, float, int, int]] = []
         self._slot, self._order, self._exchanges, self._open = 0, 0, 0, -1
         self._recording = True
         # By receiver and sender: number and age of the message.
@@ -132,10 +110,7 @@ class SlotEvents:
         self._chosen_pairs: list[tuple[list[Link], set[Link] | None]] = []
 
     def asked(self) -> np.ndarray:
-        """Return ``asked`` (E, N): 1 if node h is asked for a message in step e of the next slot;
-        the filter then decides whether it sends one. Draws the pairs of the slot. There are E
-        exchange steps in a slot.
-        """
+        """Return (E, N) flags: nodes that are asked for a message in each step of the next slot."""
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
         for step in self._iterate_steps(self._slot):
@@ -147,13 +122,8 @@ class SlotEvents:
 
     def following(self, max_events: int, decide: Decide | None) -> tuple[int, np.ndarray]:
         """Make the messages and events of the next slots, up to about ``max_events`` events; return
-        the number of slots S and ``up`` (1, S, E, W), which is 1 where a message on directed link w
-        is used in step e.
-
-        If nodes may be silent (event-triggered filters) it is one slot: ``asked`` says which nodes
-        have a message to send in it, and ``decide(step, up)`` which of them send it, (N,), given
-        ``up`` (E, W) of the steps before. Dimensions: E exchange steps in a slot (rounds of
-        messages), W directed links.
+        the number of slots S and ``up`` (1, S, E, W). If nodes may be silent it is one slot:
+        ``decide(step, up)`` returns who sends, (N,), given ``up`` (E, W) of the steps before.
         """
         setup, arrivals = self._setup, []
         self._rows, self._decide = [], decide
@@ -169,7 +139,6 @@ class SlotEvents:
         return len(arrivals), np.stack(arrivals)[None]
 
     def _one_slot(self) -> np.ndarray:
-        """Make all events of the present slot."""
         setup, timing, slot = self._setup, self._timing, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
         if setup.may_miss:
@@ -192,7 +161,6 @@ class SlotEvents:
         return up
 
     def _make_stage_events(self, slot: int, up: np.ndarray) -> None:
-        """Make the events of the readings and exchanges of slot number ``slot``, in order."""
         steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
@@ -214,7 +182,6 @@ class SlotEvents:
                 self._end_step(exchange_step, up[step])
 
     def _iterate_steps(self, slot: int) -> Iterator[Step]:
-        """Yield the exchange steps of ``slot`` with their phase and times in seconds."""
         setup, timing, repeats = self._setup, self._timing, [0, 0]
         # At the horizon filters that predict are only sampled.
         acts = slot < setup.last or not timing.predicts
@@ -230,8 +197,7 @@ class SlotEvents:
 
     def rows(self, stopped: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the events of the slots just made as EVENT rows (K,), and the number of rows
-        before each of their T samples, (T,). ``stopped`` (N,) is the number of the slot in which
-        each node stops.
+        before each sample, (T,). ``stopped`` (N,): the slot in which each node stops.
         """
         rows: list[Row] = []
         before = []
@@ -261,12 +227,10 @@ class SlotEvents:
         return np.array(rows, dtype=EVENT), np.array(before, dtype=np.int64)
 
     def _append_row(self, row: Row) -> None:
-        """Append a row, unless events of this slot are not recorded."""
         if self._recording:
             self._rows.append(row)
 
     def _send_all(self, step: Step) -> None:
-        """Send all messages of an exchange step, with a draw of the channel for each."""
         broadcast, now, phase = not self._timing.pairwise, step.begin, step.phase
         pairs, up = self._chosen_pairs.pop(0) if self._chosen_pairs else self._choose_pairs(step)
         if broadcast:
@@ -278,7 +242,7 @@ class SlotEvents:
             if self._setup.fresh[step.step] or (i, j) not in self._last:
                 # Draw even if a node sends nothing, so that the network does not depend on the
                 # filter.
-                drawn = [next(draws) for draws in self._draws[i, j]]
+                drawn = [sampler.draw() for sampler in self._samplers[i, j]]
                 # Both directions take the one draw of a symmetric channel.
                 self._last[i, j] = drawn if len(drawn) == len(both) else drawn * 2
             # A recorded link that is down loses its messages, whatever was drawn.
@@ -290,41 +254,29 @@ class SlotEvents:
                     self._send(step, direction, draw if is_up else None)
 
     def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
-        """Return the links used in a step, and those of them that are up (None: all)."""
-        activation, topology = self._scenario.network.activation, self._scenario.topology
-        links = list(topology.links)
-        if isinstance(activation, Matching):
-            return activation.draw(topology, self._random), None
-        if not isinstance(activation, RecordedSlots):
-            return links, None
-        listed = activation.pairs(step.slot, step.phase, step.repeat)
-        if self._timing.pairwise:
-            return listed, None
-        # A recorded list names links once: in an undirected graph both directions are up.
-        up = set(listed)
-        return links, up if topology.directed else up | {(j, i) for i, j in listed}
+        return used_links(
+            self._scenario.network.activation,
+            self._scenario.topology,
+            self._random,
+            (step.slot, step.phase, step.repeat),
+            self._timing.pairwise,
+        )
 
-    def _is_silent(self, direction: DirectionDraws, step: Step) -> bool:
-        """Return True if the sender of a directed link sends nothing in this step."""
+    def _is_silent(self, direction: Direction, step: Step) -> bool:
         node = self._scenario.topology.index[direction.ends[0]]
         if self._sent is not None and not self._sent[node]:
             return True
         return bool(self._setup.may_miss and self._unread[step.step, node])
 
-    def _send(self, step: Step, direction: DirectionDraws, draw: Draw | None) -> None:
+    def _send(self, step: Step, direction: Direction, draw: ChannelDraw | None) -> None:
         """Send one message; it is lost if ``draw`` says so or is None, its link being down."""
         (sender, receiver), number, now = direction.ends, direction.messages, step.begin
         direction.messages = number + 1
         self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
-            # Checked, because a user's channel may return anything.
-            probability = checked_delivery_probability(
-                channel.loss, direction.ends, number, draw[1], direction.probability
-            )
-            if draw[0] < probability:
-                delay = checked_delay(channel.delay, direction.ends, number, draw[2])
-                delay = self._instant(delay)
+            ends, table = direction.ends, direction.probability
+            delay = self._instant(transit_time(channel, ends, number, draw, table))
         if math.isnan(delay):
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:
@@ -348,7 +300,6 @@ class SlotEvents:
             heapq.heappush(self._in_flight, entry)
 
     def _deliver(self, until: float) -> None:
-        """Deliver the messages that arrive up to ``until`` (seconds)."""
         while self._in_flight and self._in_flight[0][0] <= until:
             now, _, _, direction, number, sent, phase, exchange = heapq.heappop(self._in_flight)
             (sender, receiver), in_time = direction.ends, exchange == self._open
@@ -361,7 +312,6 @@ class SlotEvents:
                 self._inbox.setdefault(receiver, {})[sender] = (number, age)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
-        """End an exchange step: set ``up`` (W,) and record swaps or absorptions."""
         count = len(self._rows)
         # By receiver and sender, the order of the kernels and of SimPy.
         for node in sorted(self._inbox):
@@ -380,3 +330,7 @@ class SlotEvents:
         self._inbox.clear()
         # From now on messages of this exchange are late.
         self._open = -1
+
+
+def _stream(streams: Streams, ends: Link, purpose: str) -> np.random.Generator:
+    return streams.generator(purpose, *ends)

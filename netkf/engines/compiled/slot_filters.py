@@ -107,8 +107,8 @@ class SlotFilters:
         )
 
     def simulate(self, y: FloatArray, H: FloatArray, samples: SlotSamples, **drawn: Any) -> None:
-        """Simulate the slots of a plan, whose drawn parts are given by name, with whitened
-        readings ``y`` (B, S, H, p, L) and their ``H``.
+        """Simulate the slots of a plan, ``drawn`` by name, with whitened readings as in
+        ReadingBlock.
         """
         self._run.y = y.reshape(-1, *y.shape[3:])
         self._run.H = H.reshape(-1, *H.shape[3:])

@@ -109,7 +109,6 @@ def exchange_of(kernels: Kernels) -> Any:
 
     @kernel
     def exchange(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
-        """Let all nodes send and absorb in step ``e`` of the exchanges of slot ``s``."""
         nodes, lanes = len(record.xhat), run.lanes
         if e != plan.begin:
             # All messages are made before any arrives.
@@ -144,7 +143,6 @@ def slot_loop(kernels: Kernels) -> Any:
 
     @kernel
     def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int) -> None:
-        """Go through the stages of slot ``s``, or those of its part."""
         nodes, e, begun = len(record.xhat), 0, plan.begin == WHOLE
         for g in range(len(plan.stages)):
             stage = plan.stages[g]
@@ -170,7 +168,6 @@ def slot_loop(kernels: Kernels) -> Any:
     def sample_slot(
         record: Any, run: SlotRun, plan: SlotPlan, samples: SlotSamples, b: int, s: int
     ) -> None:
-        """Write the sample of a slot, if it has one, and then move the origin, if it does."""
         if plan.sample[s] >= 0:
             for h in range(len(record.xhat)):
                 observe(record, h, run)
@@ -184,7 +181,6 @@ def slot_loop(kernels: Kernels) -> Any:
     def loop(
         record: Any, memories: np.ndarray, run: SlotRun, plan: SlotPlan, samples: SlotSamples
     ) -> None:
-        """Simulate all slots of the plan in all blocks."""
         nodes, slots = len(record.xhat), plan.up.shape[1]
         for b in range(len(memories)):
             block = struct_like(record, memories[b])
@@ -250,9 +246,7 @@ def store_sample(
     b: int,
     s: int,
 ) -> None:
-    """Write the sample of slot ``s`` of the L runs of block ``b`` with estimates ``xhat`` (H, n, L)
-    and roots ``root`` (H, n, n, L).
-    """
+    """Write the sample of slot ``s`` of block ``b``: ``xhat`` (H, n, L), ``root`` (H, n, n, L)."""
     k, lanes = plan.sample[s], run.lanes
     n, first = len(run.size), b * len(lanes)
     sum_of_all = load(lanes, samples.total, b)
@@ -290,9 +284,8 @@ def store_sample(
 def scatter_sample(
     lanes: Lanes, values: FloatArray, samples: FloatArray, indices: np.ndarray
 ) -> None:
-    """Write one sample of L lanes (runs side by side) into the arrays of all R runs: the first C
-    rows of ``values`` (>= C, L) into ``samples`` (R, C), lane q into row ``indices[q]`` (L,); -1:
-    no run.
+    """Write one sample, ``values`` (>= C, L), into ``samples`` (R, C): lane q into row
+    ``indices[q]``; -1: no run.
     """
     count = samples.shape[1]
     for c in range(0, count, len(lanes)):

@@ -2,28 +2,21 @@
 
 Every link draws from streams of its own, so that messages of many slots and runs are drawn before
 any estimate is computed. Dimensions: B blocks of L runs side by side (``linalg.lanes``; R <= B L
-runs), S slots, E steps of a slot's exchanges, W directed links, N nodes. Their indices are b, q
-(lane), r, s, e, w. ``up`` (B, S, E, W, L) is 1 where a message arrives.
+runs), S slots, E steps of a slot's exchanges, W directed links, N nodes, at most A pairs. Their
+indices are b, q (lane), r, s, e, w.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from netkf.core.instants import snapped
+from netkf.engines.compiled.outcomes import ChannelStreams, next_state
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import (
-    Lanes,
-    load,
-    load_flags,
-    select,
-    spread,
-    store,
-    store_flags,
-)
+from netkf.linalg.lanes import Lanes, load_flags, select, spread, store
 from netkf.network.matchings import PROTOCOLS
 from netkf.rng.draws import next_unit
 from netkf.rng.numbers import next_integer, shuffle
@@ -58,45 +51,27 @@ class Matchings(NamedTuple):
     busy: np.ndarray
 
 
-class Channels(NamedTuple):
-    """Loss model of all links, its random streams, and the last numbers drawn from them.
+class SlotChannels(NamedTuple):
+    """The links of R runs, of S streams each, and the last numbers drawn for them.
 
-    K = links x ``streams_per_link``: a symmetric channel has one stream for both directions.
-
+    channels : losses of the directed links, and their random streams
+    uniform : (R S,), the last uniform number of each stream, -1 at first
     ends : (links, 2), indices of nodes; direction 2 l goes from the first to the second
-    delivery : (2, W), delivery probabilities in the good and the bad state of the link
-    loss_streams, state_streams : (B, K, L, WIDTH), random streams of losses and of the chain of
-                                  channel states; empty where nothing is drawn
-    loss_uniform, state_uniform : (B, K, L), the last uniform numbers drawn from them, -1 at first
-    bad : (B, K, L), state of the channel (1: bad), -1 at first
-    to_bad, to_good : transition probabilities of the chain
     talks : (E, W), 1 if the sender of a direction has something to send in a step
-    directions_per_link, streams_per_link : 1 or 2
+    per_link : directions of a link, 1 or 2
     """
 
+    channels: ChannelStreams
+    uniform: FloatArray
     ends: np.ndarray
-    delivery: FloatArray
-    loss_streams: np.ndarray
-    state_streams: np.ndarray
-    loss_uniform: FloatArray
-    state_uniform: FloatArray
-    bad: np.ndarray
-    to_bad: float
-    to_good: float
     talks: np.ndarray
-    directions_per_link: int
-    streams_per_link: int
+    per_link: int
 
 
 @kernel
 def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Draw one matching of run ``r``, the set of links that exchange in a step, no two at one node:
-    write the indices of its links into ``active`` (A,), which has space for the largest one, in
-    their order; return how many. ``ends`` (links, 2) are the indices of the nodes at both ends of
-    each link.
-
-    The numbers are those that ``Matching.draw`` takes from the same stream, which advances, so
-    that both engines simulate the same run.
+    """Draw one matching of run ``r``: write the indices of its links into ``active`` (A,), in their
+    order, and return how many there are; ``ends`` (links, 2).
     """
     count, states = len(ends), matchings.states
     first, members = matchings.first, matchings.members
@@ -126,7 +101,7 @@ def draw_matching(matchings: Matchings, ends: np.ndarray, r: int, active: np.nda
 
 @kernel
 def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarray) -> int:
-    """Draw a matching that keeps links whose ends are free into ``active`` (A,)."""
+    """Draw a matching of links whose ends are free into ``active`` (A,)."""
     count, pairs, states = len(ends), 0, matchings.states
     order, busy = matchings.order, matchings.busy
     for h in range(len(busy)):
@@ -162,233 +137,68 @@ def _free_links(matchings: Matchings, ends: np.ndarray, r: int, active: np.ndarr
 
 
 @kernel
-def draw_link(
-    lanes: Lanes, channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int
-) -> None:
-    """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot ``s``
-    (index in the block of slots), in all L runs of block ``b`` at once, one in each lane; write 1
-    or 0 into ``up`` (B, S, E, W, L) for its one or two directed links. A link is ``fresh`` in a
-    step that draws losses anew; otherwise it keeps its last draws, which ``channels`` stores.
-    Dimensions: B blocks of L runs, S slots of E exchange steps, W directed links. ``lanes`` is a
-    tuple of length L.
-    """
-    uniforms = channels.loss_uniform
-    for d in range(channels.directions_per_link):
-        # With one stream per link (symmetric) both directions use it.
-        k = link * channels.streams_per_link + min(d, channels.streams_per_link - 1)
-        # A held link keeps its uniform number; -1 marks a link that has none yet.
-        if (
-            d < channels.streams_per_link
-            and len(channels.loss_streams) > 0
-            and (fresh or uniforms[b, k, 0] < 0.0)
-        ):
-            next_units(lanes, channels.loss_streams[b, k], uniforms[b, k])
-            # The channel state (Gilbert-Elliott) takes one step for each activation.
-            if len(channels.state_streams) > 0:
-                next_units(lanes, channels.state_streams[b, k], channels.state_uniform[b, k])
-                for q in range(len(lanes)):
-                    channels.bad[b, k, q] = next_state(
-                        channels.bad[b, k, q],
-                        channels.state_uniform[b, k, q],
-                        channels.to_bad,
-                        channels.to_good,
-                    )
-        w = link * channels.directions_per_link + d
-        if channels.talks[e, w] == 1:
-            uniform = load(lanes, uniforms, b, k)
-            # Without channel states one comparison decides for all lanes.
-            if len(channels.state_streams) == 0:
-                store_flags(lanes, up, b, s, e, w, uniform < channels.delivery[0, w])
-                continue
-            for q in range(len(lanes)):
-                probability = (
-                    channels.delivery[1, w]
-                    if channels.bad[b, k, q] == 1
-                    else channels.delivery[0, w]
-                )
-                up[b, s, e, w, q] = uniforms[b, k, q] < probability
-
-
-@kernel
-def next_units(lanes: Lanes, states: np.ndarray, units: FloatArray) -> None:
-    """Write the next uniform number of each of the streams ``states`` (L, WIDTH) into ``units``
-    (L,). ``lanes`` is a tuple of length L.
-    """
-    for q in range(len(lanes)):
-        units[q] = next_unit(states, q)
-
-
-@kernel
-def draw_link_of_lane(
-    channels: Channels, b: int, link: int, fresh: bool, up: np.ndarray, s: int, e: int, q: int
-) -> None:
-    """Draw which messages of one activation of ``link`` (index) arrive, in step ``e`` of slot
-    ``s``, in the run of lane ``q`` of block ``b`` alone: matchings pair other links in each run.
-    Write 1 or 0 into ``up`` (B, S, E, W, L) for its one or two directed links. A link is ``fresh``
-    in a step that draws losses anew; otherwise it keeps its last draws, which ``channels`` stores.
-    Dimensions: B blocks of L runs, S slots of E exchange steps, W directed links.
-    """
-    for d in range(channels.directions_per_link):
-        # With one stream per link both directions use its draw; a uniform below 0 is not drawn yet.
-        k = link * channels.streams_per_link + min(d, channels.streams_per_link - 1)
-        if (
-            d < channels.streams_per_link
-            and len(channels.loss_streams) > 0
-            and (fresh or channels.loss_uniform[b, k, q] < 0.0)
-        ):
-            channels.loss_uniform[b, k, q] = next_unit(channels.loss_streams[b, k], q)
-            if len(channels.state_streams) > 0:
-                u = next_unit(channels.state_streams[b, k], q)
-                channels.bad[b, k, q] = next_state(
-                    channels.bad[b, k, q], u, channels.to_bad, channels.to_good
-                )
-        w = link * channels.directions_per_link + d
-        if channels.talks[e, w] == 1:
-            # A channel without states keeps bad = -1.
-            probability = (
-                channels.delivery[1, w] if channels.bad[b, k, q] == 1 else channels.delivery[0, w]
-            )
-            up[b, s, e, w, q] = channels.loss_uniform[b, k, q] < probability
-
-
-@kernel
-def next_state(bad: int, u: float, to_bad: float, to_good: float) -> int:
-    """Return the next state (1: bad, 0: good) of the two-state Markov channel (Gilbert-Elliott) of
-    one link, decided by the uniform number ``u``: a good state turns bad with probability
-    ``to_bad``, a bad one good with ``to_good``. The first state, after ``bad`` = -1, has the
-    stationary law.
-    """
-    if bad < 0:
-        return 1 if u < to_bad / (to_bad + to_good) else 0
-    if bad == 1:
-        return 1 if u >= to_good else 0
-    return 1 if u < to_bad else 0
-
-
-@kernel
-def draw_broadcasts(
-    lanes: Lanes, channels: Channels, exchanged: np.ndarray, fresh: np.ndarray, up: np.ndarray
-) -> None:
-    """Draw which messages arrive when all nodes broadcast, so that every link is used in every
-    step: write 1 into ``up`` (B, S, E, W, L), which holds zeros before. Slots without an exchange,
-    where ``exchanged`` (S,) is False, stay 0; links draw losses anew in the steps that are
-    ``fresh`` (E,) and keep them in the others. Dimensions: B blocks of L runs, S slots of E
-    exchange steps, W directed links. ``lanes`` is a tuple of length L.
-    """
-    for b in range(up.shape[0]):
-        for s in range(up.shape[1]):
-            for e in range(up.shape[2] if exchanged[s] else 0):
-                for link in range(len(channels.ends)):
-                    draw_link(lanes, channels, b, link, fresh[e], up, s, e)
-
-
-@kernel
-def draw_matched(
+def draw_messages(
     lanes: Lanes,
-    channels: Channels,
+    links: SlotChannels,
     matchings: Matchings,
     exchanged: np.ndarray,
     fresh: np.ndarray,
-    up: np.ndarray,
-    active: np.ndarray,
-    pair_count: np.ndarray,
+    messages: SlotMessages,
 ) -> None:
-    """Draw the matchings of all runs, the pairs of nodes that exchange in each step, and which
-    messages on their links arrive: write 1 into ``up`` (B, S, E, W, L), which holds zeros before.
-    ``active`` (R, S, E, A) gets the indices of the paired links in order, ``pair_count`` (R, S, E)
-    their number. Slots without an exchange, where ``exchanged`` (S,) is False, stay 0; links draw
-    losses anew in the steps that are ``fresh`` (E,). Dimensions: B blocks of L runs, R runs in all,
-    S slots of E exchange steps, W directed links, at most A pairs. ``lanes`` is a tuple of length
-    L.
+    """Draw which links exchange in the slots that are ``exchanged`` (S,) and which messages arrive,
+    into ``messages``. Links draw losses anew in the steps that are ``fresh`` (E,).
     """
+    up, runs, matched = messages.up, len(matchings.states), matchings.protocol >= 0
     for b in range(up.shape[0]):
         for s in range(up.shape[1]):
             for e in range(up.shape[2] if exchanged[s] else 0):
-                draw_pairs(lanes, channels, matchings, fresh[e], up, active, pair_count, b, s, e)
+                arrived = up[b, s, e]
+                for r in range(b * len(lanes), min((b + 1) * len(lanes), runs)):
+                    count = len(links.ends)
+                    if matched:
+                        active = messages.active[r, s, e]
+                        count = draw_matching(matchings, links.ends, r, active)
+                        messages.pair_count[r, s, e] = count
+                    for a in range(count):
+                        link = messages.active[r, s, e, a] if matched else a
+                        draw_link(links, r, link, fresh[e], e, arrived, r - b * len(lanes))
 
 
 @kernel
-def draw_pairs(
-    lanes: Lanes,
-    channels: Channels,
-    matchings: Matchings,
-    fresh: bool,
-    up: np.ndarray,
-    active: np.ndarray,
-    pair_count: np.ndarray,
-    b: int,
-    s: int,
-    e: int,
+def draw_link(
+    links: SlotChannels, r: int, link: int, fresh: bool, e: int, up: np.ndarray, q: int
 ) -> None:
-    """Draw the matchings (which pairs of nodes exchange) of step ``e`` of slot ``s`` in all L runs
-    of block ``b``, and which messages on their links arrive: write these into ``up`` (B, S, E, W,
-    L), the paired links into ``active`` (R, S, E, A), and their number into ``pair_count`` (R, S,
-    E). ``fresh``: links draw losses anew. Dimensions: B blocks of L runs, R runs in all, S slots of
-    E exchange steps, W directed links, at most A pairs. ``lanes`` is a tuple of length L.
+    """Draw which messages of one activation of ``link`` arrive in step ``e`` of run ``r``, into
+    lane ``q`` of ``up`` (W, L). Unless it is ``fresh`` a link keeps its last draws.
     """
-    first = b * len(lanes)
-    # Run by run: the pairs are different in each. The last block may have fewer runs than lanes.
-    for q in range(min(len(lanes), len(pair_count) - first)):
-        r = first + q
-        pairs = draw_matching(matchings, channels.ends, r, active[r, s, e])
-        pair_count[r, s, e] = pairs
-        for k in range(pairs):
-            draw_link_of_lane(channels, b, active[r, s, e, k], fresh, up, s, e, q)
+    channels, uniform, last = links.channels, links.uniform, -1
+    for w in range(link * links.per_link, (link + 1) * links.per_link):
+        k = r * channels.per_run + channels.source[w]
+        # With one stream for a link both directions use its draw; below 0: not drawn yet.
+        if k != last and len(channels.loss) > 0 and (fresh or uniform[k] < 0.0):
+            uniform[k] = next_unit(channels.loss, k)
+            # The channel state (Gilbert-Elliott) takes one step for each activation.
+            if len(channels.state) > 0:
+                next_state(channels, k)
+        last = k
+        if links.talks[e, w] == 1:
+            up[w, q] = uniform[k] < channels.delivery[max(channels.bad[k], 0), w]
 
 
 @kernel
-def mark_all_senders(
-    lanes: Lanes, channels: Channels, exchanged: np.ndarray, sent: np.ndarray
+def draw_uniforms(
+    lanes: Lanes, states: np.ndarray, sent: np.ndarray, uniform: FloatArray, runs: int
 ) -> None:
-    """Mark the nodes that broadcasts ask for a message, all nodes with links, in each of the E
-    steps of the S slots that are ``exchanged`` (S,): write 1 into ``sent`` (B, S, E, N, L), for N
-    nodes in B blocks of L runs. The filters then decide which of them send. ``lanes`` is a tuple of
-    length L.
+    """Draw a uniform number for each node that is asked for a message, where ``sent`` is 1: into
+    ``uniform``, both (B, S, E, N, L), in the order of steps, from ``states`` (R N, WIDTH).
     """
-    for b in range(sent.shape[0]):
-        for s in range(sent.shape[1]):
-            for e in range(sent.shape[2] if exchanged[s] else 0):
-                for link in range(len(channels.ends)):
-                    for end in range(2):
-                        for q in range(len(lanes)):
-                            sent[b, s, e, channels.ends[link, end], q] = 1
-
-
-@kernel
-def mark_paired_senders(
-    lanes: Lanes, channels: Channels, active: np.ndarray, pair_count: np.ndarray, sent: np.ndarray
-) -> None:
-    """Mark the nodes that matchings ask for a message, both ends of all paired links: write 1 into
-    ``sent`` (B, S, E, N, L). The filters then decide which of them send.
-
-    Dimensions are B blocks of L runs, S slots of E exchange steps, N nodes, at most A pairs.
-    ``pair_count`` (R, S, E) is the number of pairs of each of the R <= B L runs, and the first so
-    many entries of ``active`` (R, S, E, A) are the indices of their links. ``lanes`` is a tuple of
-    length L.
-    """
-    for r in range(pair_count.shape[0]):
-        for s in range(pair_count.shape[1]):
-            for e in range(pair_count.shape[2]):
-                for a in range(pair_count[r, s, e]):
-                    for end in range(2):
-                        node = channels.ends[active[r, s, e, a], end]
-                        sent[r // len(lanes), s, e, node, r % len(lanes)] = 1
-
-
-@kernel
-def draw_uniforms(states: np.ndarray, sent: np.ndarray, uniform: FloatArray) -> None:
-    """Draw a uniform number for each node that is asked for a message (``sent`` is 1), by which
-    filters that send at random decide whether to: into ``uniform`` (B, S, E, N, L), in the order of
-    steps, from the streams ``states`` (B, N, L, WIDTH), one for each node and run. Dimensions: B
-    blocks of L runs, S slots of E exchange steps, N nodes.
-    """
-    for b in range(sent.shape[0]):
+    for r in range(runs):
+        b, q = r // len(lanes), r % len(lanes)
         for s in range(sent.shape[1]):
             for e in range(sent.shape[2]):
                 for h in range(sent.shape[3]):
-                    for q in range(sent.shape[4]):
-                        if sent[b, s, e, h, q] == 1:
-                            uniform[b, s, e, h, q] = next_unit(states[b, h], q)
+                    if sent[b, s, e, h, q] == 1:
+                        uniform[b, s, e, h, q] = next_unit(states, r * sent.shape[3] + h)
 
 
 class Stages(NamedTuple):
@@ -427,22 +237,33 @@ class SlotTimes(NamedTuple):
     predicts: bool
 
 
+class SlotLinks(NamedTuple):
+    """W directed links by receiver: those to filter h are ``first[h]`` to ``first[h + 1]`` - 1.
+
+    first : (H + 1,)
+    sender : index (W,) of the sending filter
+    direction : index (W,) in the axis W of ``up``
+    weight : (W,) that the receiver gives to the sender
+    """
+
+    first: np.ndarray
+    sender: np.ndarray
+    direction: np.ndarray
+    weight: FloatArray
+
+
 class TracedNodes(NamedTuple):
     """Nodes and incoming links, for the kernels that write or count events.
 
     nodes, sensing : ids of all nodes (N,) and of those with sensors
-    first, sender, direction : (N + 1,), (W,) and (W,), directed links by receiver: node h receives
-                               from the nodes ``sender[k]`` (index) on the directed links
-                               ``direction[k]``, with k from ``first[h]`` to ``first[h + 1]`` - 1
+    links : directed links by receiver
     sent : number of messages so far (W,)
     stopped : slot in which each node stopped (B, N, L)
     """
 
     nodes: np.ndarray
     sensing: np.ndarray
-    first: np.ndarray
-    sender: np.ndarray
-    direction: np.ndarray
+    links: SlotLinks
     sent: np.ndarray
     stopped: np.ndarray
 
@@ -477,6 +298,20 @@ class SlotMessages(NamedTuple):
     sent: np.ndarray
 
 
+class Tracing(NamedTuple):
+    """What the rows of the first run are made of, and where they go. ``pairwise``: nodes swap with
+    a peer, instead of absorbing broadcasts.
+    """
+
+    stages: Stages
+    times: SlotTimes
+    links: SlotChannels
+    nodes: TracedNodes
+    messages: SlotMessages
+    rows: Rows
+    pairwise: bool
+
+
 class SlotStage(NamedTuple):
     """One stage of one slot, in which events happen.
 
@@ -494,19 +329,11 @@ class SlotStage(NamedTuple):
 
 @kernel
 def write_row(
-    rows: Rows,
-    stage: SlotStage,
-    kind: int,
-    node: int,
-    peer: int,
-    message: int,
-    age: float,
+    rows: Rows, stage: SlotStage, kind: int, node: int, peer: int, message: int, age: float,
     row: int,
-) -> int:
-    """Write one event into row number ``row`` of the event table ``rows`` of a run; return the
-    number of the next row. ``kind`` is an index in trace.schema.KINDS; the time and phase are those
-    of ``stage``, the part of a slot in which it happens; ``node`` and ``peer`` are ids of nodes,
-    ``message`` a number on its link (-1: none), ``age`` its seconds under way.
+) -> int:  # fmt: skip
+    """Write one event of a ``stage`` into row number ``row``; return the number of the next row.
+    ``node`` and ``peer`` are ids, ``message`` a number on its link (-1: none).
     """
     rows.t[row], rows.kind[row], rows.node[row], rows.peer[row] = stage.t, kind, node, peer
     rows.message[row], rows.phase[row], rows.age[row] = message, stage.phase, age
@@ -514,122 +341,69 @@ def write_row(
 
 
 @kernel
-def make_rows(
-    stages: Stages,
-    times: SlotTimes,
-    channels: Channels,
-    traced: TracedNodes,
-    messages: SlotMessages,
-    pairwise: bool,
-    first: int,
-    stop: int,
-    rows: Rows,
-) -> int:
-    """Write the events of the first run in the slots with indices ``first`` to ``stop`` - 1 into
-    the event table ``rows``, in the order of time; return their number. A slot has ``stages``: a
-    reading of sensors and steps of exchanges. Messages are numbered on, by link, from
-    ``traced.sent``, which is advanced. ``pairwise``: nodes swap with a peer, instead of absorbing
-    broadcasts.
+def make_rows(trace: Tracing, first: int, stop: int) -> int:
+    """Write the events of the first run in the slots with indices ``first`` to ``stop`` - 1, in the
+    order of time; return their number. Messages are numbered on, from ``trace.nodes.sent``.
     """
-    row = 0
+    row, times = 0, trace.times
     for s in range(first, stop):
         # Filters that predict are sampled before anything happens in the slot.
-        if times.predicts:
-            mark_sample(times, s, rows, row)
+        if times.predicts and times.sample[s] >= 0:
+            trace.rows.before_sample[times.sample[s]] = row
         # At the horizon nothing is recorded but the sample.
         if times.recorded[s]:
-            row = _slot_rows(stages, times, channels, traced, messages, pairwise, rows, s, row)
-        if not times.predicts:
-            mark_sample(times, s, rows, row)
+            row = _slot_rows(trace, s, row)
+        if not times.predicts and times.sample[s] >= 0:
+            trace.rows.before_sample[times.sample[s]] = row
     return row
 
 
 @kernel
-def mark_sample(times: SlotTimes, s: int, rows: Rows, row: int) -> None:
-    """Store ``row``, the number of event rows before the sample of slot ``s`` (index), in
-    ``rows.before_sample``, if the slot has a sample: a run that diverges ends with these rows.
-    """
-    k = times.sample[s]
-    if k >= 0:
-        rows.before_sample[k] = row
-
-
-@kernel
-def _slot_rows(
-    stages: Stages,
-    times: SlotTimes,
-    channels: Channels,
-    traced: TracedNodes,
-    messages: SlotMessages,
-    pairwise: bool,
-    rows: Rows,
-    s: int,
-    row: int,
-) -> int:
-    """Write the events of the first run in slot ``s``; return the number of the next row."""
+def _slot_rows(trace: Tracing, s: int, row: int) -> int:
+    stages, times = trace.stages, trace.times
     now = times.start[s]
     for k in range(len(stages.step)):
         stage = SlotStage(times.first + s, s, stages.step[k], stages.phase[k], now)
         # Step -1: sensors are read. The row of a "sense" has no peer, message or age.
         if stage.step < 0:
             if times.sensed[s]:
-                for node in traced.sensing:
-                    row = write_row(rows, stage, SENSE, node, -1, -1, NAN, row)
+                for node in trace.nodes.sensing:
+                    row = write_row(trace.rows, stage, SENSE, node, -1, -1, NAN, row)
         elif times.exchanged[s]:
-            row = _write_sends(channels, traced, messages, rows, stage, pairwise, row)
+            row = _write_sends(trace, stage, row)
             # Absorptions happen at the end of the step, when its inboxes close.
             now = snapped(times.start[s] + stages.end[k], stages.per_second)
             closing = SlotStage(stage.slot, s, stage.step, stage.phase, now)
-            row = _write_step_end(traced, messages, rows, closing, pairwise, stages.stopping, row)
+            row = _write_step_end(trace, closing, row)
     return row
 
 
 @kernel
-def _write_sends(
-    channels: Channels,
-    traced: TracedNodes,
-    messages: SlotMessages,
-    rows: Rows,
-    stage: SlotStage,
-    pairwise: bool,
-    row: int,
-) -> int:
-    """Write what the first run sends in a step; return the number of the next row."""
+def _write_sends(trace: Tracing, stage: SlotStage, row: int) -> int:
+    messages, ends, nodes = trace.messages, trace.links.ends, trace.nodes.nodes
     # A "round" has no node, peer, message or age.
-    if not pairwise:
-        row = write_row(rows, stage, ROUND, -1, -1, -1, NAN, row)
-    links = messages.pair_count[0, stage.s, stage.step] if pairwise else len(channels.ends)
+    if not trace.pairwise:
+        row = write_row(trace.rows, stage, ROUND, -1, -1, -1, NAN, row)
+    links = messages.pair_count[0, stage.s, stage.step] if trace.pairwise else len(ends)
     for a in range(links):
-        link = messages.active[0, stage.s, stage.step, a] if pairwise else a
-        if pairwise:
-            i, j = traced.nodes[channels.ends[link, 0]], traced.nodes[channels.ends[link, 1]]
-            row = write_row(rows, stage, TICK, i, j, -1, NAN, row)
-        row = _link_rows(channels, traced, messages, rows, stage, link, row)
+        link = messages.active[0, stage.s, stage.step, a] if trace.pairwise else a
+        if trace.pairwise:
+            i, j = nodes[ends[link, 0]], nodes[ends[link, 1]]
+            row = write_row(trace.rows, stage, TICK, i, j, -1, NAN, row)
+        row = _link_rows(trace, stage, link, row)
     return row
 
 
 @kernel
-def _link_rows(
-    channels: Channels,
-    traced: TracedNodes,
-    messages: SlotMessages,
-    rows: Rows,
-    stage: SlotStage,
-    link: int,
-    row: int,
-) -> int:
-    """Write what the first run sends on ``link``; return the number of the next row."""
-    for end in range(channels.directions_per_link):
-        w, i = link * channels.directions_per_link + end, channels.ends[link, end]
-        if channels.talks[stage.step, w] == 0 or is_silent(messages, 0, stage, i, 0):
+def _link_rows(trace: Tracing, stage: SlotStage, link: int, row: int) -> int:
+    links, messages, nodes, rows = trace.links, trace.messages, trace.nodes, trace.rows
+    for end in range(links.per_link):
+        w, i, j = link * links.per_link + end, links.ends[link, end], links.ends[link, 1 - end]
+        if not is_sent(links, messages, 0, stage.s, stage.step, w, i):
             continue
         # Messages of a direction are numbered from 0, lost ones included.
-        number, sender, receiver = (
-            traced.sent[w],
-            traced.nodes[i],
-            traced.nodes[channels.ends[link, 1 - end]],
-        )
-        traced.sent[w] = number + 1
+        number, sender, receiver = nodes.sent[w], nodes.nodes[i], nodes.nodes[j]
+        nodes.sent[w] = number + 1
         row = write_row(rows, stage, SEND, sender, receiver, number, NAN, row)
         if messages.up[0, stage.s, stage.step, w, 0] == 1:
             row = write_row(rows, stage, DELIVER, receiver, sender, number, 0.0, row)
@@ -639,215 +413,73 @@ def _link_rows(
 
 
 @kernel
-def is_silent(messages: SlotMessages, b: int, stage: SlotStage, node: int, q: int) -> bool:
-    """Return True if the filter of ``node`` (an index) decided to send nothing in the exchange step
-    of ``stage``, in lane ``q`` (run) of block ``b``. ``messages.sent`` is empty for filters that
-    always send.
+def is_sent(
+    links: SlotChannels, messages: SlotMessages, r: int, s: int, e: int, w: int, sender: int
+) -> bool:
+    """Return True if an active direction ``w`` carries a message of ``sender`` (index), which may
+    have nothing to send, or decide to send nothing.
     """
-    return len(messages.sent) > 0 and messages.sent[b, stage.s, stage.step, node, q] == 0
+    sent = messages.sent
+    lanes = messages.up.shape[4]
+    decided = len(sent) > 0 and sent[r // lanes, s, e, sender, r % lanes] == 0
+    return bool(links.talks[e, w] == 1 and not decided)
 
 
 @kernel
-def _write_step_end(
-    traced: TracedNodes,
-    messages: SlotMessages,
-    rows: Rows,
-    stage: SlotStage,
-    pairwise: bool,
-    stopping: int,
-    row: int,
-) -> int:
+def _write_step_end(trace: Tracing, stage: SlotStage, row: int) -> int:
     """Write who absorbs, swaps or stops; return the number of the next row."""
-    for i in range(len(traced.nodes)):
-        has_received = False
-        for k in range(traced.first[i], traced.first[i + 1]):
-            if messages.up[0, stage.s, stage.step, traced.direction[k], 0] == 1:
+    nodes, rows, up = trace.nodes, trace.rows, trace.messages.up[0, stage.s, stage.step]
+    for i in range(len(nodes.nodes)):
+        node, has_received = nodes.nodes[i], False
+        for k in range(nodes.links.first[i], nodes.links.first[i + 1]):
+            w = nodes.links.direction[k]
+            if up[w, 0] == 1:
                 has_received = True
-                if pairwise:
+                if trace.pairwise:
                     # The message of this step is the last one that was numbered.
-                    peer, number = (
-                        traced.nodes[traced.sender[k]],
-                        traced.sent[traced.direction[k]] - 1,
-                    )
-                    row = write_row(rows, stage, SWAP, traced.nodes[i], peer, number, 0.0, row)
-        if has_received and not pairwise:
-            row = write_row(rows, stage, ABSORB, traced.nodes[i], -1, -1, 0.0, row)
+                    peer, number = nodes.nodes[nodes.links.sender[k]], nodes.sent[w] - 1
+                    row = write_row(rows, stage, SWAP, node, peer, number, 0.0, row)
+        if has_received and not trace.pairwise:
+            row = write_row(rows, stage, ABSORB, node, -1, -1, 0.0, row)
         # A node that stops in this slot does so after it absorbed.
-        if stage.step == stopping and traced.stopped[0, i, 0] == stage.slot:
-            row = write_row(rows, stage, STOP, traced.nodes[i], -1, -1, NAN, row)
+        if stage.step == trace.stages.stopping and nodes.stopped[0, i, 0] == stage.slot:
+            row = write_row(rows, stage, STOP, node, -1, -1, NAN, row)
     return row
 
 
 @kernel
-def count_events(
-    lanes: Lanes,
-    stages: Stages,
-    times: SlotTimes,
-    channels: Channels,
-    traced: TracedNodes,
-    messages: SlotMessages,
-    pairwise: bool,
-    scratch: FloatArray,
-    counts: np.ndarray,
+def count_sends(
+    links: SlotChannels, messages: SlotMessages, counted: np.ndarray, sends: np.ndarray
 ) -> None:
-    """Add to ``counts`` (R, KINDS) the number of events of each kind in S slots of each of R runs,
-    for runs of a batch whose events are not stored: as many as ``make_rows`` would write.
-    ``scratch`` (KINDS, L) is for the L runs of a block. ``pairwise``: nodes swap with a peer,
-    instead of absorbing broadcasts. ``lanes`` is a tuple of length L.
-    """
-    for b in range(messages.up.shape[0]):
-        for kind in range(len(scratch)):
-            store(lanes, scratch, kind, 0.0)
-        for s in range(len(times.start)):
-            for k in range(len(stages.step) if times.recorded[s] else 0):
-                e = stages.step[k]
-                if e < 0 and times.sensed[s]:
-                    add_count(lanes, scratch, SENSE, 1.0 * len(traced.sensing))
-                elif e >= 0 and times.exchanged[s]:
-                    stage = SlotStage(times.first + s, s, e, stages.phase[k], 0.0)
-                    # The time of the stage, 0.0 here, is not used for counts.
-                    count_step(
-                        lanes,
-                        channels,
-                        traced,
-                        messages,
-                        stage,
-                        pairwise,
-                        stages.stopping,
-                        scratch,
-                        counts,
-                        b,
-                    )
-        first = b * len(lanes)
-        for q in range(min(len(lanes), len(counts) - first)):
-            for kind in range(len(scratch)):
-                counts[first + q, kind] += int(scratch[kind, q])
-
-
-@kernel(inlined=True)
-def add_count(lanes: Lanes, scratch: FloatArray, kind: int, number: Any) -> None:
-    """Add ``number``, (L,) lanes or one number for all, to the count ``scratch[kind]`` of
-    ``scratch`` (KINDS, L). ``lanes`` is a tuple of length L.
-    """
-    store(lanes, scratch, kind, load(lanes, scratch, kind) + number)
+    """Add the messages that each run sends in the slots that are ``counted`` to ``sends`` (R,)."""
+    paired = len(messages.pair_count) > 0
+    for r in range(len(sends)):
+        for s in range(len(counted)):
+            for e in range(messages.up.shape[2] if counted[s] else 0):
+                for a in range(messages.pair_count[r, s, e] if paired else len(links.ends)):
+                    link = messages.active[r, s, e, a] if paired else a
+                    for end in range(links.per_link):
+                        w, sender = link * links.per_link + end, links.ends[link, end]
+                        sends[r] += is_sent(links, messages, r, s, e, w, sender)
 
 
 @kernel
-def count_step(
-    lanes: Lanes,
-    channels: Channels,
-    traced: TracedNodes,
-    messages: SlotMessages,
-    stage: SlotStage,
-    pairwise: bool,
-    stopping: int,
-    scratch: FloatArray,
-    counts: np.ndarray,
-    b: int,
+def count_arrivals(
+    lanes: Lanes, links: SlotLinks, up: np.ndarray, counted: np.ndarray, counts: FloatArray
 ) -> None:
-    """Add the events of an exchange step (``stage``) in the L runs of block ``b`` to ``scratch``
-    (KINDS, L), lane by lane; but those of nodes that stop, in step number ``stopping``, to
-    ``counts`` (R, KINDS) of all R runs. ``pairwise``: nodes swap with a peer,
-    instead of absorbing broadcasts. ``lanes`` is a tuple of length L.
+    """Write the numbers of messages that arrive in the slots that are ``counted`` (S,), and of
+    nodes that receive any in a step, into ``counts`` (B, 2, L).
     """
-    stops = stage.step == stopping
-    if pairwise:
-        count_matched_pairs(lanes, channels, messages, stage, scratch, counts, b)
-    else:
-        add_count(lanes, scratch, ROUND, 1.0)
-        sent = 0
-        for w in range(messages.up.shape[3]):
-            sent += channels.talks[stage.step, w]
-        add_count(lanes, scratch, SEND, 1.0 * sent)
-        add_count(lanes, scratch, LOST, 1.0 * sent)
-        if len(messages.sent) > 0:
-            count_silent(lanes, channels, messages, stage, scratch, b)
-    # LOST was counted as if all were lost: each delivery takes one off.
-    absorbed = delivered = spread(lanes, 0.0)
-    for i in range(len(traced.nodes)):
-        received = spread(lanes, 0.0)
-        for k in range(traced.first[i], traced.first[i + 1]):
-            up = load_flags(lanes, messages.up, b, stage.s, stage.step, traced.direction[k])
-            received += select(up, 1.0, 0.0)
-        delivered += received
-        absorbed += select(received > 0.0, 1.0, 0.0)
-    add_count(lanes, scratch, DELIVER, delivered)
-    add_count(lanes, scratch, LOST, -delivered)
-    add_count(lanes, scratch, SWAP if pairwise else ABSORB, delivered if pairwise else absorbed)
-    if stops:
-        count_stops(lanes, traced, stage, counts, b)
-
-
-@kernel
-def count_matched_pairs(
-    lanes: Lanes,
-    channels: Channels,
-    messages: SlotMessages,
-    stage: SlotStage,
-    scratch: FloatArray,
-    counts: np.ndarray,
-    b: int,
-) -> None:
-    """Add the ticks of pairs in the exchange step of ``stage``, and their messages, to the counts
-    ``scratch`` (KINDS, L) of the L runs of block ``b``. All messages count as lost for now: the
-    caller takes the delivered ones off again. Of ``counts`` (R, KINDS) only the number R of runs is
-    used. ``lanes`` is a tuple of length L.
-    """
-    first = b * len(lanes)
-    for r in range(first, min(first + len(lanes), len(counts))):
-        pairs, sent = messages.pair_count[r, stage.s, stage.step], 0
-        for a in range(pairs):
-            link = messages.active[r, stage.s, stage.step, a]
-            for direction in range(channels.directions_per_link):
-                if not is_silent(messages, b, stage, channels.ends[link, direction], r - first):
-                    sent += channels.talks[
-                        stage.step, link * channels.directions_per_link + direction
-                    ]
-        scratch[TICK, r - first] += pairs
-        scratch[SEND, r - first] += sent
-        scratch[LOST, r - first] += sent
-
-
-@kernel
-def count_silent(
-    lanes: Lanes,
-    channels: Channels,
-    messages: SlotMessages,
-    stage: SlotStage,
-    scratch: FloatArray,
-    b: int,
-) -> None:
-    """Subtract the messages that silent nodes (whose filters decided not to send) do not send in
-    the exchange step of ``stage``, in the L runs of block ``b``, from the counts SEND and LOST of
-    ``scratch`` (KINDS, L): the caller has added a message of each direction to both, as if all were
-    sent and lost. ``lanes`` is a tuple of length L.
-    """
-    silent = spread(lanes, 0.0)
-    # Directions w, of which link w // directions_per_link has one or two, from its ends.
-    for w in range(len(channels.ends) * channels.directions_per_link):
-        if channels.talks[stage.step, w] == 1:
-            sends = load_flags(
-                lanes,
-                messages.sent,
-                b,
-                stage.s,
-                stage.step,
-                channels.ends[w // channels.directions_per_link, w % channels.directions_per_link],
-            )
-            silent += select(sends, 0.0, 1.0)
-    add_count(lanes, scratch, SEND, -silent)
-    add_count(lanes, scratch, LOST, -silent)
-
-
-@kernel
-def count_stops(
-    lanes: Lanes, traced: TracedNodes, stage: SlotStage, counts: np.ndarray, b: int
-) -> None:
-    """Add the nodes that stop, which permanently freeze their network estimate, in the slot of
-    ``stage``, in the L runs of block ``b``, to the count STOP of ``counts`` (R, KINDS) of all R
-    runs. ``lanes`` is a tuple of length L.
-    """
-    first = b * len(lanes)
-    for r in range(first, min(first + len(lanes), len(counts))):
-        for i in range(len(traced.nodes)):
-            counts[r, STOP] += traced.stopped[b, i, r - first] == stage.slot
+    for b in range(up.shape[0]):
+        arrived = receiving = spread(lanes, 0.0)
+        for s in range(up.shape[1]):
+            for e in range(up.shape[2] if counted[s] else 0):
+                for i in range(len(links.first) - 1):
+                    received = spread(lanes, 0.0)
+                    for k in range(links.first[i], links.first[i + 1]):
+                        flags = load_flags(lanes, up, b, s, e, links.direction[k])
+                        received += select(flags, 1.0, 0.0)
+                    arrived += received
+                    receiving += select(received > 0.0, 1.0, 0.0)
+        store(lanes, counts, b, 0, arrived)
+        store(lanes, counts, b, 1, receiving)

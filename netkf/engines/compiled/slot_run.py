@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,34 +18,42 @@ import numpy as np
 from netkf.algorithms.filter import compiled_kernels
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
+from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
-    Channels,
+    ABSORB,
+    DELIVER,
+    LOST,
+    ROUND,
+    SEND,
+    SENSE,
+    STOP,
+    SWAP,
+    TICK,
     Matchings,
     Rows,
+    SlotChannels,
     SlotMessages,
     SlotTimes,
     TracedNodes,
-    count_events,
-    draw_broadcasts,
-    draw_matched,
+    Tracing,
+    count_arrivals,
+    count_sends,
+    draw_messages,
     draw_uniforms,
     make_rows,
-    mark_all_senders,
-    mark_paired_senders,
 )
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.network.deliveries import Deliveries
 from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
-from netkf.rng.draws import states_in_lanes
 from netkf.rng.numbers import normal_ziggurat
-from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import LONG, Recorder
@@ -70,21 +78,6 @@ class SampledStates(NamedTuple):
     error: FloatArray
 
 
-class ReadingBlock(NamedTuple):
-    """Whitened readings ``y = H x + v`` of S slots in B blocks of L runs; H filters have at most p
-    rows each. A recorded sensor without a reading in a slot has rows of zeros, which change
-    nothing.
-
-    y : (B, S, H, p, L)
-    H : (B, S, H, p, n, L), or (1, 1, H, p, n, L) if it is fixed
-    rebased : flags (S,) of the slots in which the origin of coordinates moves
-    """
-
-    y: FloatArray
-    H: FloatArray
-    rebased: np.ndarray
-
-
 class SlotBlock(NamedTuple):
     """Results of S slots of R runs: indices ``sampled`` (T,) of the slots with a sample, the
     ``samples`` of these slots or of all slots so far, the times of the slots, and their messages.
@@ -104,9 +97,6 @@ class SlotRuns:
     def __init__(
         self, scenario: Scenario, streams: Streams | ReplicaStreams, store_all: bool = False
     ) -> None:
-        """Set up R runs, one for each replica of ``streams``, at slot 0: filters, truth, readings
-        and messages. ``store_all``: keep the samples of all slots in ``samples``.
-        """
         self.setup: SlotSetup = slot_setup(scenario)
         self._scenario, self._streams = scenario, streams
         self._first = Streams(streams.seed, streams.replica)
@@ -133,7 +123,6 @@ class SlotRuns:
         self._begin_messages()
 
     def _begin_truth(self) -> None:
-        """Create what true states are drawn from, or load those of a plant without noise."""
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
         self._path: Path | None = None
@@ -153,7 +142,6 @@ class SlotRuns:
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
-        """Create what readings are drawn from: streams, regressors and recorded sensors."""
         setup, streams = self.setup, self._streams
         entities = [(s.node, s.placed_sensor.ordinal) for s in setup.kernel_sensors]
         # One stream for each drawn sensor of each run.
@@ -176,42 +164,19 @@ class SlotRuns:
         ]
 
     def _begin_messages(self) -> None:
-        """Create what messages are drawn from: channels, matchings and triggers."""
         setup, streams, links = self.setup, self._streams, len(self.setup.ends)
-        # Empty arrays tell the kernels to draw nothing.
-        no_streams = np.zeros((0, 0, LANES, WIDTH), dtype=np.uint64)
-        is_drawn = setup.is_drawn and links > 0
-        random_loss = is_drawn and not setup.loss.deterministic
-        shape = self._blocks, len(setup.entities), LANES
-        chain: Any = setup.loss if setup.is_chain else None
-        to_bad, to_good = chain.transitions if chain is not None else (0.0, 1.0)
-        entities = setup.entities
-        draws_states = random_loss and setup.is_chain
-        self._channels = Channels(
-            ends=setup.ends,
-            delivery=setup.delivery,
-            loss_streams=self._in_lanes("loss", entities) if random_loss else no_streams,
-            state_streams=self._in_lanes("weather", entities) if draws_states else no_streams,
-            # -1: nothing drawn yet, and no channel state yet.
-            loss_uniform=np.full(shape, -1.0),
-            state_uniform=np.full(shape, -1.0),
-            bad=np.full(shape, -1, dtype=np.int64),
-            to_bad=to_bad,
-            to_good=to_good,
-            talks=setup.talks,
-            directions_per_link=setup.directions_per_link,
-            streams_per_link=setup.streams_per_link,
+        channels = channel_streams(setup.channel, streams, setup.senders, setup.delivery)
+        # -1: nothing drawn yet.
+        uniform = np.full(len(channels.bad), -1.0)
+        self._channels = SlotChannels(
+            channels, uniform, setup.ends, setup.talks, setup.directions_per_link
         )
         protocol, probability, first, members = setup.matching
         if setup.algorithm.timing.randomised:
-            self._triggers = self._in_lanes("trigger", [(node,) for node in setup.nodes.tolist()])
+            self._triggers = streams.states("trigger", [(node,) for node in setup.nodes.tolist()])
         states = streams.states("matching", [()])
         order, busy = (np.zeros(size, dtype=np.int64) for size in (links, len(setup.nodes)))
         self._matchings = Matchings(protocol, probability, states, first, members, order, busy)
-
-    def _in_lanes(self, purpose: str, entities: Sequence[tuple[int, ...]]) -> np.ndarray:
-        """Return the states (B, K, L, WIDTH) of the random streams of K entities in each run."""
-        return states_in_lanes(self._streams.states(purpose, entities), self.runs)
 
     @property
     def over(self) -> bool:
@@ -220,13 +185,12 @@ class SlotRuns:
 
     def following(self, max_events: int, timed: bool = True) -> SlotBlock:
         """Simulate the next slots in all R runs, with about ``max_events`` events at most (0: no
-        limit), and return their results: draw messages, true states and readings, then run the
-        filters' kernel on them. ``timed``: compute the times of slots, which event rows need.
+        limit). ``timed``: compute the times of slots, which event rows need.
         """
         setup, self._max_events = self.setup, max_events
         times, messages = self._next_messages(max_events, timed)
         local, absolute, rebased = self._next_states(len(times.start))
-        readings = self._draw_readings(times, local, rebased)
+        y, H = self._draw_readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
         samples = self.samples if self.samples is not None else self._empty_samples(len(sampled))
         # Kernels take flat entries for each sample. Explicit lengths, since reshape(-1) fails for
@@ -238,24 +202,23 @@ class SlotRuns:
             x, xhat, P, error, absolute, local, setup.frame > 0, self._total,
             *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
         )  # fmt: skip
-        self._simulate(times, messages, readings, kernel_samples)
+        self._simulate(times, messages, (y, H, rebased), kernel_samples)
         return SlotBlock(sampled, samples, times, messages)
 
     def _simulate(
         self,
         times: SlotTimes,
         messages: SlotMessages,
-        readings: ReadingBlock,
+        readings: tuple[FloatArray, FloatArray, np.ndarray],
         samples: SlotSamples,
     ) -> None:
-        """Simulate the slots of ``times``: write ``samples`` and who sends."""
-        filters, count = self._filters, len(times.start)
+        filters, count, (y, H, rebased) = self._filters, len(times.start), readings
         drawn: dict[str, Any] = {
             "first": self._slot,
             "sensed": times.sensed,
             "exchanged": times.exchanged,
             "sample": times.sample,
-            "rebased": readings.rebased,
+            "rebased": rebased,
             "up": messages.up,
             "sent": messages.sent,
             "uniform": self._draw_uniforms(messages.sent),
@@ -263,10 +226,9 @@ class SlotRuns:
         unread, begin = self._missed_readings(messages, count), WHOLE
 
         def decided(step: int, up: np.ndarray) -> np.ndarray:
-            """Return the nodes (N,) that send in a step, given ``up`` (E, W) of those before it."""
             nonlocal begin
             messages.up[0, 0, ..., 0] = up
-            filters.simulate(readings.y, readings.H, samples, **drawn, begin=begin, stop=step)
+            filters.simulate(y, H, samples, **drawn, begin=begin, stop=step)
             begin = step
             sent: np.ndarray = messages.sent[0, 0, step, :, 0] & ~unread[0, step]
             return sent
@@ -275,14 +237,13 @@ class SlotRuns:
         if self._events is not None and self.setup.decides:
             _, up = self._events.following(self._max_events, decided)
             messages.up[..., 0] = up
-        filters.simulate(readings.y, readings.H, samples, **drawn, begin=begin, stop=WHOLE)
+        filters.simulate(y, H, samples, **drawn, begin=begin, stop=WHOLE)
         if len(messages.sent):
             # Only now, since the kernel decides for all nodes that are asked, readings or not.
             messages.sent[:, unread] = 0
         self._slot += count
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
-        """Return times and messages of the next slots, of one if filters decide in Python."""
         setup, events = self.setup, self._events
         if events is None:
             # The kernels draw the messages of many slots and runs at once.
@@ -311,9 +272,7 @@ class SlotRuns:
 
     @property
     def broken(self) -> np.ndarray:
-        """(R,) bool: runs with an estimate or covariance that is not finite (or their
-        sum is not).
-        """
+        """(R,) bool: runs with an estimate or covariance that is not finite."""
         return np.asarray(~np.isfinite(by_run(self._total, self.runs)))
 
     def _next_times(self, count: int, timed: bool) -> SlotTimes:
@@ -346,7 +305,6 @@ class SlotRuns:
         )
 
     def _draw_messages(self, times: SlotTimes) -> SlotMessages:
-        """Draw which nodes exchange in the S slots of ``times``, and what arrives."""
         setup = self.setup
         shape, pairs = (len(times.start), len(setup.fresh)), setup.max_pairs
         decided = setup.decides or setup.may_miss
@@ -364,20 +322,25 @@ class SlotRuns:
         )
         if not len(setup.directions):
             return messages
-        channels, exchanged, fresh = self._channels, times.exchanged, setup.fresh
-        # Separate kernels, so that a run compiles only the one that it needs.
-        if matched:
-            draw_matched(MANY, channels, self._matchings, exchanged, fresh, *messages[:3])
-        else:
-            draw_broadcasts(MANY, channels, exchanged, fresh, messages.up)
-        if decided and matched:
-            mark_paired_senders(MANY, channels, messages.active, messages.pair_count, messages.sent)
-        elif decided:
-            mark_all_senders(MANY, channels, exchanged, messages.sent)
+        draw_messages(MANY, self._channels, self._matchings, times.exchanged, setup.fresh, messages)
+        if decided:
+            self._mark_senders(messages, times.exchanged)
         # No chosen messages at all: the run as it was.
         if setup.deliveries is not None and setup.deliveries.chosen != frozenset():
             self._deliver_chosen(setup.deliveries, times, messages)
         return messages
+
+    def _mark_senders(self, messages: SlotMessages, exchanged: np.ndarray) -> None:
+        """Write 1 into ``messages.sent`` for the nodes that are asked for a message."""
+        ends = self.setup.ends
+        if not len(messages.pair_count):
+            linked = np.isin(np.arange(len(self.setup.nodes)), ends)
+            messages.sent[:, exchanged] = linked[:, None]
+            return
+        pairs = np.arange(self.setup.max_pairs) < messages.pair_count[..., None]
+        r, s, e, a = (index[:, None] for index in np.nonzero(pairs))
+        nodes = ends[messages.active[r[:, 0], s[:, 0], e[:, 0], a[:, 0]]]
+        messages.sent[r // LANES, s, e, nodes, r % LANES] = 1
 
     def _deliver_chosen(
         self, deliveries: Deliveries, times: SlotTimes, messages: SlotMessages
@@ -421,7 +384,7 @@ class SlotRuns:
             # Five dimensions, as kernels are compiled for.
             return np.zeros((0,) * 5)
         uniform = np.zeros(sent.shape)
-        draw_uniforms(self._triggers, sent, uniform)
+        draw_uniforms(MANY, self._triggers, sent, uniform, self.runs)
         return uniform
 
     def _next_states(self, count: int) -> tuple[FloatArray, FloatArray, np.ndarray]:
@@ -447,14 +410,15 @@ class SlotRuns:
     def _draw_path(
         self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
     ) -> None:
-        """Draw the next slots of a ``path`` into ``local`` and ``absolute`` (B, S, n, L)."""
         scratch = aligned((2, max(path.root.shape), LANES))
         draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
 
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray
-    ) -> ReadingBlock:
-        """Draw the whitened readings of S slots at the states ``local`` (B, S, n, L)."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draw whitened readings ``H x + v`` (B, S, H, p, L) of S slots at the states ``local``
+        (B, S, n, L), zeros where there is none, and their H (B, S, H, p, n, L), or (1, 1, ...).
+        """
         setup, count = self.setup, local.shape[1]
         shape = self._blocks, count, setup.estimators, setup.p
         y: FloatArray = unset((*shape, LANES))
@@ -477,7 +441,7 @@ class SlotRuns:
             MANY, setup.sensors, noise, normal_ziggurat(), x, regressor_states, scratch, y, H
         )
         if not (self._recorded or self._own) or not times.sensed.any():
-            return ReadingBlock(y, H, rebased)
+            return y, H
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
         for s, paths in self._own:
             rows = slice(s.row, s.row + s.rows)
@@ -493,12 +457,11 @@ class SlotRuns:
             whitened_y, whitened_H = path.whitened(slots, s.R, s.rows)
             y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
             H[:, times.sensed, s.estimator, rows] = whitened_H[..., None]
-        return ReadingBlock(y, H, rebased)
+        return y, H
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows (K,) of the table of events, of dtype EVENT, of a block of slots of one
-        run, and for each of the T samples in it the number of rows before it, (T,), with which a
-        run ends that diverges there.
+        """Return the EVENT rows (K,) of a block of one run, and the number of rows before each of
+        its samples, (T,).
         """
         # Where Python made the messages it knows the events, but not in which slot nodes stopped.
         if self._events is not None:
@@ -507,10 +470,7 @@ class SlotRuns:
         return self._rows(block, 0, len(block.times.start), before_sample), before_sample
 
     def first_events(self, block: SlotBlock) -> Iterator[np.ndarray]:
-        """Yield the rows (K,) of the table of events, of dtype EVENT, of the first run of a batch
-        in a block of slots, for some slots at a time, so that their memory stays small: they are
-        hashed for the fingerprint of the batch.
-        """
+        """Yield the EVENT rows of the first run of a batch in a block, for some slots at a time."""
         size = max(1, LONG // max(1, self.setup.rows_of(1)))
         # Samples of a batch are counted from the first of the run.
         before_sample = np.zeros(len(self.setup.samples), dtype=np.int64)
@@ -521,45 +481,48 @@ class SlotRuns:
     def _rows(
         self, block: SlotBlock, first: int, stop: int, before_sample: np.ndarray
     ) -> np.ndarray:
-        """Return the events of the first run in some slots of a block, in the order of time."""
         setup = self.setup
         # Space for the largest number of rows.
         table = np.empty(setup.rows_of(stop - first), dtype=EVENT)
         # Kernels write the columns where the records have them.
         columns: Any = [table[name] for name in ROW_COLUMNS]
-        count = make_rows(
-            setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
-            setup.algorithm.timing.pairwise, first, stop, Rows._make([*columns, before_sample]),
+        nodes = TracedNodes(setup.nodes, setup.sensing, setup.links, self._sent, self._stopped)
+        trace = Tracing(
+            setup.stages, block.times, self._channels, nodes, block.messages,
+            Rows._make([*columns, before_sample]), setup.algorithm.timing.pairwise,
         )  # fmt: skip
+        count = make_rows(trace, first, stop)
         return table[:count]
 
     def count_events(self, block: SlotBlock) -> None:
-        """Add the events of a block of slots to ``self.counts`` (R, KINDS), by run and kind, of all
-        R runs.
-        """
-        setup = self.setup
-        count_events(
-            MANY, setup.stages, block.times, self._channels, self._traced_nodes(), block.messages,
-            setup.algorithm.timing.pairwise, aligned((len(KINDS), LANES)), self.counts,
-        )  # fmt: skip
-
-    def _traced_nodes(self) -> TracedNodes:
-        """Return the nodes and incoming links as arrays."""
-        setup, links = self.setup, self.setup.links
-        return TracedNodes(
-            nodes=setup.nodes,
-            sensing=setup.sensing,
-            first=links.first,
-            sender=links.sender,
-            direction=links.direction,
-            sent=self._sent,
-            stopped=self._stopped,
-        )
+        """Add the events of a block to ``self.counts`` (R, KINDS)."""
+        setup, times, messages, counts = self.setup, block.times, block.messages, self.counts
+        recorded, pairwise = times.recorded, setup.algorithm.timing.pairwise
+        sensed, exchanged = recorded & times.sensed, recorded & times.exchanged
+        sensing = len(setup.sensing) * int((setup.stages.step < 0).sum())
+        counts[:, SENSE] += sensing * int(sensed.sum())
+        if pairwise:
+            counts[:, TICK] += messages.pair_count[:, recorded].sum(axis=(1, 2))
+        else:
+            counts[:, ROUND] += len(setup.fresh) * int(exchanged.sum())
+        if pairwise or len(messages.sent):
+            sends = np.zeros(self.runs, dtype=np.int64)
+            count_sends(self._channels, messages, exchanged, sends)
+            counts[:, SEND] += sends
+        else:
+            counts[:, SEND] += int(setup.talks.sum()) * int(exchanged.sum())
+        arrivals = aligned((self._blocks, 2, LANES))
+        count_arrivals(MANY, setup.links, messages.up, recorded, arrivals)
+        arrived, receiving = by_run(arrivals, self.runs).astype(np.int64).T
+        counts[:, DELIVER] += arrived
+        counts[:, LOST] = counts[:, SEND] - counts[:, DELIVER]
+        counts[:, SWAP if pairwise else ABSORB] += arrived if pairwise else receiving
+        if setup.stages.stopping >= 0:
+            since = by_run(self._stopped, self.runs) - times.first
+            counts[:, STOP] += ((since >= 0) & (since < recorded.sum())).sum(axis=1)
 
     def conserved(self) -> dict[str, FloatArray]:
-        """Return by name the sums over all nodes that exchanges conserve, such as the total weight
-        of push-sum: (R, 2), their values at the start and at the last sample of R runs.
-        """
+        """Return by name the sums that exchanges conserve: (R, 2), at the start and at the end."""
         conserved, sums = {}, by_run(self._conserved, self.runs)
         for k, (name, start) in enumerate(self.setup.conserved_at_start.items()):
             # fsum, so that the sums add no rounding of their own to that of the exchanges.
@@ -569,7 +532,6 @@ class SlotRuns:
 
 
 def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:
-    """Return messages and senders of one run, which Python made, in lane 0."""
     lane_arrays = [np.zeros((*values.shape, LANES), dtype=np.uint8) for values in (up, sent)]
     for lanes, values in zip(lane_arrays, (up, sent), strict=True):
         lanes[..., 0] = values
@@ -582,9 +544,7 @@ ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
 
 
 def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress) -> str:
-    """Simulate one run in slots up to the horizon, and pass its events and samples to ``recorder``;
-    ``progress`` is called with the simulated seconds. Return "complete" or "diverged".
-    """
+    """Simulate one run in slots, see ``Engine.run``."""
     runs = SlotRuns(scenario, streams)
     recorder.exact_errors = scenario.exact_errors
     try:
@@ -599,7 +559,6 @@ def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress
 def _record_block(
     scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
 ) -> bool:
-    """Simulate the next slots of one run, and pass their events and samples to ``recorder``."""
     # A limited number of rows at a time: memory does not grow with the length of the run.
     block = runs.following(MAX_EVENT_ROWS)
     rows, rows_before = runs.events(block)
@@ -612,9 +571,6 @@ def _record_block(
     times = block.times.start[block.sampled]
 
     def pass_rows_on(k: int) -> None:
-        """Record the events before sample number ``k`` of the block, the first one that is not
-        finite.
-        """
         recorder.extend(rows[: rows_before[k]])
 
     samples = StateSamples(times, x, xhat, P, error)
@@ -631,9 +587,8 @@ MAX_EVENT_ROWS = 1 << 15
 def slot_batches(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> Iterator[RunBatch]:
-    """Yield the results of consecutive ``replicas`` in order, as many runs at a time as fit the
-    memory, with random numbers from ``seed``; ``fingerprint``: with the hash of the events of the
-    first run.
+    """Yield the results of consecutive ``replicas``, as many runs at a time as fit the memory; with
+    ``fingerprint`` the hash of the events of the first run.
     """
     keep_freed_memory()
     setup = slot_setup(scenario)
@@ -648,10 +603,8 @@ def slot_batches(
 def slot_batch(
     scenario: Scenario, seed: int, replicas: range, fingerprint: bool = False
 ) -> RunBatch:
-    """Simulate R consecutive ``replicas`` (numbers of runs) side by side, with random numbers from
-    ``seed``, and return their results. A run that diverges goes on to the end with invalid numbers,
-    which ``with_ends`` replaces. ``fingerprint``: with the SHA-256 hash of the event rows of the
-    first run.
+    """Simulate R consecutive ``replicas`` side by side. A run that diverges goes on to the end with
+    invalid numbers, which ``with_ends`` replaces.
     """
     runs = SlotRuns(scenario, ReplicaStreams(seed, replicas.start, len(replicas)), store_all=True)
     assert runs.samples is not None
@@ -685,12 +638,8 @@ def slot_batch(
 
 
 def with_ends(batch: RunBatch, alone: Callable[[range, bool], Iterator[RunBatch]]) -> RunBatch:
-    """Return the batch with every run that diverges replaced, in its arrays, by the same run
-    simulated ``alone``: in a batch it went on with invalid numbers, alone it ends where it
-    diverges, as its results demand.
-
-    ``alone(replicas, fingerprint)`` simulates runs one by one and yields a batch of each;
-    ``fingerprint``: with the SHA-256 hash of the event rows.
+    """Return the batch with every run that diverges replaced by the same run simulated
+    ``alone(replicas, fingerprint)``, which ends where it diverges.
     """
     for r in np.flatnonzero(batch.diverged).tolist():
         # Only the first run of a batch has a fingerprint.

@@ -13,12 +13,16 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel
+from netkf.engines.compiled.outcomes import delivery_table
 from netkf.engines.compiled.own_sensors import is_own
+from netkf.engines.compiled.per_scenario import once_per_scenario
+from netkf.engines.compiled.senders import link_senders
 from netkf.engines.compiled.slot_messages import (
     INDEPENDENT,
     NODE_WAKEUP,
     ONE_EDGE,
     UNIFORM_MAXIMAL,
+    SlotLinks,
     Stages,
 )
 from netkf.linalg.arrays import FloatArray, block_diagonal
@@ -34,32 +38,6 @@ from netkf.plants.slot_paths import SlotSensors
 from netkf.plants.transitions import frame_slots
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
-
-
-def slot_setup(scenario: Scenario) -> SlotSetup:
-    """Return the arrays that all runs of a scenario in slots share, computed at the first call and
-    stored with the scenario.
-    """
-    # The scenario is frozen: its dictionary is where its cached properties are kept, too.
-    if "_slot_setup" not in vars(scenario):
-        vars(scenario)["_slot_setup"] = SlotSetup(scenario)
-    setup: SlotSetup = vars(scenario)["_slot_setup"]
-    return setup
-
-
-class SlotLinks(NamedTuple):
-    """W directed links by receiver: those to filter h are ``first[h]`` to ``first[h + 1]`` - 1.
-
-    first : (H + 1,)
-    sender : index (W,) of the sending filter
-    direction : index (W,) in the axis W of ``SlotPlan.up``
-    weight : (W,) that the receiver gives to the sender
-    """
-
-    first: np.ndarray
-    sender: np.ndarray
-    direction: np.ndarray
-    weight: FloatArray
 
 
 class AssignedSensor(NamedTuple):
@@ -81,9 +59,6 @@ class SlotSetup:
     """Times, links and sensors of a scenario in slots, and the states of its filters at slot 0."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Compute everything that all runs of a scenario in slots share: stages of a slot, sensors,
-        filters at slot 0, links and channel, in the attributes that the methods below set.
-        """
         algorithm, topology = scenario.node_filter, scenario.topology
         self.algorithm: Filter = algorithm
         self.n, self.nodes = scenario.plant.n, np.array(scenario.nodes, dtype=np.int64)
@@ -98,18 +73,15 @@ class SlotSetup:
         self.ends = np.array(ends, dtype=np.int64).reshape(-1, 2)
         # Directions 2 l and 2 l + 1 belong to link l, as in the SimPy engine.
         self.directions_per_link = 1 if topology.directed else 2
-        self.directions: tuple[Link, ...] = tuple(
-            direction
-            for i, j in links
-            for direction in ((i, j), (j, i))[: self.directions_per_link]
-        )
+        symmetric = scenario.network.channel.symmetric
+        self.senders = link_senders(links, topology.directed, symmetric)
+        self.directions: tuple[Link, ...] = self.senders.directions
         self.links = self._make_links(scenario)
         self._set_channel(scenario)
         self.matching = matching_lists(scenario)
         self.is_drawn = self._draws_everything(scenario)
 
     def _set_slots(self, scenario: Scenario) -> None:
-        """Set ``slots``, the ``last`` one, at the horizon, and ``samples`` with their times."""
         plant = scenario.slot_plant
         # A guess below the last slot: the plant itself decides, free of this division's rounding.
         last = max(0, int(scenario.horizon / plant.period) - 2)
@@ -122,7 +94,6 @@ class SlotSetup:
         self.sample_times = np.array([plant.slot_time(slot) for slot in self.samples.tolist()])
 
     def _set_stages(self, scenario: Scenario) -> None:
-        """Set the ``stages`` of a slot, the ``phases`` of exchange steps, and ``fresh`` ones."""
         algorithm, phase, step = self.algorithm, 0, 0
         length = scenario.phase_length if algorithm.timing.talks else 0.0
         stages: list[tuple[int, int, float]] = []
@@ -154,7 +125,6 @@ class SlotSetup:
         self.phases = [phase for step, phase, _ in stages if step >= 0]
 
     def _set_sensors(self, scenario: Scenario) -> None:
-        """Assign each sensor to a filter and to its rows there, and to what reads it."""
         pooled = self.algorithm.timing.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.estimators, dtype=np.int64)
@@ -194,7 +164,6 @@ class SlotSetup:
         self._set_kernel_sensors(scenario)
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
-        """Set the whitened H and noise by which kernels draw readings, and regressors."""
         count, p, n = len(self.kernel_sensors), self.p, self.n
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         regressor_index = np.full(count, -1, dtype=np.int64)
@@ -238,7 +207,6 @@ class SlotSetup:
         )
 
     def _set_states(self, scenario: Scenario) -> None:
-        """Set the H filters at slot 0, and the F and root of Q that all of them believe."""
         infos: Sequence[NodeInfo] = scenario.node_infos
         models: Sequence[Any] = scenario.slot_models
         if self.algorithm.timing.pooled:
@@ -292,30 +260,18 @@ class SlotSetup:
         )
 
     def _set_channel(self, scenario: Scenario) -> None:
-        """Set losses, delivery probabilities (2, W) and who sends in which step."""
-        channel, each = scenario.network.channel, self.directions_per_link
-        self.loss, bad = channel.loss, (False, True)
+        channel = scenario.network.channel
         # A replay draws as its run does, and then delivers the chosen messages.
         self.deliveries: Deliveries | None = None
         if isinstance(channel.loss, DeliveringLoss):
-            self.loss, self.deliveries = channel.loss.given, channel.loss.deliveries
-        self.is_chain = type(self.loss) is GilbertElliott
+            self.deliveries = channel.loss.deliveries
+            channel = dataclasses.replace(channel, loss=channel.loss.given)
+        self.channel, loss = channel, channel.loss
         # The probabilities of a user's own loss model are computed in Python, message by message.
-        self.has_known_probabilities = identical_per_link(self.loss) or self.is_chain
+        self.has_known_probabilities = identical_per_link(loss) or type(loss) is GilbertElliott
         self.delivery = np.ones((2, len(self.directions)))
         if self.has_known_probabilities:
-            for w, direction in enumerate(self.directions):
-                table = scenario.table_probability(direction)
-                self.delivery[:, w] = [
-                    self.loss.delivery_probability(direction, 0, b, table) for b in bad
-                ]
-        self.streams_per_link = 1 if channel.symmetric else each
-        # Streams belong to the first direction of each link, or to each direction.
-        self.entities = [
-            direction
-            for w, direction in enumerate(self.directions)
-            if w % each < self.streams_per_link
-        ]
+            self.delivery = delivery_table(scenario, loss, self.directions)
         # Some filters send nothing in some phases, the exchanges of a slot (push-sum with
         # asymptotic gains: no mass), or only from nodes that have sensors.
         sends = self.algorithm.timing.sends
@@ -347,9 +303,8 @@ class SlotSetup:
         return bool(self._recorded_slots)
 
     def unread(self, first: int, count: int) -> np.ndarray:
-        """Return (S, E, N) bool: nodes that send nothing in a step, because it sends readings and
-        they have none. S = ``count`` slots from number ``first`` on. There are E exchange steps in
-        a slot.
+        """Return (S, E, N) bool: nodes that have no reading to send in a step, in ``count`` slots
+        from ``first`` on.
         """
         missed = np.zeros((count, len(self.nodes)), dtype=bool)
         for index, slots in self._recorded_slots.items():
@@ -358,7 +313,6 @@ class SlotSetup:
         return unread
 
     def _draws_everything(self, scenario: Scenario) -> bool:
-        """Return True if kernels can draw all messages of many slots and runs at once."""
         network = scenario.network
         # Which message has which number is known before the exchange, unless nodes may be silent.
         if self.deliveries is not None and (self.decides or self.may_miss):
@@ -375,9 +329,7 @@ class SlotSetup:
         return min(len(self.nodes) // 2, len(self.ends)) if self.matching[0] >= 0 else 0
 
     def rows_of(self, slots: int) -> int:
-        """Return an upper bound of the number of events in ``slots`` slots, for which rows are
-        allocated.
-        """
+        """Return an upper bound of the number of events in ``slots`` slots."""
         pairs = self.max_pairs
         sends = self.directions_per_link * (pairs if self.matching[0] >= 0 else len(self.ends))
         # A send and its outcome for each direction, a tick for each pair, a round, and one
@@ -386,9 +338,7 @@ class SlotSetup:
         return slots * (len(self.sensing) + steps + len(self.nodes))
 
     def bytes_of_slot(self) -> int:
-        """Return the bytes of states, readings and messages that are drawn for one slot of one run,
-        by which the size of blocks of slots is chosen.
-        """
+        """Return the bytes of states, readings and messages of one slot of one run."""
         # Readings, their H if it varies, and states.
         floats = self.estimators * self.p * (1 + self.varies * self.n) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.max_pairs + 8)
@@ -406,9 +356,7 @@ class SlotSetup:
         return max(1, int(slots))
 
     def batch_runs(self) -> int:
-        """Return the number of runs that are simulated side by side: as many as fit the memory for
-        their samples and for the numbers drawn for a slot.
-        """
+        """Return the number of runs that are simulated side by side: as many as fit the memory."""
         sample_bytes = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
         # A power of two, so that a batch is one node of the merge tree; at least a block of lanes,
         # unless not even that fits.
@@ -417,17 +365,20 @@ class SlotSetup:
         return int(min(max(power, LANES), max(1, MAX_BLOCK_BYTES // sample_bytes)))
 
     def quick_runs(self) -> int:
-        """Return the number of runs that take some ten milliseconds together, the smallest batch
-        worth its preparations: a power of two, and at least a block of lanes.
-        """
+        """Return the number of runs, a power of two, that take some ten milliseconds together."""
         # A rough count for one slot: a filter's prediction and update, and its messages.
         flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_SLOT_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
 
 
+@once_per_scenario
+def slot_setup(scenario: Scenario) -> SlotSetup:
+    """Return the arrays that all runs of a scenario in slots share, made at the first call."""
+    return SlotSetup(scenario)
+
+
 def _widened(model: SlotModel, rows: int) -> SlotModel:
-    """Return a model with as many ``rows`` as its largest reading, those added empty."""
     added = rows - len(model.H)
     if added <= 0:
         return model
@@ -447,11 +398,7 @@ QUICK_FLOPS = 1 << 25
 
 
 def matching_lists(scenario: Scenario) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Return the matching protocol of a scenario as kernels take it: its index in PROTOCOLS (-1: no
-    matchings), its parameter ``lazy`` or ``p``, and K lists of link indices as ``first`` (K + 1,)
-    and ``members`` (M,): list k is ``members[first[k]:first[k + 1]]``, the links of node k for
-    node-wakeup, matching k for uniform-maximal.
-    """
+    """Return the fields protocol, probability, first and members of Matchings."""
     activation, topology = scenario.network.activation, scenario.topology
     if not isinstance(activation, Matching):
         return -1, 0.0, np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64)

@@ -27,7 +27,6 @@ from netkf.scenario.scenario import Scenario
 
 
 def _record_type(integers: str, floats: str = "") -> np.dtype:
-    """Return a record type of int64 and float64 fields, whose names are given."""
     # int64 fields first, then float64 ones: every field is aligned without padding.
     fields = [(name, np.int64) for name in integers.split()]
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
@@ -172,7 +171,7 @@ class PathBlock(Struct):
 
 
 class TickArrays(Struct):
-    """The K ticks of a ``schedule.Window``, or those of several runs one after the other.
+    """The K ticks of a window of time, or those of several runs one after the other.
 
     end : seconds; from here on ticks are not drawn yet
     t, entity : (K,), time in seconds, and index of the entity whose clock ticks
@@ -197,14 +196,12 @@ class SampleBuffer(Struct):
 
     xhat, P : (R, B, N, n) and (R, B, N, n, n)
     rows, counts : rows (R, B) of events, or events by kind (R, B, len(KINDS)), before each sample
-    piece : piece (R, B) of the path that each sample is in
     """
 
     xhat: FloatArray
     P: FloatArray
     rows: IntArray
     counts: IntArray
-    piece: IntArray
 
 
 class Simulation(Struct):
@@ -326,9 +323,7 @@ class Filters(NamedTuple):
 
 @once_per_scenario
 def filters_at_start(scenario: Scenario) -> Filters:
-    """Return all N filters at time 0, or, if they are pooled (one filter in place of those of all
-    nodes), the one that reads all sensors (N = 1).
-    """
+    """Return all N filters at time 0, or the one that reads all sensors if they are pooled."""
     # A pooled filter is one node with the id -1, which belongs to no node of the network.
     ids, pooled = scenario.nodes, scenario.node_filter.timing.pooled
     models = (scenario.pooled_model,) if pooled else scenario.models
@@ -368,9 +363,7 @@ def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
 
 @once_per_scenario
 def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Return the records of E entities with a clock of their own (links, directed links or nodes),
-    ENTITY (E,), and of W directed links, DIRECTED_LINK (W,), of a run that has not begun.
-    """
+    """Return the records of entities (E,) and directed links (W,) before a run."""
     senders, index = senders_of(scenario), scenario.topology.index
     entities = np.zeros(len(senders.entities), dtype=ENTITY)
     # (i, j) of a link or direction, (i, -1) of a node. The ids become indices below.
@@ -390,10 +383,7 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scratch_arrays(table: FlowTable, gains: Gains, unrolled: bool) -> tuple[Scratch, FlowScratch]:
-    """Return scratch arrays for all computations of a run in models with these tables.
-    ``unrolled``: they have types that know n, so that kernels are compiled for just this n, which
-    is faster.
-    """
+    """Return scratch arrays for models with these tables; ``unrolled``: of types that know n."""
     n, max_moments, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
     scratch = Scratch(
         moments=np.zeros(max_moments),
@@ -409,18 +399,14 @@ def scratch_arrays(table: FlowTable, gains: Gains, unrolled: bool) -> tuple[Scra
 
 
 def empty_pool(capacity: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pool of C = ``capacity`` messages that the event loop sends: MESSAGE records (C,),
-    all free, and the heap (C,) of messages under way, ordered by arrival.
-    """
+    """Return a pool of ``capacity`` messages, all free, and the heap of those under way."""
     pool = np.zeros(capacity, dtype=MESSAGE)
     pool["next"] = np.arange(1, capacity + 1)
     return pool, np.zeros(capacity, np.int64)
 
 
 def add_messages(state: Simulation, at_least: int) -> None:
-    """Enlarge the pool of messages of ``state`` (``pool`` and ``heap``) when the loop has used it
-    up: to twice as many messages, or by ``at_least`` messages if these are more.
-    """
+    """Enlarge the pool of messages: to twice as many, or by ``at_least`` if these are more."""
     # Doubling keeps the cost of copies proportional to the messages.
     capacity = len(state.pool)
     added = max(capacity, at_least)

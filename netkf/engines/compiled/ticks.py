@@ -1,34 +1,34 @@
-"""Schedules of the built-in clocks and channels, drawn and sorted in compiled code.
+"""The ticks of all clocks of some runs and the outcomes of their messages, window by window.
 
-Ticks are drawn entity by entity, each from its own stream, for a window of time after another, and
-then sorted. Those of random gaps are about evenly spread over a window, so that they are sorted by
-counting: a window is divided into as many bins as it has ticks, of about one tick each. Those of
-lattices may crowd, and are merged.
+Nothing here depends on an estimate. Ticks are drawn entity by entity, each from its own stream, for
+a window of time after another, and then sorted. Those of random gaps are about evenly spread over a
+window, so that they are sorted by counting: a window is divided into as many bins as it has ticks,
+of about one tick each. Others may crowd, and are merged. The ticks of a user's clock, those before
+a user's channel, and transmissions after samples are listed up to the horizon before a run.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from netkf.core.clock import generate_ticks
 from netkf.core.instants import snapped
 from netkf.engines.compiled.outcomes import (
     ChannelStreams,
     channel_streams,
+    delivery_table,
     draw_outcomes,
     is_kernel_channel,
+    list_outcomes,
 )
 from netkf.engines.compiled.per_scenario import once_per_scenario
-from netkf.engines.compiled.schedule import (
-    MAX_WINDOW_TICKS,
-    Schedule,
-    Window,
-    all_windows,
-)
-from netkf.engines.compiled.senders import senders_of
+from netkf.engines.compiled.senders import Senders, senders_of
+from netkf.engines.compiled.state import Instants, TickArrays
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
@@ -37,27 +37,26 @@ from netkf.rng.numbers import NormalZiggurat, next_gamma, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
-TICKS, MIN_TICKS_PER_ENTITY = 1 << 15, 4
+TICKS, MIN_TICKS_PER_ENTITY, MAX_WINDOW_TICKS = 1 << 15, 4, 1 << 20
 """Ticks in a window: TICKS, whose arrays fit the processor's cache, or, if these are more,
 MIN_TICKS_PER_ENTITY for each entity, since each has a fixed cost in a window; at most
 MAX_WINDOW_TICKS.
 """
-EXPONENTIAL_GAPS, UNIFORM_GAPS, GAMMA_GAPS, WEIBULL_GAPS, LATTICE = range(5)
-"""Kinds of clocks: random gaps, and times that follow from the number of the tick, but for a
-jitter.
+EXPONENTIAL_GAPS, UNIFORM_GAPS, GAMMA_GAPS, WEIBULL_GAPS, LATTICE, LISTED = range(6)
+"""Kinds of clocks: random gaps; times that follow from the number of the tick, but for a jitter;
+and times that were drawn in Python.
 """
 CROWDING_SHAPE = 100.0
 """Gaps of larger shapes are so regular that the ticks of all entities crowd."""
-
-
 NOTHING_SENT: IntArray = np.zeros(0, dtype=np.int64)
 
 
 class Clocks(NamedTuple):
     """The clocks of R runs, E entities in all; ``first`` and ``outgoing`` are those of a run.
 
-    kind : EXPONENTIAL_GAPS, ... or LATTICE
-    next_tick, number : (E,), time of the next tick, seconds, not on the grid yet, and its number
+    kind : EXPONENTIAL_GAPS, ... or LISTED
+    next_tick, number : (E,), time of the next tick, seconds, not on the grid yet, and its number,
+                        in ``listed`` if that is where it comes from
     scale : (E,), what draws of exponential or gamma gaps are divided by, or the time from which a
             lattice is counted
     low, width : uniform gaps and jitters are ``low + width u``; ``low`` is the period of a lattice,
@@ -66,6 +65,7 @@ class Clocks(NamedTuple):
     streams : (E, WIDTH), states of the random streams
     first, outgoing : entity e of a run sends on the directions ``outgoing[first[e]:first[e + 1]]``
     per_second : ticks of the time grid in a second (core.instants)
+    listed : the times of the ticks, entity after entity, of each with infinity behind them
     """
 
     kind: int
@@ -79,6 +79,7 @@ class Clocks(NamedTuple):
     first: IntArray
     outgoing: IntArray
     per_second: float
+    listed: FloatArray
 
 
 class TickBuffer(NamedTuple):
@@ -105,10 +106,9 @@ def draw_ticks(
     buffer: TickBuffer,
     counts: IntArray,
 ) -> bool:
-    """Append the ticks before ``end`` (seconds) of all entities (links, directions or nodes with a
-    clock) of run number ``run`` to ``buffer``, with their outcomes. ``counts`` (2,) are the numbers
-    of ticks and outcomes in the buffer; advances these, the clocks and the streams. Return False if
-    the buffer is full before; a call with a larger one then goes on.
+    """Append the ticks of run number ``run`` before ``end`` (seconds), entity by entity, with their
+    outcomes to ``buffer``; ``counts`` (2,) are the numbers of both in it. Return False if the
+    buffer is full before; a call with a larger one then goes on.
     """
     for e in range(len(clocks.first) - 1):
         first, after = clocks.first[e], clocks.first[e + 1]
@@ -150,6 +150,8 @@ def tick_after(
         return now + math.pow(drawn, clocks.low) * clocks.width
     number = clocks.number[k]
     clocks.number[k] = number + 1
+    if clocks.kind == LISTED:
+        return float(clocks.listed[number])
     time: float = clocks.scale[k] + clocks.low * number
     if clocks.width > 0.0:
         time += clocks.width * next_unit(clocks.streams, k)
@@ -173,7 +175,6 @@ class Sorting(NamedTuple):
 
 
 def _sorting(ticks: int) -> Sorting:
-    """Return scratch to sort K = ``ticks`` ticks."""
     return Sorting(np.empty(ticks + 1, dtype=np.int32), np.empty(ticks, dtype=np.int32))
 
 
@@ -181,8 +182,8 @@ def _sorting(ticks: int) -> Sorting:
 def merge_in_time_order(
     count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
 ) -> None:
-    """Sort the first ``count`` ticks of ``buffer`` by (time, entity) into ``ordered``, as
-    ``put_in_time_order``: merge neighbouring runs of increasing times, at first those of entities.
+    """Sort the first ``count`` ticks of ``buffer`` by (time, entity) into ``ordered``: merge
+    neighbouring runs of increasing times, at first those of entities.
     """
     t, source, merged = buffer.t, sorting.source, sorting.place
     for k in range(count):
@@ -222,9 +223,8 @@ def end_of_run(t: FloatArray, source: IntArray, begin: int, count: int) -> int:
 def put_in_time_order(
     begin: float, end: float, count: int, buffer: TickBuffer, ordered: TickBuffer, sorting: Sorting
 ) -> None:
-    """Sort the first ``count`` ticks of ``buffer``, which lie in [begin, end) seconds and were
-    drawn entity by entity, by (time, entity), the order in which they happen: write them into
-    ``ordered``. Outcomes stay where they are. ``sorting`` is scratch.
+    """Sort the first ``count`` ticks of ``buffer``, about evenly in [begin, end) seconds, by (time,
+    entity) into ``ordered``.
     """
     # Ticks are evenly spread, hence about one in each of ``count`` equal bins.
     place, source, scale = sorting.place, sorting.source, count / (end - begin)
@@ -254,9 +254,7 @@ def put_in_time_order(
 
 @kernel(inlined=True)
 def bin_of(time: float, begin: float, scale: float, count: int) -> int:
-    """Return the index (0 to ``count`` - 1) of the bin that ``time`` lies in, of ``count`` bins
-    from ``begin`` (seconds) on, ``scale`` of them per second.
-    """
+    """Return the index of the bin that ``time`` lies in, of ``count`` bins from ``begin`` on."""
     return min(int((time - begin) * scale), count - 1)
 
 
@@ -289,10 +287,8 @@ def draw_all_ticks(
     sorting: Sorting,
     ticks: AllTicks,
 ) -> bool:
-    """Draw the ticks of all R runs up to the ``horizon`` (seconds) into ``ticks``, run after run,
-    sorted by (time, entity) in each run. ``buffer``, ``counts`` (2,) and ``sorting`` are scratch.
-    Advances the clocks and streams. Return False if an array is too small: the caller restores
-    these and starts again with more space.
+    """Draw the ticks of all R runs up to the ``horizon`` into ``ticks``, run after run, each
+    sorted. Return False if an array is too small: the caller starts again with more space.
     """
     for run in range(len(ticks.first) - 1):
         counts[0] = counts[1] = 0
@@ -326,19 +322,47 @@ def is_kernel_clock(clock: object) -> bool:
     return type(clock) in (Poisson, Periodic, Renewal)
 
 
-def is_drawn_in_kernels(scenario: Scenario) -> bool:
-    """Return True if kernels can draw the ticks and the outcomes of a scenario."""
-    network, talks = scenario.network, scenario.node_filter.timing.talks
-    return (
-        talks
-        and bool(scenario.topology.links)
-        and is_kernel_clock(network.activation)
-        and is_kernel_channel(network.channel)
-    )
+def _is_listed(scenario: Scenario) -> bool:
+    """Return True if Python lists the ticks: of a user's clock or channel, or after samples."""
+    network = scenario.network
+    return not (is_kernel_clock(network.activation) and is_kernel_channel(network.channel))
+
+
+def _list_ticks(
+    scenario: Scenario,
+    streams: Streams | ReplicaStreams,
+    senders: Senders,
+    instants: Instants | None,
+) -> list[FloatArray]:
+    """Return the times (K,) of all ticks of each entity of each run (R E), in seconds."""
+    clock = scenario.network.activation
+    if senders.at == "readings":
+        assert instants is not None
+        return [instants.t[instants.index == node] for node in range(len(senders.entities))]
+    if not isinstance(clock, LinkClock):
+        return []
+    return [
+        generate_ticks(
+            clock,
+            entity,
+            partial(one.generator, "phase", *entity),
+            one.generator("clock", *entity),
+            scenario.horizon,
+        )
+        for one in streams.per_replica
+        for entity in senders.entities
+    ]
+
+
+def _listed_clocks(clocks: Clocks, listed: list[FloatArray]) -> Clocks:
+    """Return the ``clocks`` with the times of all of their ticks."""
+    times = np.concatenate([np.empty(0), *(np.append(t, np.inf) for t in listed)])
+    number = np.cumsum([0, *(len(t) + 1 for t in listed)], dtype=np.int64)[:-1]
+    return clocks._replace(kind=LISTED, crowds=True, number=number, listed=times)
 
 
 def clocks_of(
-    clock: LinkClock,
+    clock: object,
     entities: Sequence[tuple[int, ...]],
     rates: FloatArray,
     streams: Streams | ReplicaStreams,
@@ -384,6 +408,7 @@ def clocks_of(
         first=NOTHING_SENT,
         outgoing=NOTHING_SENT,
         per_second=per_second,
+        listed=np.empty(0),
     )
 
 
@@ -421,36 +446,53 @@ def _rates(scenario: Scenario) -> FloatArray:
     return np.array([clock.mean_rate(entity) for entity in senders.entities])
 
 
-class KernelSchedules:
-    """The ticks of some runs of a scenario with built-in clocks and channels, and which of their
-    messages arrive: window by window, or all at once.
+@once_per_scenario
+def _delivery(scenario: Scenario) -> FloatArray:
+    """Return the delivery probabilities (2, W) of a built-in channel, by state and direction."""
+    directions = senders_of(scenario).directions
+    return delivery_table(scenario, scenario.network.channel.loss, directions)
+
+
+class Schedule:
+    """The ticks of some runs of a scenario, and which of their messages arrive: window by window,
+    or all at once. ``bits``: the outcomes of a tick are one integer with a bit for each of its
+    messages, 1 if it arrives, instead of a delay for each; only if no message takes time. Where
+    nodes transmit after their samples, these are those of ``instants``.
     """
 
     def __init__(
-        self, scenario: Scenario, streams: Streams | ReplicaStreams, bits: bool = False
+        self,
+        scenario: Scenario,
+        streams: Streams | ReplicaStreams,
+        bits: bool = False,
+        instants: Instants | None = None,
     ) -> None:
-        """Draw the first tick of each entity (a node, link or direction that has a clock) in each
-        run of ``streams``. ``bits``: the outcomes of a tick are one integer with a bit for each of
-        its messages, 1 if it arrives, instead of a delay for each; only if no message takes time.
-        """
-        senders = senders_of(scenario)
-        clock = scenario.network.activation
-        assert isinstance(clock, LinkClock)
-        self._clocks = clocks_of(
-            clock,
-            senders.entities,
-            _rates(scenario),
-            streams,
-            ("clock", "phase"),
-            scenario.time_grid.per_second,
+        senders, channel = senders_of(scenario), scenario.network.channel
+        self._runs, sizes = streams.runs, np.diff(senders.first)
+        listed, outcomes, delivery = None, [], np.ones((2, len(senders.directions)))
+        if not senders.entities or senders.at == "readings" or _is_listed(scenario):
+            listed = _list_ticks(scenario, streams, senders, instants)
+            numbers = np.array([len(t) for t in listed], dtype=np.int64).reshape(self._runs, -1)
+            rates = numbers.mean(axis=0) / scenario.horizon
+        else:
+            rates = _rates(scenario)
+        if senders.entities and is_kernel_channel(channel):
+            delivery = _delivery(scenario)
+        elif senders.entities:
+            outcomes = list_outcomes(scenario, streams, senders, numbers)
+        # The laws of a user's clock are its own.
+        clock = scenario.network.activation if listed is None else None
+        purposes = "clock", "phase"
+        clocks = clocks_of(
+            clock, senders.entities, rates, streams, purposes, scenario.time_grid.per_second
         )._replace(first=senders.first, outgoing=senders.outgoing)
-        self._channels = channel_streams(scenario, streams, senders, bits)
+        self._clocks = clocks if listed is None else _listed_clocks(clocks, listed)
+        self._channels = channel_streams(channel, streams, senders, delivery, bits, outcomes)
         start_clocks(self._clocks, ziggurat(), normal_ziggurat())
-        rates = _rates(scenario)
-        self._runs, self._rate = streams.runs, float(rates.sum())
+        self._rate = float(rates.sum())
         # Mean number of messages for each tick.
-        self._sends = float(rates @ np.diff(senders.first)) / self._rate
-        self._max_sends = int(np.diff(senders.first).max())
+        self._sends = float(rates @ sizes) / self._rate if self._rate > 0.0 else 0.0
+        self._max_sends = int(sizes.max(initial=0))
         self._horizon, self._length = scenario.horizon, math.inf
         self._instant = scenario.time_grid.instant
         if self._rate > 0.0:
@@ -461,8 +503,10 @@ class KernelSchedules:
             )
         self._end, self._buffer = 0.0, _empty_buffer(0, 0)
 
-    def following(self) -> Window:
-        """Return the next window of the ticks of one run; the last one ends at infinity."""
+    def following(self) -> TickArrays:
+        """Return the next window of one run, sorted by (time, entity); the last ends at
+        infinity.
+        """
         begin, end = self._end, self._instant(self._end + self._length)
         # The last window has no end, so that the loop asks for no other.
         if not begin < end < self._horizon:
@@ -471,12 +515,10 @@ class KernelSchedules:
         return self._window(0, begin, end)
 
     def all(self) -> AllTicks:
-        """Return all ticks of all R runs up to the horizon, one run after the other, for batches of
-        runs.
-        """
+        """Return all ticks of all R runs up to the horizon, one run after the other."""
         clocks, channels = self._clocks, self._channels
         states: list[np.ndarray] = [clocks.next_tick, clocks.number, clocks.streams]
-        states += [channels.loss, channels.state, channels.delay, channels.bad]
+        states += [channels.loss, channels.state, channels.delay, channels.bad, channels.following]
         # Copies of the streams: an attempt that runs out of space starts again from them.
         copies = [state.copy() for state in states]
         # Space for the mean plus eight standard deviations of a Poisson count; in the rare case of
@@ -494,17 +536,15 @@ class KernelSchedules:
                 state[:] = copy
 
     def _space(self, ticks: int) -> TickBuffer:
-        """Return space for ``ticks`` ticks and the outcomes of their messages."""
         sends = 0.0 if self._channels.bits else self._sends
         return _empty_buffer(ticks, int(sends * ticks) + self._max_sends)
 
     def _space_for_all(self, ticks: int) -> AllTicks:
-        """Return space for ``ticks`` ticks of all R runs and the outcomes of their messages."""
         t, entity, first_outcome, delay = self._space(ticks)
         first, first_delay = (np.zeros(self._runs + 1, dtype=np.int64) for _ in range(2))
         return AllTicks(t, entity, first_outcome, delay, first, first_delay, self._channels.bits)
 
-    def _window(self, run: int, begin: float, end: float) -> Window:
+    def _window(self, run: int, begin: float, end: float) -> TickArrays:
         """Draw and return the ticks of run number ``run`` in [begin, end) seconds, in order."""
         last, counts = min(end, self._horizon), np.zeros(2, dtype=np.int64)
         # Space for the mean plus eight standard deviations of a Poisson count is nearly always
@@ -524,10 +564,11 @@ class KernelSchedules:
             merge_in_time_order(count, self._buffer, ordered, _sorting(count))
         else:
             put_in_time_order(begin, last, count, self._buffer, ordered, _sorting(count))
-        return Window(end, *ordered)
+        return TickArrays(
+            **ordered._asdict(), end=end, arrival_bits=np.zeros(count, dtype=np.int64)
+        )
 
     def _enlarge_buffer(self, ticks: int, sends: int) -> None:
-        """Make the buffer large enough, keeping its contents; it never shrinks."""
         if len(self._buffer.t) >= ticks and len(self._buffer.delay) >= sends:
             return
         larger = _empty_buffer(ticks, sends)
@@ -538,49 +579,9 @@ class KernelSchedules:
 
 
 def _space_for_count(expected: float, deviations: float) -> int:
-    """Return a number that a Poisson count with mean ``expected`` hardly ever exceeds."""
     return int(expected + deviations * math.sqrt(expected)) + 8
 
 
 def _empty_buffer(ticks: int, sends: int) -> TickBuffer:
-    """Return space for ``ticks`` ticks and ``sends`` outcomes."""
     entity, first_outcome = (np.empty(ticks, dtype=np.int64) for _ in range(2))
     return TickBuffer(np.empty(ticks), entity, first_outcome, np.empty(sends))
-
-
-def all_ticks(scenario: Scenario, streams: ReplicaStreams, bits: bool = False) -> AllTicks:
-    """Return all ticks of R runs up to the horizon, with their outcomes: the delay of each message,
-    or LOST. ``bits``: with arrival bits (bit m is 1 if message m of a tick arrives) instead of
-    outcomes, which is possible if clocks are Poisson and no message takes time.
-    """
-    if is_drawn_in_kernels(scenario):
-        return KernelSchedules(scenario, streams, bits).all()
-    # Any other clock or channel: windows drawn in Python, joined run after run.
-    windows = all_windows(scenario, streams)
-    first, first_delay = (
-        np.cumsum([0, *(len(getattr(window, name)) for window in windows)])
-        for name in ("t", "delay")
-    )
-    t, entity, first_outcome, delay = (
-        np.concatenate([getattr(window, name) for window in windows])
-        for name in ("t", "entity", "first_outcome", "delay")
-    )
-    return AllTicks(t, entity, first_outcome, delay, first, first_delay)
-
-
-def window_of(ticks: AllTicks, run: int) -> Window:
-    """Return all ticks of run number ``run`` (0 to R - 1) as a window without an end."""
-    own, outcomes = (slice(*first[run : run + 2]) for first in (ticks.first, ticks.first_delay))
-    return Window(
-        end=math.inf,
-        t=ticks.t[own],
-        entity=ticks.entity[own],
-        first_outcome=ticks.first_outcome[own],
-        delay=ticks.delay[outcomes],
-    )
-
-
-def schedule(scenario: Scenario, streams: Streams) -> KernelSchedules | Schedule:
-    """Return the source of the windows of ticks of one run, drawn in compiled code if possible."""
-    cls = KernelSchedules if is_drawn_in_kernels(scenario) else Schedule
-    return cls(scenario, streams)

@@ -12,7 +12,7 @@ from netkf.core.clock import ClockPosition, next_ticks
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
-from netkf.engines.simpy.transmission import LinkExchange, Transmitter, stream
+from netkf.engines.simpy.transmission import DirectedLink, LinkExchange, Transmitter, stream
 from netkf.network.clocks import LinkClock
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -35,10 +35,8 @@ def clock_processes(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """Return one SimPy process for each link, direction or node that has a clock, which waits for
-    its ticks and then lets it send. ``nodes`` are the nodes by id.
-
-    There are none with activation by readings: nodes then transmit after their samples.
+    """Return one SimPy process for each link, direction or node that has a clock; none if nodes
+    transmit after their samples.
     """
     activation = scenario.network.activation
     if not scenario.node_filter.timing.talks or not isinstance(activation, LinkClock):
@@ -69,7 +67,6 @@ def _tick_process(
     tick_order: int,
     activate: Activation,
 ) -> Process:
-    """Wait for each tick of the clock of ``entity``, and call its activation."""
     clock, instant = scenario.network.activation, scenario.time_grid.instant
     assert isinstance(clock, LinkClock)
     # A stream of its own: the ticks of one entity never depend on those of another.
@@ -109,23 +106,16 @@ def _link_activations(
 ) -> Activations:
     """Return for each link what happens at a tick: both ends exchange."""
 
-    # A factory for each link, so that the closure binds these ends and not those of the last link.
-    def activation(link: tuple[int, int], entity: int) -> Activation:
-        """Return the activation of ``link`` (i, j), in which both ends send to each other;
-        ``entity`` is its index, which orders simultaneous arrivals.
-        """
-        i, j = link
-        exchange = LinkExchange(scenario, transmitter, nodes, link, entity)
+    def activate(exchange: LinkExchange, i: int, j: int, now: float) -> None:
+        recorder.append((now, TICK, i, j, -1, -1, NAN))
+        # Both payloads are computed before either end receives.
+        exchange.exchange((nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))))
 
-        def activate(now: float) -> None:
-            """Send a message in each direction at ``now`` (seconds)."""
-            recorder.append((now, TICK, i, j, -1, -1, NAN))
-            # Both payloads are computed before either end receives.
-            exchange.exchange((nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))))
-
-        return activate
-
-    return [(link, activation(link, k)) for k, link in enumerate(scenario.topology.links)]
+    # The index of a link orders simultaneous arrivals.
+    return [
+        (link, partial(activate, LinkExchange(scenario, transmitter, nodes, link, k), *link))
+        for k, link in enumerate(scenario.topology.links)
+    ]
 
 
 def _direction_activations(
@@ -136,23 +126,24 @@ def _direction_activations(
 ) -> Activations:
     """Return for each direction what happens at a tick: the sender sends."""
 
-    def activation(link: tuple[int, int], entity: int) -> Activation:
-        """Return the activation of the directed ``link`` (sender, receiver): its sender sends one
-        message; ``entity`` is its index, which orders simultaneous arrivals.
-        """
-        i, j = link
-        direction = transmitter.directed_link(link, entity, nodes[j], transmitter.sampler(link))
+    def activate(direction: DirectedLink, now: float) -> None:
+        i, j = direction.link
+        recorder.append((now, TICK, i, j, -1, -1, NAN))
+        # Drawn in any case: even if nothing is sent, the channel takes its step.
+        outcome = direction.sampler.draw()
+        transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
 
-        def activate(now: float) -> None:
-            """Send one message at ``now`` (seconds)."""
-            recorder.append((now, TICK, i, j, -1, -1, NAN))
-            # Drawn in any case: even if nothing is sent, the channel takes its step.
-            outcome = direction.sampler.draw()
-            transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
+    links = _directed_links(scenario, transmitter, nodes)
+    return [(direction.link, partial(activate, direction)) for direction in links]
 
-        return activate
 
-    return [(link, activation(link, k)) for k, link in enumerate(scenario.topology.directions)]
+def _directed_links(
+    scenario: Scenario, transmitter: Transmitter, nodes: dict[int, ClockedNode]
+) -> list[DirectedLink]:
+    return [
+        DirectedLink(scenario, link, k, nodes[link[1]], transmitter.sampler(link))
+        for k, link in enumerate(scenario.topology.directions)
+    ]
 
 
 def broadcasts(
@@ -161,41 +152,28 @@ def broadcasts(
     transmitter: Transmitter,
     nodes: dict[int, ClockedNode],
 ) -> dict[int, Activation]:
-    """Return for each node, by id, an activation, a function of the time in seconds, that
-    broadcasts one payload to all receivers of the node; ``nodes`` are the nodes by id.
-
-    Each receiver has an outcome of its own (a loss or a delay).
+    """Return for each node, by id, a function of the time that broadcasts one payload to all its
+    receivers, to each with an outcome of its own.
     """
-    directions: dict[int, list[Any]] = {node: [] for node in scenario.nodes}
-    for k, (i, j) in enumerate(scenario.topology.directions):
-        directions[i].append(
-            transmitter.directed_link((i, j), k, nodes[j], transmitter.sampler((i, j)))
-        )
+    directions: dict[int, list[DirectedLink]] = {node: [] for node in scenario.nodes}
+    for direction in _directed_links(scenario, transmitter, nodes):
+        directions[direction.link[0]].append(direction)
+    sent = dict.fromkeys(scenario.nodes, 0)
 
-    def activation(node: int) -> Activation:
-        """Return the broadcast of ``node`` (id): one payload to all its receivers."""
-        receivers, sent = tuple(direction.link[1] for direction in directions[node]), 0
+    def transmit(node: int, now: float) -> None:
+        # Drawn even if the filter sends nothing, so that the network does not depend on it.
+        outcomes = [direction.sampler.draw() for direction in directions[node]]
+        receivers = tuple(direction.link[1] for direction in directions[node])
+        payload = nodes[node].emit(now, receivers)
+        if payload is None:
+            return
+        # A broadcast is one transmission, numbered by sender; its messages are numbered by link.
+        recorder.append((now, TRANSMIT, node, -1, sent[node], -1, NAN))
+        sent[node] += 1
+        for direction, outcome in zip(directions[node], outcomes, strict=True):
+            transmitter.send(direction, payload, outcome)
 
-        def transmit(now: float) -> None:
-            """Send one payload to each neighbour at ``now`` (seconds), each with an outcome of its
-            own.
-            """
-            nonlocal sent
-            # Drawn even if the filter sends nothing, so that the network does not depend on it.
-            outcomes = [direction.sampler.draw() for direction in directions[node]]
-            payload = nodes[node].emit(now, receivers)
-            if payload is None:
-                return
-            # A broadcast is one transmission, numbered by sender; its messages are numbered by
-            # link.
-            recorder.append((now, TRANSMIT, node, -1, sent, -1, NAN))
-            sent += 1
-            for direction, outcome in zip(directions[node], outcomes, strict=True):
-                transmitter.send(direction, payload, outcome)
-
-        return transmit
-
-    return {node: activation(node) for node in scenario.nodes}
+    return {node: partial(transmit, node) for node in scenario.nodes}
 
 
 def _node_activations(
@@ -207,18 +185,12 @@ def _node_activations(
     """Return for each node, as (id,), what happens at a tick: it broadcasts."""
     transmit = broadcasts(scenario, recorder, transmitter, nodes)
 
-    def activation(node: int) -> Activation:
-        """Return the activation of ``node`` (id): a broadcast with a row for the tick."""
+    def activate(node: int, now: float) -> None:
+        # The tick has its own row; transmit() adds that of the broadcast if there is one.
+        recorder.append((now, TICK, node, -1, -1, -1, NAN))
+        transmit[node](now)
 
-        def activate(now: float) -> None:
-            """Record the tick at ``now`` (seconds), then broadcast."""
-            # The tick has its own row; transmit() adds that of the broadcast if there is one.
-            recorder.append((now, TICK, node, -1, -1, -1, NAN))
-            transmit[node](now)
-
-        return activate
-
-    return [((node,), activation(node)) for node in scenario.nodes]
+    return [((node,), partial(activate, node)) for node in scenario.nodes]
 
 
 def _transmit_after_samples(
@@ -235,9 +207,6 @@ def _transmit_after_samples(
         clocked_node = nodes[node]
 
         def transmit_now(now: float, node: int = node, entity: int = clocked_node.entity) -> None:
-            """Broadcast at ``now`` (seconds), as soon as all samples of this instant have been
-            used.
-            """
             # At the rank of ticks: by then all nodes have used their samples of this instant.
             timeline.call_at(now, Rank.TICK, entity, lambda _: transmit[node](now))
 

@@ -60,10 +60,7 @@ class SimpyEngine(Engine):
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> str:
-        """Simulate up to the horizon with the random numbers of ``streams``, pass events and
-        samples to ``recorder``, and return the status, "complete" or "diverged". ``progress`` is
-        called with the simulated time in seconds at each sample.
-        """
+        """Simulate a scenario, see ``Engine.run``; ``progress`` is called at each sample."""
         with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
             simulation = _Simulation(scenario, streams, recorder, progress)
             # Slots and clocks share the timeline, but no process.
@@ -89,9 +86,6 @@ class _Simulation:
     def __init__(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress
     ) -> None:
-        """Make the timeline and the transmitter of a run; ``progress`` is called with the simulated
-        seconds.
-        """
         self.timeline = Timeline()
         self._scenario, self._streams = scenario, streams
         self._recorder, self._progress = recorder, progress
@@ -99,16 +93,11 @@ class _Simulation:
         recorder.exact_errors = scenario.exact_errors
 
     def clocks(self) -> list[Process]:
-        """Return the SimPy processes of a scenario in continuous time: samples, moves of the
-        origin, sensors and clocks; they share a truth, the state of the plant.
-        """
+        """Return the SimPy processes of a scenario in continuous time."""
         scenario, streams, timeline = self._scenario, self._streams, self.timeline
         truth = scenario.continuous_truth(streams)
 
         def make_node(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
-            """Return one node in continuous time (id ``node``, -1: pooled; index ``entity``) with
-            the increment sensors of the nodes ``sensing`` (ids).
-            """
             # A pooled filter has the increment sensors of all nodes.
             placed = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, placed)
@@ -127,7 +116,6 @@ class _Simulation:
         ]
 
     def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
-        """Record plant and ``nodes`` at the probe times: a SimPy process."""
         for time in self._scenario.times.tolist():
             yield self.timeline.at(time, Rank.PROBE, 0)
             # Events predict only the nodes that take part; a sample needs all nodes at one time.
@@ -136,7 +124,6 @@ class _Simulation:
             self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
 
     def _moving_origin(self, truth: Any, nodes: dict[int, ClockedNode]) -> Process:
-        """Move the origin of all ``nodes`` to the true state at every frame time."""
         for k, time in enumerate(truth.frame_times.tolist()):
             yield self.timeline.at(time, Rank.REBASE, 0)
             for node in distinct(nodes):
@@ -149,15 +136,12 @@ class _Simulation:
             self._transmitter.shift(self._scenario.node_filter, offset)
 
     def slots(self) -> list[Process]:
-        """Return the SimPy processes of a scenario in slots: samples, filters, readers of sensors
-        and the clock of exchanges; they share a truth, the state of the plant.
-        """
+        """Return the SimPy processes of a scenario in slots."""
         scenario, streams, recorder = self._scenario, self._streams, self._recorder
         truth = scenario.slot_truth(streams)
         schedule, period = SlotSchedule(scenario), scenario.slot_plant.period
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
-            """Return one node in slots (id ``node``, -1: pooled; index ``entity``)."""
             own = _identify(scenario, node, entity)
             return SlotNode(recorder, schedule, period, streams, *own)
 
@@ -184,11 +168,9 @@ class _Simulation:
     def _sampling_slots(
         self, truth: Any, schedule: SlotSchedule, nodes: dict[int, SlotNode], sums: _Sums
     ) -> Process:
-        """Record plant and ``nodes`` in slots, predictions first or filtered states last."""
         predicts, recorder, slot = self._scenario.node_filter.timing.predicts, self._recorder, 0
 
         def sample() -> None:
-            """Record a sample if the slot has one, and move the origin if a frame begins."""
             if schedule.sampled(slot):
                 time = schedule.start(slot)
                 self._record(time, truth.absolute(slot), truth.local(slot), nodes, sums)
@@ -220,7 +202,6 @@ class _Simulation:
             slot += 1
 
     def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
-        """Record one sample; raises DivergedError if an estimate is not sound."""
         scenario, recorder = self._scenario, self._recorder
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
@@ -246,7 +227,6 @@ class _Simulation:
 
 
 def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any]) -> dict[int, Any]:
-    """Return the node process of every node by id; the nodes of a pooled filter share one."""
     nodes = scenario.nodes
     if scenario.node_filter.timing.pooled:
         return dict.fromkeys(nodes, make(-1, 0, scenario.sensing_nodes))
@@ -277,7 +257,6 @@ class _Sums:
         self.start = self._compute()
 
     def _compute(self) -> dict[str, float]:
-        """Return by name the sums over all nodes that exchanges should not change."""
         parts = [_conserved_terms(node.algorithm, node.state) for node in self._nodes]
         # fsum: rounding of this sum would look like a loss.
         return {name: math.fsum(t for part in parts for t in part[name]) for name in parts[0]}
@@ -289,6 +268,5 @@ class _Sums:
 
 
 def _conserved_terms(algorithm: Filter, state: Any) -> dict[str, list[float]]:
-    """Return the terms that a node contributes to the conserved sums, as lists by name."""
     quantities = algorithm.analysis.conserved(state)
     return {name: np.atleast_1d(np.asarray(value)).tolist() for name, value in quantities.items()}

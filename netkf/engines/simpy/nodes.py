@@ -71,8 +71,8 @@ class Node:
         self.inbox: dict[int, list[Envelope]] = {}
 
     def put(self, envelope: Envelope) -> None:
-        """Put a message into the inbox, from which the filter absorbs all messages together; if the
-        filter has ``newest_only``, the newest of each sender replaces the others.
+        """Put a message into the inbox; with ``newest_only`` the newest of a sender replaces
+        others.
         """
         envelopes = self.inbox.setdefault(envelope.sender, [])
         if self._timing.newest_only and envelopes:
@@ -83,9 +83,7 @@ class Node:
             envelopes.append(envelope)
 
     def take_messages(self) -> tuple[list[Envelope], list[Message]]:
-        """Empty the inbox and return its contents, ordered by sender: the envelopes, from which
-        events are recorded, and the messages as the filter takes them.
-        """
+        """Empty the inbox; return its envelopes by sender, and the messages that filters take."""
         # A floating-point sum must not depend on the order of arrival.
         envelopes = [envelope for peer in sorted(self.inbox) for envelope in self.inbox[peer]]
         self.inbox.clear()
@@ -93,10 +91,7 @@ class Node:
         return envelopes, messages
 
     def shift(self, offset: FloatArray) -> None:
-        """Add ``offset`` (n,) to the estimate in ``self.state``, after the engine has moved the
-        origin of the coordinates. It moves the origin to the present state of the plant now and
-        then, so that errors x - xhat keep their digits while an unstable plant grows.
-        """
+        """Add ``offset`` (n,) to the estimate, after the origin of the coordinates has moved."""
         self.state = self.algorithm.shift(self.state, offset)
 
 
@@ -115,10 +110,6 @@ class ClockedNode(Node):
         increments: list[Any],
         *arguments: Any,
     ) -> None:
-        """Set up a node at time 0 whose increment sensors ``increments`` (none: empty) read the
-        path ``truth`` of the plant's state. Events are scheduled on ``timeline`` and recorded by
-        ``recorder``; ``arguments`` are those of Node.
-        """
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
         self._increments = increments
@@ -132,9 +123,7 @@ class ClockedNode(Node):
         """
 
     def predict_to(self, time: float) -> None:
-        """Predict the filter to ``time`` (seconds), using the increments since its last event, in
-        intervals that the filter allows. It is called before any event that concerns the node.
-        """
+        """Predict the filter to ``time`` (seconds), using the increments since its last event."""
         if self._now >= time:
             return
         if not self._increments:
@@ -168,9 +157,8 @@ class ClockedNode(Node):
         return np.asarray(stacked.reshape(-1))
 
     def sample(self, node: int, y: FloatArray, H: Any, R: FloatArray) -> None:
-        """Store a sample y (p,) that one sensor of ``node`` (id) has just taken, with noise
-        covariance R (p, p) and H (p, n), or a function that linearises it: one update, scheduled
-        here, uses all samples of this instant.
+        """Store a sample y (p,) that a sensor of ``node`` (id) has just taken, with its H (p, n),
+        or a function that linearises it, and R (p, p): one update uses all samples of this instant.
         """
         # The first sample of an instant schedules the update, which then uses all of them.
         if not self._samples:
@@ -178,7 +166,6 @@ class ClockedNode(Node):
         self._samples.append((node, y, H, R))
 
     def _use_samples(self, _: simpy.Event) -> None:
-        """Update ``self.state`` by all samples of this instant together."""
         time, samples = self._timeline.now, self._samples
         self._samples = []
         self.predict_to(time)
@@ -195,9 +182,7 @@ class ClockedNode(Node):
             self.after_sample(time)
 
     def emit(self, time: float, receivers: tuple[int, ...]) -> Any:
-        """Return the payload that the node sends to the ``receivers`` (ids) at ``time`` (seconds),
-        before it absorbs anything; None if it sends nothing.
-        """
+        """Return the payload that the node sends to ``receivers`` (ids) at ``time``, or None."""
         # The payload is of the present state, not of that at the last event.
         self.predict_to(time)
         exchange = Exchange(time=time, receivers=receivers)
@@ -216,7 +201,6 @@ class ClockedNode(Node):
         self.put(envelope)
 
     def _absorb(self, _: simpy.Event) -> None:
-        """Absorb all messages that have arrived at this instant."""
         time = self._timeline.now
         self.predict_to(time)
         messages = self.take_messages()[1]
@@ -228,8 +212,8 @@ class ClockedNode(Node):
 def linearise(
     algorithm: Filter, state: Any, y: FloatArray, H: Any
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a reading y (p,) and its H (p, n). A nonlinear sensor has a function in place of H,
-    which linearises its reading at the estimate (n,) of the filter's ``state``.
+    """Return a reading y (p,) and its H (p, n); of a nonlinear sensor, which has a function in
+    place of H, at the estimate of ``state``.
     """
     if isinstance(H, np.ndarray):
         return y, H

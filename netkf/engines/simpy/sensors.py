@@ -33,9 +33,7 @@ def sensor_processes(
     truth: Any,
     nodes: dict[int, ClockedNode],
 ) -> list[Process]:
-    """Return one process for each node with increment sensors and one for each sampled sensor; they
-    read the ``truth``, the state of the run, and pass readings to ``nodes``, by id.
-    """
+    """Return a process for each node with increment sensors and for each sampled sensor."""
     index = scenario.topology.index
     processes = [
         # One process for all increment sensors of a node: they are read at the same times.
@@ -64,7 +62,6 @@ def _increment_process(
     node: int,
     entity: int,
 ) -> Process:
-    """Make ``node`` use its increments at each point of the sensing grid."""
     # From grid point 1 on, since increments need an interval.
     k = 1
     # Half open: the horizon is excluded.
@@ -89,9 +86,7 @@ class SamplingProcess:
     R: FloatArray
 
     def run(self, timeline: Timeline, truth: Any, receiver: ClockedNode) -> Process:
-        """Read the state of ``truth`` at the sample times, and pass each sample to the node
-        ``receiver``, which uses all samples of an instant in one update.
-        """
+        """Read the ``truth`` at the sample times, and pass each sample to ``receiver``."""
         for k, time in enumerate(self.times.tolist()):
             yield timeline.at(time, Rank.SENSE, self.entity)
             # Relative to the moving origin, like the estimates.
@@ -102,9 +97,7 @@ class SamplingProcess:
 def increment_sensors(
     scenario: Scenario, streams: Streams, placed: list[tuple[int, PlacedSensor]]
 ) -> list[SensorPath]:
-    """Return what the increment sensors ``placed`` (node, sensor) read in one run: for each a path
-    that gives the moments of its readings over any interval.
-    """
+    """Return the readings of the increment sensors ``placed`` (node, sensor) in one run."""
     paths = []
     for node, placed_sensor in placed:
         sensor = scenario.sensors[placed_sensor.entry]

@@ -19,7 +19,7 @@ from netkf.engines.simpy.nodes import Envelope, Node, distinct, linearise
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.linalg.arrays import FloatArray, block_diagonal
-from netkf.network.matchings import Matching, RecordedSlots
+from netkf.network.matchings import used_links
 from netkf.plants.linear import Readings
 from netkf.plants.readings import covariance_of
 from netkf.rng.streams import Streams
@@ -55,9 +55,6 @@ class SlotSchedule:
     """Computes the stages of every slot from the schedule of the filter."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the filter's schedule, the order of predictions, readings and exchanges in a slot,
-        and the number of steps of each of its exchanges.
-        """
         self._timing, self._plant = scenario.node_filter.timing, scenario.slot_plant
         self.horizon, self._instant = scenario.horizon, scenario.time_grid.instant
         phases = self._timing.schedule or ()
@@ -88,9 +85,7 @@ class SlotSchedule:
         return self._plant.slot_time(slot)
 
     def stages(self, slot: int) -> list[Stage]:
-        """Return the stages of a slot in their order, at whose times and ranks the processes of
-        nodes, sensors and messages act; the result is cached, as all of them ask for it.
-        """
+        """Return the stages of a slot in their order; the result is cached for all processes."""
         if slot not in self._cache:
             # All processes are in this slot or the one before.
             self._cache.pop(slot - 2, None)
@@ -98,14 +93,11 @@ class SlotSchedule:
         return self._cache[slot]
 
     def end(self, slot: int) -> tuple[float, int]:
-        """Return a time in seconds and a rank (its order among events of that time) after all
-        stages of a slot, at which filtered states are sampled.
-        """
+        """Return a time in seconds and a rank after all stages of a slot."""
         stages = self.stages(slot)
         return (stages[-1].time, stages[-1].rank + 1) if stages else (self.start(slot), FIRST_RANK)
 
     def _stages_of(self, slot: int) -> Generator[Stage, None, None]:
-        """Yield the stages of a slot in order, by the filter's schedule."""
         timing, start = self._timing, self.start(slot)
         now, rank, phase = start, FIRST_RANK + 1, 0
         # In slot 0 a filter that does not predict uses no reading: its sample is the initial state.
@@ -146,9 +138,6 @@ class SlotNode(Node):
         streams: Streams,
         *arguments: Any,
     ) -> None:
-        """Set up a node with closed inbox, in slots of ``period`` seconds; ``arguments`` are those
-        of Node.
-        """
         super().__init__(*arguments)
         # Only randomised filters draw from this stream.
         randomised = self._timing.randomised
@@ -160,9 +149,7 @@ class SlotNode(Node):
         self._samples: list[tuple[FloatArray, Any, FloatArray]] = []
 
     def run_process(self, timeline: Timeline) -> Process:
-        """Follow the schedule, slot after slot, as a SimPy process: at each stage that concerns the
-        node's filter wait for its time and rank, and act.
-        """
+        """Follow the schedule, slot after slot, as a SimPy process."""
         slot = 0
         # Readers and the slot clock follow the same stages; ranks order the processes.
         while self._schedule.runs(slot):
@@ -174,7 +161,6 @@ class SlotNode(Node):
             slot += 1
 
     def _perform(self, stage: Stage, slot: int) -> None:
-        """Do one stage of slot number ``slot``."""
         if stage.kind == "predict":
             self.state = self.algorithm.predict(self.state, self._period)
         elif stage.kind == "update":
@@ -184,12 +170,11 @@ class SlotNode(Node):
 
     def read(self, y: FloatArray, H: Any, R: FloatArray) -> None:
         """Store the reading y (p,) of one sensor with its H (p, n), or the function that linearises
-        it, and the R (p, p) that the filter believes, until the update of this slot.
+        it, and R (p, p), until the update of this slot.
         """
         self._samples.append((y, H, R))
 
     def _update(self, time: float) -> None:
-        """Update ``self.state`` by all readings of this slot; without sensors, by no rows."""
         samples = [linearise(self.algorithm, self.state, y, H) for y, H, _ in self._samples]
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
@@ -225,7 +210,6 @@ class SlotNode(Node):
         self.put(envelope)
 
     def _close(self, stage: Stage, slot: int) -> None:
-        """Close the inbox at the end of an exchange step, and absorb its messages."""
         append, now, phase = self._recorder.append, stage.time, stage.phase
         envelopes, messages = self.take_messages()
         # From now on a message of this exchange is late.
@@ -247,7 +231,6 @@ class SlotNode(Node):
 
 
 def _finite_rows(y: FloatArray, H: FloatArray) -> np.ndarray:
-    """Return flags (p,) of the rows of a reading that have a value."""
     # A sensor without a reading may give an empty y.
     return np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
 
@@ -258,19 +241,13 @@ class Reader:
     def __init__(
         self, recorder: Recorder, schedule: SlotSchedule, node: int, entity: int, carrier: SlotNode
     ) -> None:
-        """Take the sensors of ``node`` (id; index ``entity``), whose readings the filter
-        ``carrier`` uses.
-        """
         self._recorder, self._schedule = recorder, schedule
         self._node, self._entity, self._carrier = node, entity, carrier
 
     def run_process(
         self, timeline: Timeline, truth: Any, sensors: list[tuple[Readings, FloatArray]]
     ) -> Process:
-        """Read all ``sensors`` of the node, each with the R (p, p) that the filter believes, at the
-        "read" stage of every slot, in the state of the ``truth``, and pass the readings to its
-        filter: a SimPy process.
-        """
+        """Read all ``sensors``, each with the R (p, p) that the filter believes, in every slot."""
         slot = 0
         while self._schedule.runs(slot):
             for stage in self._schedule.stages(slot):
@@ -297,9 +274,6 @@ class SlotClock:
         transmitter: Transmitter,
         nodes: dict[int, SlotNode],
     ) -> None:
-        """Make the exchange of each link between the ``nodes`` (by id), and the stream of
-        matchings.
-        """
         self._scenario, self._recorder, self._schedule = scenario, recorder, schedule
         self._nodes, self._timing = nodes, scenario.node_filter.timing
         # A pooled filter appears once.
@@ -324,12 +298,17 @@ class SlotClock:
             slot += 1
 
     def _exchange(self, stage: Stage, slot: int) -> None:
-        """Let all nodes send in one step of an exchange, and record ticks or the round."""
         now, phase, broadcast = stage.time, stage.phase, not self._timing.pairwise
         # All inboxes open before any node sends: a message without delay arrives at once.
         for node in self._distinct:
             node.open(stage.number)
-        pairs, up = self._pairs(stage, slot, broadcast)
+        pairs, up = used_links(
+            self._scenario.network.activation,
+            self._scenario.topology,
+            self._matching_random,
+            (slot, phase, stage.step),
+            self._timing.pairwise,
+        )
         senders = self._talking
         if broadcast:
             self._recorder.append((now, ROUND, -1, -1, -1, phase, NAN))
@@ -349,19 +328,3 @@ class SlotClock:
             self._links[i, j].exchange(
                 both, phase=phase, exchange=stage.number, up=is_up, fresh=fresh
             )
-
-    def _pairs(self, stage: Stage, slot: int, broadcast: bool) -> tuple[list[Any], set[Any] | None]:
-        """Return the links used in an exchange step, and those of them that are up."""
-        activation, topology = self._scenario.network.activation, self._scenario.topology
-        links = list(topology.links)
-        if isinstance(activation, Matching):
-            # Matchings are drawn from one stream for the whole network.
-            return activation.draw(topology, self._matching_random), None
-        if not isinstance(activation, RecordedSlots):
-            return links, None
-        listed = activation.pairs(slot, stage.phase, stage.step)
-        if not broadcast:
-            return listed, None
-        up = set(listed)
-        # An undirected link is listed once, and is up in both directions.
-        return links, up if topology.directed else up | {(j, i) for i, j in listed}

@@ -27,13 +27,9 @@ class Timeline(simpy.Environment):
         self.process(process)
 
     def at(self, time: float, rank: Rank | int, entity: int) -> simpy.Event:
-        """Return an event that happens at ``time`` (seconds), before those of higher
-        (rank, entity).
-
-        ``Environment.timeout`` would add a delay to the present time, and ``now + (time - now)``
-        may differ from ``time`` in the last bit: recorded times would not be reproduced, and events
-        of two grids would not coincide. This does the same as simpy.Timeout, with an absolute time
-        and an explicit priority.
+        """Return an event at ``time`` (seconds), before those of higher (rank, entity): a
+        simpy.Timeout with an absolute time, since ``now + (time - now)`` may differ in the last
+        bit, and an explicit priority.
         """
         event = simpy.Event(self)
         # An event with a value counts as triggered: SimPy calls its callbacks when its time comes.
@@ -47,9 +43,7 @@ class Timeline(simpy.Environment):
     def call_at(
         self, time: float, rank: Rank | int, entity: int, callback: Callable[[simpy.Event], None]
     ) -> None:
-        """Make an event at ``time`` (seconds) that calls ``callback``, before those of higher
-        (rank, entity).
-        """
+        """Make an event, as ``at``, that calls ``callback``."""
         event = self.at(time, rank, entity)
         # An event that is not processed yet has a list of callbacks.
         assert event.callbacks is not None

@@ -50,9 +50,6 @@ class DirectedLink:
         receiver: Receiver,
         sampler: ChannelSampler,
     ) -> None:
-        """Take probability and weight of the direction ``link`` = (sender, receiver) from the
-        scenario; no message has been sent.
-        """
         self.link, self.entity, self.sampler, self.receiver = link, entity, sampler, receiver
         # Probability in the table and weight do not change in a run.
         self.table_probability = scenario.table_probability(link)
@@ -66,7 +63,6 @@ class Transmitter:
     def __init__(
         self, scenario: Scenario, streams: Streams, timeline: Timeline, recorder: Recorder
     ) -> None:
-        """Take channel and horizon from the scenario; no message is under way."""
         self._scenario, self._streams = scenario, streams
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
@@ -76,19 +72,9 @@ class Transmitter:
         self._under_way: dict[tuple[Link, int], Envelope] = {}
 
     def sampler(self, link: Link) -> ChannelSampler:
-        """Return the sampler of ``link`` = (i, j), which draws losses and delays: of the whole link
-        with a symmetric channel, else of the direction from i to j.
-        """
+        """Return the sampler of ``link``: of both directions if the channel is symmetric."""
         # The sampler makes its streams when it needs them, by purpose.
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
-
-    def directed_link(
-        self, link: Link, entity: int, receiver: Receiver, sampler: ChannelSampler
-    ) -> DirectedLink:
-        """Return one direction ``link`` = (sender, receiver) of a link; ``entity`` is its index,
-        which orders simultaneous arrivals.
-        """
-        return DirectedLink(self._scenario, link, entity, receiver, sampler)
 
     def send(
         self,
@@ -98,9 +84,8 @@ class Transmitter:
         phase: int = -1,
         exchange: int = -1,
     ) -> None:
-        """Send one message with its outcome, the draw of the channel: record it, and deliver it
-        now, later or never. A payload of None is not sent. ``phase`` and ``exchange`` are the
-        number of the exchange in the slot and in the run, -1 under clocks.
+        """Send one message with its outcome: record it, and deliver it now, later or never. A
+        payload of None is not sent. ``phase`` and ``exchange`` are -1 under clocks.
         """
         if payload is None:
             return
@@ -132,7 +117,6 @@ class Transmitter:
     def _arrive(
         self, direction: DirectedLink, phase: int, envelope: Envelope, arrival: simpy.Event | None
     ) -> None:
-        """Deliver a message, or record that it arrives too late for its exchange."""
         now, (sender, receiver) = self._timeline.now, direction.link
         # A message without delay arrives inside the tick, and keeps its age of 0.
         if arrival is not None:
@@ -148,11 +132,8 @@ class Transmitter:
             direction.receiver.receive(envelope)
 
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
-        """Shift all messages under way by ``offset`` (n,), predicted back to the time of sending:
-        the origin of coordinates has moved by ``-offset``.
-
-        The origin follows the state of an unstable plant, whose size would cost the errors their
-        digits; the engine calls this after it has shifted the nodes.
+        """Shift all messages under way by ``offset`` (n,), predicted back to the time of sending,
+        as the origin of coordinates has moved.
         """
         now = self._timeline.now
         for key, envelope in self._under_way.items():
@@ -177,20 +158,17 @@ class LinkExchange:
         link: Link,
         entity: int,
     ) -> None:
-        """Make the one or two directions of ``link`` (i, j), whose index is ``entity``, between the
-        ``receivers`` (nodes by id).
-        """
         i, j = link
         self._transmitter, self._shared = transmitter, scenario.network.channel.symmetric
         # Outcomes of the last draw, for held links.
         self._outcomes: list[ChannelDraw] = []
         forth = transmitter.sampler((i, j))
         # Entities 2 k and 2 k + 1: the order in which simultaneous messages arrive.
-        self._directions = [transmitter.directed_link((i, j), 2 * entity, receivers[j], forth)]
+        self._directions = [DirectedLink(scenario, (i, j), 2 * entity, receivers[j], forth)]
         if not scenario.topology.directed:
             back = forth if self._shared else transmitter.sampler((j, i))
             self._directions.append(
-                transmitter.directed_link((j, i), 2 * entity + 1, receivers[i], back)
+                DirectedLink(scenario, (j, i), 2 * entity + 1, receivers[i], back)
             )
 
     def exchange(
@@ -201,12 +179,8 @@ class LinkExchange:
         up: bool = True,
         fresh: bool = True,
     ) -> None:
-        """Send the payloads of both ends, one message in each direction of the link.
-
-        All are lost if the link is not ``up``. Outcomes are drawn anew if ``fresh``, otherwise
-        those of the last exchange are used again. A payload of None is not sent, but its outcome is
-        drawn all the same. ``phase`` and ``exchange`` are the number of the exchange in the slot
-        and in the run, -1 under clocks.
+        """Send the payloads of both ends, one message in each direction. All are lost if the link
+        is not ``up``. Outcomes are drawn anew if ``fresh``, whether or not a payload is None.
         """
         if fresh or not self._outcomes:
             first, *others = self._directions
@@ -229,7 +203,5 @@ class LinkExchange:
 
 
 def stream(streams: Streams, ends: tuple[int, ...], purpose: str) -> np.random.Generator:
-    """Return the random stream for a ``purpose`` of a link or of one direction of it, with the node
-    ids ``ends``.
-    """
+    """Return the random stream for a ``purpose`` of a link with the node ids ``ends``."""
     return streams.generator(purpose, *ends)
