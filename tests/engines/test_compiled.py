@@ -385,8 +385,6 @@ def test_windows_rows_visits_and_mail_end_anywhere(ring, monkeypatch, delay):
     monkeypatch.setattr(f"{module}.visits.MAX_VISITS", 1)
     monkeypatch.setattr(f"{module}.ticks.TICKS", 5)
     monkeypatch.setattr(f"{module}.ticks.MIN_TICKS_PER_ENTITY", 0)
-    monkeypatch.setattr(f"{module}.schedule.MIN_WINDOW_TICKS", 5)
-    monkeypatch.setattr(f"{module}.schedule.TICKS_PER_ENTITY", 1)
     pieces = netkf.simulate(busy, engine="compiled")
     assert pieces.fingerprint == whole.fingerprint
     np.testing.assert_array_equal(pieces.P, whole.P)
@@ -409,7 +407,8 @@ def test_messages_and_history_that_need_more_room(ring, monkeypatch, kind):
     )
     monkeypatch.setattr("netkf.engines.compiled.flow.FIRST_MESSAGES", 1)
     monkeypatch.setattr("netkf.algorithms.records.FIRST_PAST", 1)
-    monkeypatch.setattr("netkf.engines.compiled.schedule.MAX_WINDOW_TICKS", 30)
+    monkeypatch.setattr("netkf.engines.compiled.ticks.TICKS", 30)
+    monkeypatch.setattr("netkf.engines.compiled.ticks.MIN_TICKS_PER_ENTITY", 0)
     assert assert_agree(case).count("absorb") > 50
 
 

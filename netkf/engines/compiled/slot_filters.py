@@ -107,9 +107,7 @@ class SlotFilters:
         )
 
     def simulate(self, y: FloatArray, H: FloatArray, samples: SlotSamples, **drawn: Any) -> None:
-        """Simulate the slots of a plan, ``drawn`` by name, with whitened readings as in
-        ReadingBlock.
-        """
+        """Simulate the slots of a plan, ``drawn`` by name, with whitened readings ``y`` and H."""
         self._run.y = y.reshape(-1, *y.shape[3:])
         self._run.H = H.reshape(-1, *H.shape[3:])
         plan = SlotPlan(
