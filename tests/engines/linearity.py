@@ -11,7 +11,7 @@ import scipy.linalg
 
 from netkf import simulate
 from netkf.engines.simpy.engine import SimpyEngine
-from netkf.plants import linear, paths, sensors
+from netkf.plants import linear, paths
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.transitions import frame_period
 from netkf.plants.truth import SampledTruth, multiples
@@ -93,7 +93,6 @@ def error_forms(scenario):
     with (
         mock.patch.object(linear, "BLOCK", 1),
         mock.patch.object(paths, "BLOCK", 1),
-        mock.patch.object(sensors, "BLOCK", 1),
         mock.patch.object(Diffusion, "sampled_truth", chained_truth),
     ):
         silent = OneDraw(scenario.seed)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from netkf.plants import paths, sensors
+from netkf.plants import linear, paths
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.laws import GridLaws
 from netkf.plants.sensors import LinearSensor
@@ -20,7 +20,7 @@ COV = np.array([[2.0, 0.5], [0.5, 1.0]])
 @pytest.fixture(autouse=True)
 def few_draws(monkeypatch):
     monkeypatch.setattr(paths, "BLOCK", 1)
-    monkeypatch.setattr(sensors, "BLOCK", 1)
+    monkeypatch.setattr(linear, "BLOCK", 1)
 
 
 def plant(**changes):
