@@ -24,7 +24,7 @@ class PathStates:
         path, pieces = self.path, np.searchsorted(self.path.stop, times)
         # A time is the end of its piece, or the start of the first one.
         ends = (times == path.stop[pieces])[:, None]
-        x = np.where(ends, path.x_stop[:, pieces], path.x_start[:, pieces])
+        x = np.where(ends, path.x_stop.take(pieces, axis=1), path.x_start.take(pieces, axis=1))
         # A frame begins there: the origin has moved to the state.
         x[:, np.isin(times, self.frame_times)] = 0.0
         return x
