@@ -221,7 +221,9 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     if len(run.log) and first_difference(run, replay) is not None:
         raise NetkfError("a replay makes other events than the run: it is of another version")
     # In slots the last readings come after the last state sample, when events are not recorded.
-    recorded = [one for one in recorder.recorded if one.time < scenario.horizon]
+    recorded = [
+        one for one in recorder.recorded if one.of_increments or one.time < scenario.horizon
+    ]
     recorded.sort(key=lambda one: one.time)
     nis = np.array([float(one.whitened @ one.whitened) for one in recorded])
     if not np.isfinite(nis).any():

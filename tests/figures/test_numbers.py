@@ -109,6 +109,7 @@ def test_increments_are_as_far_from_expectations_as_exact_covariances_say(believ
     scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 300.0, "probe": 0.5})
     found = compute_innovations(netkf.simulate(scenario.replace(changes)))
     assert found.increments == len(found.nis) > 500
+    assert found.times[-1] == pytest.approx(300.0)  # the increments up to the horizon
     deviation = math.sqrt(2.0 / len(found.nis))
     assert abs(found.nis.mean() / expected - 1.0) < 4.0 * deviation + (expected - 1.0) * 0.15
     if believed == 1.0:
