@@ -156,7 +156,7 @@ class InformationConsensus(Filter):
 
     @property
     def timing(self) -> Timing:
-        """In slots only, with ``steps`` steps of the only exchange."""
+        """Slots only: the one exchange has ``steps`` steps."""
         return Timing(clocks=(), steps=lambda _: self.steps)
 
     @abstractmethod
@@ -215,12 +215,12 @@ class Hcmci(InformationConsensus):
 
     @property
     def timing(self) -> Timing:
-        """That of its base, and under all clocks."""
+        """The timing of its base, and all clocks."""
         return replace(super().timing, clocks=CLOCKS)
 
     @property
     def analysis(self) -> Analysis:
-        """That of its base; consensus on information has a P that is never too small."""
+        """The facts of its base; consensus on information has a P that is never too small."""
         by_design = ("larger", "larger") if self.consensus == INFORMATION else ("", "")
         return replace(super().analysis, P_by_design=by_design)
 

@@ -208,7 +208,7 @@ class Records:
 
     @cached_property
     def _steps(self) -> np.ndarray:
-        """What is added to the words of the first block for those of each block (B, words)."""
+        """The words to add to those of the first block, for each block (B, words)."""
         blocks = np.arange(len(self.arrays["xhat"]), dtype=np.int64)
         steps = np.zeros((len(blocks), len(self.struct.memory)), dtype=np.int64)
         for name, array in self.arrays.items():

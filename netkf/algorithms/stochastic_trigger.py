@@ -391,7 +391,7 @@ class TriggeredMessages(Filter):
 
     @property
     def timing(self) -> Timing:
-        """That of the wrapped filter in slots, whose nodes draw whether they send."""
+        """The timing of the wrapped filter in slots, whose nodes draw whether they send."""
         return replace(self.inner.timing, clocks=(), randomised=True, decides=True)
 
     @property
@@ -503,7 +503,7 @@ class StochasticTrigger(Filter):
 
     @property
     def timing(self) -> Timing:
-        """That of the filter that runs, in slots."""
+        """The timing of the filter that runs, in slots."""
         return replace(self.wrapped.timing, clocks=(), talks=True)
 
     @property
@@ -513,7 +513,7 @@ class StochasticTrigger(Filter):
 
     @property
     def analysis(self) -> Analysis:
-        """That of the filter that runs."""
+        """The facts of the filter that runs."""
         return replace(self.wrapped.analysis, wrapped=self.wrapped)
 
     def _check_scenario(self, scenario: Any) -> None:
