@@ -30,7 +30,7 @@ from netkf.rng.streams import Streams
 from netkf.runs.parquet_files import ParquetSink
 from netkf.scenario.writing import as_table, to_toml
 from netkf.trace.recorder import Recorder
-from tests.benchmarks.cases import SCENARIOS, load
+from tests.benchmarks.cases import SCENARIOS, hybrid, load
 
 ROWS_A_TICK = 6.4
 WEIGHT = ("filter.epsilon=0.2",)
@@ -121,13 +121,21 @@ def large_state(folder, n=32):
     (Path(folder) / "large.toml").write_text(to_toml(as_table(case)))
 
 
+def with_sensors(folder, nodes=10_000):
+    """poisson_ring's filters on a graph in which every third node has a sensor."""
+    sensors = [{"nodes": list(range(0, nodes, 3)), "H": [[1.0, 0.0]], "R": [[0.25]]}]
+    case = hybrid(nodes, sensors=sensors)
+    (Path(folder) / "sensors.toml").write_text(to_toml(as_table(case)))
+
+
 def limits():
     """A line for each command that has a limit: processor time and memory, after a first run on few
     nodes, which compiles.
     """
     push_sum = "filter.delta=5.0", "horizon=2.0", "probe=1.0"
     rows = [
-        ("theory, hybrid, 10,000 nodes", ["theory", *of("poisson_ring", 10_000, *WEIGHT)], 30.0),
+        ("theory, hybrid, 10,000 nodes", ["theory", "sensors.toml"], 30.0),
+        ("the same, without steady state", ["theory", *of("poisson_ring", 10_000, *WEIGHT)], 30.0),
         ("theory, hybrid, n = 32", ["theory", "large.toml"], 5.0),
         ("check, hybrid, 1000 nodes", ["check", *of("poisson_ring", 1000, *WEIGHT)], 5.0),
         ("run, push-sum, 100,000 nodes", ["run", *of("push_sum_planar", 100_000, *push_sum)], 30.0),
@@ -140,6 +148,7 @@ def limits():
     print(f"{'':32s} {'CPU, s':>8} {'limit':>6} {'MiB':>6} {'limit':>6}")
     with tempfile.TemporaryDirectory() as folder:
         large_state(folder)
+        with_sensors(folder)
         for name, words, most in rows:
             command([re.sub("nodes=[0-9]+", "nodes=20", word) for word in words], folder)
             seconds, peak, status = command(words, folder)

@@ -104,7 +104,15 @@ def test_company_does_not_matter(ring, monkeypatch, name):
 
 def test_only_runs_whose_messages_take_no_time(ring):
     assert agenda.is_immediate(ring)
+    apart = (
+        {"kind": "periodic", "period": 0.5, "phase": "random"},
+        {"kind": "renewal", "distribution": "gamma", "shape": 3.0, "mean": 0.5},
+        {"kind": "renewal", "distribution": "uniform", "low": 0.1, "high": 0.5},
+    )
+    for clock in apart:
+        assert agenda.is_immediate(ring.replace({"network.activation": clock}))
     for change in (
+        {"network.activation": {"kind": "renewal", "distribution": "constant", "mean": 0.5}},
         {"network.channel.delay": {"kind": "constant", "seconds": 0.1}},
         {"network.activation": {"kind": "periodic", "period": 0.5}},
         {"filter": {"kind": "covariance-intersection", "epsilon": 0.3}},

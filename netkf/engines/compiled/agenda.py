@@ -1,7 +1,7 @@
 """The event loop for messages that take no time: it queues visits of filters, see ``visits``.
 
-The order of events, their rows and the requests are those of ``clock_loop``. Clocks are Poisson, so
-that no two ticks are at one time: all messages of a tick are absorbed before the next event.
+The order of events, their rows and the requests are those of ``clock_loop``. Clocks are such that
+no two ticks are at one time: all messages of a tick are absorbed before the next event.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ from netkf.engines.compiled.message_queue import sort_indices
 from netkf.engines.compiled.outcomes import delay_is_zero
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import LINKS, NODES, Simulation
+from netkf.engines.compiled.ticks import ticks_apart
 from netkf.engines.compiled.visits import (
     MAX_VISITS,
     Visits,
@@ -53,7 +54,6 @@ from netkf.engines.compiled.visits import (
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import struct_at
-from netkf.network.clocks import Poisson
 from netkf.scenario.scenario import Scenario
 
 PAUSE, FULL = -1, -2
@@ -83,8 +83,8 @@ PROGRESS = np.dtype([(name, np.int64) for name in _POSITIONS])
 
 def is_immediate(scenario: Scenario) -> bool:
     """Return True if filters of a scenario can be simulated in SIMD lanes, as many nodes side by
-    side as a vector register holds: convex combinations, messages without delay, Poisson clocks,
-    and no sensors that take samples. Then no event depends on an estimate.
+    side as a vector register holds: convex combinations, messages without delay, clocks that do not
+    tick together, and no sensors that take samples. Then no event depends on an estimate.
     """
     node_filter, network = scenario.node_filter, scenario.network
     kernels = compiled_kernels(node_filter, clocked=True)
@@ -93,7 +93,7 @@ def is_immediate(scenario: Scenario) -> bool:
         and kernels.is_convex
         and node_filter.timing.talks
         and not scenario.sampled_sensors
-        and type(network.activation) is Poisson
+        and ticks_apart(network.activation)
         and delay_is_zero(network.channel)
         # A negative max_age makes even messages of age 0 too old.
         and node_filter.timing.max_age >= 0.0

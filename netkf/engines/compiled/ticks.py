@@ -322,6 +322,17 @@ def is_kernel_clock(clock: object) -> bool:
     return type(clock) in (Poisson, Periodic, Renewal)
 
 
+def ticks_apart(clock: object) -> bool:
+    """Return True if two entities tick at one time with probability 0 only, and so do not."""
+    if type(clock) is Periodic:
+        return clock.phase == "random" or clock.jitter > 0.05 * clock.period
+    if type(clock) is Renewal:
+        spread = (clock.high or 0.0) - (clock.low or 0.0)
+        random = clock.shape is not None and clock.shape <= CROWDING_SHAPE
+        return random or spread > 0.05 * clock.mean_gap
+    return type(clock) is Poisson
+
+
 def _is_listed(scenario: Scenario) -> bool:
     """Return True if Python lists the ticks: of a user's clock or channel, or after samples."""
     network = scenario.network
