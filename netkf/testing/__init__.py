@@ -24,3 +24,7 @@ __all__ = [
     "check_sensor",
     "scenario_files",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

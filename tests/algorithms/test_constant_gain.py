@@ -125,6 +125,6 @@ def test_inverse_transitions_are_matrix_exponentials(n):
     for seed in range(5):
         A = np.random.default_rng(seed).standard_normal((n, n))
         for gap in (0.0, 1e-6, 0.3, 4.0):
-            fill_inverse_transition(A, gap, maps)
+            fill_inverse_transition(np.zeros(n), A, gap, maps)
             expected = scipy.linalg.expm(-A * gap)
             np.testing.assert_allclose(maps[0], expected, rtol=1e-10, atol=1e-13 * expected.max())

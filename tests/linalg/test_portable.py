@@ -15,6 +15,7 @@ DIGEST = """
 import hashlib, sys
 import numpy as np
 import netkf
+from netkf.plants.sensors import step_noise
 from netkf.rng.streams import Streams
 
 found = hashlib.sha256()
@@ -47,7 +48,7 @@ for sensors, frames in cases:
     path = scenario.sensors[0].path if not sensors[0].get("sampling") else None
     if path is not None:
         own = path(streams.generator("noise", 0, 0), streams.generator("cutting", 0, 0))
-        add(own._draw(0.1), own._root)
+        add(step_noise(own._normals.draw().reshape(2, -1), 0.1), own._root)
     for place in scenario.sampled_sensors.get(0, ()):
         samples = scenario.sample_path(streams, 0, place)
         add(*(samples.reading(k, np.array([0.3, 0.7, -0.2]))[0] for k in range(20)))

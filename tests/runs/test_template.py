@@ -68,14 +68,14 @@ def test_a_full_disk_leaves_neither_file(capsys, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
 def test_completion_knows_every_command(shell, capsys):
-    from netkf.cli.main import COMMANDS
+    from netkf.cli.commands import COMMANDS
 
     pytest.importorskip("shtab")
     with pytest.raises(SystemExit) as stop:
         main(["--print-completion", shell])
     assert stop.value.code == 0
     script = capsys.readouterr().out
-    assert all(name.replace("_", "-") in script for name in COMMANDS)
+    assert all(command.name in script for command in COMMANDS)
     assert "--node" in script
 
 

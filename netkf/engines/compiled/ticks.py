@@ -328,7 +328,8 @@ def ticks_apart(clock: object) -> bool:
         return clock.phase == "random" or clock.jitter > 0.05 * clock.period
     if type(clock) is Renewal:
         spread = (clock.high or 0.0) - (clock.low or 0.0)
-        random = clock.shape is not None and clock.shape <= CROWDING_SHAPE
+        # Gaps of a smaller shape are often shorter than one tick of the time grid.
+        random = clock.shape is not None and 1.0 <= clock.shape <= CROWDING_SHAPE
         return random or spread > 0.05 * clock.mean_gap
     return type(clock) is Poisson
 
