@@ -182,11 +182,8 @@ def fill_states(
         # processor works on several at once.
         outer, depth = depth, enter_cells(cells, walk, depth, tick)
         for d in range(outer, depth):
-            point, kind = (
-                max(walk.start[d + 1], walk.end[d + 1] * (1 - walk.part[d + 1])),
-                walk.kind[d],
-            )
-            first = int(point / cells.unit[kind])  # exact: both are below 2^53
+            kind = walk.kind[d]
+            first = int(walk.point[d] / cells.unit[kind])  # exact: both are below 2^53
             draw_normals_of_point(size, stream, first, cells.level[kind], ziggurat, walk.v[d], n)
         for d in range(outer, depth):
             divide_cell(size, cells, walk, d)

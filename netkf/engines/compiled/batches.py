@@ -24,7 +24,6 @@ from netkf.engines.compiled.sample_tables import no_instants
 from netkf.engines.compiled.state import Filters, PathBlock, TickArrays
 from netkf.engines.compiled.ticks import Schedule
 from netkf.engines.compiled.truth import PathStates
-from netkf.linalg.lanes import LANES
 from netkf.network.clocks import LinkClock
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -34,7 +33,7 @@ from netkf.trace.batch import COMPLETE, DIVERGED, RunBatch
 from netkf.trace.recorder import Recorder
 from netkf.trace.schema import KINDS
 
-MAX_BATCH_RUNS = 512  # runs of a batch
+MAX_BATCH_RUNS, ALONE = 512, 8  # runs of a batch, and of one whose runs are drawn one by one
 QUICK_VISITS = 1 << 18
 """Visits of nodes that take some thirty milliseconds; preparing a batch takes one or two."""
 MAX_BATCH_BYTES = 1 << 25
@@ -170,9 +169,9 @@ def batch_size(scenario: Scenario) -> int:
     n = scenario.plant.n
     filters = 1 if scenario.node_filter.timing.pooled else len(scenario.nodes)
     sample_floats = len(scenario.times) * filters * n * (n + 2)
-    # Runs that are drawn one by one: as many as statistics process side by side.
+    # Runs that are drawn one by one gain only from fewer calls for their statistics.
     if not drawn_together(scenario):
-        return LANES if 8.0 * LANES * sample_floats < MAX_BATCH_BYTES else 1
+        return ALONE if 8.0 * ALONE * sample_floats < MAX_BATCH_BYTES else 1
     # An estimate of the floats that one run draws and stores as samples.
     period = scenario.diffusion.sensing_period
     # One piece for each step, and one more for each sample that cuts a step.
@@ -182,10 +181,8 @@ def batch_size(scenario: Scenario) -> int:
     # Per piece: two states, two moments and the three coefficients of the cubic, of n entries each;
     # per step the two moments of each sensor's noise.
     floats = steps * (7 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
-    # At least one run, however large it is. A multiple of L, since statistics process L runs side
-    # by side and fewer take as long.
-    size = max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (floats + sample_floats)))))
-    return min(MAX_BATCH_RUNS, -(-size // LANES) * LANES) if size > LANES // 2 else size
+    # At least one run, however large it is.
+    return max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (floats + sample_floats)))))
 
 
 @once_per_scenario

@@ -66,7 +66,8 @@ class CompiledEngine(Engine):
             for sensor in scenario.sensors
             if is_own(sensor) and not reads_in_python(sensor, scenario.slotted)
         ]
-        for family, part in unknown:
+        if unknown:
+            family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)

@@ -50,16 +50,17 @@ def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatAr
 
 
 def read_whitened(
-    path: Any, slots: Sequence[int], x: FloatArray, R: FloatArray
+    path: Any, slots: Sequence[int], x: FloatArray, R: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return readings (S, p) and H (S, p, n) of S increasing ``slots``, whose states are x (S, n),
-    multiplied by the inverse Cholesky factor of the R (p, p) that filters believe.
+    multiplied by the inverse Cholesky factor of their covariance: ``root`` (p, p), that of the R
+    that filters believe, unless the path states its own.
     """
     y, H = read_many(path, slots, x)
-    roots = [cholesky(covariance_of(path, slot, R)) for slot in slots]
-    both = [
-        solve_lower(root, np.column_stack([values, matrix]))
-        for root, values, matrix in zip(roots, y, H, strict=True)
-    ]
-    whitened = np.array(both)
+    whitened = np.concatenate([y[:, :, None], H], axis=2)
+    if hasattr(path, "covariance"):
+        for k, slot in enumerate(slots):
+            whitened[k] = solve_lower(cholesky(covariance_of(path, slot, R)), whitened[k])
+    else:
+        whitened = solve_lower(root, whitened)
     return whitened[:, :, 0], whitened[:, :, 1:]

@@ -63,13 +63,12 @@ def samples_of(scenario: Scenario, streams: Streams) -> Samples:
 
 class KernelSensors(NamedTuple):
     """What is drawn of S linear sensors, in the order of ``_placed_sensors``: the ``clocks`` of
-    their entries, each with the indices of its sensors, the ``keys`` of their streams, the mean
-    number of samples of a run, and the Cholesky factors ``root`` (S, p, p) of the true R.
+    their entries, each with the indices of its sensors, the ``keys`` of their streams, and the
+    Cholesky factors ``root`` (S, p, p) of the true R.
     """
 
     clocks: list[tuple[LinkClock, np.ndarray, list[tuple[int, int]], FloatArray]]
     keys: list[tuple[int, int]]
-    expected: float
     root: FloatArray
 
 
@@ -84,17 +83,16 @@ def _kernel_sensors(scenario: Scenario) -> KernelSensors | None:
     ):
         return None
     keys, entries = [(node, p.ordinal) for node, p in placed], [p.entry for _, p in placed]
-    clocks, root, expected = [], np.zeros_like(tables.root), 0.0
+    clocks, root = [], np.zeros_like(tables.root)
     for entry in dict.fromkeys(entries):
         indices = np.flatnonzero(np.array(entries) == entry)
         clock: Any = parts[indices[0]].sampling
         own = [keys[k] for k in indices]
         rates = np.array([clock.mean_rate(key) for key in own])
         clocks.append((clock, indices, own, rates))
-        expected += scenario.horizon * float(rates.sum())
         R = cholesky(parts[indices[0]].R)
         root[indices, : len(R), : len(R)] = R
-    return KernelSensors(clocks, keys, expected, root)
+    return KernelSensors(clocks, keys, root)
 
 
 class KernelSamples:

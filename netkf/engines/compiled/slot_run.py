@@ -448,7 +448,7 @@ class SlotRuns:
             y[:, times.sensed, s.estimator, rows] = 0.0  # in lanes without a run
             for run, path in enumerate(paths):
                 b, lane = divmod(run, LANES)
-                own = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R)
+                own = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R, s.root)
                 for out, values in zip((y, H), own, strict=True):
                     out[b, times.sensed, s.estimator, rows, ..., lane] = values
         for s, path in self._recorded:
