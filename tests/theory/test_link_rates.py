@@ -10,6 +10,7 @@ import scipy.optimize
 import netkf
 from netkf import theory
 from netkf.core.errors import TheoryError
+from netkf.theory.hybrid import linearised, steady
 from netkf.theory.promises import compute_promises, promises_text
 from tests.cases import FOLDER
 from tests.conftest import SCENARIOS
@@ -85,6 +86,30 @@ def test_the_threshold_of_a_blind_node(build, rate):
     ends = theory.covariance_bound(slow, [20.0, 40.0, 60.0])[:, 1, 0, 0]
     # it grows by exp((2 a - pi lambda) t)
     assert ends[2] / ends[1] == pytest.approx(np.exp(20.0 * 0.2), rel=0.02)
+
+
+@pytest.mark.parametrize("factored", [0, 3000])
+def test_the_threshold_of_a_network_comes_from_few_linear_equations(build, monkeypatch, factored):
+    """Nodes that nobody sees must average away 2 a: that is an eigenvalue of their Laplacian."""
+    solved, solve_map = [], linearised.solve_map
+    monkeypatch.setattr(steady, "MAX_FACTORED", factored)
+    for module in (steady, linearised):
+        monkeypatch.setattr(module, "solve_map", lambda *a: solved.append(1) or solve_map(*a))
+    made = pair(build).replace(
+        {
+            "network.graph": {"kind": "regular", "nodes": 500, "degree": 4, "seed": 1},
+            "sensors.0.nodes": [0, 250],
+            "filter.epsilon": 0.2,
+        }
+    )
+    laplacian = 4.0 * np.eye(500)
+    for i, j in made.topology.directions:
+        laplacian[i, j] -= 1.0
+    blind = np.delete(np.arange(500), [0, 250])
+    least = np.linalg.eigvalsh(laplacian[np.ix_(blind, blind)])[0]
+    found = theory.link_rate_threshold(made)
+    assert found.rate == pytest.approx(2 * 0.2 / (0.2 * least), rel=1e-3)
+    assert len(solved) < 120
 
 
 def test_no_rate_helps_what_no_node_sees(build):

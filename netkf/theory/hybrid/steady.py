@@ -142,6 +142,7 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
     size = max(float(np.abs(x).max()) for x in (equations.Q, equations.start, [[1e-12]]))
     # The multiple of I makes P positive definite where start and Q are singular.
     P = equations.start + equations.Q + 1e-3 * size * np.eye(n) if first is None else first
+    limit = max(MAX_GROWTH * size, 10.0 * float(np.abs(P).max()))
     sampling = sum(float(group.rate.max(initial=0.0)) for group in equations.samples)
     leaving = float(packed.leaving.max()) + sampling
     drift = float(np.abs(equations.A).max()) + 1e-9  # 1/s, above 0
@@ -158,7 +159,7 @@ def _find_stabilising(packed: PackedRiccati, first: FloatArray | None = None) ->
             step *= 0.5
             continue
         P = following
-        if not np.abs(P).max() < MAX_GROWTH * size:
+        if not np.abs(P).max() < limit:
             return None
         step *= 3.0
     return None
@@ -212,24 +213,25 @@ def threshold_factor(equations: CoupledRiccati) -> float | None:
     low = _necessary_factor(equations)
     if low is None:
         return None
-    low, high = max(1.0, low), max(2.0, 1.25 * low)
+    low, high = max(1.0, low), max(2.0, 2.5 * low)
     while (P := _steady_at(equations, high, None)) is None:
-        low, high = high, 2.0 * high
+        low, high = high, 4.0 * high
         if high > MAX_FACTOR:
             return None
     fine = 1e-6 if equations.start.size <= FEW_UNKNOWNS else 1e-3
     # Points (factor, 1 / max P), from which guesses extrapolate to 1 / max P = 0.
     points, guesses = [(high, 1.0 / float(np.abs(P).max()))], 0
     while high / low > 1.0 + fine:
-        factor = float(np.sqrt(low * high))
         # Guesses approach from above, where the last P is a good start; a factor below the
-        # threshold takes about ten times as long.
-        if len(points) > 1 and guesses < MAX_GUESSES:
+        # threshold takes several times as long.
+        if len(points) == 1:
+            factor = low**0.2 * high**0.8
+        elif guesses < MAX_GUESSES:
             factor, guesses = _guess(points, low, high, fine), guesses + 1
         else:
-            guesses = 0
-        # The covariances for faster links are close to those that are looked for.
-        following = _steady_at(equations, factor, P)
+            factor, guesses = float(np.sqrt(low * high)), 0
+        # Covariances grow as links get slower; gains that are too large still stabilise.
+        following = _steady_at(equations, factor, 4.0 * P)
         if following is None:
             low = factor
         else:
@@ -255,11 +257,15 @@ def _steady_at(
 
 def _guess(points: list[tuple[float, float]], low: float, high: float, fine: float) -> float:
     """Return a factor near the threshold, extrapolated from ``points`` (factor, 1 / max P)."""
-    # 1 / max P falls to 0 at the threshold, between ``low`` and ``high``; so is the guess.
-    (f, inverse), (g, following) = points[-2:]
-    # The secant through both points meets 0 at ``root``. It usually lies slightly above the
-    # threshold, since both points do.
-    root = g - following * (f - g) / (inverse - following) if inverse != following else high
+    # 1 / max P falls to 0 at the threshold like a power of the distance from it: the first or, as
+    # covariances that sensors see grow like roots of the others, more. The power that puts three
+    # points on one line extrapolates them to ``root``.
+    factors, inverses = np.array(points[-3:]).T
+    powers = np.linspace(0.1, 1.0, 91) if len(factors) > 2 else np.ones(1)
+    heights = inverses[:, None] ** powers
+    slopes = np.diff(heights, axis=0) / np.diff(factors)[:, None]
+    best = int(np.argmin(np.abs(slopes[0] / slopes[-1] - 1.0)))
+    root = float(factors[-1] - heights[-1, best] / slopes[-1, best])
     above = root * (1.0 + 0.4 * fine)
     # First try a factor just above ``root``, to lower ``high``. Once ``high`` is about that close,
     # try one as far below ``root`` as ``high`` is above it, to raise ``low``. As ``above`` exceeds
@@ -280,33 +286,36 @@ def _necessary_factor(equations: CoupledRiccati) -> float | None:
         unobserved[group.nodes] = False
     if growth <= 0.0 or not unobserved.any() or any(group.heard.nnz for group in equations.samples):
         return 0.0
-    if not PackedRiccati(equations).eliminates_cheaply and unobserved.sum() > MAX_FACTORED:
-        return 0.0
+    factored = PackedRiccati(equations).eliminates_cheaply or unobserved.sum() <= MAX_FACTORED
     leaving = np.asarray(equations.coupling.sum(axis=1)).reshape(-1)[unobserved]
     inner = scipy.sparse.csc_array(equations.coupling[unobserved][:, unobserved])
     arriving = inner * float(np.exp(growth * equations.delay))
-    longest = _longest_lag(scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - arriving))
+    M = scipy.sparse.csc_array(scipy.sparse.diags_array(leaving) - arriving)
+    longest = _longest_lag(M, factored)
     return None if longest is None else growth * longest
 
 
-def _longest_lag(M: scipy.sparse.csc_array) -> float | None:
+def _longest_lag(M: scipy.sparse.csc_array, factored: bool) -> float | None:
     """Return a lower bound on the largest eigenvalue of M^-1 (seconds); None unless M-matrix."""
-    # By Collatz and Wielandt: the least factor of a step of the power method is below it.
+    # By Collatz and Wielandt: for any y > 0 the least y_i / (M y)_i of a part is below it. Steps of
+    # the power method make it large, also if they are solved roughly.
     try:
-        factors = scipy.sparse.linalg.splu(M)
+        factors = scipy.sparse.linalg.splu(M) if factored else None
     except RuntimeError:  # exactly singular
         return None
     _, part = scipy.sparse.csgraph.connected_components(M, directed=False)
-    x = np.ones(M.shape[0])
-    lag = 0.0
+    x, lag, previous = np.ones(M.shape[0]), 0.0, -1.0
     for _ in range(POWER_STEPS):
-        y = factors.solve(x)
+        if factors is not None:
+            y = factors.solve(x)
+        else:
+            y, _ = scipy.sparse.linalg.bicgstab(M, x, lag * x, rtol=1e-8)
         if not (np.isfinite(y).all() and y.min() > 0.0):
-            return None
+            return None if factored else lag
         smallest_ratio = np.full(part.max() + 1, np.inf)
-        np.minimum.at(smallest_ratio, part, y / x)
-        lag = max(lag, float(smallest_ratio.max()))
+        np.minimum.at(smallest_ratio, part, y / np.maximum(M @ y, 1e-15 * M.diagonal() * y))
+        previous, lag = lag, max(lag, float(smallest_ratio.max()))
         x = y / y.max()
-        if x.min() < 1e-200:
+        if x.min() < 1e-200 or lag - previous <= 1e-12 * lag:
             break
     return lag
