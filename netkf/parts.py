@@ -87,6 +87,7 @@ from netkf.network.graphs import (
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant
 from netkf.plants.nonlinear import (
     BearingSensor,
@@ -139,6 +140,7 @@ __all__ = [
     "ConsensusInnovations",
     "ConstantDelay",
     "ConstantGain",
+    "ConstantInput",
     "Contacts",
     "CovarianceIntersection",
     "CsvGraph",
@@ -168,6 +170,7 @@ __all__ = [
     "Hybrid",
     "Icf",
     "Increments",
+    "Input",
     "Intermittent",
     "InverseIntersection",
     "Kcf",
@@ -203,6 +206,7 @@ __all__ = [
     "RecordedClock",
     "RecordedDelay",
     "RecordedDiffusion",
+    "RecordedInput",
     "RecordedLoss",
     "RecordedPlant",
     "RecordedSampling",
@@ -213,6 +217,7 @@ __all__ = [
     "Renewal",
     "Scenario",
     "Sensor",
+    "SineInput",
     "SlotActivation",
     "Star",
     "State",

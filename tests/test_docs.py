@@ -18,6 +18,7 @@ from tests.conftest import ROOT, SCENARIOS
 TEXT = (ROOT / "docs" / "scenario_files.md").read_text(encoding="utf-8")
 HEADINGS = {
     "plant": "plant.kind",
+    "input": "plant.input.kind",
     "sensor": "sensors.kind",
     "sampling": "sensors.sampling.kind",
     "graph": "network.graph.kind",

@@ -347,7 +347,9 @@ def instance_of(*classes: type) -> Rule:
             raise TypeError
         return value
 
-    names = " or ".join(f"a {cls.__name__.lower()}" for cls in classes)
+    names = " or ".join(
+        f"a{'n' if cls.__name__[0] in 'AEIO' else ''} {cls.__name__.lower()}" for cls in classes
+    )
     return Rule(f"must be {names}", convert, 'write a table { kind = "...", ... }')
 
 

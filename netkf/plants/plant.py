@@ -5,14 +5,15 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
-from netkf.core.fields import Component, covariance, field, vector
-from netkf.core.instants import OnGrid
+from netkf.core.fields import Component, covariance, field, instance_of, vector
+from netkf.core.instants import OnGrid, TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root, product
+from netkf.plants.inputs import Input
 from netkf.rng.normals import Normals
 
 
@@ -20,7 +21,8 @@ from netkf.rng.normals import Normals
 class Plant(Component, OnGrid):
     """The contract of a plant, whose x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n).
 
-    Both are zero by default.
+    Both are zero by default. ``input`` drives the state beside the noise (``response``); what the
+    methods of plants return is the state without it.
     """
 
     is_random: ClassVar[bool] = True
@@ -32,6 +34,14 @@ class Plant(Component, OnGrid):
 
     mean: FloatArray | None = field(vector, default=None)
     cov: FloatArray | None = field(covariance, default=None)
+    input: Input | None = field(instance_of(Input), default=None)
+
+    def on_grid(self, grid: TimeGrid) -> Self:
+        """Return the plant with its instants, and those of its input, on the ``grid``."""
+        plant = super().on_grid(grid)
+        if plant is not self and plant.input is not None:
+            object.__setattr__(plant, "input", plant.input.on_grid(grid))
+        return plant
 
     @property
     @abstractmethod

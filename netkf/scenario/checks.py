@@ -14,6 +14,7 @@ from netkf.linalg.spectra import growth_rate
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.inputs import Input
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.compatibility import check_activation, check_time, filter_name
 from netkf.scenario.derived import DerivedScenario
@@ -120,6 +121,16 @@ def _check_plant(scenario: DerivedScenario) -> None:
         require_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
         require_shape("plant.cov", plant.cov, (n, n), why)
+    if plant.input is not None:
+        _check_input(plant.input, n)
+
+
+def _check_input(u: Input, n: int) -> None:
+    if u.G is None:
+        remedy = f"add G = ..., {n} rows of {u.m}"
+        raise ScenarioError("plant.input.G", "is missing", None, remedy)
+    parts = "components" if u.m > 1 else "component"
+    require_shape("plant.input.G", u.G, (n, u.m), f"n = {n}, and u has {u.m} {parts}")
 
 
 def _check_sensors(scenario: DerivedScenario) -> None:

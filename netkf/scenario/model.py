@@ -14,6 +14,7 @@ from netkf.core.errors import TheoryError, errors_under
 from netkf.core.fields import (
     Component,
     array,
+    boolean,
     covariance,
     definite_covariance,
     either,
@@ -70,6 +71,7 @@ class Belief(Component):
     F  (n, n) of a linear plant
     Q  (n, n) of a linear plant
     R  of the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry
+    input  false: they do not know the input of the plant
     """
 
     A: FloatArray | None = field(square, default=None)
@@ -82,6 +84,7 @@ class Belief(Component):
         ),
         default=None,
     )
+    input: bool = field(boolean, default=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from netkf.core.repeated_rows import RowUse, count_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.contacts import Contacts
 from netkf.network.matchings import RecordedSlots
+from netkf.plants.inputs import RecordedInput
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
@@ -112,6 +113,19 @@ def count_state_rows(scenario: DerivedScenario) -> RowUse | None:
     else:
         return None
     return count_rows(plant.path.name, plant.row_keys, used.__contains__)
+
+
+def count_input_rows(scenario: DerivedScenario) -> RowUse | None:
+    """Return the use of the rows of a recorded input; None if the input is not recorded."""
+    u, horizon = scenario.plant.input, scenario.horizon
+    if not isinstance(u, RecordedInput):
+        return None
+    starts = None
+    if scenario.slotted:
+        # In slots u counts at their beginnings only.
+        period = scenario.slot_plant.period
+        starts = scenario.time_grid.before(horizon, period * np.arange(int(horizon / period) + 2))
+    return count_rows(u.path.name, u.row_keys, u.used_keys(horizon, starts).__contains__)
 
 
 def _state_times(scenario: DerivedScenario) -> FloatArray:

@@ -14,6 +14,7 @@ from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
 from netkf.network import channels, clocks, contacts, graph_files, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant
 from netkf.plants.nonlinear import BearingSensor, RangeBearingSensor, RangeSensor
 from netkf.plants.plant import Plant
@@ -32,6 +33,7 @@ from netkf.scenario.imports import Origin, find_class, find_offered_class, offer
 FAMILIES: dict[str, type[Component]] = {
     "plant": Plant,
     "continuous plant": Plant,
+    "input": Input,
     "sensor": Sensor,
     "sampling": Clock,
     "graph": graphs.Graph,
@@ -52,6 +54,7 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "unknown": UnknownPlant,
     },
     "continuous plant": {"recorded": RecordedDiffusion, "unknown": UnknownDiffusion},
+    "input": {"constant": ConstantInput, "sine": SineInput, "recorded": RecordedInput},
     "sensor": {
         "linear": LinearSensor,
         "regressor": RegressorSensor,

@@ -18,6 +18,7 @@ from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
+from netkf.plants.plant import Plant
 from netkf.scenario.imports import offered_kinds
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
 from netkf.scenario.registry import KINDS, list_kinds
@@ -33,6 +34,7 @@ DEFAULT_KINDS = {"sensor": "linear"}
 """The kind of a table without the key ``kind``, by family; other families need the key."""
 NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (ScenarioModel, "plant"): {"$ref": "#/$defs/plant"},
+    (Plant, "input"): {"$ref": "#/$defs/input"},
     (ScenarioModel, "sensors"): {"type": "array", "items": {"$ref": "#/$defs/sensor"}},
     (ScenarioModel, "network"): {"$ref": "#/$defs/network"},
     (ScenarioModel, "filter"): {"$ref": "#/$defs/filter"},
@@ -50,6 +52,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
 SAMPLING: Schema = {"anyOf": [{"const": "continuous"}, {"$ref": "#/$defs/sampling"}]}
 FAMILIES = {
     "plant": ("plant", "continuous plant"),
+    "input": ("input",),
     "sensor": ("sensor",),
     "sampling": ("sampling",),
     "graph": ("graph",),

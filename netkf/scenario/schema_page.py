@@ -25,6 +25,7 @@ TABLES: dict[str, type[Component]] = {
 SECTIONS = {
     "plant": "plant.kind",
     "continuous plant": "plant.kind in continuous time, with A and B",
+    "input": "plant.input.kind",
     "sensor": "sensors.kind",
     "sampling": "sensors.sampling.kind",
     "graph": "network.graph.kind",

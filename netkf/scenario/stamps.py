@@ -28,6 +28,7 @@ from netkf.core.stamps import UNITS, TimeBase
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import RecordedClock
 from netkf.network.contacts import Contacts
+from netkf.plants.inputs import RecordedInput
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sampling import RecordedSampling
 
@@ -150,3 +151,5 @@ def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion | RecordedPlant):
         yield plant.row_times
+    if isinstance(plant.input, RecordedInput):
+        yield np.array(plant.input.row_keys)

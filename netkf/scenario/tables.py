@@ -240,7 +240,7 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _build_plant(origin: Origin, value: Any) -> Any:
-    table = _as_dict(value)
+    table = _build_inner(_as_dict(value), {"input": partial(_build_part, "input", origin)})
     # Two kinds exist for both models of time; the keys tell which one is meant.
     in_both_times = table.get("kind") in ("recorded", "unknown")
     continuous = in_both_times and ("A" in table or "B" in table)

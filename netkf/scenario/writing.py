@@ -22,7 +22,7 @@ from netkf.network.graphs import RandomGraph
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.model import Filtering, Network
+from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.names import map_nodes
 from netkf.scenario.registry import FAMILIES, name_of
 
@@ -101,7 +101,8 @@ def part_as_table(part: Component) -> dict[str, Any]:
 def _part_table(part: Component, style: _Style) -> dict[str, Any]:
     values = _field_values(part, style)
     if isinstance(part, Filtering):
-        rest = {key: values[key] for key in ("mean", "cov", "model") if values.get(key)}
+        is_told = {"mean": True, "cov": True, "model": part.model != Belief()}
+        rest = {key: values[key] for key, told in is_told.items() if told and values.get(key)}
         return {**_part_table(part.algorithm, style), **rest}
     family = next((family for family, base in FAMILIES.items() if isinstance(part, base)), None)
     if family is None:
