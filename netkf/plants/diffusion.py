@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -82,13 +82,14 @@ class Diffusion(Plant):
         sampled: FloatArray = NO_TIMES,
         horizon: float = 0.0,
         frames: bool = False,
+        forcing: Any = None,
     ) -> DiffusionPath:
         """Return the path of one run, see ``paths``: ``random``, ``probing`` and ``sampling`` draw
         what ``normals`` and the others draw there; frames begin before the ``horizon`` (seconds).
         """
         steps, probes = GeneratorNormals([random]), GeneratorNormals([probing])
         samples = GeneratorNormals([] if sampling is None else [sampling])
-        paths = self.paths(steps, probes, probe_times, samples, sampled, frames)
+        paths = self.paths(steps, probes, probe_times, samples, sampled, frames, forcing)
         return DiffusionPath(paths, horizon)
 
     def paths(
@@ -99,6 +100,7 @@ class Diffusion(Plant):
         sampling: Normals | None = None,
         sampled: FloatArray = NO_TIMES,
         frames: bool = False,
+        forcing: Any = None,
     ) -> DiffusionPaths:
         """Return the paths of R runs, one for each of the R streams of ``normals``, which draw x(0)
         and the steps; all have states on the sensing grid and at the times ``sampled`` and
@@ -106,11 +108,13 @@ class Diffusion(Plant):
 
         ``sampling`` draws only the states at times ``sampled`` off the grid, ``probing`` those at
         probe times off both. With ``frames`` states are relative to the origin of their frame.
+        ``forcing``, a response to an input, is added to the paths.
         """
         start = self.starts(normals)
         cuts = [] if sampling is None or not len(sampled) else [(sampled, sampling)]
         steps = self.frame_steps if frames else None
-        return DiffusionPaths(self.laws, start, normals, [*cuts, (probe_times, probing)], steps)
+        cuts.append((probe_times, probing))
+        return DiffusionPaths(self.laws, start, normals, cuts, steps, forcing)
 
     def start(self, random: np.random.Generator) -> FloatArray:
         """Return x(0) (n,), drawn from ``random``."""

@@ -30,6 +30,7 @@ import numpy as np
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import LANES, MANY, ONE, Lanes, load, spread, store
+from netkf.linalg.portable import apply
 from netkf.linalg.structs import Size
 from netkf.plants.laws import GridLaws
 from netkf.plants.transitions import Transitions
@@ -98,7 +99,8 @@ class DiffusionPaths:
     overwritten: it holds the state at the end of the last step drawn.
 
     With ``frame_steps`` states are local: they restart from zero after every ``frame_steps`` steps,
-    so that a piece may end at a state from which the next one does not start.
+    so that a piece may end at a state from which the next one does not start. ``forcing`` is a
+    response to an input that is added to all paths (``response``), or None.
 
     A path has the same bits alone or among others, and however many steps one call draws.
     """
@@ -110,8 +112,10 @@ class DiffusionPaths:
         normals: Normals,
         cuts: Sequence[tuple[FloatArray, Normals]],
         frame_steps: int | None = None,
+        forcing: Any = None,
     ) -> None:
         self.laws, self._normals, self._cuts = laws, normals, cuts
+        self._forcing = forcing
         self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
 
@@ -163,7 +167,28 @@ class DiffusionPaths:
             inside = block_times[block.end[np.searchsorted(block.end, block_times)] != block_times]
             if len(inside):
                 block = self._cut(block, inside, cut_normals)
-        return block
+        return block if self._forcing is None else self._forced(block)
+
+    def _forced(self, block: Block) -> Block:
+        """Return the block with the response to an input, whose course inside a piece is
+        approximated as that of the noise is.
+        """
+        laws, snap = self.laws, self.laws.time_grid.snap
+        start, pieces = self._forcing.over_pieces(block.start, block.end, laws.time_grid)
+        gaps, index = np.unique(snap(block.end - block.start), return_inverse=True)
+        responses = np.stack([laws.responses(gap) for gap in gaps.tolist()])[index]
+        # What is not the response to the state at the start of a piece, (K, 3, n).
+        driven = pieces - apply(responses, start[:, None])
+        cubic = np.zeros((1, len(start), 3, laws.n))
+        for k, length in enumerate(block.end - block.start):
+            for i in range(laws.n):
+                fill_cubic(cubic, 0, k, i, length, *driven[k, :, i])
+        return block._replace(
+            x_start=block.x_start + start,
+            x_end=block.x_end + pieces[:, 0],
+            moments=block.moments + pieces[:, 1:],
+            cubic=block.cubic + cubic,
+        )
 
     def _cut(self, block: Block, times: FloatArray, source: Normals) -> Block:
         """Return the block cut further at C ``times`` (C,), drawn from ``source``."""

@@ -414,3 +414,17 @@ def covariance_of(path: Any, k: int, R: FloatArray) -> FloatArray:
     """Return the covariance of reading number ``k``: its own, or the R (p, p) of the sensor."""
     covariance = getattr(path, "covariance", None)
     return R if covariance is None else np.asarray(covariance(k, R))
+
+
+def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return readings (S, p) and H (S, p, n) of S increasing ``numbers`` of samples or slots of a
+    ``path``, whose states are x (S, n).
+    """
+    if hasattr(path, "several"):
+        y, H = path.several(numbers, x)
+        return y, H
+    # What a user's class must have: ``reading`` of a sample gives y and H, in a slot y alone.
+    pairs = [(path.reading(k, state), k) for k, state in zip(numbers, x, strict=True)]
+    if hasattr(path, "matrix"):
+        return np.array([y for y, _ in pairs]), np.array([path.matrix(k) for _, k in pairs])
+    return np.array([y for (y, _), _ in pairs]), np.array([H for (_, H), _ in pairs])

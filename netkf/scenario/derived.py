@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import scipy.linalg
@@ -28,8 +28,10 @@ from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.plants.diffusion import Diffusion, default_sensing_period
+from netkf.plants.driven import InputResponses, MovedReadings, driven
 from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
+from netkf.plants.response import Difference, FlowResponse, Response, SlotResponse
 from netkf.plants.sampling import Samples
 from netkf.plants.sensors import Sensor
 from netkf.plants.transitions import frame_period, frame_slots
@@ -41,6 +43,7 @@ from netkf.scenario.sampling import (
     sample_path,
     sample_rate,
     sample_times,
+    times_of_sensor,
     uses_grid,
 )
 
@@ -196,24 +199,74 @@ class DerivedScenario(ScenarioModel):
         """
         frames = self.exact_errors if frames is None else frames
         plant, horizon = self.diffusion, self.horizon
-        if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
-            require_states(self, sample_times(self, streams))
-            return plant.recorded_truth
-        if sampled is None:
-            sampled = all_sample_times(sample_times(self, streams))
+        recorded, on_grid = not plant.is_random, uses_grid(self)
+        if sampled is None or recorded:
+            by_sensor = sample_times(self, streams)
+            require_states(self, by_sensor)
+            sampled = all_sample_times(by_sensor)
         random, probes = streams.generator("plant"), self.times
-        if not uses_grid(self):
-            times = np.concatenate([sampled, probes])
-            return plant.sampled_truth(random, times, horizon, frames)
-        probe_random = streams.generator("probe")
-        sample_random = streams.generator("samples") if len(sampled) else None
-        return plant.path(random, probe_random, probes, sample_random, sampled, horizon, frames)
+        times, responses = np.union1d(sampled, probes), self.input_responses
+        truth: Any
+        if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
+            truth = plant.recorded_truth
+        elif not on_grid:
+            truth = plant.sampled_truth(random, times, horizon, frames)
+        else:
+            probe_random = streams.generator("probe")
+            sample_random = streams.generator("samples") if len(sampled) else None
+            truth = plant.path(
+                random, probe_random, probes, sample_random, sampled, horizon, frames,
+                None if responses is None else responses.surprise,
+            )  # fmt: skip
+        return truth if responses is None else driven(truth, responses, recorded, on_grid, times)
 
-    def slot_truth(self, streams: Streams) -> Any:
-        """Return the true state of one run in slots, a plants.linear.Truth; if ``exact_errors``,
-        its local states are relative to an origin that moves.
+    def slot_truth(self, streams: Streams, frames: bool | None = None) -> Any:
+        """Return the true state of one run in slots, a plants.linear.Truth; with ``frames``, by
+        default ``exact_errors``, its local states are relative to an origin that moves.
         """
-        return self.slot_plant.truth(streams.generator("plant"), self.exact_errors)
+        frames = self.exact_errors if frames is None else frames
+        plant, responses = self.slot_plant, self.input_responses
+        truth = plant.truth(streams.generator("plant"), frames)
+        return truth if responses is None else driven(truth, responses, not plant.is_random)
+
+    @cached_property
+    def knows_input(self) -> bool:
+        """True if the plant has an input and the filters know it."""
+        return self.plant.input is not None and self.filter.model.input
+
+    @cached_property
+    def input_responses(self) -> InputResponses | None:
+        """The responses to the input of the plant; None if it has none."""
+        u, believed, true = self.plant.input, None, None
+        if u is None:
+            return None
+        if self.knows_input and commutes(self.node_filter):
+            believed = self.believed_response
+        # In recorded states the true response is contained.
+        if self.plant.is_random:
+            A = self.slot_plant.F if self.slotted else self.diffusion.A
+            true = self._response(A)
+            if believed is not None:
+                same = np.array_equal(A, self.slot_belief[0] if self.slotted else self.belief[0])
+                true = None if same else Difference(true, believed)
+        return InputResponses(believed, true)
+
+    @cached_property
+    def believed_response(self) -> FlowResponse | SlotResponse:
+        """The response to the input by the matrices that filters believe."""
+        return self._response(self.slot_belief[0] if self.slotted else self.belief[0])
+
+    def _response(self, A: FloatArray) -> FlowResponse | SlotResponse:
+        u = self.plant.input
+        assert u is not None
+        return SlotResponse(A, self.slot_plant) if self.slotted else FlowResponse(A, u)
+
+    @cached_property
+    def undriven(self) -> Self:
+        """The scenario without input."""
+        if self.plant.input is None:
+            return self
+        return dataclasses.replace(self, plant=dataclasses.replace(self.plant, input=None))
 
     @cached_property
     def exact_errors(self) -> bool:
@@ -227,6 +280,8 @@ class DerivedScenario(ScenarioModel):
         """
         # Nonlinear readings depend on the absolute state.
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):
+            return False
+        if self.input_responses is not None and self.input_responses.surprise is not None:
             return False
         plant = self.plant
         if isinstance(plant, LinearPlant):
@@ -315,15 +370,31 @@ class DerivedScenario(ScenarioModel):
 
     def sample_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Samples:
         """Return the samples of one sensor of a node in one run in continuous time."""
-        return sample_path(self, streams, node, placed_sensor)
+        path = sample_path(self, streams, node, placed_sensor)
+        believed = self._moves_readings(self.sensors[placed_sensor.entry])
+        if believed is None:
+            return path
+        times = times_of_sensor(self, streams, node, placed_sensor)
+        return MovedReadings(path, believed, times)
 
     def slot_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Readings:
         """Return the readings of one sensor of a node in one run in slots."""
         sensor: Sensor = self.located_sensors[placed_sensor.entry]
         period = self.slot_plant.period
-        return sensor.slot_path(
+        path = sensor.slot_path(
             node, period, lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
         )
+        believed = self._moves_readings(sensor)
+        return path if believed is None else MovedReadings(path, believed)
+
+    def _moves_readings(self, sensor: Sensor) -> Response | None:
+        """Return the response that states are counted from, if readings of the sensor depend on
+        it: drawn linear ones are of the local state.
+        """
+        responses = self.input_responses
+        if responses is None or (sensor.linear and sensor.is_random):
+            return None
+        return responses.believed
 
     @cached_property
     def belief(self) -> tuple[FloatArray, FloatArray]:
@@ -341,7 +412,7 @@ class DerivedScenario(ScenarioModel):
         False if states or readings are recorded: their true matrices are unknown.
         """
         plant = self.plant
-        if not self.is_random:
+        if not self.is_random or (plant.input is not None and not self.knows_input):
             return False
         if isinstance(plant, LinearPlant):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]

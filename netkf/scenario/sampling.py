@@ -28,17 +28,24 @@ def sample_times(scenario: ScenarioModel, streams: Streams) -> dict[tuple[int, i
 
     Only sensors that sample a diffusion are in it; times are below the horizon.
     """
-    times_of_sensors = {}
-    for node, placed_sensor in _iterate_sampled_sensors(scenario):
-        sensor = scenario.sensors[placed_sensor.entry]
-        generator = _make_generator(streams, node, placed_sensor)
-        with errors_under(f"sensors[{placed_sensor.entry}]"):
-            times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
-        times = scenario.time_grid.before(scenario.horizon, times)
-        if isinstance(getattr(sensor, "sampling", None), RecordedSampling):
-            times = np.unique(times)  # rows of one instant are one sample
-        times_of_sensors[node, placed_sensor.ordinal] = times
-    return times_of_sensors
+    return {
+        (node, placed_sensor.ordinal): times_of_sensor(scenario, streams, node, placed_sensor)
+        for node, placed_sensor in _iterate_sampled_sensors(scenario)
+    }
+
+
+def times_of_sensor(
+    scenario: ScenarioModel, streams: Streams, node: int, placed_sensor: PlacedSensor
+) -> FloatArray:
+    """Return the sample times (K,) in seconds of one sensor of a node, see ``sample_times``."""
+    sensor = scenario.sensors[placed_sensor.entry]
+    generator = _make_generator(streams, node, placed_sensor)
+    with errors_under(f"sensors[{placed_sensor.entry}]"):
+        times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
+    times = scenario.time_grid.before(scenario.horizon, times)
+    # Rows of one instant are one sample.
+    is_recorded = isinstance(getattr(sensor, "sampling", None), RecordedSampling)
+    return np.unique(times) if is_recorded else times
 
 
 def sample_path(

@@ -100,10 +100,12 @@ def _states(scenario: Scenario, streams: Streams, law: PathLaw) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _choose_times(scenario: Scenario) -> Scenario:
-    """Return the scenario with states at the times of its path law; cached for its tables."""
+    """Return the scenario with states at the times of its path law, without the response to an
+    input, which is no noise; cached for its tables.
+    """
     law = path_law(scenario)
     assert law is not None
-    return dataclasses.replace(scenario, probe=law.times)
+    return dataclasses.replace(scenario.undriven, probe=law.times)
 
 
 def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
@@ -179,6 +181,7 @@ def reading_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
     Sensors read states drawn here, of typical size, since their noise must not depend on the state.
     The k-th noises of all sensors form one vector; entries of sensors with fewer readings are nan.
     """
+    scenario = scenario.undriven
     laws = sensor_laws(scenario)
     if not laws:
         return None

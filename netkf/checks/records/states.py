@@ -75,7 +75,7 @@ def drawn_states(
     streams, truth = Streams(seed, replica), None
     moments: list[Any]
     if scenario.slotted:
-        truth = scenario.slot_plant.truth(streams.generator("plant"))
+        truth = scenario.slot_truth(streams, frames=False)
         moments = [int(slot) for slot in scenario.sampled_slots[: len(times)]]
     else:
         truth, moments = scenario.continuous_truth(streams, frames=False), times.tolist()

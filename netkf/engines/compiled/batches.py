@@ -115,10 +115,10 @@ def _all_at_once(
     else:
         assert workspace.clocked is not None
         workspace.clocked.simulate(workspace.begin(draws, traced=False, buffer=buffer), arrays)
-    if len(draws.states.frame_times):
-        for k in range(len(draws.states.frame_times)):
-            draws.states.rebase(k)
-        local, absolute = draws.states.of_runs(scenario.times)
+    for k in range(len(draws.states.frame_times)):
+        draws.states.rebase(k)
+    local, absolute = draws.states.of_runs(scenario.times)
+    if absolute is not local:
         arrays.x[:] = absolute
         # As in a run alone, to the last bit.
         buffer.xhat += (absolute - local)[:, :, None]

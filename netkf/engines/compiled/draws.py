@@ -91,6 +91,7 @@ class Paths:
             samples,
             sampled,
             scenario.exact_errors,
+            None if scenario.input_responses is None else scenario.input_responses.surprise,
         )
         self._senses, self._horizon = bool(scenario.increment_sensors), scenario.horizon
         self.frame_times = self._paths.frame_times(scenario.horizon)

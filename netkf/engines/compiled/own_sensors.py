@@ -9,7 +9,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import cholesky, solve_lower
-from netkf.plants.readings import covariance_of
+from netkf.plants.readings import covariance_of, read_many
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
 from netkf.plants.sensors import LinearSensor, Sensor
@@ -33,20 +33,6 @@ def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
     increments would be drawn by kernels.
     """
     return sensor.linear and (slotted or getattr(sensor, "sampling", None) is not None)
-
-
-def read_many(path: Any, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return readings (S, p) and H (S, p, n) of S increasing ``numbers`` of samples or slots of a
-    ``path``, whose states are x (S, n).
-    """
-    if hasattr(path, "several"):
-        y, H = path.several(numbers, x)
-        return y, H
-    # What a user's class must have: ``reading`` of a sample gives y and H, in a slot y alone.
-    pairs = [(path.reading(k, state), k) for k, state in zip(numbers, x, strict=True)]
-    if hasattr(path, "matrix"):
-        return np.array([y for y, _ in pairs]), np.array([path.matrix(k) for _, k in pairs])
-    return np.array([y for (y, _), _ in pairs]), np.array([H for (_, H), _ in pairs])
 
 
 def read_whitened(

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from netkf.engines.compiled.own_sensors import is_own, read_many
+from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.state import Instants
 from netkf.engines.compiled.ticks import clocks_of, draw_instants, is_kernel_clock
@@ -20,6 +20,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.portable import cholesky
 from netkf.network.clocks import LinkClock
 from netkf.plants import sampling
+from netkf.plants.readings import read_many
 from netkf.plants.sensors import LinearSensor
 from netkf.rng.draws import ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat

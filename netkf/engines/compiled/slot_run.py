@@ -187,7 +187,7 @@ class SlotRuns:
         """Simulate the next slots in all R runs, with about ``max_events`` events at most (0: no
         limit). ``timed``: compute the times of slots, which event rows need.
         """
-        setup, self._max_events = self.setup, max_events
+        self._max_events = max_events
         times, messages = self._next_messages(max_events, timed)
         local, absolute, rebased = self._next_states(len(times.start))
         y, H = self._draw_readings(times, local, rebased)
@@ -199,7 +199,7 @@ class SlotRuns:
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
         kernel_samples = SlotSamples(
-            x, xhat, P, error, absolute, local, setup.frame > 0, self._total,
+            x, xhat, P, error, absolute, local, absolute is not local, self._total,
             *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
         )  # fmt: skip
         self._simulate(times, messages, (y, H, rebased), kernel_samples)
@@ -393,10 +393,12 @@ class SlotRuns:
         slots = range(self._slot, self._slot + count)
         rebased = np.zeros(count, dtype=bool)
         if self._path is None:
-            x = np.stack([self._truth.state(slot) for slot in slots])
             # A recorded truth is the same in all runs.
-            x = in_lanes(x, self._blocks)
-            return x, x, rebased
+            local, absolute = (
+                in_lanes(np.stack([state(slot) for slot in slots]), self._blocks)
+                for state in (self._truth.local, self._truth.absolute)
+            )
+            return local, absolute, rebased
         # At the end of a frame the origin moves to the state.
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
@@ -405,6 +407,14 @@ class SlotRuns:
         # Without frames both are the same array.
         absolute: FloatArray = unset(shape) if setup.frame else local
         self._draw_path(self._path, self._plant_states, local, absolute)
+        if (responses := self._scenario.input_responses) is not None:
+            believed, surprise = (
+                None if one is None else one.states(np.array(slots))[..., None] for one in responses
+            )
+            if surprise is not None:
+                local += surprise
+            if believed is not None:
+                absolute = absolute + believed
         return local, absolute, rebased
 
     def _draw_path(

@@ -18,6 +18,8 @@ class PathStates:
     def __init__(self, scenario: Scenario, frame_times: FloatArray, path: PathBlock) -> None:
         self._moves, self._offsets = scenario.diffusion.moves, list[FloatArray]()
         self.frame_times, self.path = frame_times, path
+        responses = scenario.input_responses
+        self._believed = None if responses is None else responses.believed
 
     def local(self, times: FloatArray) -> FloatArray:
         """Return the states (R, T, n) at ``times`` (T,), relative to the origin of their frame."""
@@ -39,13 +41,15 @@ class PathStates:
 
     def of_runs(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local and absolute states (R, T, n) each at ``times`` (T,) in seconds."""
-        local = self.local(times)
-        # No frame has begun: local states are absolute.
-        if not self._offsets:
-            return local, local
-        begun = self.frame_times[: len(self._offsets)]
-        offsets = np.stack(self._offsets, axis=1)
-        return local, absolute_states(self._moves, begun, offsets, times, local)
+        absolute = local = self.local(times)
+        # Until a frame begins the origin is at 0, and where it does not move with an input.
+        if self._offsets:
+            begun = self.frame_times[: len(self._offsets)]
+            offsets = np.stack(self._offsets, axis=1)
+            absolute = absolute_states(self._moves, begun, offsets, times, local)
+        if self._believed is not None:
+            absolute = absolute + self._believed.states(times)
+        return local, absolute
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local and absolute states (T, n) each of the first run."""

@@ -1,0 +1,179 @@
+"""Truth and readings of a plant with an input, in coordinates that move along with its response.
+
+Filters that commute with a shift run the same wherever states are counted from. Of a driven plant
+they are counted from the response m(t) to the input (``response``), as far as filters believe in
+it: there the truth, its readings and all that filters do are those of the plant without input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import apply
+from netkf.plants.readings import covariance_of, read_many
+from netkf.plants.response import Response
+
+
+class InputResponses(NamedTuple):
+    """The responses of a plant whose input filters know, or not.
+
+    believed : m by the matrices that filters believe. Their estimates are counted from it: the
+               origin of coordinates moves along, so that a filter that knows u runs as without it.
+               None where the origin does not move
+    surprise : the true m minus that, which is left in the state in these coordinates; None if it
+               is 0, or in the recorded states
+    """
+
+    believed: Response | None
+    surprise: Response | None
+
+
+Shift = Callable[[np.ndarray], FloatArray]
+"""Returns what is added to states (K, n) at K times in seconds, or in K slots."""
+
+
+class DrivenTruth:
+    """The state of one run with an input, from the ``truth`` without it: ``local`` and ``absolute``
+    say what is added to its local and absolute states, None: nothing.
+    """
+
+    def __init__(self, truth: Any, local: Shift | None, absolute: Shift | None) -> None:
+        self._truth, self._local, self._absolute = truth, local, absolute
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the input leaves as it is: frames, and the moments of a path."""
+        return getattr(self.__dict__["_truth"], name)
+
+    def local(self, time: Any) -> FloatArray:
+        """Return x (n,) at ``time``, in seconds or a slot, in the coordinates of the filters."""
+        return _shifted(self._truth.local(time), self._local, time)
+
+    def absolute(self, time: Any) -> FloatArray:
+        """Return x (n,) at ``time``, in seconds or a slot, in the coordinates of the plant."""
+        return _shifted(self._truth.absolute(time), self._absolute, time)
+
+    state = absolute
+
+    def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""
+        local, absolute = self._truth.states(times)
+        return (
+            local if self._local is None else local + self._local(times),
+            absolute if self._absolute is None else absolute + self._absolute(times),
+        )
+
+
+def _shifted(x: FloatArray, shift: Shift | None, time: Any) -> FloatArray:
+    return x if shift is None else np.asarray(x + shift(np.array([time]))[0])
+
+
+def driven(
+    truth: Any,
+    responses: InputResponses,
+    recorded: bool,
+    on_grid: bool = False,
+    times: FloatArray | None = None,
+) -> DrivenTruth:
+    """Return a ``truth`` without input with it. States that are ``recorded`` have it already, and
+    paths ``on_grid`` the surprise. The shifts at ``times`` (K,) are computed at once.
+    """
+    believed, surprise = responses
+    if recorded:
+        return DrivenTruth(truth, _shift(times, believed, -1.0), None)
+    local = None if on_grid else surprise
+    return DrivenTruth(truth, _shift(times, local), _shift(times, believed, 1.0, local))
+
+
+def _shift(
+    known: FloatArray | None,
+    first: Response | None,
+    sign: float = 1.0,
+    second: Response | None = None,
+) -> Shift | None:
+    """Return the shift by ``sign`` times the ``first`` response and the ``second``."""
+    if first is None and second is None:
+        return None
+
+    def compute(times: np.ndarray) -> FloatArray:
+        parts = [s * r.states(times) for s, r in ((sign, first), (1.0, second)) if r is not None]
+        return np.asarray(sum(parts))
+
+    if known is None:
+        return compute
+    table = compute(known)
+
+    def look_up(times: np.ndarray) -> FloatArray:
+        rows = np.minimum(np.searchsorted(known, times), len(known) - 1)
+        return table[rows] if np.array_equal(known[rows], times) else compute(times)
+
+    return look_up
+
+
+class MovedFunction:
+    """What linearises the readings of a sensor, for estimates that are counted from ``m`` (n,)."""
+
+    def __init__(self, function: Any, m: FloatArray) -> None:
+        self._function, self._m = function, m
+
+    def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the reading ``y`` (p,) linearised at the estimate ``xhat`` (n,), and H (p, n)."""
+        z, J = self._function(y, xhat + self._m)
+        return z - J @ self._m, J
+
+
+class MovedReadings:
+    """The readings of one sensor on one node where states are counted from m: nonlinear ones, or
+    recorded ones, which are of the plant's coordinates. In slots (``Readings``); in continuous time
+    with the ``times`` (K,) of its samples (``Samples``).
+    """
+
+    def __init__(self, path: Any, believed: Response, times: FloatArray | None = None) -> None:
+        self._path, self._believed = path, believed
+        self._at_samples = None if times is None else believed.states(times)
+
+    def _m(self, numbers: Sequence[int]) -> FloatArray:
+        if self._at_samples is None:
+            return self._believed.states(np.array(numbers))
+        return self._at_samples[list(numbers)]
+
+    def matrix(self, slot: int) -> Any:
+        """Return H (p, n) in slot number ``slot``, or a function that linearises."""
+        H = self._path.matrix(slot)
+        return H if isinstance(H, np.ndarray) else MovedFunction(H, self._m([slot])[0])
+
+    def reading(self, k: int, x: FloatArray) -> Any:
+        """Return the reading (p,) in slot number ``k`` whose state is x (n,), or of sample number
+        ``k`` with its H (p, n), or the function that linearises.
+        """
+        m = self._m([k])[0]
+        if self._at_samples is None:
+            y, H = self._path.reading(k, x + m), self._path.matrix(k)
+            return _moved(y, H, m)
+        y, H = self._path.reading(k, x + m)
+        return _moved(y, H, m), H if isinstance(H, np.ndarray) else MovedFunction(H, m)
+
+    def covariance(self, k: int, R: FloatArray) -> FloatArray:
+        """Return the covariance of reading number ``k``, see ``covariance_of``."""
+        return covariance_of(self._path, k, R)
+
+    def several(self, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return readings (S, p) and H (S, p, n) of increasing ``numbers``, states x (S, n)."""
+        m = self._m(numbers)
+        y, H = read_many(self._path, numbers, x + m)
+        return y - apply(H, m), H
+
+    def whitened(
+        self, slots: Sequence[int], R: FloatArray, p: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return whitened readings (S, p) and H (S, p, n), see ``RecordedReadings``."""
+        y, H = self._path.whitened(slots, R, p)
+        return y - apply(H, self._m(slots)), H
+
+
+def _moved(y: FloatArray, H: Any, m: FloatArray) -> FloatArray:
+    # A sensor without a reading may give an empty y, whatever H is.
+    return y - H @ m if isinstance(H, np.ndarray) and len(H) == len(y) else y

@@ -1,0 +1,168 @@
+"""The response of a linear plant to its input: the state m(t) that the input alone would give.
+
+``m' = A m + G u``, in slots ``m[k+1] = F m[k] + G u[k]``, from m(0) = 0 on. The state of a driven
+plant is that of the same plant without input plus m. It is computed exactly: input and response
+together are a linear system that nothing drives, and its state moves by one exponential of
+``[[A, G C], [0, S]]`` over any gap, see ``inputs``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from netkf.core.instants import TimeGrid
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.portable import apply
+from netkf.plants.inputs import Input
+from netkf.plants.linear import LinearPlant
+from netkf.plants.transitions import Transitions
+
+CHUNK = 4096  # transitions computed at once
+SLOTS = 256  # slots computed at once, at least
+
+
+class Response(Protocol):
+    """The response m to an input."""
+
+    def states(self, times: FloatArray) -> FloatArray:
+        """Return m (K, n) at K ``times`` (K,) in seconds; of a plant in slots, at K slots."""
+
+
+@kernel(allocates=True)
+def _recur(start: FloatArray, moves: FloatArray, drive: FloatArray, out: FloatArray) -> None:
+    """Write ``m[k+1] = moves[k] m[k] + drive[k]`` from m[0] = ``start`` (n,) on into ``out`` (K,
+    n); of ``moves`` (K, n, n) or (1, n, n) the last one goes on.
+    """
+    m = start.copy()
+    for k in range(len(drive)):
+        move = moves[min(k, len(moves) - 1)]
+        for i in range(len(m)):
+            total = drive[k, i]
+            for j in range(len(m)):
+                total += move[i, j] * m[j]
+            out[k, i] = total
+        m[:] = out[k]
+
+
+def _follow(start: FloatArray, moves: FloatArray, drive: FloatArray) -> FloatArray:
+    """Return m[1], m[2], ... (K, n), see ``_recur``."""
+    out = np.empty(drive.shape)
+    _recur(np.array(start), moves, np.array(drive), out)
+    return out
+
+
+class FlowResponse:
+    """The response to the input ``u`` of a diffusion with this ``A`` (n, n)."""
+
+    def __init__(self, A: FloatArray, u: Input) -> None:
+        assert u.G is not None
+        self.n, self._exogenous = len(A), u.exogenous
+        _, S, C, z = self._exogenous
+        q = len(S)
+        self.joint = np.block([[A, u.G @ C], [np.zeros((q, self.n)), S]])
+        self._moves = Transitions(self.joint, np.zeros((len(self.joint), 1)))
+        # m where the input jumps, as far as it has been asked for.
+        self._at_jumps = np.zeros((min(len(z), 1), self.n))
+
+    def joint_states(self, times: FloatArray) -> FloatArray:
+        """Return m and the state of the input, (K, n + q), at K ``times`` (K,) in seconds."""
+        last = self._exogenous.last(times)
+        starts = self._starts(int(last.max(initial=-1)))
+        out = np.zeros((len(times), len(self.joint)))
+        begun = np.flatnonzero(last >= 0)
+        for k in range(0, len(begun), CHUNK):
+            chunk = begun[k : k + CHUNK]
+            gaps = times[chunk] - self._exogenous.times[last[chunk]]
+            out[chunk] = apply(self._moves.transitions(gaps), starts[last[chunk]])
+        return out
+
+    def states(self, times: FloatArray) -> FloatArray:
+        """Return m (K, n) at K ``times`` (K,) in seconds."""
+        return self.joint_states(times)[:, : self.n]
+
+    def _starts(self, last: int) -> FloatArray:
+        """Return m and the state of the input (last + 1, n + q) at its jumps up to ``last``."""
+        times, z, n = self._exogenous.times, self._exogenous.z, self.n
+        for first in range(len(self._at_jumps) - 1, last, CHUNK):
+            stop = min(first + CHUNK, last)
+            moves = self._moves.transitions(np.diff(times[first : stop + 1]))
+            drive = apply(moves[:, :n, n:], z[first:stop])
+            driven = _follow(self._at_jumps[-1], np.array(moves[:, :n, :n]), drive)
+            self._at_jumps = np.concatenate([self._at_jumps, driven])
+        return np.hstack([self._at_jumps[: last + 1], z[: last + 1]])
+
+    def over_pieces(
+        self, start: FloatArray, end: FloatArray, grid: TimeGrid
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return m (K, n) at the ``start`` of K pieces of time, which follow each other, and end
+        state and both moments (K, 3, n) of each, see ``paths``.
+        """
+        n, N, jumps = self.n, len(self.joint), self._exogenous.times
+        inside = jumps[(jumps > start[0]) & (jumps < end[-1])]
+        first = np.unique(np.concatenate([start, inside]))
+        last = np.append(first[1:], end[-1])
+        gaps, w = grid.snap(last - first), self.joint_states(first)
+        # exp([[M, I, 0], [0, 0, I], [0, 0, 0]] g) has the integrals of e^{M s} and of (g - s) e^{M
+        # s} over the gap g in its first row of blocks.
+        nested = np.zeros((3 * N, 3 * N))
+        nested[:N, :N], nested[:N, N : 2 * N], nested[N : 2 * N, 2 * N :] = (
+            self.joint,
+            np.eye(N),
+            np.eye(N),
+        )
+        moves = Transitions(nested, np.zeros((3 * N, 1))).transitions(gaps)[:, :n]
+        ends, plain, tail = (apply(moves[..., k * N : (k + 1) * N], w) for k in range(3))
+        # P_1 = 2 s / g - 1, and s = g - (g - s).
+        tilted = plain - 2.0 * tail / gaps[:, None]
+        # Parts of a piece that the input cuts: P_1 of the piece is middle + share P_1 of the part.
+        piece = np.searchsorted(start, first, side="right") - 1
+        length = (end - start)[piece]
+        middle = ((first - start[piece]) - (end[piece] - last)) / length
+        tilted = middle[:, None] * plain + (gaps / length)[:, None] * tilted
+        begins = np.searchsorted(piece, np.arange(len(start)))
+        sums = [np.add.reduceat(values, begins) for values in (plain, tilted)]
+        stops = ends[np.append(begins[1:], len(first)) - 1]
+        return w[begins, :n], np.stack([stops, *sums], axis=1)
+
+
+class SlotResponse:
+    """The response to the input of a ``plant`` in slots, moved by ``F`` (n, n)."""
+
+    def __init__(self, F: FloatArray, plant: LinearPlant) -> None:
+        u = plant.input
+        assert u is not None
+        assert u.G is not None
+        self._F, self._G, self._u, self._plant = F, u.G, u, plant
+        self._states = np.zeros((1, len(F)))
+
+    def states(self, slots: np.ndarray) -> FloatArray:
+        """Return m (K, n) in K ``slots`` (K,) by number."""
+        needed, known = int(np.max(slots, initial=0)) + 1, len(self._states)
+        if needed > known:
+            driving = np.arange(known - 1, max(needed, known + SLOTS) - 1)
+            starts = self._plant.time_grid.snap(driving * self._plant.period)
+            drive = apply(self._G, self._u.values(starts))
+            driven = _follow(self._states[-1], np.array(self._F[None]), drive)
+            self._states = np.concatenate([self._states, driven])
+        return np.asarray(self._states[slots])
+
+
+class Difference:
+    """The response ``true`` minus the one that filters believe."""
+
+    def __init__(self, true: Any, believed: Any) -> None:
+        self._true, self._believed = true, believed
+
+    def states(self, times: np.ndarray) -> FloatArray:
+        """Return the difference (K, n) at K ``times`` (K,) in seconds, or in K slots."""
+        return np.asarray(self._true.states(times) - self._believed.states(times))
+
+    def over_pieces(
+        self, start: FloatArray, end: FloatArray, grid: TimeGrid
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the difference of what ``FlowResponse.over_pieces`` returns."""
+        true, believed = (r.over_pieces(start, end, grid) for r in (self._true, self._believed))
+        return true[0] - believed[0], true[1] - believed[1]
