@@ -30,6 +30,7 @@ from netkf.core.fields import (
     node_id,
     one_of,
     source_file,
+    text,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.linear import SlotReadings
@@ -239,12 +240,17 @@ class PositionedSensor(NonlinearSensor):
                default, takes those of the graph. Of a table with a column ``to`` the coordinates of
                all its anchors, in the order of their ids
     states     which components of the state are the target's position
+    heading    the component of the state that is the target's heading, if it is the target that
+               looks at the place, and directions are measured from its heading
+    of         with [[plants]], the block that ``states`` and ``heading`` count in
     """
 
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"), default=None)
     R: FloatArray = field(definite_covariance, default=None)
     positions: str | FloatArray = field(either(one_of(GRAPH), matrix, has_depth(1)), default=GRAPH)
     states: tuple[int, ...] = field(list_of(integer(low=0), "numbers of states"), default=(0, 1))
+    heading: int | None = field(integer(low=0), default=None)
+    of: str | None = field(text, default=None)
 
     rows: ClassVar[int] = 0
     """Number p of the values of a reading, distance and angle, which subclasses set."""
@@ -285,6 +291,9 @@ class PositionedSensor(NonlinearSensor):
         if max(self.states) >= n or len(set(self.states)) < len(self.states):
             rule = f"must be different components of a state of {n}, counted from 0"
             raise ScenarioError("states", rule, list(self.states), "name those of the position")
+        if self.heading is not None and (self.heading >= n or not self.turns):
+            rule = f"must be a component of a state of {n}, and means nothing without directions"
+            raise ScenarioError("heading", rule, self.heading, "correct it, or leave it out")
         dimensions = (2, 3) if self.rows == 1 and not self.turns else (2,)
         if len(self.states) not in dimensions:
             rule = f"must be {' or '.join(map(str, dimensions))} for this sensor"
@@ -301,29 +310,43 @@ class PositionedSensor(NonlinearSensor):
             raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id)."""
+        """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id); with
+        a ``heading``, that of the node relative to the target.
+        """
         positions = np.asarray(self.positions, dtype=np.float64)
-        return np.asarray(x[list(self.states)] - positions[self.places.index(node)])
+        d = x[list(self.states)] - positions[self.places.index(node)]
+        return np.asarray(d if self.heading is None else -d)
+
+    def offset_gradient(self, n: int, node: int) -> FloatArray:
+        """Return the derivative (d, n) of ``offset`` by a state of ``n`` components."""
+        gradient = np.zeros((len(self.states), n))
+        gradient[:, list(self.states)] = np.eye(len(self.states))
+        return gradient if self.heading is None else -gradient
 
     def h(self, x: FloatArray, node: int) -> FloatArray:
-        """Return distance or angle (radians, in (-pi, pi]) or both (p,) of the target in the state
-        x (n,) from ``node`` (id).
+        """Return length or angle (radians, in (-pi, pi], or from the heading) or both (p,) of the
+        ``offset`` in the state x (n,) on ``node`` (id).
         """
         d = self.offset(x, node)
         angle = [math.atan2(d[1], d[0])] if self.turns else []
-        return np.array([math.hypot(*d)] * (self.rows - self.turns) + angle)
+        reading = np.array([math.hypot(*d)] * (self.rows - self.turns) + angle)
+        if self.heading is not None:
+            reading[-1] -= x[self.heading]
+        return reading
 
     def jacobian(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the Jacobian (p, n) at the state x (n,): the unit vector ``d / |d|`` along the
-        offset d of the target from ``node`` (id), and ``[-d_2, d_1] / |d|^2``, or one of them; 0
-        where d is 0, and in the columns of other components.
+        """Return the Jacobian (p, n) at the state x (n,), on ``node`` (id): the unit vector
+        ``d / |d|`` along the offset d, and ``[-d_2, d_1] / |d|^2``, or one of them, times the
+        derivative of the offset; 0 where d is 0, and in the columns of other components.
         """
         d, jacobian = self.offset(x, node), np.zeros((self.rows, len(x)))
         length = math.hypot(*d)
         if length > 0.0:
             angle = [np.array([-d[1], d[0]]) / length / length] if self.turns else []
             rows = [d / length] * (self.rows - self.turns) + angle
-            jacobian[:, list(self.states)] = rows
+            jacobian[:] = np.array(rows) @ self.offset_gradient(len(x), node)
+        if self.heading is not None:
+            jacobian[-1, self.heading] -= 1.0
         return jacobian
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:

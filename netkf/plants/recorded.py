@@ -8,10 +8,11 @@ slot has no reading in that slot.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from netkf.core.fields import (
     node_id,
     one_of,
     source_file,
+    text,
 )
 from netkf.core.repeated_rows import first_rows
 from netkf.linalg.arrays import FloatArray, readonly_array
@@ -280,15 +282,18 @@ class RecordedSensor(Sensor):
     ``phi0,...`` (one for each state, p = 1) holds the H of every reading; ``H`` may then be left
     out, and is ignored if it is given. ``nodes`` are by default all that the table lists; rows of
     other nodes may be there for other ``[[sensors]]``, which may have more or fewer components:
-    what a row has beyond its own p must be empty, nan or 0.
+    what a row has beyond its own p must be empty, nan or 0. With ``[[plants]]``, ``of`` names the
+    block that H multiplies.
     """
 
     is_random: ClassVar[bool] = False
+    _pairs: ClassVar[Mapping[int, FloatArray]] = MappingProxyType({})
 
     path: SourceFile = field(source_file)
     H: FloatArray = field(matrix, default=None)
     R: FloatArray = field(definite_covariance, default=None)
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"), default=None)
+    of: str | None = field(text, default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -308,6 +313,18 @@ class RecordedSensor(Sensor):
             remedy = "add H = ..., or columns phi0, ... to the table"
             raise ScenarioError("H", "is missing", None, remedy)
 
+    @classmethod
+    def of_pairs(cls, sensor: Any, node: int, matrices: Mapping[int, FloatArray]) -> RecordedSensor:
+        """Return the sensor of ``node`` (id) whose rows, those of the table of a relative
+        ``sensor``, have the H (p, n) of ``matrices`` for the node in their column ``to``.
+        """
+        new = object.__new__(cls)
+        H = next(iter(matrices.values()))
+        values = {"path": sensor.path, "H": H, "R": sensor.R, "nodes": (node,), "of": None}
+        for name, value in (*values.items(), ("_pairs", matrices), ("record", sensor.record)):
+            object.__setattr__(new, name, value)
+        return new
+
     @cached_property
     def record(self) -> ReadingTable:
         """The table of the readings."""
@@ -319,11 +336,14 @@ class RecordedSensor(Sensor):
     def varying(self) -> bool:
         """True if the table has columns phi0, ... or R0, ..., or if values are missing."""
         is_uniform = (self.record.rows(node).is_uniform for node in self.nodes)
-        return bool(self.record.regressors) or not all(is_uniform)
+        has_own_H = bool(self.record.regressors) or len(self._pairs) > 1
+        return has_own_H or not all(is_uniform)
 
     def _matrix_function(self, node: int) -> Matrix:
         """Return the function that gives H (p', n) of the values of row k of ``node``."""
         rows = self.record.rows(node)
+        if self._pairs:
+            return lambda k, present: self._pairs[int(rows.anchors[k])][present]
         phi = rows.phi if self.record.regressors else None
         return lambda k, present: self.H[present] if phi is None else phi[k : k + 1]
 

@@ -28,6 +28,7 @@ from netkf.core.fields import (
     list_of,
     matrix,
     node_id,
+    text,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -128,12 +129,14 @@ class LinearSensor(Sensor):
     slot. In continuous time it reads increments ``dy = H x dt + dv``, cov(dv) = R dt, Tanwani,
     H (3). With a clock as ``sampling`` it reads ``y = H x + v`` in continuous time at every tick.
 
-    ``H`` (p, n), ``R`` (p, p).
+    ``H`` (p, n), ``R`` (p, p). With ``[[plants]]``, ``of`` names the block that H multiplies: the
+    node's own, or one that all share.
     """
 
     H: FloatArray = field(matrix)
     R: FloatArray = field(definite_covariance)
     sampling: Clock | None = field(sampling, default=None)
+    of: str | None = field(text, default=None)
 
     def sample_times(
         self,

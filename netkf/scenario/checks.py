@@ -299,7 +299,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
 
 
 def _check_believed_noise(scenario: DerivedScenario) -> None:
-    R, sensors = scenario.filter.model.R, scenario.sensors
+    R, sensors = scenario.filter.model.R, scenario.declared_sensors
     if R is None:
         return
     if isinstance(R, tuple) and len(R) != len(sensors):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter
-from netkf.core.errors import TheoryError, errors_under
+from netkf.core.errors import ScenarioError, TheoryError, errors_under
 from netkf.core.fields import (
     Component,
     array,
@@ -37,10 +37,12 @@ from netkf.network.clocks import LinkClock
 from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
+from netkf.plants.blocks import Block, Layout, stack
 from netkf.plants.linear import LinearPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.block_sensors import require_no_blocks, stacked_sensors
 from netkf.scenario.names import bind_names
 from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
@@ -133,13 +135,15 @@ def takes_samples(sensor: Sensor) -> bool:
 class ScenarioModel(Component):
     """The fields of a scenario, and properties that need no numerical computation.
 
-    ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
+    With ``plants``, blocks of the state, ``plant`` is the stacked one, and ``sensors`` are those of
+    the stacked state; ``sensor_entries`` has the index of the one of ``declared_sensors`` that each
+    comes from. ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
     samples, or an array (T,) of their increasing times.
     """
 
     name: str = field(text)
     horizon: float = field(seconds)
-    plant: Plant = field(instance_of(Plant))
+    plant: Plant = field(instance_of(Plant), default=None)
     sensors: tuple[Any, ...] = field(list_of(instance_of(Sensor), "sensors", min_length=0))
     network: Network = field(instance_of(Network))
     filter: Filtering = field(instance_of(Filtering))
@@ -147,23 +151,55 @@ class ScenarioModel(Component):
     claim: str = field(line, default="")
     seed: int = field(integer(low=0), default=0)
     time: Time = field(instance_of(Time), default=Time())
+    plants: tuple[Block, ...] = field(list_of(instance_of(Block), "blocks"), default=())
 
     def __post_init__(self) -> None:
         """Check the fields, and read tables anew that were read without ``time`` or names of nodes;
-        raises ScenarioError for a mistake in either.
+        raises ScenarioError for a mistake in either. Plant and sensors of blocks become those of
+        the stacked state; ``declared_sensors`` are the sensors as they were given.
         """
         super().__post_init__()
-        for name in ("plant", "sensors", "network", "filter"):
+        for name in ("plants", "plant", "sensors", "network", "filter"):
             with errors_under(name):
                 restamped = restamp(getattr(self, name), self.time.stamps)
             object.__setattr__(self, name, restamped)
         # Only graphs that are read, or made in Python, have nodes with names.
         names = self.topology.names if self.network.graph.may_name_nodes else None
-        for name in ("sensors", "network", "filter"):
+        for name in ("plants", "sensors", "network", "filter"):
             with errors_under(name):
                 bound = bind_names(getattr(self, name), names)
             object.__setattr__(self, name, bound)
+        self._stack_blocks()
         self._put_on_grid()
+
+    def _stack_blocks(self) -> None:
+        declared, entries = self.sensors, tuple(range(len(self.sensors)))
+        if not self.plants:
+            if self.plant is None:
+                raise ScenarioError("plant", "is missing", None, "add [plant] or [[plants]]")
+            with errors_under("sensors"):
+                require_no_blocks(self.sensors)
+        else:
+            with errors_under("plants"):
+                object.__setattr__(self, "plant", stack(self.plants, self.layout))
+            for k, block in enumerate(self.plants):
+                for place, node in enumerate(block.nodes or ()):
+                    if node not in self.topology.index:
+                        key, rule = f"plants[{k}].nodes[{place}]", "must be a node of the graph"
+                        raise ScenarioError(key, rule, node, "correct the id")
+            with errors_under("sensors"):
+                stacked, entries = stacked_sensors(declared, self.layout, self.topology)
+            object.__setattr__(self, "sensors", stacked)
+        object.__setattr__(self, "declared_sensors", declared)
+        object.__setattr__(self, "sensor_entries", entries)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The blocks of ``[[plants]]`` in the stacked state; one of all states without these."""
+        if not self.plants:
+            return Layout([Block(name="plant", plant=self.plant)])
+        with errors_under("plants"):
+            return Layout(self.plants)
 
     def _put_on_grid(self) -> None:
         grid = self.time_grid
@@ -300,7 +336,8 @@ class ScenarioModel(Component):
         if not believed or believed_R is None:
             true_R: FloatArray = self.sensors[entry].R
             return true_R
-        return believed_R[entry] if isinstance(believed_R, tuple) else believed_R
+        given = isinstance(believed_R, tuple)
+        return believed_R[self.sensor_entries[entry]] if given else believed_R
 
     def table_probability(self, link: Link) -> float:
         """Return the delivery probability of a directed link in the graph's CSV table.

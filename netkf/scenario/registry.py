@@ -26,6 +26,12 @@ from netkf.plants.recorded import (
     UnknownPlant,
 )
 from netkf.plants.regressors import RegressorSensor
+from netkf.plants.relative import (
+    RelativeBearingSensor,
+    RelativeRangeBearingSensor,
+    RelativeRangeSensor,
+    RelativeSensor,
+)
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.imports import Origin, find_class, find_offered_class, offered_kinds
@@ -62,6 +68,10 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "range": RangeSensor,
         "bearing": BearingSensor,
         "range-bearing": RangeBearingSensor,
+        "relative": RelativeSensor,
+        "relative-range": RelativeRangeSensor,
+        "relative-bearing": RelativeBearingSensor,
+        "relative-range-bearing": RelativeRangeBearingSensor,
     },
     "sampling": {
         "periodic": clocks.Periodic,

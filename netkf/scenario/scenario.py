@@ -25,6 +25,7 @@ class Scenario(DerivedScenario):
     name     one line of text; it names the run directory
     horizon  simulated seconds; a run covers [0, horizon)
     plant    the dynamics of the state
+    plants   in place of ``plant``: blocks of the state, each shared by all nodes or owned by one
     sensors  the sensors and the nodes that have them; nodes without a sensor only relay
     network  the graph, the activation of its links, and the channel of its messages
     filter   the filter that every node runs
@@ -48,7 +49,8 @@ class Scenario(DerivedScenario):
         file it was read from may not exist where the pickle is loaded.
         """
         names = {field.name for field in dataclasses.fields(self)}
-        names |= {"_folder", "_trust", "topology", "time_grid"}
+        names |= {"_folder", "_trust", "topology", "time_grid", "declared_sensors"}
+        names |= {"sensor_entries"}
         return {name: value for name, value in self.__dict__.items() if name in names}
 
     def __repr__(self) -> str:

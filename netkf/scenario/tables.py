@@ -20,6 +20,7 @@ from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
+from netkf.plants.blocks import Block
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin
 from netkf.scenario.model import Belief, Filtering, Network
@@ -32,6 +33,7 @@ FORMAT = 1  # version of scenario files
 MAX_DEPTH = 30  # of tables and lists inside one another
 UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
+BLOCK_KEYS = ("name", "nodes", "coupling")  # in one of [[plants]], beside those of its plant
 FILTERING_KEYS = ("mean", "cov", "model")  # in the table of a filter, beside those of its kind
 
 NOT_IMPORTED = object()
@@ -141,12 +143,19 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     values = _build_inner(values, {"time": partial(_build_table, Time, origin)})
     if "time" in values:
         origin = origin._replace(stamps=values["time"].stamps)
-    values = _build_inner(values, {"plant": partial(_build_plant, origin)})
+    if "plants" in values and "plant" in values:
+        rule = "cannot stand beside [[plants]]"
+        raise ScenarioError("plant", rule, None, "write one of the two")
+    plant_builders = {"plant": _build_plant, "plants": _build_blocks}
+    builders = {key: partial(builder, origin) for key, builder in plant_builders.items()}
+    values = _build_inner(values, builders)
     plant = values.get("plant")
+    if "plants" in values:
+        plant = values["plants"][0].plant
     time = "slot " if isinstance(plant, SLOTTED) else ""
     if plant is NOT_IMPORTED:
         time = "unknown"
-    builders: dict[str, Callable[[Any], Any]] = {
+    builders = {
         "sensors": partial(_build_sensors, origin),
         "network": partial(_build_network, origin, time),
         "filter": partial(_build_filtering, origin),
@@ -245,6 +254,22 @@ def _build_plant(origin: Origin, value: Any) -> Any:
     in_both_times = table.get("kind") in ("recorded", "unknown")
     continuous = in_both_times and ("A" in table or "B" in table)
     return _build_component("continuous plant" if continuous else "plant", origin, table)
+
+
+def _build_blocks(origin: Origin, value: Any) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)) or not value:
+        raise ScenarioError("", "must be a list of tables", value, "write [[plants]]")
+    tables = {f"[{k}]": item for k, item in enumerate(value)}
+    return tuple(_build_inner(tables, dict.fromkeys(tables, partial(_build_block, origin))).values())
+
+
+def _build_block(origin: Origin, value: Any) -> Any:
+    if isinstance(value, Block):
+        return value
+    table = _as_dict(value)
+    own = {key: table.pop(key) for key in BLOCK_KEYS if key in table}
+    table.setdefault("kind", "linear" if "F" in table else "diffusion")
+    return _build_object(Block, {**own, "plant": _build_plant(origin, table)}, origin)
 
 
 def _build_component(

@@ -19,6 +19,8 @@ from netkf.core.fields import Component, SourceFile
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import RandomGraph
+from netkf.plants.blocks import Block
+from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
@@ -82,11 +84,34 @@ def _scenario_table(
     grid = scenario.time_grid.as_table() if style.with_defaults else {}
     if time := {**_field_values(scenario.time, style), **grid}:
         table["time"] = time
-    table["plant"] = _part_table(plant, style)
-    table["sensors"] = [_part_table(sensor, style) for sensor in scenario.sensors]
+    if scenario.plants:
+        del table["plant"]
+        table["plants"] = [_block_table(block, plant, style) for block in scenario.plants]
+    else:
+        table.pop("plants", None)
+        table["plant"] = _part_table(plant, style)
+    table["sensors"] = [_part_table(sensor, style) for sensor in scenario.declared_sensors]
     table["network"] = _part_table(network, style)
     table["filter"] = _part_table(filtering, style)
     return {"format": 1, **table}
+
+
+def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
+    """Return the table of one of [[plants]], with the values of the ``stacked`` plant that all
+    share.
+    """
+    plant = block.plant
+    if style.with_defaults:
+        period = {} if isinstance(plant, LinearPlant) else {"sensing_period": stacked.sensing_period}  # type: ignore[attr-defined]
+        plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov, **period)
+    own = _field_values(block, style)
+    del own["plant"]
+    if block.coupling:
+        own["coupling"] = [
+            {"from": c.origin if isinstance(c.origin, str) else list(c.origin), "A": c.A.tolist()}
+            for c in block.coupling
+        ]
+    return {**own, **_part_table(plant, style)}
 
 
 def part_as_table(part: Component) -> dict[str, Any]:

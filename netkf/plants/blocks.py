@@ -1,0 +1,261 @@
+"""States of one's own: the truth as blocks, each a plant that all nodes share or that one node has.
+
+The blocks together are one linear system, the *stacked* plant, whose state is that of all blocks,
+one after the other: that of a scenario with ``[[plants]]`` is an ordinary plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError, quote, suggest_nearest
+from netkf.core.fields import (
+    Component,
+    Rule,
+    field,
+    instance_of,
+    list_of,
+    matrix,
+    node_id,
+    text,
+)
+from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.plants.diffusion import Diffusion
+from netkf.plants.linear import LinearPlant
+from netkf.plants.plant import Plant
+
+
+class Coupling(NamedTuple):
+    """A block is driven by others: ``A`` (n, n') times the state of each block of ``origin``, the
+    name of a shared block or of the block of that name on the same node, or ids of nodes.
+    """
+
+    origin: str | tuple[int, ...]
+    A: FloatArray
+
+
+def _convert_coupling(value: Any) -> tuple[Coupling, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise TypeError
+    return tuple(_as_coupling(f"[{k}]", item) for k, item in enumerate(value))
+
+
+def _as_coupling(key: str, value: Any) -> Coupling:
+    if isinstance(value, Coupling):
+        return value
+    names = {"from", "A"}
+    if not isinstance(value, Mapping) or not set(value) >= names:
+        rule, remedy = "must be a table with the keys from and A", "write { from = ..., A = ... }"
+        raise ScenarioError(key, rule, value, remedy)
+    for name in set(value) - names:
+        raise ScenarioError(f"{key}.{name}", "is not a key here", value[name], "keys are from, A")
+    origin: Any = value["from"]
+    rule = text if isinstance(origin, str) else list_of(node_id(), "node ids")
+    return Coupling(rule(f"{key}.from", origin), matrix(f"{key}.A", value["A"]))
+
+
+_couplings = Rule(
+    "must be a list of tables { from = ..., A = ... }",
+    _convert_coupling,
+    'write coupling = [{ from = "name", A = ... }]',
+    {"type": "array", "items": {"type": "object", "required": ["from", "A"]}},
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Block(Component):
+    """One entry of ``[[plants]]``: a plant that all nodes share, or that each of ``nodes`` has.
+
+    name      what sensors and results call it
+    plant     its dynamics: a Diffusion or a LinearPlant
+    nodes     the nodes of which each has one of its own, with independent noise and start; by
+              default all share one
+    coupling  by which other blocks it is driven: [{ from = "name" or node ids, A = ... }], the
+              blocks of that name on the same node or shared, or the own blocks of these nodes;
+              A (n, n') multiplies the state of each
+    """
+
+    name: str = field(text)
+    plant: Plant = field(instance_of(Diffusion, LinearPlant))
+    nodes: tuple[int, ...] | None = field(list_of(node_id(), "node ids"), default=None)
+    coupling: tuple[Coupling, ...] = field(_couplings, default=())
+
+
+class Place(NamedTuple):
+    """A block of the stacked state: ``name``, the ``node`` (id) that owns it, None if all share it,
+    and its entries ``first`` to ``first + n`` - 1.
+    """
+
+    name: str
+    node: int | None
+    first: int
+    n: int
+
+    @property
+    def entries(self) -> slice:
+        """Its entries in the stacked state."""
+        return slice(self.first, self.first + self.n)
+
+
+class Layout:
+    """The places of all blocks in the stacked state, in the order of ``[[plants]]`` and of their
+    nodes.
+    """
+
+    def __init__(self, blocks: Sequence[Block]) -> None:
+        """Raises ScenarioError for names and nodes that occur twice."""
+        self.places: tuple[Place, ...] = tuple(_places(blocks))
+        self.n = sum(place.n for place in self.places)
+        self.names = tuple(dict.fromkeys(place.name for place in self.places))
+        self._by_key = {(place.name, place.node): place for place in self.places}
+
+    def find(self, name: str, node: int) -> Place | None:
+        """Return the block ``name`` that ``node`` (id) owns or that all share, None without one."""
+        return self._by_key.get((name, node), self._by_key.get((name, None)))
+
+    def require(self, name: object, node: int) -> Place:
+        """Return the block ``name`` of ``node``; raises ScenarioError without one."""
+        if name not in self.names:
+            listed = ", ".join(f'"{one}"' for one in self.names)
+            remedy = f"{suggest_nearest(name, self.names)}names are {listed}"
+            raise ScenarioError("", "must be the name of one of [[plants]]", name, remedy)
+        place = self.find(str(name), node)
+        if place is None:
+            owners = [one.node for one in self.places if one.name == name]
+            rule = f"must be a block that node {node} has"
+            raise ScenarioError("", rule, name, f"nodes with it are {', '.join(map(str, owners))}")
+        return place
+
+    def owned(self, node: int) -> tuple[Place, ...]:
+        """Return the blocks that ``node`` (id) owns."""
+        return tuple(place for place in self.places if place.node == node)
+
+    @property
+    def shared(self) -> tuple[Place, ...]:
+        """The blocks that all nodes share."""
+        return tuple(place for place in self.places if place.node is None)
+
+    def embed(self, parts: Iterable[tuple[Place, FloatArray]]) -> FloatArray:
+        """Return the matrix (p, n) of all states that has the given ones (p, n') at their blocks,
+        and zeros elsewhere.
+        """
+        parts = list(parts)
+        whole = np.zeros((len(parts[0][1]), self.n))
+        for place, H in parts:
+            whole[:, place.entries] += H
+        return whole
+
+
+def _places(blocks: Sequence[Block]) -> Iterator[Place]:
+    first, seen = 0, set[tuple[str, int | None]]()
+    names = [block.name for block in blocks]
+    for k, block in enumerate(blocks):
+        others = [one for one in blocks if one.name == block.name]
+        if len(others) > 1 and any(one.nodes is None for one in others):
+            rule = "must be unique, or all entries of that name must have nodes"
+            raise ScenarioError(f"[{k}].name", rule, block.name, "give the block another name")
+        for node in block.nodes or (None,):
+            if (block.name, node) in seen:
+                j = names.index(block.name)
+                rule = f"must not own two blocks {quote(block.name)}, see also [{j}]"
+                raise ScenarioError(f"[{k}].nodes", rule, node, "give one of them another name")
+            seen.add((block.name, node))
+            yield Place(block.name, node, first, block.plant.n)
+            first += block.plant.n
+
+
+def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
+    """Return the plant whose state is that of all ``blocks``, at the places of their ``layout``.
+
+    Raises ScenarioError if blocks belong to different models of time, or a coupling does not fit.
+    """
+    copies = [block for block in blocks for _ in block.nodes or (None,)]
+    plants = [block.plant for block in copies]
+    slotted = isinstance(plants[0], LinearPlant)
+    for k, block in enumerate(blocks):
+        if isinstance(block.plant, LinearPlant) != slotted:
+            rule = "must be in slots as the others are, or in continuous time"
+            raise ScenarioError(f"[{k}]", rule, block.name, "give all F, Q, period, or all A, B")
+        if not block.plant.is_random:
+            rule = "must be drawn: recorded or unknown states cannot be blocks"
+            raise ScenarioError(f"[{k}].kind", rule, None, "leave kind out")
+        _check_shapes(k, block)
+    mean = np.concatenate([plant.start_mean for plant in plants])
+    cov = block_diagonal([plant.start_cov for plant in plants])
+    M = block_diagonal([np.asarray(_dynamics(plant)) for plant in plants])
+    _add_couplings(M, blocks, layout)
+    if slotted:
+        Q = block_diagonal([plant.Q for plant in plants])  # type: ignore[attr-defined]
+        return LinearPlant(F=M, Q=Q, period=_one(blocks, "period"), mean=mean, cov=cov)
+    B = block_diagonal([np.asarray(plant.B) for plant in plants])  # type: ignore[attr-defined]
+    period = _one(blocks, "sensing_period")
+    return Diffusion(A=M, B=B, sensing_period=period, mean=mean, cov=cov)
+
+
+def _dynamics(plant: Any) -> FloatArray:
+    return plant.F if isinstance(plant, LinearPlant) else plant.A  # type: ignore[no-any-return]
+
+
+def _check_shapes(k: int, block: Block) -> None:
+    plant: Any = block.plant
+    n, is_slotted = plant.n, isinstance(plant, LinearPlant)
+    shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (n, n)}
+    shapes |= {"Q": (n, n)} if is_slotted else {"B": (n, plant.B.shape[1])}
+    for name, shape in shapes.items():
+        value = getattr(plant, name)
+        if value is not None and value.shape != shape:
+            wanted, given = (" x ".join(map(str, one)) for one in (shape, value.shape))
+            why = f"because {'F' if is_slotted else 'A'} has {n} rows"
+            rule = f"must be {wanted}, not {given}, {why}"
+            raise ScenarioError(f"[{k}].{name}", rule, value, "correct the shape")
+
+
+def _one(blocks: Sequence[Block], key: str) -> Any:
+    """Return the value of a key that all plants share, None if none of them gives it."""
+    values = {getattr(block.plant, key) for block in blocks} - {None}
+    if len(values) > 1:
+        rule = "must be the same in all entries"
+        raise ScenarioError(f"[0].{key}", rule, sorted(values), "write one value")
+    return values.pop() if values else None
+
+
+def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:
+    places = iter(layout.places)
+    for k, block in enumerate(blocks):
+        for _ in block.nodes or (None,):
+            place = next(places)
+            for c, coupling in enumerate(block.coupling):
+                key = f"[{k}].coupling[{c}]"
+                for origin in _origins(f"{key}.from", coupling, place, layout):
+                    if coupling.A.shape != (place.n, origin.n):
+                        rule = f"must be {place.n} x {origin.n}, from the block of {origin.n} states"
+                        raise ScenarioError(f"{key}.A", rule, coupling.A, "correct the shape")
+                    M[place.entries, origin.entries] += coupling.A
+
+
+def _origins(key: str, coupling: Coupling, place: Place, layout: Layout) -> list[Place]:
+    """Return the blocks by which the block at ``place`` is driven."""
+    if isinstance(coupling.origin, str):
+        name = coupling.origin
+        found = [one for one in layout.places if one.name == name]
+        # A block of a node is driven by that of the same node, and by a shared one.
+        own = [one for one in found if one.node in (place.node, None)]
+        if not own:
+            remedy = f"{suggest_nearest(name, layout.names)}or give ids of nodes"
+            raise ScenarioError(key, "must be a block of the same node or a shared one", name, remedy)
+        return own
+    origins = []
+    for node in coupling.origin:
+        if node == place.node:
+            continue
+        owned = layout.owned(node)
+        same = [one for one in owned if one.name == place.name] or list(owned)
+        if len(same) != 1:
+            rule = f"must be nodes with a block {quote(place.name)} or one block in all"
+            raise ScenarioError(key, rule, node, "correct the id, or couple by name")
+        origins += same
+    return origins

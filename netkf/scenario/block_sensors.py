@@ -1,0 +1,151 @@
+"""Sensors of blocks: each as the sensors of the stacked state that stand for it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError, errors_under
+from netkf.network.graphs import Topology
+from netkf.plants.blocks import Layout, Place
+from netkf.plants.nonlinear import PositionedSensor
+from netkf.plants.recorded import RecordedSensor
+from netkf.plants.relative import RelativePositionSensor, RelativeSensor
+
+RELATIVE = (RelativeSensor, RelativePositionSensor)
+
+
+def require_no_blocks(sensors: Sequence[Any]) -> None:
+    """Raise ScenarioError for a sensor of blocks where there are none."""
+    for k, sensor in enumerate(sensors):
+        if isinstance(sensor, RELATIVE):
+            rule, remedy = "means nothing without [[plants]]", "give nodes blocks of their own"
+            raise ScenarioError(f"[{k}].kind", rule, None, remedy)
+        if getattr(sensor, "of", None) is not None:
+            rule, remedy = "means nothing without [[plants]]", "leave it out"
+            raise ScenarioError(f"[{k}].of", rule, sensor.of, remedy)
+
+
+def stacked_sensors(
+    sensors: Sequence[Any], layout: Layout, topology: Topology
+) -> tuple[tuple[Any, ...], tuple[int, ...]]:
+    """Return the sensors of the stacked state that stand for ``sensors``, and the index of the
+    entry that each comes from.
+
+    Raises ScenarioError for a block that a node does not have, and for shapes that do not fit.
+    """
+    stacked, entries = [], []
+    for k, sensor in enumerate(sensors):
+        with errors_under(f"[{k}]"):
+            for one in _stacked(sensor, layout, topology):
+                stacked.append(one)
+                entries.append(k)
+    return tuple(stacked), tuple(entries)
+
+
+def _stacked(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
+    if isinstance(sensor, RELATIVE):
+        # One that was replaced before is left as it is.
+        if getattr(sensor, "_others", None) is not None:
+            yield sensor
+        else:
+            yield from sensor.lowered(layout, list(_pairs(sensor, layout, topology)))
+        return
+    name = _name_of(sensor, layout)
+    if name is None:
+        yield sensor
+        return
+    nodes: dict[Place, list[int]] = {}
+    for node in sensor.nodes:
+        with errors_under("of"):
+            nodes.setdefault(layout.require(name, node), []).append(node)
+    for place, readers in nodes.items():
+        yield _at_place(sensor, place, tuple(readers), layout)
+
+
+def _name_of(sensor: Any, layout: Layout) -> str | None:
+    """Return the name of the block that a sensor reads; None if it reads the stacked state."""
+    name = getattr(sensor, "of", None)
+    if name is not None:
+        return str(name)
+    H = getattr(sensor, "H", None)
+    whole = H is not None and H.shape[1] == layout.n
+    if whole or not hasattr(type(sensor), "of"):
+        return None
+    if len(layout.names) > 1:
+        listed = ", ".join(f'"{one}"' for one in layout.names)
+        remedy = f"write of = ..., one of {listed}"
+        raise ScenarioError("of", "is missing, and there are several [[plants]]", None, remedy)
+    return layout.names[0]
+
+
+def _at_place(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout) -> Any:
+    """Return a sensor of a block as one of the stacked state, on ``nodes`` alone."""
+    if isinstance(sensor, PositionedSensor):
+        largest = max(*sensor.states, sensor.heading or 0)
+        if largest >= place.n:
+            rule = f"must be components of block {place.name!r}, which has {place.n}"
+            raise ScenarioError("states", rule, list(sensor.states), "they count from 0")
+        states = tuple(place.first + s for s in sensor.states)
+        heading = None if sensor.heading is None else place.first + sensor.heading
+        own = {"nodes": nodes, "states": states, "heading": heading, "of": None}
+        if not isinstance(sensor.positions, str) and sensor.places == sensor.nodes:
+            rows = [sensor.nodes.index(node) for node in nodes]
+            own["positions"] = np.asarray(sensor.positions)[rows]
+        return dataclasses.replace(sensor, **own)
+    if isinstance(sensor, RecordedSensor) and sensor.record.regressors:
+        rule, remedy = "cannot have columns phi for a block", "write H, or one plant for all"
+        raise ScenarioError("path", rule, sensor.path.name, remedy)
+    H = sensor.H
+    if H.shape[1] != place.n:
+        rule = f"must have {place.n} columns, because block {place.name!r} has {place.n} components"
+        raise ScenarioError("H", rule, H, "correct it")
+    return dataclasses.replace(sensor, nodes=nodes, H=layout.embed([(place, H)]), of=None)
+
+
+def _pairs(sensor: Any, layout: Layout, topology: Topology) -> Iterator[tuple[Place, Place]]:
+    """Yield the blocks of the pairs that a relative sensor reads, that of the reader first."""
+    name = sensor.of
+    if name is None:
+        owned = dict.fromkeys(place.name for place in layout.places if place.node is not None)
+        if len(owned) != 1:
+            listed = ", ".join(f'"{one}"' for one in owned)
+            remedy = f"write of = ..., one of {listed}" if owned else "give [[plants]] nodes"
+            raise ScenarioError("of", "is missing, the block that is read", None, remedy)
+        name = next(iter(owned))
+    owners = {place.node: place for place in layout.places if place.name == name}
+    owners.pop(None, None)
+    for key, reader, other in _targets(sensor, topology, list(owners)):
+        for node in (reader, other):
+            if node not in owners:
+                rule = f"must be nodes with a block {name!r} of their own"
+                remedy = f"nodes with it are {', '.join(map(str, owners))}"
+                raise ScenarioError(key, rule, node, remedy)
+        if reader == other:
+            raise ScenarioError(key, "must be two nodes", reader, "correct the pair")
+        yield owners[reader], owners[other]
+
+
+def _targets(
+    sensor: Any, topology: Topology, owners: Sequence[int]
+) -> Iterator[tuple[str, int, int]]:
+    """Yield (key, reader, other) of all that a relative sensor reads."""
+    if sensor.record is not None:
+        table = sensor.record
+        pairs = dict.fromkeys(zip(table.nodes, table.columns.integers("to"), strict=True))
+        yield from (("path", i, j) for i, j in pairs if i in sensor.nodes)
+        return
+    if not isinstance(sensor.to, str):
+        for k, (i, j) in enumerate(sensor.to):
+            if sensor.nodes is None or i in sensor.nodes:
+                yield f"to[{k}]", i, j
+        return
+    linked: dict[int, set[int]] = {}
+    for i, j in topology.links:
+        linked.setdefault(i, set()).add(j)
+        linked.setdefault(j, set()).add(i)
+    for i in owners if sensor.nodes is None else sensor.nodes:
+        yield from (("to", i, j) for j in sorted(linked.get(i, set()) & set(owners)))
