@@ -86,6 +86,7 @@ from netkf.network.graphs import (
 )
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.plants.blocks import Block
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant
@@ -104,6 +105,12 @@ from netkf.plants.recorded import (
     UnknownPlant,
 )
 from netkf.plants.regressors import RegressorSensor
+from netkf.plants.relative import (
+    RelativeBearingSensor,
+    RelativeRangeBearingSensor,
+    RelativeRangeSensor,
+    RelativeSensor,
+)
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.model import Belief, Filtering, Network
@@ -131,6 +138,7 @@ __all__ = [
     "Belief",
     "BeliefPropagation",
     "Bernoulli",
+    "Block",
     "Broadcast",
     "Central",
     "Chain",
@@ -214,6 +222,10 @@ __all__ = [
     "RecordedSlots",
     "RegressorSensor",
     "Regular",
+    "RelativeBearingSensor",
+    "RelativeRangeBearingSensor",
+    "RelativeRangeSensor",
+    "RelativeSensor",
     "Renewal",
     "Scenario",
     "Sensor",

@@ -1,4 +1,4 @@
-"""States of one's own: the truth as blocks, each a plant that all nodes share or that one node has.
+"""The truth as blocks, each a plant that all nodes share or that one node owns.
 
 The blocks together are one linear system, the *stacked* plant, whose state is that of all blocks,
 one after the other: that of a scenario with ``[[plants]]`` is an ordinary plant.
@@ -54,8 +54,8 @@ def _as_coupling(key: str, value: Any) -> Coupling:
     for name in set(value) - names:
         raise ScenarioError(f"{key}.{name}", "is not a key here", value[name], "keys are from, A")
     origin: Any = value["from"]
-    rule = text if isinstance(origin, str) else list_of(node_id(), "node ids")
-    return Coupling(rule(f"{key}.from", origin), matrix(f"{key}.A", value["A"]))
+    of_nodes = text if isinstance(origin, str) else list_of(node_id(), "node ids")
+    return Coupling(of_nodes(f"{key}.from", origin), matrix(f"{key}.A", value["A"]))
 
 
 _couplings = Rule(
@@ -197,7 +197,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
 
 
 def _dynamics(plant: Any) -> FloatArray:
-    return plant.F if isinstance(plant, LinearPlant) else plant.A  # type: ignore[no-any-return]
+    return plant.F if isinstance(plant, LinearPlant) else plant.A
 
 
 def _check_shapes(k: int, block: Block) -> None:
@@ -232,7 +232,9 @@ def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> No
                 key = f"[{k}].coupling[{c}]"
                 for origin in _origins(f"{key}.from", coupling, place, layout):
                     if coupling.A.shape != (place.n, origin.n):
-                        rule = f"must be {place.n} x {origin.n}, from the block of {origin.n} states"
+                        rule = (
+                            f"must be {place.n} x {origin.n}, from the block of {origin.n} states"
+                        )
                         raise ScenarioError(f"{key}.A", rule, coupling.A, "correct the shape")
                     M[place.entries, origin.entries] += coupling.A
 
@@ -246,7 +248,9 @@ def _origins(key: str, coupling: Coupling, place: Place, layout: Layout) -> list
         own = [one for one in found if one.node in (place.node, None)]
         if not own:
             remedy = f"{suggest_nearest(name, layout.names)}or give ids of nodes"
-            raise ScenarioError(key, "must be a block of the same node or a shared one", name, remedy)
+            raise ScenarioError(
+                key, "must be a block of the same node or a shared one", name, remedy
+            )
         return own
     origins = []
     for node in coupling.origin:

@@ -310,8 +310,8 @@ class PositionedSensor(NonlinearSensor):
             raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
-        """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id); with
-        a ``heading``, that of the node relative to the target.
+        """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id);
+        with a ``heading``, that of the node relative to the target.
         """
         positions = np.asarray(self.positions, dtype=np.float64)
         d = x[list(self.states)] - positions[self.places.index(node)]

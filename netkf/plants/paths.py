@@ -57,7 +57,7 @@ class PathStep(NamedTuple):
     cubic: FloatArray
 
 
-class Block(NamedTuple):
+class StepBlock(NamedTuple):
     """S consecutive sensing steps of B paths, cut into K >= S pieces at the sample and probe times.
 
     Of the pieces: ``start, end`` (K,) in seconds, states ``x_start, x_end`` (B, K, n), ``moments``
@@ -77,7 +77,7 @@ class Block(NamedTuple):
     step: np.ndarray
     ends: FloatArray
 
-    def of(self, k: int) -> Block:
+    def of(self, k: int) -> StepBlock:
         """Return the block of path ``k`` alone, without the axis of the B paths."""
         return self._replace(
             x_start=self.x_start[k],
@@ -128,7 +128,7 @@ class DiffusionPaths:
         times = self.laws.time_grid.snap(period * (steps * np.arange(1, count)))
         return np.asarray(times[times < horizon])
 
-    def following(self, blocks: int = 1, most: int | None = None) -> Block:
+    def following(self, blocks: int = 1, most: int | None = None) -> StepBlock:
         """Return the next ``blocks`` times BLOCK steps, at most ``most``, with their cuts."""
         laws, (paths, n) = self.laws, self._x.shape
         total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
@@ -149,7 +149,7 @@ class DiffusionPaths:
         # Grid times from their index, and not as sums of periods.
         times = laws.grid(self._drawn, total + 1)
         self._drawn += total
-        block = Block(
+        block = StepBlock(
             start=times[:-1],
             end=times[1:],
             x_start=x_start,
@@ -190,7 +190,7 @@ class DiffusionPaths:
             cubic=block.cubic + cubic,
         )
 
-    def _cut(self, block: Block, times: FloatArray, source: Normals) -> Block:
+    def _cut(self, block: StepBlock, times: FloatArray, source: Normals) -> StepBlock:
         """Return the block cut further at C ``times`` (C,), drawn from ``source``."""
         # owners: the index of the piece that contains each time.
         owners = np.searchsorted(block.end, times)
@@ -198,7 +198,7 @@ class DiffusionPaths:
         # A piece with m cuts becomes m + 1 rows of the arrays, copies of it at first.
         counts = 1 + np.bincount(owners, minlength=len(block.end))
         parents = np.repeat(np.arange(len(block.end)), counts)
-        pieces = Block(
+        pieces = StepBlock(
             start=block.start[parents],
             end=block.end[parents],
             x_start=np.take(block.x_start, parents, axis=1),
@@ -215,7 +215,9 @@ class DiffusionPaths:
             self._split(pieces, row, stop, time, np.ascontiguousarray(normals[:, cut]))
         return pieces
 
-    def _split(self, pieces: Block, row: int, stop: int, time: float, normals: FloatArray) -> None:
+    def _split(
+        self, pieces: StepBlock, row: int, stop: int, time: float, normals: FloatArray
+    ) -> None:
         """Cut the piece in ``row`` of B paths at ``time``."""
         laws, start = self.laws, float(pieces.start[row])
         length, before = float(pieces.end[row]) - start, time - start
@@ -252,7 +254,7 @@ def split_piece(
     responses (3, 3, n, n) GridLaws.responses over the whole piece and the parts before and after
     lengths   (2,) seconds of the whole piece and of the part before the cut
     work      (4, 3 n) scratch
-    pieces    the first arrays of a Block but its times
+    pieces    the first arrays of a StepBlock but its times
 
     Vectors of 3 n numbers hold a state x and its plain and tilted moments, one after the other.
     """
@@ -425,7 +427,7 @@ class DiffusionPath:
         self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
         # The local states just before the frames so far began.
         self._offsets: list[FloatArray] = []
-        self._block: Block | None = None
+        self._block: StepBlock | None = None
         # Indices of the first piece of the present step, and of the piece last asked for; that
         # piece, of which there is none yet, and the end of its step.
         self._first = self._piece = 0

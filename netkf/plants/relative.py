@@ -121,16 +121,15 @@ class RelativeSensor(Sensor):
         of the reader first.
         """
         matrices = {
-            (own.node, other.node): layout.embed(
-                [(own, -self.of_pair(own, other)), (other, self.of_pair(own, other))]
-            )
+            (own.node, other.node): layout.embed([(own, -H), (other, H)])
             for own, other in pairs
+            if own.node is not None and other.node is not None
+            for H in [self.of_pair(own, other)]
         }
         if self.record is None:
             return [
                 LinearSensor(nodes=(own,), H=H, R=self.R, sampling=self.sampling)
                 for (own, _), H in matrices.items()
-                if own is not None
             ]
         readers = dict.fromkeys(own for own, _ in matrices)
         return [

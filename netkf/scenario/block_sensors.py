@@ -6,8 +6,6 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
-
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.network.graphs import Topology
 from netkf.plants.blocks import Layout, Place
@@ -91,11 +89,11 @@ def _at_place(sensor: Any, place: Place, nodes: tuple[int, ...], layout: Layout)
             raise ScenarioError("states", rule, list(sensor.states), "they count from 0")
         states = tuple(place.first + s for s in sensor.states)
         heading = None if sensor.heading is None else place.first + sensor.heading
-        own = {"nodes": nodes, "states": states, "heading": heading, "of": None}
-        if not isinstance(sensor.positions, str) and sensor.places == sensor.nodes:
-            rows = [sensor.nodes.index(node) for node in nodes]
-            own["positions"] = np.asarray(sensor.positions)[rows]
-        return dataclasses.replace(sensor, **own)
+        positions = sensor.positions
+        if not isinstance(positions, str) and sensor.places == sensor.nodes:
+            positions = positions[[sensor.nodes.index(node) for node in nodes]]
+        own = {"nodes": nodes, "states": states, "heading": heading, "positions": positions}
+        return dataclasses.replace(sensor, of=None, **own)  # type: ignore[arg-type]
     if isinstance(sensor, RecordedSensor) and sensor.record.regressors:
         rule, remedy = "cannot have columns phi for a block", "write H, or one plant for all"
         raise ScenarioError("path", rule, sensor.path.name, remedy)
@@ -116,8 +114,7 @@ def _pairs(sensor: Any, layout: Layout, topology: Topology) -> Iterator[tuple[Pl
             remedy = f"write of = ..., one of {listed}" if owned else "give [[plants]] nodes"
             raise ScenarioError("of", "is missing, the block that is read", None, remedy)
         name = next(iter(owned))
-    owners = {place.node: place for place in layout.places if place.name == name}
-    owners.pop(None, None)
+    owners = {p.node: p for p in layout.places if p.name == name and p.node is not None}
     for key, reader, other in _targets(sensor, topology, list(owners)):
         for node in (reader, other):
             if node not in owners:

@@ -137,7 +137,9 @@ class ScenarioModel(Component):
 
     With ``plants``, blocks of the state, ``plant`` is the stacked one, and ``sensors`` are those of
     the stacked state; ``sensor_entries`` has the index of the one of ``declared_sensors`` that each
-    comes from. ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
+    comes from.
+
+    ``horizon`` and ``probe`` are in simulated seconds; ``probe`` is the period of the state
     samples, or an array (T,) of their increasing times.
     """
 
@@ -151,7 +153,11 @@ class ScenarioModel(Component):
     claim: str = field(line, default="")
     seed: int = field(integer(low=0), default=0)
     time: Time = field(instance_of(Time), default=Time())
-    plants: tuple[Block, ...] = field(list_of(instance_of(Block), "blocks"), default=())
+    plants: tuple[Block, ...] = field(
+        list_of(instance_of(Block), "blocks", min_length=0), default=()
+    )
+    declared_sensors: tuple[Any, ...] = dataclasses.field(default=(), init=False, repr=False)
+    sensor_entries: tuple[int, ...] = dataclasses.field(default=(), init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check the fields, and read tables anew that were read without ``time`` or names of nodes;
@@ -180,15 +186,16 @@ class ScenarioModel(Component):
             with errors_under("sensors"):
                 require_no_blocks(self.sensors)
         else:
+            layout = self.layout
             with errors_under("plants"):
-                object.__setattr__(self, "plant", stack(self.plants, self.layout))
+                object.__setattr__(self, "plant", stack(self.plants, layout))
             for k, block in enumerate(self.plants):
                 for place, node in enumerate(block.nodes or ()):
                     if node not in self.topology.index:
                         key, rule = f"plants[{k}].nodes[{place}]", "must be a node of the graph"
                         raise ScenarioError(key, rule, node, "correct the id")
             with errors_under("sensors"):
-                stacked, entries = stacked_sensors(declared, self.layout, self.topology)
+                stacked, entries = stacked_sensors(declared, layout, self.topology)
             object.__setattr__(self, "sensors", stacked)
         object.__setattr__(self, "declared_sensors", declared)
         object.__setattr__(self, "sensor_entries", entries)
@@ -336,8 +343,9 @@ class ScenarioModel(Component):
         if not believed or believed_R is None:
             true_R: FloatArray = self.sensors[entry].R
             return true_R
-        given = isinstance(believed_R, tuple)
-        return believed_R[self.sensor_entries[entry]] if given else believed_R
+        if isinstance(believed_R, tuple):
+            return believed_R[self.sensor_entries[entry]]
+        return believed_R
 
     def table_probability(self, link: Link) -> float:
         """Return the delivery probability of a directed link in the graph's CSV table.

@@ -49,8 +49,7 @@ class Scenario(DerivedScenario):
         file it was read from may not exist where the pickle is loaded.
         """
         names = {field.name for field in dataclasses.fields(self)}
-        names |= {"_folder", "_trust", "topology", "time_grid", "declared_sensors"}
-        names |= {"sensor_entries"}
+        names |= {"_folder", "_trust", "topology", "time_grid"}
         return {name: value for name, value in self.__dict__.items() if name in names}
 
     def __repr__(self) -> str:

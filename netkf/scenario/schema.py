@@ -18,6 +18,9 @@ from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
+from netkf.plants.blocks import Block
+from netkf.plants.diffusion import Diffusion
+from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
 from netkf.scenario.imports import offered_kinds
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
@@ -35,6 +38,7 @@ DEFAULT_KINDS = {"sensor": "linear"}
 NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (ScenarioModel, "plant"): {"$ref": "#/$defs/plant"},
     (Plant, "input"): {"$ref": "#/$defs/input"},
+    (ScenarioModel, "plants"): {"type": "array", "items": {"$ref": "#/$defs/block"}},
     (ScenarioModel, "sensors"): {"type": "array", "items": {"$ref": "#/$defs/sensor"}},
     (ScenarioModel, "network"): {"$ref": "#/$defs/network"},
     (ScenarioModel, "filter"): {"$ref": "#/$defs/filter"},
@@ -90,8 +94,10 @@ def scenario_schema() -> Schema:
     file_schema = _table_schema(scenario_keys, constants={"format": file_format})
     # A scenario without sensors may leave out the list.
     required = [name for name in file_schema["required"] if name != "sensors"]
+    file_schema["oneOf"] = [{"required": ["plant"]}, {"required": ["plants"]}]
     file_schema["required"] = ["format", *required]
     definitions = {name: _family_schema(name, families) for name, families in FAMILIES.items()}
+    definitions["block"] = _block_schema()
     definitions["network"] = _table_schema(list_keys(Network))
     definitions["channel"] = _table_schema(list_keys(Channel))
     definitions["time"] = _table_schema(list_keys(Time))
@@ -170,6 +176,15 @@ def _family_schema(name: str, families: Sequence[str]) -> Schema:
     kind_schema = {"type": "string", "pattern": _user_kinds(), "description": description}
     user_class = {"type": "object", "properties": {"kind": kind_schema}, "required": ["kind"]}
     return {"anyOf": [*variants, {"title": "a custom class", **user_class}]}
+
+
+def _block_schema() -> Schema:
+    """Return the schema of one of [[plants]]: its own keys beside those of its plant."""
+    own = [key for key in list_keys(Block) if key.name != "plant"]
+    plants: list[type[Component]] = [Diffusion, LinearPlant]
+    names = {cls: name for name, cls in KINDS["plant"].items()}
+    variants = [_kind_schema(names[cls], cls, own, is_default=True) for cls in plants]
+    return {"anyOf": variants}
 
 
 def _kind_schema(

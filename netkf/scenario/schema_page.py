@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from netkf.core.fields import Component
 from netkf.network.channels import Channel
+from netkf.plants.blocks import Block
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
@@ -15,6 +16,7 @@ from netkf.scenario.writing import part_as_table, toml_text
 
 TABLES: dict[str, type[Component]] = {
     "The file": Scenario,
+    "plants, beside the keys of its plant": Block,
     "time": Time,
     "network": Network,
     "network.channel": Channel,
@@ -22,6 +24,8 @@ TABLES: dict[str, type[Component]] = {
     "filter.model": Belief,
 }
 """Classes of the tables without a kind, by heading."""
+INNER = ((Filtering, "algorithm"), (Block, "plant"))
+"""Fields whose keys stand beside those of the table."""
 SECTIONS = {
     "plant": "plant.kind",
     "continuous plant": "plant.kind in continuous time, with A and B",
@@ -48,7 +52,11 @@ def _iterate_page_lines() -> Iterator[str]:
     yield ""
     yield "`netkf schema --markdown` prints this page. Keys whose default is a dash must be given."
     for heading, cls in TABLES.items():
-        keys = [key for key in list_keys(cls) if key.name != "algorithm"]
+        keys = [
+            key
+            for key in list_keys(cls)
+            if (cls, key.name) not in ((Filtering, "algorithm"), (Block, "plant"))
+        ]
         yield from ("", f"## {heading}", "", summary(cls), "")
         yield from _iterate_table_lines(keys)
     for family, heading in SECTIONS.items():

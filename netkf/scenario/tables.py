@@ -260,7 +260,9 @@ def _build_blocks(origin: Origin, value: Any) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)) or not value:
         raise ScenarioError("", "must be a list of tables", value, "write [[plants]]")
     tables = {f"[{k}]": item for k, item in enumerate(value)}
-    return tuple(_build_inner(tables, dict.fromkeys(tables, partial(_build_block, origin))).values())
+    return tuple(
+        _build_inner(tables, dict.fromkeys(tables, partial(_build_block, origin))).values()
+    )
 
 
 def _build_block(origin: Origin, value: Any) -> Any:

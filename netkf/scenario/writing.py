@@ -20,7 +20,7 @@ from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import RandomGraph
 from netkf.plants.blocks import Block
-from netkf.plants.linear import LinearPlant
+from netkf.plants.diffusion import Diffusion
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
@@ -102,8 +102,10 @@ def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
     """
     plant = block.plant
     if style.with_defaults:
-        period = {} if isinstance(plant, LinearPlant) else {"sensing_period": stacked.sensing_period}  # type: ignore[attr-defined]
-        plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov, **period)
+        plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
+        if isinstance(stacked, Diffusion):
+            period = stacked.sensing_period
+            plant = dataclasses.replace(plant, sensing_period=period)  # type: ignore[call-arg]
     own = _field_values(block, style)
     del own["plant"]
     if block.coupling:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.errors import ScenarioError, quote
+from netkf.core.errors import ScenarioError, errors_under, quote
 from netkf.core.notebook import NotebookTable
 from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
@@ -126,9 +126,45 @@ class Run(NotebookTable):
         }
         return pd.DataFrame(columns, index=pd.Index(self.nodes, name="node"))
 
+    def block(self, name: str, node: int, by: int | None = None) -> BlockSamples:
+        """Return the samples of one block of ``[[plants]]``, the one called ``name`` that ``node``
+        (id) owns or that all share, as it is estimated by the node ``by``, by default ``node``.
+
+        Raises ScenarioError for a block or a node that does not exist.
+        """
+        if self.scenario is None:
+            rule, remedy = "is unknown for this run", "take a run that netkf.simulate returns"
+            raise ScenarioError("scenario", rule, None, remedy)
+        by = node if by is None else by
+        for key, one in (("node", node), ("by", by)):
+            if one not in self.nodes:
+                raise ScenarioError(key, "must be a node of the run", one, "give another id")
+        with errors_under("name"):
+            entries = self.scenario.layout.require(name, node).entries
+        k = self.nodes.index(by)
+        return BlockSamples(
+            times=self.times,
+            x=self.x[:, entries],
+            xhat=self.xhat[:, k, entries],
+            P=self.P[:, k, entries, entries],
+            error=self.error[:, k, entries],
+        )
+
     def count(self, kind: str) -> int:
         """Return the number of events of a kind."""
         return int((self.log["kind"] == CODES[kind]).sum())
+
+
+class BlockSamples(NamedTuple):
+    """T samples of one block of n states as one node estimates it: ``times`` (T,) in seconds, x,
+    xhat and error = x - xhat (T, n), P (T, n, n).
+    """
+
+    times: FloatArray
+    x: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+    error: FloatArray
 
 
 def plot_by_name(result: Any, figure: str) -> Any:

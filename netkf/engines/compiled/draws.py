@@ -17,7 +17,7 @@ from netkf.linalg.lanes import aligned, unset, with_spare
 from netkf.linalg.portable import cholesky
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.laws import course_width
-from netkf.plants.paths import BLOCK, Block
+from netkf.plants.paths import BLOCK, StepBlock
 from netkf.plants.sensors import step_noise
 from netkf.rng.normals import StreamNormals
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
@@ -96,11 +96,11 @@ class Paths:
         self._senses, self._horizon = bool(scenario.increment_sensors), scenario.horizon
         self.frame_times = self._paths.frame_times(scenario.horizon)
 
-    def following(self, max_steps: int | None = None) -> Block:
+    def following(self, max_steps: int | None = None) -> StepBlock:
         """Return the next steps of all runs, at most ``max_steps``; the last reach the horizon."""
         return self._paths.following(self._blocks, max_steps)
 
-    def block(self, block: Block, together: int = 1) -> PathBlock:
+    def block(self, block: StepBlock, together: int = 1) -> PathBlock:
         """Return a block of steps as arrays for the event loop, which simulates ``together`` runs
         at a time.
         """
