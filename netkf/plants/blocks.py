@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import scipy.linalg
 
 from netkf.core.errors import ScenarioError, quote, suggest_nearest
 from netkf.core.fields import (
@@ -23,8 +25,10 @@ from netkf.core.fields import (
     node_id,
     text,
 )
+from netkf.core.instants import TimeGrid
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.inputs import Exogenous, Input
 from netkf.plants.linear import LinearPlant
 from netkf.plants.plant import Plant
 
@@ -168,6 +172,38 @@ def _places(blocks: Sequence[Block]) -> Iterator[Place]:
             first += block.plant.n
 
 
+@dataclass(frozen=True, eq=False)
+class StackedInput(Input):
+    """The ``inputs`` (u_1, u_2, ...) of several blocks together; G (n, m) is that of all states."""
+
+    inputs: tuple[Input, ...] = field(list_of(instance_of(Input), "inputs"))
+
+    def on_grid(self, grid: TimeGrid) -> Self:
+        """Return the input with its instants on the ``grid``."""
+        stacked = super().on_grid(grid)
+        object.__setattr__(stacked, "inputs", tuple(one.on_grid(grid) for one in self.inputs))
+        return stacked
+
+    @cached_property
+    def exogenous(self) -> Exogenous:
+        """The systems of all inputs side by side, which begins anew where any of them jumps."""
+        parts = [one.exogenous for one in self.inputs]
+        times, z = np.unique(np.concatenate([part.times for part in parts])), []
+        for part in parts:
+            last = part.last(times)
+            gaps = (times - part.times[last])[:, None, None]
+            moved = scipy.linalg.expm(gaps * part.S) @ part.z[last][:, :, None]
+            z.append(np.where(last[:, None] >= 0, moved[:, :, 0], 0.0))
+        S, C = (
+            block_diagonal(matrices) for matrices in zip(*((p.S, p.C) for p in parts), strict=True)
+        )
+        return Exogenous(times, S, C, np.concatenate(z, axis=1))
+
+    def values(self, times: FloatArray) -> FloatArray:
+        """Return u (K, m) at K ``times`` (K,) in seconds."""
+        return np.concatenate([one.values(times) for one in self.inputs], axis=1)
+
+
 def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     """Return the plant whose state is that of all ``blocks``, at the places of their ``layout``.
 
@@ -188,12 +224,13 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     cov = block_diagonal([plant.start_cov for plant in plants])
     M = block_diagonal([np.asarray(_dynamics(plant)) for plant in plants])
     _add_couplings(M, blocks, layout)
+    shared = {"mean": mean, "cov": cov, "input": _stacked_input(blocks, layout)}
     if slotted:
         Q = block_diagonal([plant.Q for plant in plants])  # type: ignore[attr-defined]
-        return LinearPlant(F=M, Q=Q, period=_one(blocks, "period"), mean=mean, cov=cov)
+        return LinearPlant(F=M, Q=Q, period=_one(blocks, "period"), **shared)
     B = block_diagonal([np.asarray(plant.B) for plant in plants])  # type: ignore[attr-defined]
     period = _one(blocks, "sensing_period")
-    return Diffusion(A=M, B=B, sensing_period=period, mean=mean, cov=cov)
+    return Diffusion(A=M, B=B, sensing_period=period, **shared)
 
 
 def _dynamics(plant: Any) -> FloatArray:
@@ -221,6 +258,23 @@ def _one(blocks: Sequence[Block], key: str) -> Any:
         rule = "must be the same in all entries"
         raise ScenarioError(f"[0].{key}", rule, sorted(values), "write one value")
     return values.pop() if values else None
+
+
+def _stacked_input(blocks: Sequence[Block], layout: Layout) -> StackedInput | None:
+    """Return what drives all blocks; None if nothing does."""
+    inputs, parts, places = list[Input](), list[FloatArray](), iter(layout.places)
+    for k, block in enumerate(blocks):
+        for _ in block.nodes or (None,):
+            place, one = next(places), block.plant.input
+            if one is None:
+                continue
+            if one.G is None or one.G.shape != (place.n, one.m):
+                rule = f"must be {place.n} x {one.m}"
+                raise ScenarioError(f"[{k}].input.G", rule, one.G, "correct the shape")
+            inputs.append(one)
+            parts.append(np.zeros((layout.n, one.m)))
+            parts[-1][place.entries] = one.G
+    return StackedInput(inputs=inputs, G=np.concatenate(parts, axis=1)) if inputs else None
 
 
 def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:

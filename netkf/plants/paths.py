@@ -169,7 +169,7 @@ class DiffusionPaths:
                 block = self._cut(block, inside, cut_normals)
         return block if self._forcing is None else self._forced(block)
 
-    def _forced(self, block: Block) -> Block:
+    def _forced(self, block: StepBlock) -> StepBlock:
         """Return the block with the response to an input, whose course inside a piece is
         approximated as that of the noise is.
         """

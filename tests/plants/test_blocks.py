@@ -324,3 +324,22 @@ def test_sensors_of_blocks_need_blocks(tmp_path: Path) -> None:
     text = first + STACKED + rest[rest.index("[[sensors]]") :]
     with pytest.raises(netkf.ScenarioError, match=r"sensors\[0\].of: means nothing without"):
         load(text, tmp_path)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_each_block_has_its_own_input(tmp_path: Path, engine: str) -> None:
+    (tmp_path / "u.csv").write_text("t,u0\n0.5,2\n3,-1\n")
+    recorded = 'input = { kind = "recorded", G = [[0.5]], path = "u.csv" }\n'
+    sine = 'input = { kind = "sine", G = [[1.0]], amplitude = 1.0, frequency = 0.2 }\n'
+    third = '[[plants]]\nname = "pose"\nnodes = [3]\nA = [[0.0]]\nB = [[0.5]]\ncov = [[1.0]]\n'
+    without = ROBOTS.replace("[1, 2, 3]", "[1, 2]").replace("[[sensors]]", third + "[[sensors]]", 1)
+    driven = without.replace(third, recorded + third + sine)
+    one, other = (netkf.simulate(load(text, tmp_path), engine=engine) for text in (driven, without))
+    t = one.times
+    held = np.where(t < 3.0, np.maximum(t - 0.5, 0.0), 2.5 - 0.5 * (t - 3.0))
+    wave = (1.0 - np.cos(0.4 * math.pi * t)) / (0.4 * math.pi)
+    expected = np.stack([held, held, wave], axis=1)
+    np.testing.assert_allclose(one.x - other.x, expected, atol=1e-12)
+    np.testing.assert_array_equal(one.error, other.error)
+    np.testing.assert_array_equal(one.P, other.P)
+    assert one.fingerprint == other.fingerprint
