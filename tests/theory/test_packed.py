@@ -10,18 +10,20 @@ from netkf import theory
 from netkf.theory.hybrid import bounds, linearised
 from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.packed import PackedRiccati
+from netkf.theory.hybrid.samples import PoissonSamples
 
 N, n = 5, 3
 
 
-def equations(delay=0.0, seed=1):
+def equations(delay=0.0, seed=1, n=n):
     random = np.random.default_rng(seed)
     A, B = random.normal(size=(n, n)), random.normal(size=(n, n))
     coupling = random.uniform(size=(N, N)) * (random.uniform(size=(N, N)) < 0.6)
     np.fill_diagonal(coupling, 0.0)
     G = np.zeros((N, n, n))
     for i, rows in ((0, 1), (2, 2), (3, 3)):
-        H = random.normal(size=(rows, n)) * [1.0, 1e-3, 10.0]  # states in units of their own
+        H = random.normal(size=(rows, n))
+        H[:, :3] *= [1.0, 1e-3, 10.0]  # states in units of their own
         G[i] = H.T @ H
     T, q = scipy.linalg.expm(A * delay), delay * np.eye(n)
     start = random.normal(size=(N, n, n))
@@ -120,3 +122,43 @@ def test_iterations_and_elimination_agree(random_graph, monkeypatch):
     eliminated = theory.steady_covariance_bound(scenario)
     monkeypatch.setattr(linearised, "FEW_UNKNOWNS", 0)
     near(theory.steady_covariance_bound(scenario), eliminated, 1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1])
+@pytest.mark.parametrize("sampled", [False, True])
+def test_linear_equations_of_many_states_take_no_matrix_of_all_entries(monkeypatch, delay, sampled):
+    """Of 20 states 210 entries of P: GMRES, and its preconditioner, multiply matrices (20, 20)."""
+    e, X = equations(delay, n=20), equations(seed=2, n=20).start
+    e = e._replace(A=e.A / 5.0 - np.eye(20), start=e.start / 20.0)
+    if sampled:
+        H, nodes = np.random.default_rng(3).normal(size=(2, 1, 20)), np.array([1, 4])
+        heard = scipy.sparse.csr_array((N, 2))
+        group = PoissonSamples(nodes, H, np.ones((2, 1, 1)), np.array([1.0, 3.0]), heard)
+        e = e._replace(samples=(group,))
+    packed = PackedRiccati(e)
+    half = (packed.slope(packed.pack(e.start + h * X), h * packed.pack(X)) for h in (1e-5, -1e-5))
+    right = -(next(half) - next(half)) / 2e-5
+
+    def refused(*_):
+        raise AssertionError("of order m^3")
+
+    for module, name in ((np.linalg, "inv"), (scipy.sparse.linalg, "spsolve")):
+        monkeypatch.setattr(module, name, refused)
+    monkeypatch.setattr(linearised, "FEW_UNKNOWNS", 0)
+    monkeypatch.setattr(PackedRiccati, "eliminates_cheaply", False)
+    near(packed.unpack(linearised.solve_map(packed.linear(e.start), right)), X, 1e-6)
+
+
+def test_a_bound_without_stiffness_takes_few_steps(random_graph, monkeypatch):
+    """Series of 28 terms: explicit methods of order 8 take thousands of evaluations."""
+    monkeypatch.setattr(bounds, "MAX_EXPLICIT_EVALUATIONS", 600)
+    monkeypatch.setattr(bounds, "_PiecewiseSolution", None)
+    scenario = random_graph(60)
+    found = theory.covariance_bound(scenario, np.linspace(0.0, 10.0, 41))
+    assert np.linalg.eigvalsh(found).min() > 0.0
+    blind = scenario.replace({"sensors": []})
+    grown, A = theory.covariance_bound(blind, [2.0])[0], scenario.plant.A
+    # Without sensors all nodes have the covariance of the prediction alone.
+    exponential = scipy.linalg.expm(np.block([[-A, np.eye(4)], [np.zeros((4, 4)), A.T]]) * 2.0)
+    F = exponential[4:, 4:].T
+    near(grown, np.broadcast_to(F @ F.T + F @ exponential[:4, 4:], grown.shape), 1e-10)

@@ -10,13 +10,15 @@ converge and the unknowns are not too many for it.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse.linalg
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.theory.hybrid.packed import LinearisedRiccati
+from netkf.theory.hybrid.packed import MAX_PACKED, LinearisedRiccati
 
 MAX_CONDITION = 1e13
 """A map whose slowest time constant is longer, in units of the fastest, is singular but for
@@ -26,6 +28,7 @@ MAX_ELIMINATED = 6000  # unknowns of a network without small cuts, whose fill-in
 ROUNDS, ROUND_TOLERANCE = 4, 1e-7  # each round reduces the residual by this factor
 RESIDUAL_TOLERANCE = 1e-14  # relative to the right-hand side
 RESTART, RESTARTS = 60, 3  # of GMRES
+Rows = Callable[[FloatArray], FloatArray]
 
 
 def solve_map(
@@ -67,7 +70,7 @@ def is_stable(linear: LinearisedRiccati) -> bool:
     values = np.linalg.eigvalsh(X)
     # Of a singular map, such as that of a plant without damping that nobody observes, X is the
     # inverse of a rounding error, of either sign.
-    slowest = values.max() * float(np.abs(linear.blocks).max())
+    slowest = values.max() * 2.0 * float(np.abs(linear.drifts).max())
     return bool(values.min() > 0.0 and slowest < MAX_CONDITION)
 
 
@@ -75,27 +78,20 @@ def _solve_by_gmres(
     linear: LinearisedRiccati, right: FloatArray, tolerance: float
 ) -> FloatArray | None:
     """Return X (N, m) of ``L(X) = -right`` by refined GMRES; None if it diverges."""
-    # The preconditioner solves for a change that all nodes share, then inverts each node's block.
-    blocks = linear.blocks
     try:
-        inverse = np.linalg.inv(blocks)
-        coarse = np.linalg.inv(linear.mean_map())
+        solve_alone, solve_shared = _inverses(linear)
     except np.linalg.LinAlgError:
         return None
 
     def apply(x: FloatArray) -> FloatArray:
         """Return L(x) (N m,) for a vector x (N m,)."""
         X = x.reshape(right.shape)
-        return np.asarray(np.einsum("ik,ikl->il", X, blocks) + linear.arriving(X)).reshape(-1)
-
-    def solve_alone(x: FloatArray) -> FloatArray:
-        """Return the solution (N m,) of ``L(X) = x`` for each node alone, without arrivals."""
-        return np.asarray(np.einsum("ik,ikl->il", x.reshape(right.shape), inverse)).reshape(-1)
+        return np.asarray(linear.remaining(X) + linear.arriving(X)).reshape(-1)
 
     def precondition(x: FloatArray) -> FloatArray:
-        """Return ``L^-1 x`` (N m,) roughly: the mean over nodes exactly, then each node alone."""
-        shared = np.tile(x.reshape(right.shape).mean(axis=0) @ coarse, len(right))
-        return shared + solve_alone(x - apply(shared))
+        """Return ``L^-1 x`` (N m,) roughly: a change that all nodes share, then each node alone."""
+        shared = np.tile(solve_shared(x.reshape(right.shape).mean(axis=0)), len(right))
+        return shared + solve_alone((x - apply(shared)).reshape(right.shape)).reshape(-1)
 
     shape = (right.size, right.size)
     operator = scipy.sparse.linalg.LinearOperator(shape, matvec=apply, dtype=np.float64)
@@ -120,3 +116,37 @@ def _solve_by_gmres(
         if np.linalg.norm(residual) <= tolerance * size:
             break
     return np.asarray(x).reshape(right.shape)
+
+
+def _inverses(linear: LinearisedRiccati) -> tuple[Rows, Rows]:
+    """Return two inverses: that of rows (N, m) of nodes by themselves, and that of the mean of all
+    nodes for one row (m,); LinAlgError if there are none.
+    """
+    packed, n = linear.packed, linear.drifts.shape[1]
+    if n <= MAX_PACKED:
+        inverse, coarse = np.linalg.inv(linear.blocks), np.linalg.inv(linear.mean_map())
+        return (lambda X: np.einsum("ik,ikl->il", X, inverse)), (lambda x: x @ coarse)
+    # m^3 operations are too many: Lyapunov equations take n^3. They leave out what samples add to
+    # drifts, and what the prediction over a delay changes.
+    kinds, kind = np.unique(linear.drifts.reshape(-1, n * n), axis=0, return_inverse=True)
+    solvers = [_lyapunov_solver(F.reshape(n, n)) for F in kinds]
+    arriving = sum(float(rates.sum()) for rates, _, _ in linear.heard) / len(linear.drifts)
+    shared = _lyapunov_solver(linear.drifts.mean(axis=0) + 0.5 * arriving * np.eye(n))
+
+    def solve_alone(X: FloatArray) -> FloatArray:
+        return packed.pack(
+            np.stack([solvers[k](R) for k, R in zip(kind, packed.unpack(X), strict=True)])
+        )
+
+    return solve_alone, lambda x: packed.pack(shared(packed.unpack(x)))
+
+
+def _lyapunov_solver(F: FloatArray) -> Rows:
+    """Return the function of R (n, n) that solves ``F X + X F' = R`` (Bartels and Stewart 1972)."""
+    T, U = scipy.linalg.schur(F)
+
+    def solve(R: FloatArray) -> FloatArray:
+        X, scale, _ = scipy.linalg.lapack.dtrsyl(T, T, U.T @ R @ U, tranb="T")
+        return np.asarray(U @ X @ U.T / scale)
+
+    return solve

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.errors import TheoryError
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.hybrid.coupled import CoupledRiccati, coupled_riccati
 from netkf.theory.hybrid.limits import limit_covariance
@@ -64,12 +65,15 @@ def link_rate_for(scenario: Scenario, delta: float) -> LinkRate:
     if as_numbers("delta", delta).size != 1 or not 0.0 < delta < math.inf:
         raise TheoryError(f"delta must be a positive number, got {delta!r}")
     equations, S = _require_talk(scenario), limit_covariance(scenario)
+    known: FloatArray | None = None
 
     def excess(log_factor: float) -> float:
         """Return log(distance / delta) with all link rates times exp(``log_factor``)."""
-        P = steady_state(equations.scale_rates(math.exp(log_factor)))
+        nonlocal known
+        P = steady_state(equations.scale_rates(math.exp(log_factor)), known)
         if P is None:
             return NO_STEADY_STATE
+        known = P
         distance = float(np.linalg.norm(P - S, axis=(1, 2)).max())
         return math.log(max(distance, 1e-300) / delta)
 

@@ -8,8 +8,8 @@ sensor.
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -19,7 +19,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.coupled import CoupledRiccati
 from netkf.theory.hybrid.samples import PoissonSamples
 
-MAX_PRODUCTS = 1 << 20  # entries of gains times unit matrices at once
+MAX_PACKED = 16  # states up to which the linear maps of nodes are matrices of packed rows
 ELIMINATION_WORK = 3e9  # multiplications up to which elimination is taken
 
 
@@ -43,6 +43,7 @@ class PackedRiccati:
         self._basis = np.zeros((self.m, n, n))
         self._basis[np.arange(self.m), self._i, self._j] = 1.0
         self._basis[np.arange(self.m), self._j, self._i] = 1.0
+        self._lyapunov = self._lyapunov_maps()
         self._set_drift(equations.A, equations.Q)
         self._predicted = self.pack(equations.T @ self._basis @ equations.T.T)
         self.start = self.pack(equations.start)
@@ -63,9 +64,26 @@ class PackedRiccati:
 
     def _set_drift(self, A: FloatArray, Q: FloatArray) -> None:
         """Set the map (m, m) of rows by A P + P A', and the rows of the noise Q."""
-        drift = A @ self._basis
-        self._drift_map = self.pack(drift + np.swapaxes(drift, 1, 2))
+        drift_map = self.lyapunov_maps(A[None])[0]
+        # Of many states most entries are 0.
+        sparse = len(A) > MAX_PACKED
+        self._drift_map = scipy.sparse.csr_array(drift_map) if sparse else drift_map
         self._Q = self.pack(Q)
+
+    def _lyapunov_maps(self) -> scipy.sparse.csr_array:
+        """Return the sparse map (n n, m m) of F to the map of rows by F X + X F'."""
+        n, m = len(self.equations.A), self.m
+        indices, k, row = self._indices.reshape(n, n), np.arange(n), np.arange(m)[:, None]
+        # Entry (i, j) of a row of F X + X F' is the sum over k of F_ik X_kj + F_jk X_ik.
+        i, j = self._i[:, None], self._j[:, None]
+        entries = np.concatenate([i * n + k, j * n + k])
+        maps = np.concatenate([indices[k, j] * m + row, indices[k, i] * m + row])
+        arrays = np.ones(entries.size), (entries.reshape(-1), maps.reshape(-1))
+        return scipy.sparse.csr_array(scipy.sparse.coo_array(arrays, shape=(n * n, m * m)))
+
+    def lyapunov_maps(self, F: FloatArray) -> FloatArray:
+        """Return the maps (N, m, m) of rows by ``F X + X F'`` for F (N, n, n)."""
+        return np.asarray(F.reshape(len(F), -1) @ self._lyapunov).reshape(-1, self.m, self.m)
 
     @cached_property
     def eliminates_cheaply(self) -> bool:
@@ -112,6 +130,28 @@ class PackedRiccati:
             )
         return np.asarray(change)
 
+    def series(self, Y: FloatArray, span: float, order: int) -> FloatArray:
+        """Return the Taylor coefficients (order + 1, N, m), in powers of seconds / ``span``, of the
+        solution through ``Y`` (N, m), without delays and samples.
+        """
+        series = np.empty((order + 1, *Y.shape))
+        series[0] = Y
+        # Coefficient k of P G P is the sum over i of (P_i G) P_k-i, one product of block matrices:
+        # a row of P_0 G ... P_k G times a column of P_k ... P_0.
+        sensed, n = len(self._sensed), len(self.equations.A)
+        gains, P = np.empty((sensed, n, order, n)), np.empty((sensed, order, n, n))
+        for k in range(order):
+            change = self._exchange @ series[k] + series[k] @ self._drift_map
+            if k == 0:
+                change += self._Q
+            P[:, order - 1 - k] = present = self.unpack(series[k, self._sensed])
+            gains[:, :, k] = present @ self.equations.G[self._sensed]
+            row = gains[:, :, : k + 1].reshape(sensed, n, (k + 1) * n)
+            column = P[:, order - 1 - k :].reshape(sensed, (k + 1) * n, n)
+            change[self._sensed] -= self.pack(row @ column)
+            np.multiply(change, span / (k + 1), out=series[k + 1])
+        return series
+
     def _add_samples(
         self, change: FloatArray, group: PoissonSamples, P: FloatArray, sent: FloatArray | None
     ) -> None:
@@ -132,57 +172,74 @@ class PackedRiccati:
         """Return H(12) linearised at ``P`` (N, n, n), with its gains held fixed: P minimises the
         right-hand side over gains, so that their change has no first-order effect.
         """
-        blocks = self._blocks(self._sensed, P[self._sensed] @ self.equations.G[self._sensed])
-        heard = [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
+        drifts = self._drifts()
+        drifts[self._sensed] -= P[self._sensed] @ self.equations.G[self._sensed]
+        own, heard = [], [(self.equations.coupling, np.arange(len(P)), self._predicted[None])]
         for group in self.equations.samples:
-            _, closed = group.update_gains(P)
-            closed = closed[:, None]
-            # A sample maps X to (I - K H) X (I - K H)'.
-            maps = self.pack(closed @ self._basis @ np.swapaxes(closed, -1, -2))
-            np.add.at(blocks, group.nodes, group.rate[:, None, None] * (maps - np.eye(self.m)))
+            K, closed = group.update_gains(P)
+            # A sample maps X to (I - K H) X (I - K H)' = X - K H X - X (K H)' + K H X (K H)'.
+            loss = (K @ group.H)[:, None]
+            np.subtract.at(drifts, group.nodes, group.rate[:, None, None] * loss[:, 0])
+            maps = self.pack(loss @ self._basis @ np.swapaxes(loss, -1, -2))
+            own.append((group.nodes, group.rate[:, None, None] * maps))
             if group.heard.nnz:
+                maps = self.pack(closed[:, None] @ self._basis @ np.swapaxes(closed, 1, 2)[:, None])
                 heard.append((group.heard, group.nodes, maps @ self._predicted))
-        return LinearisedRiccati(np.asarray(blocks), heard, self)
+        return LinearisedRiccati(drifts, own, heard, self)
 
     def linear_with_gains(self, corrections: FloatArray) -> LinearisedRiccati:
         """Return the map of P with gains whose ``L_i H_i`` are ``corrections`` (N, n, n)."""
-        blocks = self._blocks(np.arange(len(corrections)), corrections)
         heard = [(self.equations.coupling, np.arange(len(corrections)), self._predicted[None])]
-        return LinearisedRiccati(blocks, heard, self)
+        return LinearisedRiccati(self._drifts() - corrections, [], heard, self)
 
-    def _blocks(self, nodes: np.ndarray, corrections: FloatArray) -> FloatArray:
-        """Return each node's own part (N, m, m) of the linearised equations."""
-        # (A - C_i) X_i + X_i (A - C_i)' less X_i times the rate at which it is replaced; C_i is
-        # that of ``corrections`` (S, n, n) at the ``nodes`` (S,), 0 at all others.
-        blocks = np.tile(self._drift_map, (len(self.leaving), 1, 1))
-        # In parts: the products of all nodes take 278 MB at 1000 nodes and n = 16.
-        chunk_count = max(1, -(-len(nodes) * self._basis.size // MAX_PRODUCTS))
-        for rows in np.array_split(np.arange(len(nodes)), chunk_count):
-            change = -(corrections[rows, None] @ self._basis)
-            blocks[nodes[rows]] += self.pack(change + np.swapaxes(change, -1, -2))
-        blocks -= self.leaving[:, None, None] * np.eye(self.m)
-        return np.asarray(blocks)
+    def _drifts(self) -> FloatArray:
+        """Return the drifts (N, n, n) without gains: A less half the rate at which P leaves."""
+        A = self.equations.A
+        return np.asarray(A - 0.5 * self.leaving[:, None, None] * np.eye(len(A)))
 
 
-class LinearisedRiccati(NamedTuple):
+@dataclass(frozen=True)
+class LinearisedRiccati:
     """H(12) linearised at some P, as a linear map on rows X (N, m).
 
-    blocks : (N, m, m) the map ``X_i B_i`` of each row by itself
+    drifts : (N, n, n) F_i of each node's own ``F_i X_i + X_i F_i'``
+    own    : what samples add to that: nodes (S,), and maps (S, m, m) of their rows
     heard  : for each kind of arrival the rates (N, S), the indices (S,) of the senders, and maps
              (S, m, m), or one map (1, m, m), of the sender's row
     packed : the equations
     """
 
-    blocks: FloatArray
+    drifts: FloatArray
+    own: list[tuple[np.ndarray, FloatArray]]
     heard: list[tuple[scipy.sparse.csr_array, np.ndarray, FloatArray]]
     packed: PackedRiccati
+
+    @cached_property
+    def blocks(self) -> FloatArray:
+        """The map (N, m, m) of each row by itself, ``X_i B_i``."""
+        blocks = self.packed.lyapunov_maps(self.drifts)
+        for nodes, maps in self.own:
+            np.add.at(blocks, nodes, maps)
+        return blocks
+
+    def remaining(self, X: FloatArray) -> FloatArray:
+        """Return what the nodes' own rows add per second, (N, m), for rows X (N, m)."""
+        if self.drifts.shape[1] <= MAX_PACKED:
+            return np.asarray(np.einsum("ik,ikl->il", X, self.blocks))
+        half = self.drifts @ self.packed.unpack(X)
+        change = self.packed.pack(half + np.swapaxes(half, 1, 2))
+        for nodes, maps in self.own:
+            np.add.at(change, nodes, (X[nodes, None] @ maps)[:, 0])
+        return change
 
     def arriving(self, X: FloatArray) -> FloatArray:
         """Return what messages add per second at each node, (N, m), for rows X (N, m)."""
         total = np.zeros_like(X)
         for rates, nodes, maps in self.heard:
-            sent = X[nodes]
-            total += rates @ (sent @ maps[0] if len(maps) == 1 else (sent[:, None] @ maps)[:, 0])
+            sent, equations = X[nodes], self.packed.equations
+            if rates is not equations.coupling or equations.delay > 0.0:  # else the map is I
+                sent = sent @ maps[0] if len(maps) == 1 else (sent[:, None] @ maps)[:, 0]
+            total += rates @ sent
         return total
 
     def mean_map(self) -> FloatArray:
@@ -196,7 +253,7 @@ class LinearisedRiccati(NamedTuple):
 
     def matrix(self, arriving: bool = True) -> scipy.sparse.csc_array:
         """Return the map as a sparse matrix (N m, N m), with the arrivals or block diagonal."""
-        size, m, _ = self.blocks.shape
+        size, m = len(self.blocks), self.packed.m
         shape = (size * m, size * m)
         transposed = np.ascontiguousarray(np.swapaxes(self.blocks, 1, 2))
         bsr_arrays = (transposed, np.arange(size), np.arange(size + 1))

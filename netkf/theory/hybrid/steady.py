@@ -75,7 +75,7 @@ def has_stabilising_gains(scenario: Scenario) -> bool:
     finds plants with a mode that is neither driven nor damped. Raises TheoryError if H(12) does not
     apply.
     """
-    return _stabilising_covariances(PackedRiccati(coupled_riccati(scenario))) is not None
+    return _stabilising_covariances(PackedRiccati(coupled_riccati(scenario)), None) is not None
 
 
 def steady_by_node(scenario: Scenario) -> FloatArray:
@@ -88,10 +88,12 @@ def steady_by_node(scenario: Scenario) -> FloatArray:
     return np.stack([no_state if P is None else P[0] for P in states])
 
 
-def steady_state(equations: CoupledRiccati) -> FloatArray | None:
-    """Return the steady state (N, n, n) of H(12), or None. Raises TheoryError for a cycle."""
+def steady_state(equations: CoupledRiccati, first: FloatArray | None = None) -> FloatArray | None:
+    """Return the steady state (N, n, n) of H(12), or None; searched for from ``first`` (N, n, n),
+    such as that for other rates. Raises TheoryError for a cycle.
+    """
     packed = PackedRiccati(equations)
-    P = _stabilising_covariances(packed)
+    P = _stabilising_covariances(packed, first)
     if P is None:
         return None
     # Newton's method converges monotonically from stabilising gains, quadratically in the end,
@@ -116,7 +118,7 @@ def steady_state(equations: CoupledRiccati) -> FloatArray | None:
     return P
 
 
-def _stabilising_covariances(packed: PackedRiccati) -> FloatArray | None:
+def _stabilising_covariances(packed: PackedRiccati, first: FloatArray | None) -> FloatArray | None:
     """Return covariances (N, n, n) whose gains stabilise H(12), or None."""
     equations = packed.equations
     if equations.jumps:
@@ -126,7 +128,7 @@ def _stabilising_covariances(packed: PackedRiccati) -> FloatArray | None:
         margin = _necessary_factor(equations)
         if margin is None or margin > 1.0 + 1e-9:
             return None
-    return _find_stabilising(packed)
+    return _find_stabilising(packed, first)
 
 
 def _newton(packed: PackedRiccati, P: FloatArray) -> FloatArray:
