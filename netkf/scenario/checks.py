@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.algorithms.filter import commutes
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
@@ -255,7 +256,7 @@ def _check_ticks(scenario: DerivedScenario) -> None:
 
 
 def _check_filter(scenario: DerivedScenario) -> None:
-    filtering, n = scenario.filter, scenario.plant.n
+    filtering, algorithm, n = scenario.filter, scenario.filter.algorithm, scenario.plant.n
     why = f"the state has {n} components"
     for key, value, shape in (
         ("filter.mean", filtering.mean, (n,)),
@@ -269,7 +270,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
                     f"{len(value)} entries",
                     "add or remove some",
                 )
-            if filtering.algorithm.timing.pooled:
+            if algorithm.timing.pooled:
                 raise ScenarioError(
                     key,
                     "must be one for the filter that all nodes share",
@@ -293,6 +294,15 @@ def _check_filter(scenario: DerivedScenario) -> None:
                 "use F and Q for linear plants, A and B for diffusions",
             )
         require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
+    if scenario.knows_input and not commutes(algorithm) and algorithm.kernels is not None:
+        raise ScenarioError(
+            "filter.kind",
+            "must define shift beside its other methods, since the plant has an input and the "
+            "filter predicts by kernels, which do not know it",
+            type(algorithm).__name__,
+            "write shift = Filter.shift if its estimates move with the state, or "
+            "filter.model.input = false",
+        )
     _check_believed_noise(scenario)
     check_weights(scenario)
     _check_degrees(scenario)

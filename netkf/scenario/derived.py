@@ -261,6 +261,16 @@ class DerivedScenario(ScenarioModel):
         assert u is not None
         return SlotResponse(A, self.slot_plant) if self.slotted else FlowResponse(A, u)
 
+    def origins(self, times: np.ndarray, local: FloatArray, x: FloatArray) -> FloatArray:
+        """Return where the coordinates of filters begin at K ``times`` (K,), in seconds or slots:
+        (K, n), from states ``local`` to them and absolute ones ``x`` (K, n), or from what is known
+        without a state where the truth is recorded.
+        """
+        if self.plant.is_random or self.input_responses is None:
+            return np.asarray(x - local)
+        believed = self.input_responses.believed
+        return np.zeros(x.shape) if believed is None else believed.states(times)
+
     @cached_property
     def undriven(self) -> Self:
         """The scenario without input."""

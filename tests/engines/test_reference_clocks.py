@@ -8,6 +8,7 @@ graphs, messages out of order, losses in one direction, filters that believe in 
 
 import csv
 import heapq
+import itertools
 import json
 from collections import Counter
 from functools import cache
@@ -31,6 +32,9 @@ class Reference:
         self.B = np.array(model.get("B", case["B"]))
         self.n = len(self.A)
         self.transition = cache(self._transition)
+        u = case.get("input")
+        self.input = None if u is None or model.get("input") is False else u
+        self.response = cache(self._response)
         self.ids = sorted(case["ids"])
         options = case["filter"]
         self.start = {}
@@ -64,12 +68,38 @@ class Reference:
             total, spread = F @ total, F @ spread @ F.T + Q
         return total, spread
 
-    def predict(self, x, P, gap):
+    def predict(self, x, P, gap, now):
+        """``now`` is the end of the gap."""
         if gap == 0.0:
             return x, P
         F, Q = self.transition(gap)
         P = F @ P @ F.T + Q
-        return F @ x, (P + P.T) / 2.0
+        return F @ x + self.response(now - gap, now), (P + P.T) / 2.0
+
+    def _response(self, start, end):
+        """What the input adds: the integral of e^{A (end - s)} G u(s) ds."""
+        u, n, A = self.input, self.n, self.A
+        if u is None:
+            return np.zeros(n)
+        G = np.array(u["G"])
+        if u["kind"] == "sine":
+            # a sin(w t + p) is the imaginary part of a e^{i p} e^{i w t}
+            total = np.zeros(n, dtype=complex)
+            for g, a, f, p in zip(G.T, u["amplitude"], u["frequency"], u["phase"], strict=True):
+                w = 2.0 * np.pi * f
+                ends = np.exp(1j * w * end) * g
+                ends = ends - scipy.linalg.expm(A * (end - start)) @ g * np.exp(1j * w * start)
+                total += a * np.exp(1j * p) * np.linalg.solve(1j * w * np.eye(n) - A, ends)
+            return total.imag
+        rows = sorted(u.get("rows", [[0.0, *u.get("value", ())]]))
+        cuts = [start, *(t for t, *_ in rows if start < t < end), end]
+        x = np.zeros(n)
+        for first, last in itertools.pairwise(cuts):
+            held = [values for t, *values in rows if t <= first]
+            drive = G @ held[-1] if held else np.zeros(n)
+            M = np.block([[A, drive[:, None]], [np.zeros((1, n + 1))]]) * (last - first)
+            x = (scipy.linalg.expm(M) @ np.append(x, 1.0))[:n]
+        return x
 
     @staticmethod
     def update(x, P, H, R, y):
@@ -97,17 +127,17 @@ class Reference:
         """The estimate of a node now."""
         if self.kind != "intermittent":
             t0, x, P = self.state[node]
-            x, P = self.predict(x, P, t - t0)
+            x, P = self.predict(x, P, t - t0, t)
             self.state[node] = (t, x, P)
             return x, P
         x, P = self.start[node]
         last = 0.0
         for stamp in sorted({stamp for stamp, *_ in self.known[node]}):
-            x, P = self.predict(x, P, stamp - last)
+            x, P = self.predict(x, P, stamp - last, stamp)
             parts = [rest for other, *rest in self.known[node] if other == stamp]
             x, P = self.update(x, P, *self.stack(parts))
             last = stamp
-        return self.predict(x, P, t - last)
+        return self.predict(x, P, t - last, t)
 
     def readings(self):
         """By time, then node: the parts (H, R, y)."""
@@ -226,7 +256,7 @@ class Reference:
             self.rows += [("deliver", t, node, sender, number) for sender, number, *_ in box]
             newest = {}
             for sender, _number, stamp, payload in sorted(box, key=lambda m: (m[0], m[1])):
-                newest[sender] = self.predict(*payload, t - stamp)
+                newest[sender] = self.predict(*payload, t - stamp, t)
             after[node] = self.combine(node, *self.at(node, t), newest)
         for node, (x, P) in after.items():
             self.state[node] = (t, x, P)
@@ -325,6 +355,15 @@ def scenario_file(case, folder):
             path = write(folder, f"{name}.csv", header, case[name]["rows"])
             after = case[name]["after"]
             channel.append(f'{name} = {{ kind = "recorded", path = {path}, after = "{after}" }}')
+    driving = ""
+    if case.get("input"):
+        u = dict(case["input"])
+        if "rows" in u:
+            header = ["t", *(f"u{k}" for k in range(len(u["G"][0])))]
+            write(folder, "u.csv", header, u.pop("rows"))
+            u["path"] = "u.csv"
+        keys = ", ".join(f"{k} = {json.dumps(v)}" for k, v in u.items())
+        driving = f"input = {{ {keys} }}\n"
     own = "".join(f"{k} = {json.dumps(case[k])}\n" for k in ("mean", "cov") if k in case)
     settings = "".join(f"{k} = {json.dumps(v)}\n" for k, v in case["filter"].items())
     model = "".join(f"{k} = {json.dumps(v)}\n" for k, v in case["model"].items())
@@ -341,7 +380,7 @@ probe = {json.dumps(case["probe"])}
 kind = "{"recorded" if truth else "unknown"}"
 A = {json.dumps(case["A"])}
 B = {json.dumps(case["B"])}
-{own}{truth}
+{own}{truth}{driving}
 {"".join(sensors)}
 [network]
 graph = {{ kind = "edges", edges = {json.dumps(case["edges"])}{directed} }}
@@ -575,7 +614,28 @@ def draw(seed, kind=None):
         slow(case, 16.0)
     if random.random() < 0.3:
         case["truth"] = [[t, *random.normal(size=n).tolist()] for t in case["probe"]]
+    add_input(case, np.random.default_rng([2027, seed]))
     return case
+
+
+def add_input(case, random):
+    """Of two cases in three; sometimes filters do not know it."""
+    kind = str(random.choice(["constant", "sine", "recorded"]))
+    m, n = int(random.integers(1, 3)), len(case["A"])
+    case["input"] = u = {"kind": kind, "G": random.normal(size=(n, m)).tolist()}
+    if kind == "constant":
+        u["value"] = random.normal(size=m).tolist()
+    elif kind == "sine":
+        u["amplitude"], u["phase"] = random.normal(size=(2, m)).tolist()
+        u["frequency"] = (2.0 * random.random(m)).tolist()
+    else:
+        times = moments(random, case["horizon"], 0.3, random.random() < 0.5) or [STEP]
+        u["rows"] = [[t, *random.normal(size=m).tolist()] for t in times]
+        u["rows"] = [u["rows"][k] for k in random.permutation(len(times))]
+    if random.random() < 0.33:
+        del case["input"]
+    elif random.random() < 0.1:
+        case["model"]["input"] = False
 
 
 # -- comparing ----------------------------------------------------------------------------------

@@ -375,7 +375,7 @@ class FlowRun:
         # Relative to the moving origin: a difference of large absolute states would lose digits.
         error = local[:, None] - xhat
         if local is not x:
-            xhat += (x - local)[:, None]
+            xhat += self._scenario.origins(times, local, x)[:, None]
         samples = StateSamples(times, x, xhat, P, error)
         run = self._scenario, self._recorder, self._progress
         finite = record_samples(*run, samples, pass_rows_on)

@@ -190,6 +190,7 @@ class SlotRuns:
         self._max_events = max_events
         times, messages = self._next_messages(max_events, timed)
         local, absolute, rebased = self._next_states(len(times.start))
+        drawn, responses = self._path is not None, self._scenario.input_responses
         y, H = self._draw_readings(times, local, rebased)
         sampled = np.flatnonzero(times.sample >= 0)
         samples = self.samples if self.samples is not None else self._empty_samples(len(sampled))
@@ -199,10 +200,14 @@ class SlotRuns:
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
         kernel_samples = SlotSamples(
-            x, xhat, P, error, absolute, local, absolute is not local, self._total,
+            x, xhat, P, error, absolute, local, drawn and absolute is not local, self._total,
             *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
         )  # fmt: skip
+        slots = times.first + sampled
         self._simulate(times, messages, (y, H, rebased), kernel_samples)
+        if not drawn and responses is not None and responses.believed is not None:
+            # Recorded states may be unknown, where coordinates begin is not.
+            samples.xhat[:, times.sample[sampled]] += responses.believed.states(slots)[:, None]
         return SlotBlock(sampled, samples, times, messages)
 
     def _simulate(

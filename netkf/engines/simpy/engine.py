@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import simpy
 
-from netkf.algorithms.filter import Filter
+from netkf.algorithms.filter import Filter, commutes
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
+from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.nodes import ClockedNode, Node, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import (
@@ -121,7 +122,7 @@ class _Simulation:
             # Events predict only the nodes that take part; a sample needs all nodes at one time.
             for node in distinct(nodes):
                 node.predict_to(time)
-            self._record(time, truth.absolute(time), truth.local(time), nodes, sums)
+            self._record(time, time, truth, nodes, sums)
 
     def _moving_origin(self, truth: Any, nodes: dict[int, ClockedNode]) -> Process:
         for k, time in enumerate(truth.frame_times.tolist()):
@@ -173,7 +174,7 @@ class _Simulation:
         def sample() -> None:
             if schedule.sampled(slot):
                 time = schedule.start(slot)
-                self._record(time, truth.absolute(slot), truth.local(slot), nodes, sums)
+                self._record(time, slot, truth, nodes, sums)
             # The origin moves after the sample, which still refers to the old one.
             if truth.frame_slots and slot and slot % truth.frame_slots == 0:
                 offset = -truth.rebase(slot)
@@ -201,15 +202,21 @@ class _Simulation:
             recorder.flush_if_full()
             slot += 1
 
-    def _record(self, time: float, x: Any, local: Any, nodes: dict[int, Any], sums: _Sums) -> None:
+    def _record(
+        self, time: float, when: float, truth: Any, nodes: dict[int, Any], sums: _Sums
+    ) -> None:
+        """Record the states at ``time``; ``when`` is that time, or its slot."""
         scenario, recorder = self._scenario, self._recorder
+        x, local = truth.absolute(when), truth.local(when)
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]
         local_estimates, P, has_no_P = stack_estimates(estimates)
         # The trace has absolute states. Adding the origin loses digits, so the error is computed
         # from local ones.
-        xhat = local_estimates if x is local else local_estimates + (x - local)
+        xhat = local_estimates
+        if x is not local:
+            xhat = local_estimates + scenario.origins(np.array([when]), local[None], x[None])
         error = local - local_estimates
         recorder.sample(time, x, xhat, P, error)
         # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
@@ -239,6 +246,8 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     # -1: the pooled filter, which is not a node of the graph.
     if node < 0:
         model = scenario.believed_pooled_model
+    if scenario.knows_input and not commutes(scenario.node_filter):
+        model = DrivenModel(scenario, model)
     return (
         scenario.node_filter,
         node,

@@ -18,6 +18,7 @@ from netkf.algorithms.filter import (
 )
 from netkf.algorithms.kernels.run import interval_end
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
+from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.trace.recorder import NAN, Recorder
@@ -69,6 +70,13 @@ class Node:
         self.state = algorithm.init(model, *start, info)
         # By sender: absorption is in the order of senders, whatever the order of arrival.
         self.inbox: dict[int, list[Envelope]] = {}
+
+    def _advance(self, start: float, gap: float) -> None:
+        """Predict the filter over ``gap`` seconds from ``start`` on."""
+        if isinstance(self.model, DrivenModel):
+            self.state = self.model.advance(self.algorithm, self.state, start, gap)
+        else:
+            self.state = self.algorithm.predict(self.state, gap)
 
     def put(self, envelope: Envelope) -> None:
         """Put a message into the inbox; with ``newest_only`` the newest of a sender replaces
@@ -127,7 +135,7 @@ class ClockedNode(Node):
         if self._now >= time:
             return
         if not self._increments:
-            self.state = self.algorithm.predict(self.state, time - self._now)
+            self._advance(self._now, time - self._now)
             self._now = time
             return
         # A lower bound: a diverging covariance would make intervals ever shorter.
@@ -141,7 +149,7 @@ class ClockedNode(Node):
                 min_interval *= LONGER
             # Predict first: the increments of a gap are an observation at its end.
             gap = end - self._now
-            self.state = self.algorithm.predict(self.state, gap)
+            self._advance(self._now, gap)
             moments = self._read(self._now, end)
             # The two moments of the increments, with the gains for a gap of this length.
             self.state = self.algorithm.update(self.state, Increments(moments, gap))

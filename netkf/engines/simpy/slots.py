@@ -162,7 +162,9 @@ class SlotNode(Node):
 
     def _perform(self, stage: Stage, slot: int) -> None:
         if stage.kind == "predict":
-            self.state = self.algorithm.predict(self.state, self._period)
+            # A filtered estimate is of the slot before.
+            start = self._schedule.start(slot - (not self._timing.predicts))
+            self._advance(start, self._period)
         elif stage.kind == "update":
             self._update(stage.time)
         else:
