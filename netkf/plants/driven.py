@@ -38,14 +38,17 @@ Shift = Callable[[np.ndarray], FloatArray]
 
 class DrivenTruth:
     """The state of one run with an input, from the ``truth`` without it: ``local`` and ``absolute``
-    say what is added to its local and absolute states, None: nothing.
+    say what is added to its local and absolute states, None: nothing; ``over`` is the response
+    that is added to the moments of a path.
     """
 
-    def __init__(self, truth: Any, local: Shift | None, absolute: Shift | None) -> None:
-        self._truth, self._local, self._absolute = truth, local, absolute
+    def __init__(
+        self, truth: Any, local: Shift | None, absolute: Shift | None, over: Any = None
+    ) -> None:
+        self._truth, self._local, self._absolute, self._over = truth, local, absolute, over
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the input leaves as it is: frames, and the moments of a path."""
+        """Return what the input leaves as it is, such as frames."""
         return getattr(self.__dict__["_truth"], name)
 
     def local(self, time: Any) -> FloatArray:
@@ -57,6 +60,14 @@ class DrivenTruth:
         return _shifted(self._truth.absolute(time), self._absolute, time)
 
     state = absolute
+
+    def moments(self, start: float, end: float) -> FloatArray:
+        """Return the two moments (2, n) of local states over [start, end] seconds of a path."""
+        moments: FloatArray = self._truth.moments(start, end)
+        if self._over is None:
+            return moments
+        pieces = self._over.over_pieces(np.array([start]), np.array([end]), self._truth.time_grid)
+        return np.asarray(moments + pieces[1][0, 1:])
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""
@@ -75,17 +86,18 @@ def driven(
     truth: Any,
     responses: InputResponses,
     recorded: bool,
-    on_grid: bool = False,
+    forced: bool = False,
     times: FloatArray | None = None,
 ) -> DrivenTruth:
     """Return a ``truth`` without input with it. States that are ``recorded`` have it already, and
-    paths ``on_grid`` the surprise. The shifts at ``times`` (K,) are computed at once.
+    paths that are ``forced`` the surprise. The shifts at ``times`` (K,) are computed at once.
     """
     believed, surprise = responses
     if recorded:
         return DrivenTruth(truth, _shift(times, believed, -1.0), None)
-    local = None if on_grid else surprise
-    return DrivenTruth(truth, _shift(times, local), _shift(times, believed, 1.0, local))
+    local = None if forced else surprise
+    shifts = _shift(times, local), _shift(times, believed, 1.0, local)
+    return DrivenTruth(truth, *shifts, local)
 
 
 def _shift(

@@ -423,6 +423,7 @@ class DiffusionPath:
 
     def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
         self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
+        self.time_grid = paths.laws.time_grid
         self.frame_times = paths.frame_times(horizon)
         self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
         # The local states just before the frames so far began.

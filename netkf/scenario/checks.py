@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.algorithms.filter import commutes
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
@@ -294,7 +293,7 @@ def _check_filter(scenario: DerivedScenario) -> None:
                 "use F and Q for linear plants, A and B for diffusions",
             )
         require_shape(f"filter.model.{name}", value, (n, None if name == "B" else n), why)
-    if scenario.knows_input and not commutes(algorithm) and algorithm.kernels is not None:
+    if scenario.tells_models and algorithm.kernels is not None:
         raise ScenarioError(
             "filter.kind",
             "must define shift beside its other methods, since the plant has an input and the "

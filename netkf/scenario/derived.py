@@ -214,11 +214,12 @@ class DerivedScenario(ScenarioModel):
         else:
             probe_random = streams.generator("probe")
             sample_random = streams.generator("samples") if len(sampled) else None
+            forcing = None if responses is None or self.tells_models else responses.surprise
             truth = plant.path(
-                random, probe_random, probes, sample_random, sampled, horizon, frames,
-                None if responses is None else responses.surprise,
-            )  # fmt: skip
-        return truth if responses is None else driven(truth, responses, recorded, on_grid, times)
+                random, probe_random, probes, sample_random, sampled, horizon, frames, forcing
+            )
+        forced = on_grid and not self.tells_models
+        return truth if responses is None else driven(truth, responses, recorded, forced, times)
 
     def slot_truth(self, streams: Streams, frames: bool | None = None) -> Any:
         """Return the true state of one run in slots, a plants.linear.Truth; with ``frames``, by
@@ -234,13 +235,20 @@ class DerivedScenario(ScenarioModel):
         """True if the plant has an input and the filters know it."""
         return self.plant.input is not None and self.filter.model.input
 
+    @property
+    def tells_models(self) -> bool:
+        """True if the models of nodes tell filters of the input: such in plain Python that do not
+        commute with a shift, so that their coordinates cannot move along with it.
+        """
+        return self.knows_input and not commutes(self.node_filter)
+
     @cached_property
     def input_responses(self) -> InputResponses | None:
         """The responses to the input of the plant; None if it has none."""
         u, believed, true = self.plant.input, None, None
         if u is None:
             return None
-        if self.knows_input and commutes(self.node_filter):
+        if self.knows_input and not self.tells_models:
             believed = self.believed_response
         # In recorded states the true response is contained.
         if self.plant.is_random:

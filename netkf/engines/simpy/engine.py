@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import simpy
 
-from netkf.algorithms.filter import Filter, commutes
+from netkf.algorithms.filter import Filter
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
@@ -246,7 +246,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     # -1: the pooled filter, which is not a node of the graph.
     if node < 0:
         model = scenario.believed_pooled_model
-    if scenario.knows_input and not commutes(scenario.node_filter):
+    if scenario.tells_models:
         model = DrivenModel(scenario, model)
     return (
         scenario.node_filter,

@@ -1,0 +1,320 @@
+"""Known inputs: what moves a state that filters know moves estimates alike and nothing else; what
+they do not know is a bias. Plain recursions with u(t) in them are in test_reference_clocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import netkf
+from netkf.algorithms.traits import Timing
+from netkf.core.errors import NetkfError
+from netkf.parts import Filter, Filtering, Local
+from netkf.scenario.reading import from_table
+from netkf.scenario.usage import record_usage
+from tests.engines.agreement import assert_agree
+from tests.reference import kalman_update, kcf
+from tests.scenario.test_preconditions import ALL
+
+INPUT = {
+    "kind": "sine",
+    "G": [[1.0, 0.0], [0.5, 2.0]],
+    "amplitude": [3.0, 40.0],
+    "frequency": [0.31, 0.05],
+    "phase": 0.4,
+}
+LINEAR = {"kind": "linear", "F": [[1.02, 0.3], [-0.2, 0.9]], "Q": [[0.2, 0.0], [0.0, 0.1]]}
+FLOW = {"kind": "diffusion", "A": [[0.05, 0.4], [-0.5, -0.3]], "B": [[0.5, 0.0], [0.1, 0.4]]}
+START = {"mean": [1.0, -1.0], "cov": [[1.0, 0.2], [0.2, 0.8]]}
+SAMPLING = {"kind": "periodic", "period": 0.4, "jitter": 0.1}
+HYBRID = {"kind": "hybrid", "epsilon": 0.3}
+
+
+def scenario(filtering, plant, activation, u=INPUT, horizon=8.0, model=None, **more):
+    """Four nodes in a cycle, of which 0 and 2 have a sensor."""
+    slotted = "F" in plant
+    sensors = [
+        {"nodes": [node], "H": H, "R": [[0.3]]} | ({} if slotted else {"sampling": SAMPLING})
+        for node, H in ((0, [[1.0, 0.0]]), (2, [[0.4, 1.0]]))
+    ]
+    channel = {"loss": {"kind": "bernoulli", "delivery": 0.7}}
+    if not slotted:
+        channel["delay"] = {"kind": "exponential", "mean": 0.2}
+    table = {
+        "format": 1, "name": "driven", "horizon": horizon, "probe": 1.0, "seed": 7,
+        "plant": {**plant, **START, **({"period": 1.0} if slotted else {})},
+        "sensors": sensors,
+        "network": {"graph": {"kind": "cycle", "nodes": 4}, "channel": channel},
+        "filter": filtering if isinstance(filtering, dict) else {"kind": "local"},
+        **more,
+    }  # fmt: skip
+    if u is not None:
+        table["plant"]["input"] = u
+    if activation is not None:
+        table["network"]["activation"] = activation
+    if model is not None:
+        table["filter"] = {**table["filter"], "model": model}
+    return from_table(table, Path())
+
+
+ACTIVATIONS = {
+    "slots": [None, {"kind": "broadcast"}, {"kind": "matching", "protocol": "uniform-maximal"}],
+    "clocks": [
+        None, {"kind": "poisson", "rate": 2.0},
+        *({"kind": "poisson", "rate": 2.0, "at": at} for at in ("directions", "nodes")),
+        {"kind": "readings"},
+    ],
+}  # fmt: skip
+
+
+def fitting(name, time, **more):
+    """A scenario of a filter with the first activation that it takes; None without one."""
+    plant = LINEAR if time == "slots" else FLOW
+    if name == "belief-propagation" and time == "clocks":
+        plant = {**plant, "B": [[0.0], [0.0]]}
+    for activation in ACTIVATIONS[time]:
+        try:
+            return scenario(ALL[name], plant, activation, **more)
+        except NetkfError:
+            continue
+    return None
+
+
+RUNS = [(name, time) for time in ACTIVATIONS for name in ALL if fitting(name, time)]
+COMPILED = {("kcf", "slots"), ("push-sum", "slots"), ("hybrid", "clocks"), ("gossip", "clocks")}
+
+
+def test_all_filters_are_here():
+    assert {name for name, _ in RUNS} == set(ALL)
+
+
+@pytest.mark.parametrize(("name", "time"), RUNS)
+def test_a_known_input_changes_no_event_no_covariance_and_no_error(name, time):
+    driven = fitting(name, time)
+    engine = "compiled" if (name, time) in COMPILED else "simpy"
+    run, free = (netkf.simulate(one, engine=engine) for one in (driven, driven.undriven))
+    assert run.events.equals(free.events)
+    assert np.array_equal(run.P, free.P)
+    assert np.array_equal(run.error, free.error)
+    response = run.x - free.x
+    assert np.abs(response).max() > 10.0
+    size = np.abs(run.x).max()
+    moved = np.broadcast_to(response[:, None], run.xhat.shape)
+    np.testing.assert_allclose(run.xhat - free.xhat, moved, atol=1e-12 * size)
+    np.testing.assert_allclose(response, response_of(driven, run.times), atol=1e-10 * size)
+
+
+def response_of(driven, times):
+    """m(t), by a plain recursion in slots or by the trapezoidal rule refined twice."""
+    u, plant = driven.plant.input, driven.plant
+    if driven.slotted:
+        m, found = np.zeros(2), []
+        for k in range(len(times)):
+            found.append(m)
+            m = plant.F @ m + u.G @ u.at(float(k))
+        return np.array(found)
+    w, phase = 2.0 * np.pi * u.frequency, np.exp(0.4j)
+    found = np.zeros((len(times), 2), dtype=complex)
+    for j in range(2):
+        # x' = A x + g e^{i w t} is solved by (i w - A)^-1 g e^{i w t} but for its value at 0.
+        steady = np.linalg.solve(1j * w[j] * np.eye(2) - plant.A, u.G[:, j])
+        for k, t in enumerate(times):
+            free = scipy.linalg.expm(plant.A * t) @ steady
+            found[k] += u.amplitude[j] * phase * (steady * np.exp(1j * w[j] * t) - free)
+    return found.imag
+
+
+@pytest.mark.parametrize("unstable", [False, True])
+@pytest.mark.parametrize("model", [None, {"input": False}, {"A": [[0.0, 0.5], [-0.4, -0.2]]}])
+@pytest.mark.parametrize("increments", [False, True])
+def test_both_engines_make_the_same_run_of_a_driven_plant(unstable, model, increments, tmp_path):
+    (tmp_path / "u.csv").write_text("t,u0\n1.3,4.0\n0.55,-2\n3.1,0.5\n3.1,0.5\n40,1\n")
+    plant = {**FLOW, "A": [[1.3, 0.2], [0.0, -0.5]]} if unstable else FLOW
+    driven = scenario(HYBRID, plant, {"kind": "poisson", "rate": 2.0}, None, model=model)
+    sensors = [{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.3]]}]
+    changes = {"plant.input": {"kind": "recorded", "G": [[0.5], [1.0]], "path": "u.csv"}}
+    object.__setattr__(driven, "_folder", tmp_path)
+    run = assert_agree(driven.replace(changes | ({"sensors": sensors} if increments else {})))
+    assert run.exact_errors == (unstable and model is None)
+    if model is None:
+        free = netkf.simulate(run.scenario.undriven, engine="compiled")
+        assert np.array_equal(run.error, free.error)
+
+
+def in_slots(folder, filtering, sensors, network=None, u=INPUT, **more):
+    """A scenario in slots of a plant of unknown state."""
+    table = {
+        "format": 1, "name": "replayed", "horizon": 12.0, "probe": 1.0,
+        "plant": {**LINEAR, **START, "kind": "unknown", "period": 1.0, "input": u},
+        "sensors": sensors, "filter": filtering,
+        "network": {"graph": {"kind": "cycle", "nodes": 4}, **(network or {})}, **more,
+    }  # fmt: skip
+    return from_table(table, folder)
+
+
+def values(seed, shape):
+    """Numbers with few digits."""
+    return np.random.default_rng(seed).normal(size=shape).round(6)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_kcf_replays_recorded_readings_of_a_driven_plant(engine, tmp_path):
+    F, Q, G = np.array(LINEAR["F"]), np.array(LINEAR["Q"]), np.array(INPUT["G"])
+    y, u = 5.0 * values(1, (13, 2)), 3.0 * values(2, (8, 2))
+    nodes, H, R = (0, 2), np.array([[0.4, 1.0]]), np.array([[0.3]])
+    rows = [f"{k},{node},{y[k, j]}" for k in range(13) for j, node in enumerate(nodes)]
+    (tmp_path / "y.csv").write_text("\n".join(["t,node,y0", *rows]) + "\n")
+    # Rows between slots hold until the next; u is 0 before the first one, in slot 0.
+    at = [0.5, 2.0, 2.25, 3.9, 4.0, 6.5, 9.75, 11.0]
+    rows = [f"{t},{a},{b}" for t, (a, b) in zip(at, u, strict=True)]
+    (tmp_path / "u.csv").write_text("\n".join(["t,u0,u1", *rows[::-1]]) + "\n")
+    sensor = {"kind": "recorded", "path": "y.csv", "H": H.tolist(), "R": R.tolist()}
+    driven = in_slots(
+        tmp_path, {"kind": "kcf", "epsilon": 0.1}, [sensor],
+        {"activation": {"kind": "broadcast"}},
+        {"kind": "recorded", "path": "u.csv", "G": G.tolist()},
+    )  # fmt: skip
+    run = netkf.simulate(driven, engine=engine)
+    x, P = [np.array(START["mean"])] * 4, [np.array(START["cov"])] * 4
+    heard = [np.array([[abs(i - j) in (1, 3) for j in range(4)] for i in range(4)])]
+    for k in range(13):
+        if k:
+            held = [row for t, row in zip(at, u, strict=True) if t <= k - 1]
+            drive = G @ held[-1] if held else np.zeros(2)
+            x, P = [F @ one + drive for one in x], [F @ one @ F.T + Q for one in P]
+            readings = {node: (y[k, j : j + 1], H, R) for j, node in enumerate(nodes)}
+            x, P = kcf(x, P, readings, heard, 0.1)
+        np.testing.assert_allclose(run.xhat[k], x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(run.P[k], P, rtol=1e-9, atol=1e-9)
+    use = record_usage(driven, None)["plant.input"]
+    assert (use["rows"], use["unused"]) == (8, 1)  # 3.9 is over in slot 4
+
+
+@pytest.mark.parametrize("slotted", [True, False])
+@pytest.mark.parametrize("truth", ["drawn", "recorded"])
+def test_ranges_of_a_driven_plant_are_linearised_where_its_state_is(slotted, truth, tmp_path):
+    anchor, R = np.array([3.0, -4.0]), np.array([[0.2]])
+    sensor = {"kind": "range", "nodes": [0], "positions": [anchor.tolist()], "R": R.tolist()}
+    if not slotted:
+        sensor["sampling"] = {"kind": "periodic", "period": 1.0}
+    plant = LINEAR if slotted else FLOW
+    driven = scenario({"kind": "local"}, plant, None, sensors=[sensor])
+    if truth == "recorded":
+        rows = [f"{t},{a},{b}" for t, (a, b) in enumerate(9.0 * values(3, (9, 2)))]
+        (tmp_path / "x.csv").write_text("\n".join(["t,x0,x1", *rows]) + "\n")
+        object.__setattr__(driven, "_folder", tmp_path)
+        driven = driven.replace({"plant.kind": "recorded", "plant.path": "x.csv"})
+    run = netkf.simulate(driven, engine="simpy")
+    if truth == "drawn":
+        free = netkf.simulate(driven.undriven, engine="simpy")
+        np.testing.assert_allclose(run.x - free.x, response_of(driven, run.times), atol=1e-9)
+    # The noises of the readings are those of the sensor alone.
+    streams = netkf.rng.streams.Streams(driven.seed)
+    noise = streams.generator("noise", 0, 0).standard_normal(9)
+    F, Q = (np.array(LINEAR["F"]), np.array(LINEAR["Q"])) if slotted else flow_step(1.0)
+    m = response_of(driven, run.times)
+    x, P = np.array(START["mean"]), np.array(START["cov"])
+    for k in range(1, 8):
+        x, P = F @ x + m[k] - F @ m[k - 1], F @ P @ F.T + Q
+        d = x - anchor
+        y = np.linalg.norm(run.x[k] - anchor) + np.sqrt(0.2) * noise[k if slotted else k - 1]
+        J = (d / np.linalg.norm(d))[None]
+        x, P = kalman_update(x, P, np.array([y - np.linalg.norm(d)]) + J @ x, J, R)
+        np.testing.assert_allclose(run.xhat[k, 0], x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(run.P[k, 0], P, rtol=1e-9, atol=1e-9)
+
+
+def flow_step(gap):
+    A, B, zero = np.array(FLOW["A"]), np.array(FLOW["B"]), np.zeros((2, 2))
+    E = scipy.linalg.expm(np.block([[-A, B @ B.T], [zero, A.T]]) * gap)
+    return E[2:, 2:].T, E[2:, 2:].T @ E[:2, 2:]
+
+
+@dataclass(frozen=True, eq=False)
+class Plain(Filter):
+    """Takes over what it hears, in Python, and does not say that it moves with a shift."""
+
+    timing = Timing(schedule=("predict", "sense", "exchange"))
+
+    def predict(self, state, gap):
+        xhat, root = state.model.predict(state.xhat, state.root, gap)
+        return state._replace(xhat=xhat, root=root)
+
+    def absorb(self, state, messages, exchange):
+        for message in messages:
+            xhat, root = state.model.extrapolate(*message.payload, message.age)
+            state = state._replace(xhat=xhat, root=root)
+        return state
+
+
+@dataclass(frozen=True, eq=False)
+class Shifted(Plain):
+    shift = Filter.shift
+
+
+@dataclass(frozen=True, eq=False)
+class Deaf(Plain):
+    """Predicts by itself."""
+
+    def predict(self, state, gap):
+        return state._replace(xhat=state.model.F @ state.xhat)
+
+
+@dataclass(frozen=True, eq=False)
+class Louder(Local):
+    """A filter of kernels with a step of its own."""
+
+    def estimate(self, state):
+        return 2.0 * state.xhat, state.P
+
+
+@pytest.mark.parametrize("model", [None, {"R": [[0.1]]}])
+@pytest.mark.parametrize("plant", ["slots", "samples", "increments"])
+def test_a_filter_that_does_not_move_is_told_by_its_model(plant, model):
+    if plant == "slots":
+        driven = scenario(ALL["kcf"], LINEAR, {"kind": "broadcast"}, model=model)
+    else:
+        driven = scenario(HYBRID, FLOW, {"kind": "poisson", "rate": 2.0}, model=model)
+    if plant == "increments":
+        driven = driven.replace({"sensors": [{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.3]]}]})
+    plain, moved = (
+        netkf.simulate(driven.replace({"filter": Filtering(cls(), model=driven.filter.model)}))
+        for cls in (Plain, Shifted)
+    )
+    assert plain.events.equals(moved.events)
+    for name in ("x", "xhat", "error", "P"):
+        np.testing.assert_allclose(getattr(plain, name), getattr(moved, name), atol=1e-9)
+
+
+def test_filters_that_cannot_be_told_are_refused():
+    with pytest.raises(NetkfError, match="must define shift") as refusal:
+        scenario({"kind": "local"}, LINEAR, None).replace({"filter": Louder()})
+    assert refusal.value.key == "filter.kind"
+    deaf = scenario({"kind": "kcf", "epsilon": 0.1}, LINEAR, {"kind": "broadcast"})
+    with pytest.raises(TypeError, match=r"Deaf.predict must call model.predict"):
+        netkf.simulate(deaf.replace({"filter": Deaf()}), engine="simpy")
+
+
+def test_a_log_in_other_units_gives_the_same_run(tmp_path):
+    runs = []
+    for unit, scale, origin in (("s", 1.0, 0.0), ("ms", 1e3, 0.0), ("us", 1e6, 1e6)):
+        rows = [
+            f"{t * scale + origin * scale:.0f},{u}" for t, u in ((-3, 9), (-1, 2), (2, 5), (4, -1))
+        ]
+        rows = rows if origin else ["0,2", *rows[2:]]
+        (tmp_path / f"{unit}.csv").write_text("\n".join(["t,u0", *rows]) + "\n")
+        driven = scenario({"kind": "local"}, FLOW, None, None)
+        object.__setattr__(driven, "_folder", tmp_path)
+        u = {"kind": "recorded", "G": [[1.0], [2.0]], "path": f"{unit}.csv"}
+        time = {"unit": unit} | ({"origin": 1e6} if origin else {})
+        runs.append(netkf.simulate(driven.replace({"time": time, "plant.input": u})))
+    for run in runs[1:]:
+        assert run.events.equals(runs[0].events)
+        assert np.array_equal(run.x, runs[0].x)
+    use = [record_usage(run.scenario, None)["plant.input"] for run in runs]
+    assert [(one["rows"], one["unused"]) for one in use] == [(3, 0), (3, 0), (4, 1)]
