@@ -9,6 +9,7 @@ compute a flow over any gap without matrix exponentials at run time.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -146,7 +147,7 @@ class SlotModel:
         """Lower triangular root (n, n) of the process noise, ``root_Q root_Q' = Q``."""
         return lower_root(square_root(self.Q))
 
-    @property
+    @cached_property
     def information(self) -> FloatArray:
         """The information ``H' R^-1 H`` (n, n) of a reading of the node's sensors."""
         return symmetric(self.H.T @ np.linalg.solve(self.R, self.H))
@@ -189,6 +190,13 @@ def first_root(cov: FloatArray) -> FloatArray:
     (n, n), which may be singular.
     """
     return lower_root(square_root(cov))
+
+
+def first_roots(covariances: Sequence[FloatArray]) -> FloatArray:
+    """Return the roots (N, n, n) of N initial covariances (n, n), many of which are one array."""
+    distinct = {id(cov): cov for cov in covariances}
+    roots = {key: first_root(cov) for key, cov in distinct.items()}
+    return np.stack([roots[id(cov)] for cov in covariances])
 
 
 @kernel

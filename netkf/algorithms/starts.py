@@ -50,10 +50,12 @@ def _information_condition(scenario: Any) -> float:
         return 1.0
     F, Q = scenario.slot_belief
     try:
-        pairs = [scenario.observation_matrices(node, believed=True) for node in scenario.nodes]
+        pairs = [
+            scenario.observation_matrices(node, believed=True) for node in scenario.sensing_nodes
+        ]
     except TheoryError:
         return 1.0
-    G = np.sum([H.T @ np.linalg.solve(R, H) for H, R in pairs], axis=0)
+    G = sum((H.T @ np.linalg.solve(R, H) for H, R in pairs), np.zeros(Q.shape))
     covs = {cov.tobytes(): cov for _, cov in map(scenario.initial_estimate, scenario.nodes)}
     largest = 1.0
     for cov in covs.values():

@@ -162,8 +162,11 @@ class ParquetSink(Sink):
 
     def events(self, rows: np.ndarray) -> None:
         """Take the next EVENT ``rows`` (E,) of the run."""
-        self._events.collect(event_columns(rows, self._replica, self._event_count))
-        self._event_count += len(rows)
+        # A row group at a time: in large networks a slot has millions of rows.
+        for first in range(0, max(1, len(rows)), ROW_GROUP_ROWS):
+            part = rows[first : first + ROW_GROUP_ROWS]
+            self._events.collect(event_columns(part, self._replica, self._event_count))
+            self._event_count += len(part)
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray

@@ -16,7 +16,7 @@ from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import node_columns
 from netkf.runs.labels import covariance_notes
-from netkf.runs.transmissions import Transmissions
+from netkf.runs.transmissions import Transmissions, count_pairs
 from netkf.scenario.scenario import Scenario
 from netkf.trace.nees import blurred_from, errors
 from netkf.trace.recorder import Sink
@@ -59,10 +59,10 @@ class SummarySink(Sink):
         """Count the messages in a block ``rows`` (E,) of EVENT rows."""
         self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
-        deliveries = rows[rows["kind"] == CODES["deliver"]]
-        ends = np.sort(np.column_stack([deliveries["node"], deliveries["peer"]]), axis=1)
-        links, counts = np.unique(ends, axis=0, return_counts=True)
-        for (i, j), count in zip(links.tolist(), counts.tolist(), strict=True):
+        is_delivery = rows["kind"] == CODES["deliver"]
+        node, peer = rows["node"][is_delivery], rows["peer"][is_delivery]
+        links = count_pairs(np.minimum(node, peer), np.maximum(node, peer))
+        for i, j, count in zip(*(column.tolist() for column in links), strict=True):
             self.delivered[i, j] = self.delivered.get((i, j), 0) + count
 
     def states(

@@ -39,24 +39,21 @@ class Transmissions:
         """Count the next block ``rows`` (E,) of EVENT rows; blocks must come in the order of the
         run.
         """
-        sends = rows[rows["kind"] == SEND]
-        _add_counts(self.sent, sends["node"])
+        is_send = rows["kind"] == SEND
+        node, t, phase = (rows[name][is_send] for name in ("node", "t", "phase"))
+        _add_counts(self.sent, node)
         _add_counts(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
-        in_slots = sends["phase"] >= 0
-        _add_counts(self._clock_messages, sends["node"][~in_slots])
-        self._add_slot_messages(sends[in_slots])
+        in_slots = phase >= 0
+        _add_counts(self._clock_messages, node[~in_slots])
+        self._add_slot_messages(node[in_slots], t[in_slots], phase[in_slots])
 
-    def _add_slot_messages(self, sends: np.ndarray) -> None:
-        """Count the transmissions in ``sends`` (K,), the ``send`` rows of slots."""
-        if not len(sends):
+    def _add_slot_messages(self, node: np.ndarray, t: np.ndarray, phase: np.ndarray) -> None:
+        """Count the transmissions of ``send`` rows of slots, of which these are columns (K,)."""
+        if not len(node):
             return
-        t, phase = sends["t"], sends["phase"]
         step = np.cumsum(np.append(False, (t[1:] != t[:-1]) | (phase[1:] != phase[:-1])))
         # Each pair of step and sender once.
-        order = np.lexsort((sends["node"], step))
-        step, node = step[order], sends["node"][order]
-        is_new = np.append(True, (step[1:] != step[:-1]) | (node[1:] != node[:-1]))
-        step, node = step[is_new], node[is_new]
+        step, node, _ = count_pairs(step, node)
         # The first step may have begun in the block before.
         seen = self._senders if (float(t[0]), int(phase[0])) == self._step else set()
         repeated = [sender in seen for sender in node[step == 0].tolist()]
@@ -88,16 +85,26 @@ class SentPerLink(Sink):
 
     def events(self, rows: np.ndarray) -> None:
         """Count the messages in a block ``rows`` (E,) of EVENT rows, in ``sent``."""
-        sends = rows[rows["kind"] == SEND]
-        ends = np.column_stack([sends["node"], sends["peer"]])
-        pairs, counts = np.unique(ends, axis=0, return_counts=True)
-        for (i, j), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+        is_send = rows["kind"] == SEND
+        pairs = count_pairs(rows["node"][is_send], rows["peer"][is_send])
+        for i, j, count in zip(*(column.tolist() for column in pairs), strict=True):
             self.sent[i, j] += count
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
         """Ignore samples; only events are counted."""
+
+
+def count_pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the P distinct pairs of ``first`` and ``second`` (K,), sorted, and how often each
+    occurs: three arrays (P,).
+    """
+    # One number a pair: rows are sorted forty times as slowly.
+    i, j = np.unique(first), np.unique(second)
+    codes = np.searchsorted(i, first) * len(j) + np.searchsorted(j, second)
+    distinct, counts = np.unique(codes, return_counts=True)
+    return i[distinct // len(j)], j[distinct % len(j)], counts
 
 
 def _add_counts(counter: Counter[int], nodes: np.ndarray) -> None:

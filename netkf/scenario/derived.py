@@ -8,11 +8,11 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -50,6 +50,8 @@ from netkf.scenario.sampling import (
 MAX_DECAY = float(np.log(1e8))
 """Largest decay of a mode, as a logarithm, over which an offset of states is predicted back."""
 
+Made = TypeVar("Made")
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DerivedScenario(ScenarioModel):
@@ -72,17 +74,14 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def slot_models(self) -> tuple[SlotModel, ...]:
         """The believed model of each node in slots, in the order of ``nodes``: F, Q, and H and R of
-        its sensors together.
+        its sensors together; equal models are one object.
 
         A random H is that of slot 0.
         """
-        return tuple(
-            self._slot_model(self._stack_sensors(self.placed_sensors.get(node, ()), believed=True))
-            for node in self.nodes
-        )
+        return _shared(self._slot_model, self._believed_stacks)
 
-    def _slot_model(self, H_and_R: tuple[FloatArray, FloatArray]) -> SlotModel:
-        return SlotModel(*self.slot_belief, *H_and_R, self.slot_plant.period)
+    def _slot_model(self, H: FloatArray, R: FloatArray) -> SlotModel:
+        return SlotModel(*self.slot_belief, H, R, self.slot_plant.period)
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
@@ -125,11 +124,15 @@ class DerivedScenario(ScenarioModel):
         return len(sensor.R) * max(1, *map(len, slots.values()), 1)
 
     @property
-    def informations(self) -> Iterator[FloatArray]:
+    def informations(self) -> tuple[FloatArray, ...]:
         """Believed ``H' R^-1 H`` (n, n) of the sensors of each node, in the order of ``nodes``."""
+        return _shared(lambda H, R: symmetric(H.T @ np.linalg.solve(R, H)), self._believed_stacks)
+
+    @property
+    def _believed_stacks(self) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """H and R of the sensors of each node together, in the order of ``nodes``."""
         for node in self.nodes:
-            H, R = self._stack_sensors(self.placed_sensors.get(node, ()), believed=True)
-            yield symmetric(H.T @ np.linalg.solve(R, H))
+            yield self._stack_sensors(self.placed_sensors.get(node, ()), believed=True)
 
     @property
     def _network_info(self) -> NetworkInfo | None:
@@ -140,7 +143,7 @@ class DerivedScenario(ScenarioModel):
         for sender, receiver in self.topology.directions:
             senders[receiver].append(self.topology.index[sender])
         sender_indices = tuple(tuple(sorted(senders[node])) for node in self.nodes)
-        return NetworkInfo(np.stack(list(self.informations)), sender_indices)
+        return NetworkInfo(np.stack(self.informations), sender_indices)
 
     @property
     def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:
@@ -157,7 +160,7 @@ class DerivedScenario(ScenarioModel):
         """The believed model of a central filter, which reads the sensors of all nodes, in
         slots.
         """
-        return self._slot_model(self._stack_sensors(self._pooled_sensors, believed=True))
+        return self._slot_model(*self._stack_sensors(self._pooled_sensors, believed=True))
 
     @cached_property
     def diffusion(self) -> Diffusion:
@@ -445,34 +448,25 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def models(self) -> tuple[FlowModel, ...]:
         """The believed model of each node in continuous time; equal models are one object."""
-        models: dict[bytes, FlowModel] = {}
-        return tuple(
-            self._model(self.observation_matrices(node, believed=True), models)
-            for node in self.nodes
-        )
+        stacks = (self.observation_matrices(node, believed=True) for node in self.nodes)
+        return _shared(self._flow_model, stacks)
 
     @cached_property
     def pooled_model(self) -> FlowModel:
         """The believed model of a central filter, which reads the increments of all nodes, in
         continuous time.
         """
-        return self._model(self._stack_sensors(self._pooled_sensors, believed=True), {})
+        return self._flow_model(*self._stack_sensors(self._pooled_sensors, believed=True))
 
     @property
     def _pooled_sensors(self) -> tuple[PlacedSensor, ...]:
         sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
         return tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
 
-    def _model(
-        self, H_and_R: tuple[FloatArray, FloatArray], models: dict[bytes, FlowModel]
-    ) -> FlowModel:
-        H, R = H_and_R
-        key = b"".join((H.tobytes(), b"|", R.tobytes()))
-        if key not in models:
-            # The longest gap to predict over, and the longest step whose increment is used at once.
-            period = self.diffusion.sensing_period or 0.0
-            models[key] = FlowModel(*self.belief, H, R, self.horizon, min(period, self.horizon))
-        return models[key]
+    def _flow_model(self, H: FloatArray, R: FloatArray) -> FlowModel:
+        # The longest gap to predict over, and the longest step whose increment is used at once.
+        period = self.diffusion.sensing_period or 0.0
+        return FlowModel(*self.belief, H, R, self.horizon, min(period, self.horizon))
 
     def initial_estimate(self, node: int) -> tuple[FloatArray, FloatArray]:
         """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0.
@@ -550,3 +544,17 @@ class DerivedScenario(ScenarioModel):
             "nodes": (sender,),
         }
         return clock.mean_rate(entities[clock.at])
+
+
+def _shared(
+    make: Callable[[FloatArray, FloatArray], Made], stacks: Iterable[tuple[FloatArray, FloatArray]]
+) -> tuple[Made, ...]:
+    """Return ``make(H, R)`` for each of many (H, R), made once for equal ones."""
+    made: dict[tuple[bytes, bytes], Made] = {}
+    results = []
+    for H, R in stacks:
+        key = H.tobytes(), R.tobytes()
+        if key not in made:
+            made[key] = make(H, R)
+        results.append(made[key])
+    return tuple(results)

@@ -46,19 +46,6 @@ class ClockFilters:
         self.records = make_records(
             scenario.node_filter, starts, infos, models, links=count, messages=messages
         )
-        states = (
-            [
-                scenario.node_filter.init(model, *scenario.initial_estimate(info.node), info)
-                for model, info in zip(models, infos, strict=True)
-            ]
-            if "conserved" in self.records.arrays
-            else []
-        )
-        values = [scenario.node_filter.analysis.conserved(state) for state in states]
-        self._at_start = {
-            name: math.fsum(np.concatenate([np.atleast_1d(sums[name]) for sums in values]))
-            for name in (values[0] if values else ())
-        }
         self.record, self.start = self.records.struct, self.records.copied()
         n, size = start.xhat.shape[1], size_of(start.xhat.shape[1], kernels.unrolled)
         cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
@@ -83,6 +70,14 @@ class ClockFilters:
             gap=0.0,
             **scratch_of(n, 1),
         )
+        self._conserved, self._at_start = (), list[float]()
+        if "conserved" in self.records.arrays:
+            first = scenario.initial_estimate(infos[0].node)
+            state = scenario.node_filter.init(models[0], *first, infos[0])
+            self._conserved = tuple(scenario.node_filter.analysis.conserved(state))
+            for h in range(len(infos)):
+                kernels.observe(self.record, h, self.run)
+            self._at_start = self._sums()
 
     def begin(self, instants: Instants) -> None:
         """Go back to time 0, for a run whose sensors take samples at these ``instants``."""
@@ -104,17 +99,17 @@ class ClockFilters:
     @property
     def needs_python(self) -> bool:
         """Whether a run must stop for sums that exchanges conserve, or for a longer past."""
-        return bool(self._at_start) or self.kernels.remembers
+        return bool(self._conserved) or self.kernels.remembers
 
     def sums(self) -> dict[str, tuple[float, float]]:
         """Return by name the sums that exchanges conserve, at the start and at the last sample."""
-        now = self.records.arrays.get("conserved")
-        if now is None:
-            return {}
-        return {
-            name: (self._at_start[name], math.fsum(now[0, :, k, 0].tolist()))
-            for k, name in enumerate(self._at_start)
-        }
+        pairs = zip(self._at_start, self._sums(), strict=True)
+        return dict(zip(self._conserved, pairs, strict=True))
+
+    def _sums(self) -> list[float]:
+        """Return the sums that exchanges conserve, at the last sample."""
+        now = self.record.conserved if self._conserved else ()
+        return [math.fsum(now[:, k, 0].tolist()) for k in range(len(self._conserved))]
 
     def _inbox(self, messages: int, n: int) -> dict[str, np.ndarray]:
         readings = 1 + messages if self.kernels.sends_readings else 1

@@ -106,6 +106,11 @@ class SlotFilters:
             dtype=np.int64,
         )
 
+    def observe(self) -> None:
+        """Write into the record of each node of the first block what exchanges conserve, now."""
+        for h in range(self._setup.estimators):
+            self._kernels.observe(self.records.struct, h, self._run)
+
     def simulate(self, y: FloatArray, H: FloatArray, samples: SlotSamples, **drawn: Any) -> None:
         """Simulate the slots of a plan, ``drawn`` by name, with whitened readings ``y`` and H."""
         self._run.y = y.reshape(-1, *y.shape[3:])

@@ -115,6 +115,9 @@ class SlotRuns:
         # NEVER: a slot that no run reaches, for a node that never stops.
         self._stopped = arrays.get("stopped", np.full(never, NEVER))
         self._conserved = arrays.get("conserved", aligned((blocks, setup.estimators, 2, LANES)))
+        if setup.conserved_names:
+            self._filters.observe()
+        self._at_start = self._sums(1)
         self._sent = np.zeros(len(setup.directions), dtype=np.int64)
         self.counts = np.zeros((runs, len(KINDS)), dtype=np.int64)
         self._begin_truth()
@@ -538,12 +541,20 @@ class SlotRuns:
 
     def conserved(self) -> dict[str, FloatArray]:
         """Return by name the sums that exchanges conserve: (R, 2), at the start and at the end."""
-        conserved, sums = {}, by_run(self._conserved, self.runs)
-        for k, (name, start) in enumerate(self.setup.conserved_at_start.items()):
-            # fsum, so that the sums add no rounding of their own to that of the exchanges.
-            now = [math.fsum(column) for column in sums[:, :, k].tolist()]
-            conserved[name] = np.array([[start, value] for value in now])
-        return conserved
+        # All runs start alike.
+        return {
+            name: np.array([[*self._at_start[name], value] for value in now])
+            for name, now in self._sums(self.runs).items()
+        }
+
+    def _sums(self, runs: int) -> dict[str, list[float]]:
+        """Return by name the sums that exchanges conserve at the last sample, of so many runs."""
+        sums = by_run(self._conserved, runs)
+        # fsum, so that the sums add no rounding of their own to that of the exchanges.
+        return {
+            name: [math.fsum(column) for column in sums[:, :, k].tolist()]
+            for k, name in enumerate(self.setup.conserved_names)
+        }
 
 
 def _pack_messages(up: np.ndarray, sent: np.ndarray) -> SlotMessages:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -12,7 +11,7 @@ import numpy as np
 
 from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
 from netkf.algorithms.kernels.square_root import lower_root
-from netkf.algorithms.models import SlotModel
+from netkf.algorithms.models import SlotModel, first_roots
 from netkf.engines.compiled.outcomes import delivery_table
 from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
@@ -216,28 +215,19 @@ class SlotSetup:
         ]
         self.infos, self.models = infos, models
         self.period = scenario.slot_plant.period
-        self.states = [
-            self.algorithm.init(model, *scenario.initial_estimate(info.node), info)
-            for info, model in zip(infos, models, strict=True)
-        ]
+        starts = [scenario.initial_estimate(info.node) for info in infos]
         # All filters of a scenario believe one F and Q.
         self.F, self.root_Q = np.array(models[0].F), lower_root(models[0].root_Q)
-        self.xhat = np.stack([state.xhat for state in self.states])
-        self.root = np.stack([state.root for state in self.states])
+        # Exchanges conserve quantities with these names.
+        first = self.algorithm.init(models[0], *starts[0], infos[0])
+        self.conserved_names = tuple(self.algorithm.analysis.conserved(first))
+        self.xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
+        self.root = first_roots([cov for _, cov in starts])
 
     @cached_property
     def index_of_direction(self) -> dict[Link, int]:
         """The index in ``directions`` of each directed link."""
         return {direction: w for w, direction in enumerate(self.directions)}
-
-    @cached_property
-    def conserved_at_start(self) -> dict[str, float]:
-        """The sums over all nodes that exchanges conserve, in slot 0, by name."""
-        values = [self.algorithm.analysis.conserved(state) for state in self.states]
-        return {
-            name: math.fsum(np.concatenate([np.atleast_1d(sums[name]) for sums in values]))
-            for name in values[0]
-        }
 
     def _make_links(self, scenario: Scenario) -> SlotLinks:
         """Return the W directed links sorted by receiver and sender, with their weights."""

@@ -17,7 +17,7 @@ from netkf.algorithms.kernels.root_flow import (
     flow_scratch,
     stack_tables,
 )
-from netkf.algorithms.models import FlowModel, first_root
+from netkf.algorithms.models import FlowModel, first_roots
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.senders import senders_of
 from netkf.linalg.arrays import FloatArray, IntArray
@@ -344,14 +344,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # One table for each distinct model.
     table, gains = _stack_model_tables(distinct)
     xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
-    return Filters(nodes, xhat, _roots_of([cov for _, cov in starts]), table, gains)
-
-
-def _roots_of(covariances: list[FloatArray]) -> FloatArray:
-    """Return the roots (N, n, n) of N covariances (n, n), many of which are one array."""
-    distinct = {id(cov): cov for cov in covariances}
-    roots = {key: first_root(cov) for key, cov in distinct.items()}
-    return np.stack([roots[id(cov)] for cov in covariances])
+    return Filters(nodes, xhat, first_roots([cov for _, cov in starts]), table, gains)
 
 
 def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
