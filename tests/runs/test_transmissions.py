@@ -7,7 +7,7 @@ import pytest
 
 import netkf
 from netkf.runs.tables import summary_table
-from netkf.runs.transmissions import Transmissions
+from netkf.runs.transmissions import Transmissions, count_pairs
 from netkf.trace.schema import CODES, EVENT
 from tests.conftest import scenario_files
 
@@ -70,3 +70,18 @@ def test_the_table_shows_transmissions_that_differ_from_messages():
     for equal in (3, None, float("nan")):  # in slots they are not counted
         messages["transmissions"] = equal
         assert "messages: 3 sent, 3 delivered" in summary_table(summary)
+
+
+@pytest.mark.parametrize("largest", [9, 2**53])
+def test_pairs_are_counted_whatever_their_ids(largest):
+    random = np.random.default_rng(5)
+    ids = np.array([0, 3, largest - 1, largest])
+    first, second = random.choice(ids, 500), random.choice(ids, 500)
+    columns = (column.tolist() for column in count_pairs(first, second))
+    counted = {(i, j): count for i, j, count in zip(*columns, strict=True)}
+    assert counted == Counter(zip(first.tolist(), second.tolist(), strict=True))
+    assert list(counted) == sorted(counted)
+
+
+def test_no_pairs_are_counted():
+    assert [len(column) for column in count_pairs(*np.zeros((2, 0), dtype=np.int64))] == [0] * 3

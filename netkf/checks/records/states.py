@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -120,13 +121,13 @@ def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None
 
 def weight_fault(scenario: Scenario) -> str:
     """Return one line about the first link whose weight is not that of [filter]; or empty."""
-    weights, nodes = getattr(scenario.filter.algorithm, "weights", None), scenario.nodes
-    heard = {node: {j for j, i in scenario.topology.directions if i == node} for node in nodes}
+    weights, index = getattr(scenario.filter.algorithm, "weights", None), scenario.topology.index
+    heard = Counter(receiver for _, receiver in scenario.topology.directions)
     for sender, receiver in scenario.topology.directions:
         if isinstance(weights, np.ndarray):
-            expected = float(weights[nodes.index(sender), nodes.index(receiver)])
+            expected = float(weights[index[sender], index[receiver]])
         elif weights == METROPOLIS:
-            expected = 1.0 / (1.0 + max(len(heard[sender]), len(heard[receiver])))
+            expected = 1.0 / (1.0 + max(heard[sender], heard[receiver]))
         else:
             return ""
         seen = scenario.weight(receiver, sender)
