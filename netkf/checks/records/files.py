@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,7 @@ def _summary_fault(run: Run, stored: StoredRun) -> str:
     """Return a fault of summary.json, whose counts and averages should be those of ``run``."""
     summary, kinds = stored.summary, run.log["kind"]
     count = {kind: int((kinds == code).sum()) for kind, code in CODES.items()}
-    senders = run.log["node"][kinds == CODES["send"]]
+    senders = Counter(run.log["node"][kinds == CODES["send"]].tolist())
     transmissions = _transmissions(run)
     expected = {
         "sent": count["send"],
@@ -124,7 +125,7 @@ def _summary_fault(run: Run, stored: StoredRun) -> str:
         return "summary.json: its nodes are not those of the run"
     for node in run.nodes:
         for name, value in (
-            ("sent", int((senders == node).sum())),
+            ("sent", senders[node]),
             ("transmissions", transmissions.get(node, 0)),
         ):
             if rows[node].get(name) != value:

@@ -70,14 +70,14 @@ class ClockFilters:
             gap=0.0,
             **scratch_of(n, 1),
         )
-        self._conserved, self._at_start = (), list[float]()
+        self._conserved: tuple[str, ...] = ()
         if "conserved" in self.records.arrays:
             first = scenario.initial_estimate(infos[0].node)
             state = scenario.node_filter.init(models[0], *first, infos[0])
             self._conserved = tuple(scenario.node_filter.analysis.conserved(state))
             for h in range(len(infos)):
                 kernels.observe(self.record, h, self.run)
-            self._at_start = self._sums()
+        self._at_start = self._sums()
 
     def begin(self, instants: Instants) -> None:
         """Go back to time 0, for a run whose sensors take samples at these ``instants``."""
@@ -108,8 +108,8 @@ class ClockFilters:
 
     def _sums(self) -> list[float]:
         """Return the sums that exchanges conserve, at the last sample."""
-        now = self.record.conserved if self._conserved else ()
-        return [math.fsum(now[:, k, 0].tolist()) for k in range(len(self._conserved))]
+        columns = range(len(self._conserved))
+        return [math.fsum(self.record.conserved[:, k, 0].tolist()) for k in columns]
 
     def _inbox(self, messages: int, n: int) -> dict[str, np.ndarray]:
         readings = 1 + messages if self.kernels.sends_readings else 1
