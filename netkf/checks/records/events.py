@@ -123,10 +123,11 @@ def _numbered(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     links = set(scenario.topology.directions)
     for kind in (SEND, TRANSMIT):
         rows = np.flatnonzero(log["kind"] == kind)
-        ends = log[rows][["node", "peer"]]
-        pairs, first, index = np.unique(ends, return_index=True, return_inverse=True)
-        for pair, row in zip(pairs.tolist(), first.tolist(), strict=True):
-            if kind == SEND and pair not in links:
+        node, peer = log["node"][rows], log["peer"][rows]
+        codes = (node + 1) * (int(peer.max(initial=0)) + 2) + peer + 1
+        pairs, first, index = np.unique(codes, return_index=True, return_inverse=True)
+        for row in first.tolist() if kind == SEND else ():
+            if (int(node[row]), int(peer[row])) not in links:
                 yield f"{_describe(log, int(rows[row]))} is on no link"
         order = np.argsort(index, kind="stable")
         counts = np.bincount(index, minlength=len(pairs))
@@ -194,19 +195,21 @@ def _absorbed(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
         return
     step = np.cumsum(kinds == ROUND) if scenario.slotted else log["t"]
     rows = [np.flatnonzero(kinds == kind) for kind in (DELIVER, ABSORB)]
-    kind = np.dtype([("step", step.dtype), ("node", np.int64)])
-    reached, absorbed = (np.empty(len(part), dtype=kind) for part in rows)
-    for made, part in zip((reached, absorbed), rows, strict=True):
-        made["step"], made["node"] = step[part], log["node"][part]
-    distinct, counts = np.unique(absorbed, return_counts=True)
+    steps, nodes = np.unique(step), np.unique(log["node"])
+    # One integer for each step and node.
+    places, size = np.searchsorted(nodes, log["node"]), len(nodes)
+    codes = [np.searchsorted(steps, step[part]) * size + places[part] for part in rows]
+    reached, (absorbed, counts) = np.unique(codes[0]), np.unique(codes[1], return_counts=True)
     if (k := _first(counts > 1)) is not None:
-        yield f"node {distinct[k]['node']} absorbs {counts[k]} times in one exchange"
-    missing = np.setdiff1d(np.unique(reached), distinct)
-    extra = np.setdiff1d(distinct, np.unique(reached))
+        yield f"node {nodes[absorbed[k] % size]} absorbs {counts[k]} times in one exchange"
+    missing = np.setdiff1d(reached, absorbed, assume_unique=True)
+    extra = np.setdiff1d(absorbed, reached, assume_unique=True)
     if len(missing) and run.status == "complete":
-        yield f"node {missing[0]['node']} never absorbs what reaches it at {missing[0]['step']:.9g}"
+        node, at = nodes[missing[0] % size], steps[missing[0] // size]
+        yield f"node {node} never absorbs what reaches it at {at:.9g}"
     if len(extra):
-        yield f"node {extra[0]['node']} absorbs what never reached it at {extra[0]['step']:.9g}"
+        node, at = nodes[extra[0] % size], steps[extra[0] // size]
+        yield f"node {node} absorbs what never reached it at {at:.9g}"
 
 
 def _compare_times(
