@@ -90,6 +90,7 @@ from netkf.plants.blocks import Block
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.nonlinear import (
     BearingSensor,
     NonlinearSensor,
@@ -198,6 +199,7 @@ __all__ = [
     "NoDelay",
     "NoLoss",
     "NodeInfo",
+    "NonlinearPlant",
     "NonlinearSensor",
     "OnReadings",
     "OneBit",

@@ -447,6 +447,7 @@ class BeliefPropagation(Filter):
             one_way=True,
             samples=True,
             inverts=True,
+            linear_plant=self.memory == ALL,
             check=self._check_scenario,
             notes=self._scenario_notes,
         )

@@ -430,6 +430,7 @@ class ConsensusInnovations(Filter):
         return Needs(
             one_way=True,
             fixed_sensors=True,
+            linear_plant=True,
             every_reading=True,
             common_start=True,
             network=True,

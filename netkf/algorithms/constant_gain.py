@@ -190,7 +190,11 @@ class ConstantGain(Filter):
     def needs(self) -> Needs:
         """Its demands on a scenario."""
         return Needs(
-            one_way=True, fixed_sensors=True, every_reading=True, check=self._check_scenario
+            one_way=True,
+            fixed_sensors=True,
+            linear_plant=True,
+            every_reading=True,
+            check=self._check_scenario,
         )
 
     def _check_scenario(self, scenario: Any) -> None:

@@ -12,17 +12,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import ClassVar
 
 import numpy as np
 
 from netkf.algorithms.kernels.estimates import transform_root, update_by_row
 from netkf.algorithms.kernels.gains import GainTable, gain_table
+from netkf.algorithms.kernels.maps import MapTables, move_estimate, spread_of
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import usable
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
-from netkf.linalg.lanes import ONE
+from netkf.linalg.lanes import ONE, aligned
+from netkf.linalg.vector_functions import VectorFunction
 
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
@@ -183,6 +186,70 @@ class SlotModel:
         ``Timing.interval``.
         """
         return math.inf
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapModel(SlotModel):
+    """Slots of a plant that need not be linear: ``x[k+1] = f(x[k], u[k], t_k) + w``; F is nan.
+
+    ``f`` and ``jacobian`` are the map and its Jacobian, ``u`` (S, m) the input of slots 0 to S - 1
+    as filters know it, and ``linearise`` is how they predict, "ekf", "ukf" or "ckf".
+    """
+
+    f: VectorFunction
+    jacobian: VectorFunction
+    u: FloatArray
+    linearise: str
+
+    slot: ClassVar[int] = 0
+    """The slot from which ``predict`` begins; engines say it by ``move_to``, of a copy."""
+
+    def move_to(self, time: float) -> None:
+        """Predict from the slot that begins at ``time`` (seconds) on."""
+        self.__dict__["slot"] = round(time / self.period)
+
+    def tables(self, lanes: int = 1, active: int = 1, delay: int = 0) -> MapTables:
+        """Return the model as kernels take it, for so many ``lanes`` with ``active`` runs; see
+        ``MapTables`` for ``delay``.
+        """
+        n = len(self.Q)
+        distance, weight, center = spread_of(self.linearise, n)
+        return MapTables(
+            f=self.f.address,
+            jacobian=self.jacobian.address,
+            delay=delay,
+            active=active,
+            period=self.period,
+            distance=distance,
+            weight=weight,
+            center=center,
+            u=np.array(self.u, order="C"),
+            root_Q=np.array(self.root_Q, order="C"),
+            x=np.zeros(n),
+            moved=np.zeros(n),
+            J=np.zeros((n, n)),
+            J_lanes=aligned((n, n, lanes)),
+            points=np.zeros((2 * n + 1, n)),
+            work=np.zeros((n, 3 * n + 1)),
+        )
+
+    def raise_error(self) -> None:
+        """Raise the error of a user's f or Jacobian, if a call has failed."""
+        for function in (self.f, self.jacobian):
+            function.raise_error()
+
+    def predict(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate and the root of its covariance, see ``SlotModel.predict``."""
+        n = len(xhat)
+        x, S = np.array(xhat).reshape(1, n, 1), np.array(root).reshape(1, n, n, 1)
+        tables = self.tables()
+        scratch = np.empty((n, n, 1)), np.empty((n, n, 1))
+        for k in range(round(gap / self.period)):
+            move_estimate(tables, np.zeros(n), ONE, x, S, 0, self.slot + k, scratch)
+        self.raise_error()
+        return x.reshape(n), S.reshape(n, n)
 
 
 def first_root(cov: FloatArray) -> FloatArray:

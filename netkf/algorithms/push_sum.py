@@ -584,6 +584,7 @@ class PushSum(Filter):
         """Its demands on a scenario."""
         return Needs(
             fixed_sensors=True,
+            linear_plant=True,
             every_reading=True,
             inverts_under_clocks=True,
             ways_between_all=True,

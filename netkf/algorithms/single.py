@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.gains import stack_gains
+from netkf.algorithms.kernels.maps import MapTables, SingleMapRun
 from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
     ALL,
@@ -24,7 +25,7 @@ from netkf.algorithms.kernels.run import (
     scratch_of,
     size_of,
 )
-from netkf.algorithms.models import FlowModel, first_root, whiten_reading
+from netkf.algorithms.models import FlowModel, MapModel, first_root, whiten_reading
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE
@@ -151,7 +152,7 @@ class Surroundings:
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
         # Not unrolled: one compiled kernel serves all n.
-        size, cls = size_of(n, unrolled=False), ClockRun if self.clocked else SingleSlotRun
+        size, cls = size_of(n, unrolled=False), _run_class(model)
         degree = max(1, info.degree, len(info.senders))
         self.links = {sender: k for k, sender in enumerate(info.senders)}
         self.struct = cls(
@@ -238,8 +239,16 @@ class Surroundings:
         run.uniform[0], run.sends[0] = exchange.uniform, 1
 
 
-def _tables_of(model: Any, size: Size) -> SlotTables | ClockTables:
+def _run_class(model: Any) -> Any:
+    if isinstance(model, MapModel):
+        return SingleMapRun
+    return ClockRun if isinstance(model, FlowModel) else SingleSlotRun
+
+
+def _tables_of(model: Any, size: Size) -> SlotTables | MapTables | ClockTables:
     """Return the model of one node as kernels take it."""
+    if isinstance(model, MapModel):
+        return model.tables()
     if not isinstance(model, FlowModel):
         F, root_Q = map(np.ascontiguousarray, (model.F, model.root_Q))
         return SlotTables(F=F, root_Q=root_Q)
@@ -275,10 +284,14 @@ def predict(state: NodeState, gap: float) -> NodeState:
     """Return the state ``gap`` seconds later."""
     new = state.copied()
     new.reading = None
-    run = state.run.struct
+    run, model = state.run.struct, state.model
     run.gap = gap
-    for _ in range(1 if state.run.clocked else round(gap / state.run.period)):
+    for k in range(1 if state.run.clocked else round(gap / state.run.period)):
+        if isinstance(model, MapModel):
+            run.slot = model.slot + k
         state.kernels.predict(new.record, 0, run)
+    if isinstance(model, MapModel):
+        model.raise_error()
     return new
 
 

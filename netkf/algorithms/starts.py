@@ -48,8 +48,8 @@ def _information_condition(scenario: Any) -> float:
     """Return the largest condition of ``I + S' G S`` over the nodes of a scenario in slots."""
     if not scenario.slotted:
         return 1.0
-    F, Q = scenario.slot_belief
     try:
+        F, Q = scenario.slot_belief
         pairs = [
             scenario.observation_matrices(node, believed=True) for node in scenario.sensing_nodes
         ]

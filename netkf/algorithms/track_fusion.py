@@ -338,7 +338,12 @@ class BarShalomCampo(Filter):
     )
     timing = Timing(clocks=())
     needs = Needs(
-        one_way=True, fixed_sensors=True, every_reading=True, common_start=True, network=True
+        one_way=True,
+        fixed_sensors=True,
+        linear_plant=True,
+        every_reading=True,
+        common_start=True,
+        network=True,
     )
     kernels = Kernels(
         predict=predict_track,

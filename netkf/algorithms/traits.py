@@ -19,6 +19,8 @@ class Needs:
     samples : it cannot use increment sensors
     fixed_sensors : it computes with H before there are readings, so H must not vary: no nonlinear
                     sensors, regressors or columns phi
+    linear_plant : it computes with F (or A) otherwise than by predictions, so the plant must be
+                   linear
     every_reading : in slots its gains and P count a reading of every sensor in every slot, so that
                     no row of a recorded sensor may be missing
     common_start : all nodes must begin with the same mean and the same covariance
@@ -36,6 +38,7 @@ class Needs:
     inverts_under_clocks: bool = False
     samples: bool = False
     fixed_sensors: bool = False
+    linear_plant: bool = False
     every_reading: bool = False
     common_start: bool = False
     ways_between_all: bool = False

@@ -32,7 +32,7 @@ from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
 from netkf.core.errors import TheoryError
 from netkf.network.clocks import LinkClock
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import NONLINEAR
+from netkf.theory.common.evidence import nonlinear_rows
 from netkf.theory.one_bit.covariances import bit_covariances
 from netkf.trace.run import Run
 
@@ -153,18 +153,20 @@ NEES_BOUND = Promise(
     (KNOWN, NO_LOSS, START),
     check_nees_bound,
 )
-LINEAR = "readings are linear in the state"
-FOLLOWS_DATA = Promise(
-    "P and errors follow the equations",
-    "all papers",
-    (LINEAR,),
-    lambda *_: find_unknown(NONLINEAR),
-)
+
+
+def _follows_data(scenario: Scenario) -> tuple[Promise, ...]:
+    rows = nonlinear_rows(scenario)
+    promise, needs = "P and errors follow the equations", tuple(name for name, *_ in rows)
+    evidence = rows[0][3]
+    return (Promise(promise, "all papers", needs, lambda *_: find_unknown(evidence)),)
+
+
 WITHOUT_PAPER = PaperChecks(
-    lambda _: (FOLLOWS_DATA,), lambda _: [Assumption(LINEAR, "all papers", False, NONLINEAR)]
+    _follows_data, lambda scenario: [Assumption(*row) for row in nonlinear_rows(scenario)]
 )
-"""Scenarios whose readings are not linear: gains, P and errors follow the data, so that no paper
-promises anything; their clocks, channels, noises and records are judged as everywhere.
+"""Scenarios whose dynamics or readings are not linear: gains, P and errors follow the data, so that
+no paper promises anything; their clocks, channels, noises and records are judged as everywhere.
 """
 OF_EQUATIONS = {
     # On trees P is the covariance of the error.

@@ -328,7 +328,7 @@ def _every_slot(scenario: Scenario) -> Assumption:
     algorithm: Any = with_promised_filter(scenario).filter.algorithm
     holds = algorithm.stop == "never" and not algorithm.asymptotic
     evidence = "exchanged for ever" if holds else "gains are frozen or taken from the limit"
-    if not np.array_equal(scenario.slot_belief[0], scenario.slot_plant.F):
+    if not np.array_equal(scenario.slot_belief[0], scenario.linear_plant.F):
         holds, evidence = False, "exchanged, but the filters' F is not the plant's"
     if any(sensor.varying for sensor in scenario.sensors):
         holds, evidence = False, "exchanged, but H differs from slot to slot"

@@ -338,7 +338,7 @@ def _sample_invariant_law(data: FigureData) -> FloatArray | None:
     H = getattr(scenario.sensors[0], "H", None)
     if H is None or not _hears_one_sensor(scenario).any() or not scenario.filters_know_the_truth:
         return None
-    plant = scenario.slot_plant
+    plant = scenario.linear_plant
     R = scenario.sensors[0].R
     try:
         samples = invariant_samples(plant.F, plant.Q, H, R, loss.delivery, LAW_SAMPLES, data.seed)

@@ -94,13 +94,14 @@ def kernel(
 
 
 @cache
-def _numba() -> Any:
+def require_numba() -> Any:
     """Return the module numba, with the types that kernels use registered."""
     # Imported by the first call of a kernel: importing netkf must not import numba.
     _configure_numba()
     import numba
 
     from netkf.linalg import (  # noqa: F401 - register types
+        function_types,
         generic_types,
         lane_types,
         local_types,
@@ -189,7 +190,7 @@ class Kernel:
 
     def _new_dispatcher(self) -> Any:
         """Return a numba dispatcher of the function."""
-        numba = _numba()
+        numba = require_numba()
         options = {name: self._options[name] for name in self._options.keys() - _unknown_options()}
         return numba.njit(**options)(self._loops)
 

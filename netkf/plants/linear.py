@@ -9,6 +9,7 @@ so many slots, the *rebase*. The interval between two rebases is a *frame* (``tr
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,21 +26,13 @@ from netkf.plants.transitions import frame_slots
 BLOCK = 64  # slots drawn at once
 
 
-@dataclass(frozen=True, eq=False)
-class LinearPlant(Plant):
-    """``x[k+1] = F x[k] + w[k]``, cov(w) = Q; slot k is at time ``k * period`` seconds.
-
-    ``F`` (n, n), ``Q`` (n, n).
+class SlotPlant(Plant):
+    """The contract of plants in slots, which last a ``period`` (seconds) each, with noise of the
+    covariance ``Q`` (n, n): slot k is at time ``k * period``.
     """
 
-    F: FloatArray = field(square)
-    Q: FloatArray = field(covariance)
-    period: float = field(seconds)
-
-    @property
-    def n(self) -> int:
-        """Dimension of the state."""
-        return len(self.F)
+    Q: FloatArray
+    period: float
 
     def slot_time(self, k: int) -> float:
         """Return the start of slot k in seconds, on the grid of the scenario."""
@@ -56,16 +49,37 @@ class LinearPlant(Plant):
         """Return True if ``slot`` begins at or after the horizon (seconds)."""
         return self.slot_time(slot) >= self.time_grid.instant(horizon)
 
+    @abstractmethod
     def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
         """Return the true states of one run, drawn from ``random``, with ``frames`` or without."""
-        start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
-        slots = frame_slots(self.F) if frames else None
-        return LinearPath(self.F, self.noise_root, start, random, slots)
 
     @cached_property
     def noise_root(self) -> FloatArray:
         """A root S (n, n) of ``Q = S S'``, by which standard normals are multiplied."""
         return noise_root(self.Q)
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPlant(SlotPlant):
+    """``x[k+1] = F x[k] + w[k]``, cov(w) = Q; slot k is at time ``k * period`` seconds.
+
+    ``F`` (n, n), ``Q`` (n, n).
+    """
+
+    F: FloatArray = field(square)
+    Q: FloatArray = field(covariance)
+    period: float = field(seconds)
+
+    @property
+    def n(self) -> int:
+        """Dimension of the state."""
+        return len(self.F)
+
+    def truth(self, random: np.random.Generator, frames: bool = False) -> Truth:
+        """Return the true states of one run, drawn from ``random``, with ``frames`` or without."""
+        start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
+        slots = frame_slots(self.F) if frames else None
+        return LinearPath(self.F, self.noise_root, start, random, slots)
 
 
 class Truth(Protocol):

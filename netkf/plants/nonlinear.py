@@ -69,12 +69,50 @@ class Linearised:
         ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n), which a linear filter uses as
         reading and H.
         """
-        J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)
-        expected = np.asarray(self._sensor.h(xhat, self._node), dtype=np.float64)
-        whole = expected.copy()
-        whole[self._present] = y
-        linear = self._sensor.difference(whole, expected) + J @ xhat
-        return linear[self._present], J[self._present]
+        J = np.asarray(self._sensor.jacobian(xhat, self._node), dtype=np.float64)[self._present]
+        return self.difference(y, self.value(xhat)) + J @ xhat, J
+
+    def value(self, x: FloatArray) -> FloatArray:
+        """Return the reading (p,) without noise at the state x (n,)."""
+        value: FloatArray = np.asarray(self._sensor.h(x, self._node), dtype=np.float64)
+        return np.asarray(value[self._present])
+
+    def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
+        """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
+        both = np.zeros((2, len(self._present)))
+        both[:, self._present] = y, expected
+        return np.asarray(self._sensor.difference(*both)[self._present])
+
+
+def linearise_by_points(
+    function: Any,
+    y: FloatArray,
+    xhat: FloatArray,
+    root: FloatArray,
+    points: tuple[float, float, float],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a reading y (p,), its H (p, n) and a covariance (p, p) to add to that of its noise,
+    with which the Kalman update is that of the sigma points: statistical linearisation of h at
+    ``xhat`` (n,) and the lower triangular ``root`` (n, n) of P. ``function`` is a Linearised or
+    Stacked; ``points`` = (distance, weight, center) are a ``kernels.maps.Spread``.
+    """
+    distance, weight, center = points
+    middle = function.value(xhat)
+    above, below = (
+        np.stack([function.difference(function.value(xhat + step), middle) for step in steps])
+        for steps in (distance * root.T, -distance * root.T)
+    )
+    # Relative to the reading at xhat. G is the covariance of reading and state times S^-T.
+    mean = weight * (above + below).sum(axis=0)
+    G = weight * distance * (above - below).T
+    # H = G S^-1; columns of the root that are 0 say nothing.
+    H = G.copy()
+    for j in range(len(xhat) - 1, -1, -1):
+        H[:, j] = (G[:, j] - H[:, j + 1 :] @ root[j + 1 :, j]) / (root[j, j] or np.inf)
+    # P_yy - H P H': what is even in the deviations, while H P H' = G G' has all that is odd.
+    even = above + below - 2.0 * mean
+    extra = 0.5 * weight * even.T @ even + center * np.outer(mean, mean)
+    return function.difference(y, middle + mean) + H @ xhat, H, extra
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,8 @@ class Plant(Component, OnGrid):
     """
     truth_known: ClassVar[bool] = True
     """True if the state is known, so that errors can be computed."""
+    linear: ClassVar[bool] = True
+    """Whether the dynamics are linear in the state."""
 
     mean: FloatArray | None = field(vector, default=None)
     cov: FloatArray | None = field(covariance, default=None)

@@ -9,7 +9,7 @@ nonlinear sensor measures from. Several rows of one node at one time are used to
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -338,6 +338,16 @@ class RecordedReadings:
         y = self._rows.y[self._slots.get(slot, [])].reshape(-1)
         return y[np.isfinite(y)]
 
+    def readings_at(self, slot: int, R: FloatArray) -> Iterator[tuple[FloatArray, int, FloatArray]]:
+        """Yield of each row of a slot the values (p,), nan where they are missing, the id of the
+        anchor, -1 for the node itself, and the noise covariance (p, p), from that of the sensor, R.
+        """
+        for k in self._slots.get(slot, ()):
+            y, whole = self._rows.y[k], R.copy()
+            present = np.flatnonzero(np.isfinite(y))
+            whole[np.ix_(present, present)] = self._rows.covariance(k, R)
+            yield y, int(self._rows.anchors[k]), whole
+
     def covariance(self, slot: int, R: FloatArray) -> FloatArray:
         """Return the noise covariance (p', p') in slot number ``slot``, from R (p, p)."""
         return block_diagonal([self._rows.covariance(k, R) for k in self._slots.get(slot, ())])
@@ -391,11 +401,30 @@ class Stacked:
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the readings ``y`` (p,) linearised at the estimate ``xhat`` (n,), and H (p, n)."""
-        pairs, first = [(y[:0], np.zeros((0, len(xhat))))], 0
-        for part in self._parts:
-            pairs.append(part(y[first : first + part.size], xhat))
-            first += part.size
+        pairs = [(y[:0], np.zeros((0, len(xhat))))]
+        pairs += [part(y[rows], xhat) for part, rows in self._rows()]
         return np.concatenate([z for z, _ in pairs]), np.concatenate([H for _, H in pairs])
+
+    def value(self, x: FloatArray) -> FloatArray:
+        """Return the readings (p,) without noise at the state x (n,)."""
+        return np.concatenate([np.zeros(0), *(part.value(x) for part in self._parts)])
+
+    def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
+        """Return the innovations (p,) of readings y (p,) minus the ``expected`` ones (p,)."""
+        parts = (part.difference(y[rows], expected[rows]) for part, rows in self._rows())
+        return np.concatenate([np.zeros(0), *parts])
+
+    @property
+    def size(self) -> int:
+        """The number p of values."""
+        return sum(part.size for part in self._parts)
+
+    def _rows(self) -> Iterator[tuple[Any, slice]]:
+        """Yield each part, and its values among all."""
+        first = 0
+        for part in self._parts:
+            yield part, slice(first, first + part.size)
+            first += part.size
 
 
 def take_from_record(sensor: Any, record: ReadingTable) -> None:

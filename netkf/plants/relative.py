@@ -223,7 +223,10 @@ class RelativePositionSensor(PositionedSensor):
         """Return the sensor: it needs no positions."""
         return self
 
-    def _places_of(self, node: int) -> tuple[int, ...]:
+    def other_states(self, node: int) -> tuple[int, ...]:
+        """Return which components of the stacked state are the position of the other, whose id is
+        ``node`` where readings are recorded.
+        """
         others = self._others
         assert others is not None
         return others[node] if node in others else next(iter(others.values()))
@@ -232,13 +235,13 @@ class RelativePositionSensor(PositionedSensor):
         """Return the other's position (d,) relative to the own one in the stacked state x (n,);
         ``node`` is the id of the other where readings are recorded.
         """
-        return np.asarray(x[list(self._places_of(node))] - x[list(self.states)])
+        return np.asarray(x[list(self.other_states(node))] - x[list(self.states)])
 
     def offset_gradient(self, n: int, node: int) -> FloatArray:
         """Return the derivative (d, n) of ``offset`` by a stacked state of ``n`` components."""
         gradient, eye = np.zeros((len(self.states), n)), np.eye(len(self.states))
         gradient[:, list(self.states)] = -eye
-        gradient[:, list(self._places_of(node))] = eye
+        gradient[:, list(self.other_states(node))] = eye
         return gradient
 
 

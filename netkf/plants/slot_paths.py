@@ -17,6 +17,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
+from netkf.linalg.functions import call_function
 from netkf.linalg.lanes import Lanes, load, spread, store
 from netkf.rng.numbers import NormalZiggurat, next_normal
 
@@ -158,6 +159,58 @@ def draw_paths(
                 path.root.shape[1],
             )
             move_path(lanes, path, b, s, slot + s, scratch[0], local, absolute, scratch[1])
+
+
+class MapPaths(NamedTuple):
+    """``x[k+1] = f(x[k], u[k], t_k) + root z[k]`` in R runs, z standard normal: root (n, q).
+
+    f            address of the map (``linalg.functions``)
+    u            (S, m) the input of all slots
+    period       seconds of a slot
+    x            (B, n, L) state of the next slot
+    given, moved (n,) scratch
+    """
+
+    f: int
+    u: FloatArray
+    period: float
+    root: FloatArray
+    x: FloatArray
+    given: FloatArray
+    moved: FloatArray
+
+
+@kernel
+def draw_map_paths(
+    lanes: Lanes,
+    path: MapPaths,
+    states: np.ndarray,
+    ziggurat: NormalZiggurat,
+    slot: int,
+    scratch: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the states of R runs in S slots from number ``slot`` on into ``out`` (B, S, n, L); move
+    ``path`` behind these slots. ``states`` (R, WIDTH), ``scratch`` (q, L).
+    """
+    n, columns = path.x.shape[1], path.root.shape[1]
+    for b in range(out.shape[0]):
+        first = b * len(lanes)
+        runs = min(len(lanes), len(states) - first)
+        for s in range(out.shape[1]):
+            draw_normals(lanes, states, first, 1, runs, ziggurat, scratch, columns)
+            t, u = (slot + s) * path.period, path.u[slot + s]
+            for i in range(n):
+                store(lanes, out, b, s, i, load(lanes, path.x, b, i))
+            for q in range(runs):
+                for i in range(n):
+                    path.given[i] = path.x[b, i, q]
+                call_function(path.f, path.given, u, t, path.period, path.moved)
+                for i in range(n):
+                    total = path.moved[i]
+                    for j in range(columns):
+                        total += path.root[i, j] * scratch[j, q]
+                    path.x[b, i, q] = total
 
 
 class SlotSensors(NamedTuple):

@@ -50,8 +50,10 @@ def mismatch_note(scenario: Scenario) -> str:
     else an empty text.
     """
     if not scenario.is_linear:
+        names = {"dynamics": scenario.plant.linear, "readings": scenario.has_linear_sensors}
+        parts = " and ".join(name for name, is_linear in names.items() if not is_linear)
         return (
-            "readings are not linear: filters linearise them at their own estimates, and P need "
+            f"{parts} are not linear: filters linearise them at their own estimates, and P need "
             "not be, or bound, the covariance of the error"
         )
     if scenario.filters_know_the_truth:

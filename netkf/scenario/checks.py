@@ -15,6 +15,7 @@ from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import Input
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.compatibility import check_activation, check_time, filter_name
 from netkf.scenario.derived import DerivedScenario
@@ -114,6 +115,8 @@ def _check_plant(scenario: DerivedScenario) -> None:
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
         require_shape("plant.B", plant.B, (n, None), why)
+    elif isinstance(plant, NonlinearPlant):
+        why = f"plant.Q has {n} rows"
     else:
         why = f"plant.F has {n} rows"
         require_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
@@ -121,7 +124,10 @@ def _check_plant(scenario: DerivedScenario) -> None:
         require_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
         require_shape("plant.cov", plant.cov, (n, n), why)
-    if plant.input is not None:
+    if isinstance(plant, NonlinearPlant):
+        with errors_under("plant"):
+            plant.check_dynamics()
+    elif plant.input is not None:
         _check_input(plant.input, n)
 
 
@@ -285,6 +291,9 @@ def _check_filter(scenario: DerivedScenario) -> None:
         value = getattr(model, name)
         if value is None:
             continue
+        if not scenario.plant.linear and name in "AF":
+            rule = "means nothing with a nonlinear plant, whose f filters know"
+            raise ScenarioError(f"filter.model.{name}", rule, value, "leave it out")
         if (name in "FQ") != scenario.slotted:
             raise ScenarioError(
                 f"filter.model.{name}",

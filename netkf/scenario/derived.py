@@ -19,7 +19,7 @@ import scipy.linalg
 
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval
-from netkf.algorithms.models import FlowModel, SlotModel
+from netkf.algorithms.models import FlowModel, MapModel, SlotModel
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
 from netkf.core.contracts import ContractError
@@ -30,6 +30,7 @@ from netkf.network.graphs import Link
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.driven import InputResponses, MovedReadings, driven
 from netkf.plants.linear import LinearPlant, Readings
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
 from netkf.plants.response import Difference, FlowResponse, Response, SlotResponse
 from netkf.plants.sampling import Samples
@@ -66,7 +67,7 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def slot_belief(self) -> tuple[FloatArray, FloatArray]:
         """The matrices ``F`` and ``Q`` (n, n) that the filters use in slots."""
-        plant, model = self.slot_plant, self.filter.model
+        plant, model = self.linear_plant, self.filter.model
         F = plant.F if model.F is None else model.F
         Q = plant.Q if model.Q is None else model.Q
         return F, Q
@@ -81,7 +82,23 @@ class DerivedScenario(ScenarioModel):
         return _shared(self._slot_model, self._believed_stacks)
 
     def _slot_model(self, H: FloatArray, R: FloatArray) -> SlotModel:
-        return SlotModel(*self.slot_belief, H, R, self.slot_plant.period)
+        plant = self.slot_plant
+        if not isinstance(plant, NonlinearPlant):
+            return SlotModel(*self.slot_belief, H, R, plant.period)
+        (f, jacobian), Q = plant.functions, self.filter.model.Q
+        return MapModel(
+            np.full((plant.n, plant.n), math.nan), plant.Q if Q is None else Q, H, R,
+            plant.period, f=f, jacobian=jacobian, u=self.believed_inputs,
+            linearise=self.filter.linearise,
+        )  # fmt: skip
+
+    @cached_property
+    def believed_inputs(self) -> FloatArray:
+        """The input u (S, m) of a nonlinear plant in all slots, as the filters know it."""
+        plant = self.slot_plant
+        assert isinstance(plant, NonlinearPlant)
+        u = plant.inputs(int(self.horizon / plant.period) + 2)
+        return u if self.filter.model.input else 0.0 * u
 
     @cached_property
     def node_infos(self) -> tuple[NodeInfo, ...]:
@@ -243,19 +260,21 @@ class DerivedScenario(ScenarioModel):
         """True if the models of nodes tell filters of the input: such in plain Python that do not
         commute with a shift, so that their coordinates cannot move along with it.
         """
-        return self.knows_input and not commutes(self.node_filter)
+        return self.plant.linear and self.knows_input and not commutes(self.node_filter)
 
     @cached_property
     def input_responses(self) -> InputResponses | None:
-        """The responses to the input of the plant; None if it has none."""
+        """The responses to the input of the plant; None if it has none, or is not linear: f takes u
+        then.
+        """
         u, believed, true = self.plant.input, None, None
-        if u is None:
+        if u is None or not self.plant.linear:
             return None
         if self.knows_input and not self.tells_models:
             believed = self.believed_response
         # In recorded states the true response is contained.
         if self.plant.is_random:
-            A = self.slot_plant.F if self.slotted else self.diffusion.A
+            A = self.linear_plant.F if self.slotted else self.diffusion.A
             true = self._response(A)
             if believed is not None:
                 same = np.array_equal(A, self.slot_belief[0] if self.slotted else self.belief[0])
@@ -270,7 +289,7 @@ class DerivedScenario(ScenarioModel):
     def _response(self, A: FloatArray) -> FlowResponse | SlotResponse:
         u = self.plant.input
         assert u is not None
-        return SlotResponse(A, self.slot_plant) if self.slotted else FlowResponse(A, u)
+        return SlotResponse(A, self.linear_plant) if self.slotted else FlowResponse(A, u)
 
     def origins(self, times: np.ndarray, local: FloatArray, x: FloatArray) -> FloatArray:
         """Return where the coordinates of filters begin at K ``times`` (K,), in seconds or slots:
@@ -284,8 +303,8 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def undriven(self) -> Self:
-        """The scenario without input."""
-        if self.plant.input is None:
+        """The scenario without input; itself if its plant is not linear."""
+        if self.plant.input is None or not self.plant.linear:
             return self
         return dataclasses.replace(self, plant=dataclasses.replace(self.plant, input=None))
 
@@ -435,7 +454,9 @@ class DerivedScenario(ScenarioModel):
         plant = self.plant
         if not self.is_random or (plant.input is not None and not self.knows_input):
             return False
-        if isinstance(plant, LinearPlant):
+        if isinstance(plant, NonlinearPlant):
+            pairs = [(plant.Q if self.filter.model.Q is None else self.filter.model.Q, plant.Q)]
+        elif isinstance(plant, LinearPlant):
             pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
         else:
             pairs = [*zip(self.belief, (self.diffusion.A, self.diffusion.Q), strict=True)]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter
+from netkf.algorithms.kernels.maps import METHODS
 from netkf.core.errors import ScenarioError, TheoryError, errors_under
 from netkf.core.fields import (
     Component,
@@ -25,6 +26,7 @@ from netkf.core.fields import (
     line,
     list_of,
     matrix,
+    one_of,
     seconds,
     square,
     text,
@@ -38,7 +40,7 @@ from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
 from netkf.plants.blocks import Block, Layout, stack
-from netkf.plants.linear import LinearPlant
+from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
@@ -97,6 +99,10 @@ class Filtering(Component):
            node ids; the plant's by default
     cov    its covariance (n, n), or a list with one per node; the plant's by default
     model  what the filters believe where it differs from the truth
+
+    linearise  how they use dynamics and sensors that are not linear: "ekf", by Jacobians at the
+               estimate; "ukf" and "ckf", by sigma points, unscented (alpha = 1, beta = 2,
+               kappa = 0) or cubature
     """
 
     algorithm: Filter = field(instance_of(Filter))
@@ -108,6 +114,7 @@ class Filtering(Component):
         default=None,
     )
     model: Belief = field(instance_of(Belief), default=Belief())
+    linearise: str = field(one_of(*METHODS), default=METHODS[0])
 
 
 class PlacedSensor(NamedTuple):
@@ -237,6 +244,11 @@ class ScenarioModel(Component):
 
     @property
     def is_linear(self) -> bool:
+        """True if the dynamics and all readings are linear in the state."""
+        return self.plant.linear and self.has_linear_sensors
+
+    @property
+    def has_linear_sensors(self) -> bool:
         """True if all readings are linear in the state."""
         return all(sensor.linear for sensor in self.sensors)
 
@@ -271,14 +283,22 @@ class ScenarioModel(Component):
     @property
     def slotted(self) -> bool:
         """True if the scenario runs in slots, False if in continuous time."""
-        return isinstance(self.plant, LinearPlant)
+        return isinstance(self.plant, SlotPlant)
 
     @property
-    def slot_plant(self) -> LinearPlant:
+    def slot_plant(self) -> SlotPlant:
         """The plant of a scenario in slots; raises TheoryError for one in continuous time."""
-        if not isinstance(self.plant, LinearPlant):
+        if not isinstance(self.plant, SlotPlant):
             raise TheoryError("this is about scenarios in slots, and the plant is a diffusion")
         return self.plant
+
+    @property
+    def linear_plant(self) -> LinearPlant:
+        """The plant of a scenario in slots with linear dynamics; raises TheoryError for others."""
+        plant = self.slot_plant
+        if not isinstance(plant, LinearPlant):
+            raise TheoryError("this is about linear plants, and the dynamics are not linear")
+        return plant
 
     @cached_property
     def sampled_slots(self) -> tuple[int, ...]:

@@ -15,14 +15,16 @@ from typing import Any
 from netkf.core.contracts import ContractError, is_netkf_class, last_call, place_of, place_of_error
 from netkf.core.errors import quote
 from netkf.core.fields import Component, walk
+from netkf.plants.dynamics import CustomDynamics
 
 
 def user_components(value: Any) -> list[Component]:
     """Return the components in a scenario, a component or a tuple whose classes are not netkf's.
 
-    Each comes before the components inside it.
+    Each comes before the components inside it. Dynamics may be of any class.
     """
-    parts = (part for part in walk(value) if isinstance(part, Component))
+    parts: Iterator[Any] = (part for part in walk(value) if isinstance(part, Component))
+    parts = (part.part if isinstance(part, CustomDynamics) else part for part in parts)
     return [part for part in parts if not is_netkf_class(type(part))]
 
 

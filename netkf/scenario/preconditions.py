@@ -31,6 +31,14 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     needs = scenario.node_filter.needs
     if not scenario.slotted:
         _check_increments(scenario)
+    if needs.linear_plant and not scenario.plant.linear:
+        raise ScenarioError(
+            "filter.kind",
+            f"must be a filter that uses dynamics in predictions only; the {filter_name(scenario)} "
+            "computes with F",
+            kind_name(scenario.filter.algorithm),
+            f"use a linear plant, or {ANOTHER}",
+        )
     if needs.fixed_sensors:
         _check_fixed_sensors(scenario)
     if needs.every_reading and scenario.slotted:
@@ -113,8 +121,9 @@ def _check_invertible(scenario: DerivedScenario) -> None:
     initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
     singular = next((node for node, P in initial.items() if not bool(is_definite(P))), None)
     if scenario.slotted:
-        F, Q = scenario.slot_belief
-        nonsingular = bool(is_definite(Q)) or (singular is None and np.linalg.matrix_rank(F) == n)
+        model = scenario.slot_models[0]
+        is_regular = scenario.plant.linear and np.linalg.matrix_rank(model.F) == n
+        nonsingular = bool(is_definite(model.Q)) or (singular is None and is_regular)
     else:
         A, Q = scenario.belief
         # (A, Q) is controllable if and only if (A', Q) is observable.

@@ -15,7 +15,8 @@ from netkf.core.fields import Component
 from netkf.network import channels, clocks, contacts, graph_files, graphs, matchings, recorded
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
-from netkf.plants.linear import LinearPlant
+from netkf.plants.linear import LinearPlant, SlotPlant
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.nonlinear import BearingSensor, RangeBearingSensor, RangeSensor
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import (
@@ -56,6 +57,7 @@ KINDS: dict[str, dict[str, type[Component]]] = {
     "plant": {
         "diffusion": Diffusion,
         "linear": LinearPlant,
+        "nonlinear": NonlinearPlant,
         "recorded": RecordedPlant,
         "unknown": UnknownPlant,
     },
@@ -137,7 +139,7 @@ key that chooses the class (algorithms.registry.choice_name). "slot activation" 
 slots; "slot filter" holds those of "filter" that run in slots.
 """
 
-SLOTTED = (LinearPlant,)
+SLOTTED = (SlotPlant,)
 """Base classes of plants in slots."""
 
 

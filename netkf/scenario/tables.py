@@ -22,7 +22,7 @@ from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
 from netkf.plants.blocks import Block
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.imports import Origin
+from netkf.scenario.imports import Origin, find_class
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.plugins import describe_error, explain_user_error
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
@@ -34,7 +34,8 @@ MAX_DEPTH = 30  # of tables and lists inside one another
 UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 BLOCK_KEYS = ("name", "nodes", "coupling")  # in one of [[plants]], beside those of its plant
-FILTERING_KEYS = ("mean", "cov", "model")  # in the table of a filter, beside those of its kind
+FILTERING_KEYS = ("mean", "cov", "model", "linearise")
+"""Keys in the table of a filter beside those of its kind."""
 
 NOT_IMPORTED = object()
 """Stands for an object whose class is not imported yet, or that contains such an object."""
@@ -249,7 +250,11 @@ def _construct(cls: type[Any], values: dict[str, Any]) -> Any:
 
 
 def _build_plant(origin: Origin, value: Any) -> Any:
-    table = _build_inner(_as_dict(value), {"input": partial(_build_part, "input", origin)})
+    builders = {
+        "f": partial(_find_dynamics, origin),
+        "input": partial(_build_part, "input", origin),
+    }
+    table = _build_inner(_as_dict(value), builders)
     # Two kinds exist for both models of time; the keys tell which one is meant.
     in_both_times = table.get("kind") in ("recorded", "unknown")
     continuous = in_both_times and ("A" in table or "B" in table)
@@ -272,6 +277,17 @@ def _build_block(origin: Origin, value: Any) -> Any:
     own = {key: table.pop(key) for key in BLOCK_KEYS if key in table}
     table.setdefault("kind", "linear" if "F" in table else "diffusion")
     return _build_object(Block, {**own, "plant": _build_plant(origin, table)}, origin)
+
+
+def _find_dynamics(origin: Origin, value: Any) -> Any:
+    """Return the class that "module:Class" names, other values as they are."""
+    if not isinstance(value, str) or ":" not in value:
+        return value
+    try:
+        cls = find_class(value, origin)
+    except ScenarioError as error:
+        raise ScenarioError("", error.rule, error.value, error.remedy) from None
+    return NOT_IMPORTED if cls is None else cls
 
 
 def _build_component(

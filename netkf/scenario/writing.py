@@ -21,6 +21,7 @@ from netkf.network.clocks import LinkClock
 from netkf.network.graphs import RandomGraph
 from netkf.plants.blocks import Block
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.dynamics import CustomDynamics
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.derived import DerivedScenario
@@ -128,7 +129,7 @@ def part_as_table(part: Component) -> dict[str, Any]:
 def _part_table(part: Component, style: _Style) -> dict[str, Any]:
     values = _field_values(part, style)
     if isinstance(part, Filtering):
-        is_told = {"mean": True, "cov": True, "model": part.model != Belief()}
+        is_told = {"mean": True, "cov": True, "model": part.model != Belief(), "linearise": True}
         rest = {key: values[key] for key, told in is_told.items() if told and values.get(key)}
         return {**_part_table(part.algorithm, style), **rest}
     family = next((family for family, base in FAMILIES.items() if isinstance(part, base)), None)
@@ -169,6 +170,8 @@ def _toml_value(value: Any, style: _Style) -> Any:
         return value.tolist()
     if isinstance(value, tuple):
         return [_toml_value(item, style) for item in value]
+    if isinstance(value, CustomDynamics):
+        return value.name
     return _part_table(value, style) if isinstance(value, Component) else value
 
 

@@ -128,9 +128,11 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 def _mean_nis(
     scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean NIS (N,) of the nodes' own readings and its expected value; nan without slots."""
+    """Return mean NIS (N,) of the nodes' own readings and its expected value; nan without slots,
+    and where errors alone do not tell innovations.
+    """
     unknown = np.full(len(run.nodes), np.nan)
-    if not scenario.slotted:
+    if not scenario.slotted or not scenario.plant.linear:
         return unknown, unknown.copy()
     innovations = _Innovations(scenario, run, sigma, blurred)
     pairs = [np.array(list(innovations.of_node(i))) for i in range(len(run.nodes))]
@@ -157,7 +159,7 @@ class _Innovations:
         ]
         self._slots = [slots[k] for k in self._samples]
         # With F = 0 the state is the noise of the last step, with the same draws.
-        plant = scenario.slot_plant
+        plant = scenario.linear_plant
         memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
         path = memoryless.truth(self._streams.generator("plant"))
         self._noise = [path.state(slot) for slot in self._slots]
@@ -195,7 +197,7 @@ class _Innovations:
         self, k: int, i: int, noise: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Return error (n,), P (n, n) and E[e e'] of sample k, or of its prediction by one slot."""
-        run, plant = self._run, self._scenario.slot_plant
+        run, plant = self._run, self._scenario.linear_plant
         e, P = run.error[k, i], run.P[k, i]
         Sigma = None if self._sigma is None else self._sigma[k, i]
         if noise is None:

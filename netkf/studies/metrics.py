@@ -173,7 +173,8 @@ def central_trace(scenario: Scenario) -> float:
 
 
 def _require_fixed_H(scenario: Scenario) -> None:
-    """Raise TheoryError if readings are recorded or H is random."""
+    """Raise TheoryError if readings are recorded, H is random or the dynamics are not linear."""
+    _ = scenario.linear_plant
     if not scenario.is_random:
         raise TheoryError("the readings are recorded: their law is unknown")
     for node in scenario.sensing_nodes:

@@ -11,9 +11,9 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import (
-    NONLINEAR,
     AssumptionRow,
     judge_plant,
+    nonlinear_rows,
     true_model_row,
 )
 from netkf.theory.common.plant_assumptions import (
@@ -52,6 +52,9 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return a row for each assumption: text, equation, whether it holds, and why."""
+    nonlinear = nonlinear_rows(scenario)
+    if not scenario.plant.linear:
+        return [*nonlinear, *start_rows(scenario, ANY)]
     paper_rows = theory_of(scenario).slot_rows
     if not scenario.slotted:
         rows = _clock_rows(scenario)
@@ -59,9 +62,7 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
         rows = [*slot_plant_rows(scenario), *start_rows(scenario, "G (10)")]
     else:
         rows = paper_rows(scenario)
-    if not scenario.is_linear:
-        rows = [("readings are linear in the state", "all papers", False, NONLINEAR), *rows]
-    return rows
+    return [*nonlinear, *rows]
 
 
 def _clock_rows(scenario: Scenario) -> list[AssumptionRow]:

@@ -18,7 +18,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.theory.common.clock_columns import ClockColumns
 from netkf.theory.common.columns import ErrorColumns, has_columns
-from netkf.theory.common.evidence import NONLINEAR
+from netkf.theory.common.evidence import require_linear
 from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.folders import theory_of
 from netkf.trace.run import Run
@@ -98,8 +98,7 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         )
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
-    if not scenario.is_linear:
-        raise TheoryError(NONLINEAR)
+    require_linear(scenario)
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
     if has_columns(scenario):
@@ -116,8 +115,7 @@ def require_known_filter(scenario: Scenario) -> None:
     """Raise TheoryError if the equations of the scenario's filter are not known here."""
     algorithm = scenario.filter.algorithm
     name = type(algorithm).__name__
-    if not scenario.is_linear:
-        raise TheoryError(NONLINEAR)
+    require_linear(scenario)
     if built_in_class(algorithm) is None:
         raise TheoryError(f"no exact error covariance for {name}")
     overridden_names = overridden(algorithm)

@@ -138,7 +138,7 @@ def _require_known_law(scenario: Scenario) -> None:
     if not scenario.is_random:
         raise TheoryError("the state or readings are recorded: their law is not known")
     believed, true = (
-        (scenario.slot_belief[0], scenario.slot_plant.F)
+        (scenario.slot_belief[0], scenario.linear_plant.F)
         if scenario.slotted
         else (scenario.belief[0], scenario.diffusion.A)
     )
@@ -208,4 +208,6 @@ def silent_jumps(scenario: Scenario) -> SlotJumps:
     gains = [steady_gain(F, Q, *sensor) for sensor in sensors]
     closed = np.stack([np.eye(len(F)) - K @ H for K, (H, _) in zip(gains, sensors, strict=True)])
     noise = block_diagonal([K @ R @ K.T for K, R in zip(gains, true, strict=True)])
-    return SlotJumps(scenario.slot_plant.F, scenario.slot_plant.Q, closed, noise, directions=None)
+    return SlotJumps(
+        scenario.linear_plant.F, scenario.linear_plant.Q, closed, noise, directions=None
+    )

@@ -123,6 +123,7 @@ def _steady_error(scenario: Scenario) -> dict[str, Any]:
 
 def _slot_central_covariance(scenario: Scenario) -> FloatArray:
     """Return P* (n, n) of all readings in every slot; raises TheoryError if H varies."""
+    _ = scenario.linear_plant  # raises TheoryError if there is no F
     for node in scenario.sensing_nodes:
         scenario.observation_matrices(node)  # raises TheoryError if H is not constant
     model = scenario.pooled_slot_model

@@ -256,16 +256,16 @@ def _predict_in_slot(
 
 @carry.register(SlotTables)
 @kernel(inlined=True)
-def _carry_in_slot(
+def carry_in_slot(
     model: SlotTables, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
 ) -> None:
-    pass
+    """Do nothing: messages are used in the slot in which they are sent."""
 
 
 @carry_mean.register(SlotTables)
 @kernel(inlined=True)
-def _carry_mean_in_slot(model: SlotTables, run: Any, x: FloatArray, m: int, age: float) -> None:
-    pass
+def carry_mean_in_slot(model: SlotTables, run: Any, x: FloatArray, m: int, age: float) -> None:
+    """Do nothing, see ``carry_in_slot``."""
 
 
 @carry_mean.register(ClockTables)
@@ -286,9 +286,10 @@ def _carry_mean_over_age(model: ClockTables, _run: Any, x: FloatArray, m: int, a
 
 @update_estimate.register(SlotTables)
 @kernel(inlined=True)
-def _update_in_slot(
+def update_in_slot(
     _model: SlotTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
+    """Update with the reading of the slot."""
     use_reading(run, x, root, k, run.reading, True)
 
 

@@ -18,7 +18,7 @@ from netkf.laws.noise import MIN_VARIANCE_SHARE, NoiseDraws, noise_draws, transi
 from netkf.laws.stating import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.plants.diffusion import Diffusion
-from netkf.plants.linear import LinearPlant
+from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.rng.normals import StreamNormals
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -49,9 +49,9 @@ class PathLaw(NamedTuple):
 @lru_cache(maxsize=8)
 def path_law(scenario: Scenario) -> PathLaw | None:
     """Return the law of the true state at up to MAX_STEPS + 1 times of a run, by the matrices of
-    the scenario; None for recorded states.
+    the scenario; None for recorded states, and for dynamics that are not linear.
     """
-    if not scenario.plant.is_random:
+    if not scenario.plant.is_random or not scenario.plant.linear:
         return None
     stated: Any = stated_part(scenario.plant, "plant")
     if scenario.slotted:
@@ -120,7 +120,7 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
     for replica in range(count):
         random = Streams(seed, replica).generator("plant")
         plant: Any = scenario.plant
-        if isinstance(plant, LinearPlant):
+        if isinstance(plant, SlotPlant):
             starts.append(plant.truth(random).absolute(0))
         else:
             starts.append(scenario.diffusion.start(random))

@@ -25,6 +25,7 @@ from netkf.linalg import compiling
 from netkf.linalg.plain import announce_plain, has_numba, is_plain
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.recorded import (
     RecordedDiffusion,
     RecordedPlant,
@@ -39,7 +40,7 @@ from netkf.trace.recorder import Recorder
 
 PLANTS = (
     *(Diffusion, RecordedDiffusion, UnknownDiffusion),
-    *(LinearPlant, RecordedPlant, UnknownPlant),
+    *(LinearPlant, NonlinearPlant, RecordedPlant, UnknownPlant),
 )
 
 
@@ -85,7 +86,8 @@ class CompiledEngine(Engine):
         kernels = compiled_kernels(scenario.node_filter, not scenario.slotted)
         assert kernels is not None
         if scenario.slotted:
-            compiling.announce(slot_loop(kernels))
+            linear = all(sensor.linear for sensor in scenario.sensors)
+            compiling.announce(slot_loop(kernels, linear))
         else:
             compiling.announce(simulate_agenda if is_immediate(scenario) else clock_loop(kernels))
 

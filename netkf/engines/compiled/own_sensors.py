@@ -9,6 +9,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import cholesky, solve_lower
+from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.readings import covariance_of, read_many
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor
@@ -30,8 +31,11 @@ def is_own(sensor: Sensor) -> bool:
 
 def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
     """Return True if Python can read a user's sensor for the engine: in slots, or by samples. Its
-    increments would be drawn by kernels.
+    increments would be drawn by kernels, and a nonlinear one is linearised in slots only.
     """
+    if isinstance(sensor, NonlinearSensor):
+        is_usual = type(sensor).slot_path is NonlinearSensor.slot_path
+        return slotted and is_usual
     return sensor.linear and (slotted or getattr(sensor, "sampling", None) is not None)
 
 

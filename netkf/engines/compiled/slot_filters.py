@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.kernels.maps import MapRun
 from netkf.algorithms.kernels.run import (
     ALL,
     SlotRun,
@@ -14,6 +15,7 @@ from netkf.algorithms.kernels.run import (
     scratch_of,
     size_of,
 )
+from netkf.algorithms.models import MapModel
 from netkf.algorithms.records import Kernels, make_records
 from netkf.engines.compiled.slot_loop import (
     EXCHANGE,
@@ -34,10 +36,18 @@ class SlotFilters:
     """H filters in B blocks of L runs, whose verbs are kernels."""
 
     def __init__(
-        self, setup: SlotSetup, kernels: Kernels, blocks: int, with_means: bool = True
+        self,
+        setup: SlotSetup,
+        kernels: Kernels,
+        blocks: int,
+        with_means: bool = True,
+        active: int = LANES,
     ) -> None:
-        """Make the filters at time 0; unless ``with_means`` all estimates are zero."""
+        """Make the filters at time 0; unless ``with_means`` all estimates are zero. At most
+        ``active`` lanes of a block have runs.
+        """
         self._setup, self._kernels = setup, kernels
+        self._rows: Any = None
         H, W, n = setup.estimators, len(setup.links.sender), setup.n
         means = setup.xhat if with_means else np.zeros(setup.xhat.shape)
         self.records = make_records(
@@ -51,13 +61,19 @@ class SlotFilters:
             lanes=LANES,
         )
         size = size_of(n, kernels.unrolled)
-        cls = SlotRun.of_size(n) if isinstance(size, tuple) else SlotRun
+        model: Any = SlotTables(F=setup.F, root_Q=setup.root_Q)
+        cls: Any = SlotRun
+        if isinstance(setup.models[0], MapModel):
+            delay = 0 if setup.algorithm.timing.predicts else 1
+            model = setup.models[0].tables(LANES, active, delay)
+            cls = MapRun
+        cls = cls.of_size(n) if isinstance(size, tuple) else cls
         # Inbox: a node hears at most all of its links.
         most = max(1, int(np.diff(setup.links.first).max(initial=0)))
         self._run = cls(
             size=size,
             lanes=MANY,
-            model=SlotTables(F=setup.F, root_Q=setup.root_Q),
+            model=model,
             first=setup.links.first,
             sender=setup.links.sender,
             opposite=opposite_links(setup.links.first, setup.links.sender),
@@ -111,6 +127,10 @@ class SlotFilters:
         for h in range(self._setup.estimators):
             self._kernels.observe(self.records.struct, h, self._run)
 
+    def set_rows(self, rows: Any) -> None:
+        """Let readings have nonlinear rows, ``nonlinear_rows.NonlinearRows``."""
+        self._rows = rows
+
     def simulate(self, y: FloatArray, H: FloatArray, samples: SlotSamples, **drawn: Any) -> None:
         """Simulate the slots of a plan, ``drawn`` by name, with whitened readings ``y`` and H."""
         self._run.y = y.reshape(-1, *y.shape[3:])
@@ -127,11 +147,17 @@ class SlotFilters:
             **drawn,
         )
         setup, record, count = self._setup, self.records.struct, len(plan.sensed)
-        loop, step = slot_loop(self._kernels), 1 if self._kernels.slotwise else max(1, count)
+        rows: Any = 0 if self._rows is None else self._rows
+        loop = slot_loop(self._kernels, self._rows is None)
+        step = 1 if self._kernels.slotwise else max(1, count)
         assert setup.algorithm.kernels is not None
         prepare = setup.algorithm.kernels.prepare
         for start in range(0, count, step):
             first = plan.first + start
             prepare(setup.algorithm, record, setup.infos, setup.models, first, step)
             part = plan._replace(start=start, end=start + step)
-            loop(record, self.records.memories, self._run, part, samples)
+            loop(record, self.records.memories, self._run, part, samples, rows)
+        if isinstance(setup.models[0], MapModel):
+            setup.models[0].raise_error()
+        if setup.nonlinear is not None:
+            setup.nonlinear.raise_error()

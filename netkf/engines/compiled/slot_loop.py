@@ -13,6 +13,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
+from netkf.engines.compiled.nonlinear_rows import linearise_rows, no_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import struct_like
@@ -133,16 +134,18 @@ def exchange_of(kernels: Kernels) -> Any:
 
 
 @cache
-def slot_loop(kernels: Kernels) -> Any:
-    """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan,
-    samples)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first.
+def slot_loop(kernels: Kernels, linear: bool = True) -> Any:
+    """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan, samples,
+    rows)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first; unless
+    sensors are all ``linear``, ``rows`` are NonlinearRows.
     """
+    linearise = no_rows if linear else linearise_rows
     predict, update = kernels.predict, kernels.update
     shift, observe = kernels.shift, kernels.observe
     exchange = exchange_of(kernels)
 
     @kernel
-    def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int) -> None:
+    def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, rows: Any, b: int, s: int) -> None:
         nodes, e, begun = len(record.xhat), 0, plan.begin == WHOLE
         for g in range(len(plan.stages)):
             stage = plan.stages[g]
@@ -162,6 +165,7 @@ def slot_loop(kernels: Kernels) -> Any:
                         predict(record, h, run)
                     else:
                         run.reading = h
+                        linearise(rows, record, h, run, s)
                         update(record, h, run)
 
     @kernel
@@ -179,7 +183,12 @@ def slot_loop(kernels: Kernels) -> Any:
 
     @kernel
     def loop(
-        record: Any, memories: np.ndarray, run: SlotRun, plan: SlotPlan, samples: SlotSamples
+        record: Any,
+        memories: np.ndarray,
+        run: SlotRun,
+        plan: SlotPlan,
+        samples: SlotSamples,
+        rows: Any,
     ) -> None:
         nodes, slots = len(record.xhat), plan.up.shape[1]
         for b in range(len(memories)):
@@ -190,7 +199,7 @@ def slot_loop(kernels: Kernels) -> Any:
                 run.first_H = run.first_y if plan.varies else 0
                 if plan.predicts and plan.begin == WHOLE:
                     sample_slot(block, run, plan, samples, b, s)
-                simulate_slot(block, run, plan, b, s)
+                simulate_slot(block, run, plan, rows, b, s)
                 if not plan.predicts and plan.stop == WHOLE:
                     sample_slot(block, run, plan, samples, b, s)
 

@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels.maps import spread_of
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
+from netkf.engines.compiled.nonlinear_rows import NonlinearRows, add_values, reference
 from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import record_samples
@@ -51,7 +53,15 @@ from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotS
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
 from netkf.network.deliveries import Deliveries
-from netkf.plants.slot_paths import Path, draw_paths, draw_readings, draw_starts
+from netkf.plants.maps import NonlinearPlant
+from netkf.plants.slot_paths import (
+    MapPaths,
+    Path,
+    draw_map_paths,
+    draw_paths,
+    draw_readings,
+    draw_starts,
+)
 from netkf.rng.numbers import normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
@@ -110,9 +120,14 @@ class SlotRuns:
         self._total = aligned((blocks, LANES))
         kernels = compiled_kernels(setup.algorithm, clocked=False)
         assert kernels is not None
-        self._filters = SlotFilters(setup, kernels, blocks)
+        self._filters = SlotFilters(setup, kernels, blocks, active=min(runs, LANES))
         arrays, never = self._filters.records.arrays, (blocks, setup.estimators, LANES)
         # NEVER: a slot that no run reaches, for a node that never stops.
+        self._nonlinear: NonlinearRows | None = None
+        if setup.nonlinear is not None:
+            points = spread_of(scenario.filter.linearise, setup.n)
+            self._nonlinear = setup.nonlinear.tables(points, min(runs, LANES))
+            self._filters.set_rows(self._nonlinear)
         self._stopped = arrays.get("stopped", np.full(never, NEVER))
         self._conserved = arrays.get("conserved", aligned((blocks, setup.estimators, 2, LANES)))
         if setup.conserved_names:
@@ -128,7 +143,7 @@ class SlotRuns:
     def _begin_truth(self) -> None:
         plant, setup = self._scenario.slot_plant, self.setup
         self._truth: Any = None
-        self._path: Path | None = None
+        self._path: Path | MapPaths | None = None
         # A recorded truth is the same in all runs.
         if not plant.is_random:
             self._truth = self._scenario.slot_truth(self._first)
@@ -136,12 +151,20 @@ class SlotRuns:
         self._plant_states = self._streams.states("plant", [()])
         x, origin = (aligned((self._blocks, setup.n, LANES)) for _ in range(2))
         # C-contiguous copies, whatever the plant gives: kernels are compiled for one memory layout.
-        mean, F, root, noise = (
+        mean, root, noise = (
             np.array(part, order="C")
-            for part in (plant.start_mean, plant.F, plant.start_root, plant.noise_root)
+            for part in (plant.start_mean, plant.start_root, plant.noise_root)
         )
         scratch = np.zeros((setup.n, LANES))
         draw_starts(MANY, self._plant_states, normal_ziggurat(), mean, root, scratch, x)
+        if isinstance(plant, NonlinearPlant):
+            self._map = plant.functions[0]
+            self._path = MapPaths(
+                self._map.address, plant.inputs(setup.slots + 1), plant.period, noise, x,
+                np.zeros(setup.n), np.zeros(setup.n),
+            )  # fmt: skip
+            return
+        F = np.array(self._scenario.linear_plant.F, order="C")
         self._path = Path(F, noise, setup.frame, x, origin)
 
     def _begin_readings(self) -> None:
@@ -411,9 +434,15 @@ class SlotRuns:
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
         shape = self._blocks, count, setup.n, LANES
-        local: FloatArray = unset(shape)
+        local = unset(shape)
+        if isinstance(self._path, MapPaths):
+            scratch = aligned((self._path.root.shape[1], LANES))
+            first, states = self._slot, self._plant_states
+            draw_map_paths(MANY, self._path, states, normal_ziggurat(), first, scratch, local)
+            self._map.raise_error()
+            return local, local, rebased
         # Without frames both are the same array.
-        absolute: FloatArray = unset(shape) if setup.frame else local
+        absolute = unset(shape) if setup.frame else local
         self._draw_path(self._path, self._plant_states, local, absolute)
         if (responses := self._scenario.input_responses) is not None:
             believed, surprise = (
@@ -458,6 +487,10 @@ class SlotRuns:
         draw_readings(
             MANY, setup.sensors, noise, normal_ziggurat(), x, regressor_states, scratch, y, H
         )
+        if self._nonlinear is not None and setup.nonlinear is not None:
+            flat_y, flat_H = y.reshape(-1, *y.shape[3:]), H.reshape(-1, *H.shape[3:])
+            add_values(self._nonlinear, x, flat_y, flat_H, setup.nonlinear.drawn)
+            setup.nonlinear.raise_error()
         if not (self._recorded or self._own) or not times.sensed.any():
             return y, H
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
@@ -471,11 +504,34 @@ class SlotRuns:
                     out[b, times.sensed, s.estimator, rows, ..., lane] = values
         for s, path in self._recorded:
             rows = slice(s.row, s.row + s.rows)
+            if s in setup.nonlinear_sensors:
+                self._read_nonlinear(s, path, times.sensed, y, H)
+                continue
             # L^-1 y and L^-1 H, with the R = L L' that filters believe; all runs read the same.
             whitened_y, whitened_H = path.whitened(slots, s.R, s.rows)
             y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
             H[:, times.sensed, s.estimator, rows] = whitened_H[..., None]
         return y, H
+
+    def _read_nonlinear(
+        self, s: AssignedSensor, path: Any, sensed: np.ndarray, y: FloatArray, H: FloatArray
+    ) -> None:
+        """Write the recorded values of a nonlinear sensor, nan where there is none, what they are
+        measured from, and the covariances of their noise.
+        """
+        assert self._nonlinear is not None
+        sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
+        n, p = self.setup.n, len(s.R)
+        y[:, sensed, s.estimator, s.row : s.row + s.rows] = np.nan
+        if len(self._nonlinear.R) != len(sensed):
+            self._nonlinear.R = np.repeat(self._nonlinear.R[:1], len(sensed), axis=0)
+        for k in np.flatnonzero(sensed).tolist():
+            for m, (values, anchor, R) in enumerate(path.readings_at(self._slot + k, s.R)):
+                rows = slice(s.row + m * p, s.row + (m + 1) * p)
+                place = reference(sensor, s.node if anchor < 0 else anchor, n)
+                y[:, k, s.estimator, rows] = values[:, None]
+                H[:, k, s.estimator, rows] = place[:, None]
+                self._nonlinear.R[k, s.estimator, rows, rows] = R
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
         """Return the EVENT rows (K,) of a block of one run, and the number of rows before each of

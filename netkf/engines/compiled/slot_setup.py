@@ -12,6 +12,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel, first_roots
+from netkf.engines.compiled.nonlinear_rows import NonlinearSetup, reference
 from netkf.engines.compiled.outcomes import delivery_table
 from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
@@ -62,7 +63,7 @@ class SlotSetup:
         self.algorithm: Filter = algorithm
         self.n, self.nodes = scenario.plant.n, np.array(scenario.nodes, dtype=np.int64)
         # Frames are for exact errors of unstable plants; 0: the origin never moves.
-        self.frame = frame_slots(scenario.slot_plant.F) or 0 if scenario.exact_errors else 0
+        self.frame = frame_slots(scenario.linear_plant.F) or 0 if scenario.exact_errors else 0
         self._set_slots(scenario)
         self._set_stages(scenario)
         self._set_sensors(scenario)
@@ -147,9 +148,14 @@ class SlotSetup:
         self.own_sensors: list[AssignedSensor] = []
         self.kernel_sensors: list[AssignedSensor] = []
         self.regressor_sensors: list[AssignedSensor] = []
+        self.nonlinear_sensors: list[AssignedSensor] = []
         for assigned in self.assigned:
             sensor = scenario.sensors[assigned.placed_sensor.entry]
-            if is_own(sensor):
+            if not sensor.linear:
+                self.nonlinear_sensors.append(assigned)
+                recorded = sensor.record is not None
+                (self.recorded_sensors if recorded else self.kernel_sensors).append(assigned)
+            elif is_own(sensor):
                 self.own_sensors.append(assigned)
             elif isinstance(sensor, RecordedSensor):
                 self.recorded_sensors.append(assigned)
@@ -157,10 +163,25 @@ class SlotSetup:
                 self.kernel_sensors.append(assigned)
                 if isinstance(sensor, RegressorSensor):
                     self.regressor_sensors.append(assigned)
-        self.varies = len(self.kernel_sensors) < len(self.assigned) or bool(self.regressor_sensors)
+        linear = not self.regressor_sensors and not self.nonlinear_sensors
+        self.varies = len(self.kernel_sensors) < len(self.assigned) or not linear
         # The same in all blocks of runs and all slots, hence 1, 1.
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
+        self._set_nonlinear_rows(scenario)
         self._set_kernel_sensors(scenario)
+
+    def _set_nonlinear_rows(self, scenario: Scenario) -> None:
+        self.nonlinear: NonlinearSetup | None = None
+        if not self.nonlinear_sensors:
+            return
+        self.nonlinear = NonlinearSetup(self.estimators, self.p, self.n)
+        for s in self.nonlinear_sensors:
+            sensor: Any = scenario.located_sensors[s.placed_sensor.entry]
+            rows = len(s.R)
+            for first in range(s.row, s.row + s.rows, rows):
+                self.nonlinear.add(sensor, s.estimator, first, s.R)
+                place = reference(sensor, s.node, self.n) if sensor.record is None else 0.0
+                self.H[0, 0, s.estimator, first : first + rows] = np.array(place)[..., None]
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
         count, p, n = len(self.kernel_sensors), self.p, self.n
@@ -170,6 +191,10 @@ class SlotSetup:
             sensor = scenario.sensors[s.placed_sensor.entry]
             rows = len(s.root)
             true_root = cholesky(sensor.R)
+            if not sensor.linear:
+                # Nonlinear rows are whitened where they are used.
+                noise[m, :rows, :rows] = true_root
+                continue
             # The noise of a whitened reading is L_b^-1 L times white noise, with the believed R =
             # L_b L_b' and the true R = L L'.
             noise[m, :rows, :rows] = solve_lower(s.root, true_root)

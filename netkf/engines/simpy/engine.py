@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Filter
+from netkf.algorithms.kernels.maps import spread_of
+from netkf.algorithms.models import MapModel
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
@@ -248,6 +251,9 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         model = scenario.believed_pooled_model
     if scenario.tells_models:
         model = DrivenModel(scenario, model)
+    if isinstance(model, MapModel):
+        # It follows the slots of one run.
+        model = dataclasses.replace(model)
     return (
         scenario.node_filter,
         node,
@@ -255,6 +261,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         model,
         scenario.initial_estimate(first),
         scenario.node_infos[entity],
+        spread_of(scenario.filter.linearise, scenario.plant.n),
     )
 
 

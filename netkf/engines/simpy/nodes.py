@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,15 +17,21 @@ from netkf.algorithms.filter import (
     Reading,
     interval_rule,
 )
+from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
+from netkf.algorithms.models import MapModel, first_root
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.plants.nonlinear import linearise_by_points
+from netkf.plants.readings import Stacked
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
 SENSE, ABSORB = CODES["sense"], CODES["absorb"]
+Sample = tuple[FloatArray, Any, FloatArray]
+"""A sample y (p,), its H (p, n), or a function that linearises it, and R (p, p)."""
 
 
 class Envelope(NamedTuple):
@@ -60,10 +67,13 @@ class Node:
         model: Any,
         start: tuple[FloatArray, FloatArray],
         info: NodeInfo,
+        points: Spread,
     ) -> None:
         """Set up the filter with its ``model`` and its estimate ``start`` = (xhat (n,), P (n, n))
-        at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index.
+        at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index, and ``points`` are
+        those by which nonlinear sensors are linearised.
         """
+        self._points = points
         self.node, self.entity, self.info, self.model = node, entity, info, model
         self.algorithm, self._timing = algorithm, algorithm.timing
         self._interval = interval_rule(algorithm)
@@ -75,8 +85,10 @@ class Node:
         """Predict the filter over ``gap`` seconds from ``start`` on."""
         if isinstance(self.model, DrivenModel):
             self.state = self.model.advance(self.algorithm, self.state, start, gap)
-        else:
-            self.state = self.algorithm.predict(self.state, gap)
+            return
+        if isinstance(self.model, MapModel):
+            self.model.move_to(start)
+        self.state = self.algorithm.predict(self.state, gap)
 
     def put(self, envelope: Envelope) -> None:
         """Put a message into the inbox; with ``newest_only`` the newest of a sender replaces
@@ -97,6 +109,28 @@ class Node:
         self.inbox.clear()
         messages = [Message(e.sender, e.weight, e.payload, e.age) for e in envelopes]
         return envelopes, messages
+
+    def linearise(self, samples: Sequence[Sample]) -> Sequence[Sample]:
+        """Return samples in which matrices at the present estimate replace the functions that
+        nonlinear sensors have in place of H.
+        """
+        functions = [sample for sample in samples if not isinstance(sample[1], np.ndarray)]
+        if not functions:
+            return samples
+        xhat, P = self.algorithm.estimate(self.state)
+        if not self._points.distance:
+            return [
+                (y, H, R) if isinstance(H, np.ndarray) else (*H(y, xhat), R) for y, H, R in samples
+            ]
+        root = getattr(self.state, "root", None)
+        if root is None:
+            root = first_root(np.zeros((len(xhat),) * 2) if P is None else P)
+        # All together: deviations of functions of one state are correlated.
+        y = np.concatenate([y for y, *_ in functions])
+        stacked = Stacked([h for _, h, _ in functions])
+        y, H, extra = linearise_by_points(stacked, y, xhat, root, self._points)
+        linear = [sample for sample in samples if isinstance(sample[1], np.ndarray)]
+        return [*linear, (y, H, block_diagonal([R for *_, R in functions]) + extra)]
 
     def shift(self, offset: FloatArray) -> None:
         """Add ``offset`` (n,) to the estimate, after the origin of the coordinates has moved."""
@@ -181,9 +215,9 @@ class ClockedNode(Node):
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
-        pairs = [linearise(self.algorithm, self.state, y, H) for _, y, H, _ in samples]
-        y, H = (np.concatenate(part) for part in zip(*pairs, strict=True))
-        R = block_diagonal([sample[3] for sample in samples])
+        known = self.linearise([sample[1:] for sample in samples])
+        y, H = (np.concatenate([sample[part] for sample in known]) for part in range(2))
+        R = block_diagonal([R for *_, R in known])
         self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
         # Under activation by readings the node transmits now.
         if self.after_sample is not None:
@@ -215,18 +249,6 @@ class ClockedNode(Node):
         self.state = self.algorithm.absorb(self.state, messages, Exchange(time=time))
         oldest = max(message.age for message in messages)
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))
-
-
-def linearise(
-    algorithm: Filter, state: Any, y: FloatArray, H: Any
-) -> tuple[FloatArray, FloatArray]:
-    """Return a reading y (p,) and its H (p, n); of a nonlinear sensor, which has a function in
-    place of H, at the estimate of ``state``.
-    """
-    if isinstance(H, np.ndarray):
-        return y, H
-    reading: tuple[FloatArray, FloatArray] = H(y, algorithm.estimate(state)[0])
-    return reading
 
 
 def distinct(nodes: dict[int, Any]) -> list[Any]:

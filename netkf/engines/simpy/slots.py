@@ -15,7 +15,7 @@ import simpy
 
 from netkf.algorithms.filter import Exchange, Reading
 from netkf.engines.base import Rank
-from netkf.engines.simpy.nodes import Envelope, Node, distinct, linearise
+from netkf.engines.simpy.nodes import Envelope, Node, distinct
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.linalg.arrays import FloatArray, block_diagonal
@@ -177,13 +177,13 @@ class SlotNode(Node):
         self._samples.append((y, H, R))
 
     def _update(self, time: float) -> None:
-        samples = [linearise(self.algorithm, self.state, y, H) for y, H, _ in self._samples]
+        samples = self.linearise(self._samples)
         # Empty arrays first, so that nodes without sensors concatenate too.
-        y = np.concatenate([np.empty(0), *(y for y, _ in samples)])
-        H = np.concatenate([self.model.H[:0], *(H for _, H in samples)])
-        R = block_diagonal([R for *_, R in self._samples])
+        y = np.concatenate([np.empty(0), *(y for y, *_ in samples)])
+        H = np.concatenate([self.model.H[:0], *(H for _, H, _ in samples)])
+        R = block_diagonal([R for *_, R in samples])
         present = np.concatenate(
-            [np.empty(0, dtype=bool), *(_finite_rows(y, H) for y, H in samples)]
+            [np.empty(0, dtype=bool), *(_finite_rows(y, H) for y, H, _ in samples)]
         )
         # Rows without a value are left out of y, H and R alike.
         if not present.all():

@@ -5,6 +5,7 @@ A record is one outcome and does not show the law that it came from: the verdict
 
 from __future__ import annotations
 
+from netkf.core.errors import TheoryError
 from netkf.network.channels import Channel
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.scenario import Scenario
@@ -13,9 +14,25 @@ AssumptionRow = tuple[str, str, bool | None, str]
 """assumption, source, holds (None: not known), evidence."""
 
 UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
-NONLINEAR = "readings are not linear in the state: gains, P and errors follow the data"
+FOLLOWS_DATA = "not linear in the state: gains, P and errors follow the data"
 RECORDED_CHANNEL = "losses or delays are recorded: one outcome, not a law"
 TRUE_MODEL = "the filters know the plant and the sensors"
+
+
+def nonlinear_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return a row for dynamics, and one for readings, that are not linear; [] if all are."""
+    parts = {"dynamics": scenario.plant.linear, "readings": scenario.has_linear_sensors}
+    return [
+        (f"{part} are linear in the state", "all papers", False, f"{part} are {FOLLOWS_DATA}")
+        for part, is_linear in parts.items()
+        if not is_linear
+    ]
+
+
+def require_linear(scenario: Scenario) -> None:
+    """Raise TheoryError if dynamics or readings are not linear."""
+    for *_, evidence in nonlinear_rows(scenario):
+        raise TheoryError(evidence)
 
 
 def is_recorded(channel: Channel) -> bool:

@@ -48,7 +48,7 @@ def judge_observed(scenario: Scenario, F: FloatArray, note: str = "") -> tuple[b
 
 def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows that papers about slots share: stabilisable, Q definite, model known."""
-    plant = scenario.slot_plant
+    plant = scenario.linear_plant
     smallest = float(np.linalg.eigvalsh(plant.Q)[0])
     # (F, Q^1/2) is stabilisable if and only if (F', Q^1/2) is detectable.
     idle = undetectable_slot_mode(plant.F.T, plant.Q)

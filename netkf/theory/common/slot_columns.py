@@ -49,7 +49,7 @@ class SlotColumns(ErrorColumns):
         self._scenario, self._run = scenario, run
         self._setup: SlotSetup = slot_setup(scenario)
         self.estimators, self.n = self._setup.estimators, self._setup.n
-        plant = scenario.slot_plant
+        plant = scenario.linear_plant
         self._F, self._noise = plant.F, square_root(plant.Q)
         self._kernels = replace(kernels, decides=False)
         super().__init__()

@@ -32,7 +32,7 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     sensors = [scenario.observation_matrices(node) for node in scenario.nodes]
     closed = [np.eye(n) - L @ H for L, (H, _) in zip(gains, sensors, strict=True)]
     noise = block_diagonal([L @ R @ L.T for L, (_, R) in zip(gains, sensors, strict=True)])
-    plant = scenario.slot_plant
+    plant = scenario.linear_plant
     return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, broadcast_directions(scenario))
 
 

@@ -92,7 +92,7 @@ def _judge_mixing(W: scipy.sparse.csr_array) -> tuple[bool | None, str]:
 
 
 def _plant_rows(scenario: Scenario) -> list[AssumptionRow]:
-    plant = scenario.slot_plant
+    plant = scenario.linear_plant
     F, Q = scenario.slot_belief
     smallest = float(np.linalg.eigvalsh(Q)[0])
     random_walk = bool(np.array_equal(plant.F, np.eye(plant.n)) and np.array_equal(F, plant.F))

@@ -25,7 +25,7 @@ from netkf.network.clocks import LinkClock
 from netkf.plants.transitions import Transitions
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import NONLINEAR
+from netkf.theory.common.evidence import nonlinear_rows
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
@@ -127,8 +127,8 @@ def reason_without_bound(scenario: Scenario) -> str | None:
 
 def _reason_of_samples(scenario: Scenario) -> str | None:
     """Return why the bound does not cover sensors that sample, or None if it does."""
-    if not scenario.is_linear:
-        return f"not promised: {NONLINEAR}"
+    for *_, evidence in nonlinear_rows(scenario):
+        return f"not promised: {evidence}"
     for node, placed_sensor in randomly_sampled_sensors(scenario):
         clock = sampling_clock(scenario.sensors[placed_sensor.entry])
         if clock is not None and not clock.memoryless:

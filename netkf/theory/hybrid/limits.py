@@ -146,7 +146,7 @@ def central_covariance(scenario: Scenario) -> FloatArray:
 
 def _central_slot_covariance(scenario: Scenario) -> FloatArray:
     """Return the steady covariance (n, n) of the central filter in slots, after the reading."""
-    plant = scenario.slot_plant
+    plant = scenario.linear_plant
     if scenario.node_filter.timing.predicts:
         raise TheoryError("the filter's samples are predictions, the central filter's are not")
     if any(sensor.varying for sensor in scenario.sensors):

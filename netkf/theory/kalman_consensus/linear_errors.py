@@ -60,5 +60,5 @@ def slot_jumps(scenario: Scenario) -> SlotJumps:
     }
     directions = directions_of(scenario, weights, scenario.phase_length) if weights else None
     stacked_gains = gains.reshape(-1, rows[-1])
-    plant, noise = scenario.slot_plant, stacked_gains @ true @ stacked_gains.T
+    plant, noise = scenario.linear_plant, stacked_gains @ true @ stacked_gains.T
     return SlotJumps(plant.F, plant.Q, np.stack(closed), noise, directions, on_predictions=True)

@@ -74,7 +74,7 @@ def estimation_steps(scenario: Scenario, averaging: Averaging | None = None) -> 
     """
     limits = push_sum_limits(scenario)
     F, _ = scenario.slot_belief
-    plant = scenario.slot_plant
+    plant = scenario.linear_plant
     if not np.array_equal(F, plant.F):
         raise TheoryError("the filters' F differs from the plant's: the error follows the state")
     truth = [scenario.observation_matrices(node) for node in scenario.nodes]

@@ -1,0 +1,56 @@
+"""The numba implementation of :mod:`netkf.linalg.functions`: a call of an address."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+from llvmlite import ir
+from numba import types
+from numba.extending import lower_builtin, type_callable
+
+from netkf.linalg.functions import call_function
+
+_numba: Any = numba
+carray, _POINTER = _numba.carray, _numba.types.CPointer(types.float64)
+_SIGNATURE = types.void(_POINTER, _POINTER, types.float64, types.float64, _POINTER)
+
+
+def compile_function(function: Any, shapes: tuple[Any, Any, Any], takes_period: bool) -> Any:
+    """Return the C function of a kernel, see ``VectorFunction``."""
+    of_x, of_u, of_out = shapes
+
+    def call(x: Any, u: Any, t: Any, period: Any, out: Any) -> None:
+        function(carray(x, of_x), carray(u, of_u), t, period, carray(out, of_out))
+
+    def call_shortly(x: Any, u: Any, t: Any, _period: Any, out: Any) -> None:
+        function(carray(x, of_x), carray(u, of_u), t, carray(out, of_out))
+
+    made = call if takes_period else call_shortly
+    return _numba.cfunc(_SIGNATURE, error_model="numpy")(made)
+
+
+@type_callable(call_function)
+def _type_call(_: Any) -> Any:
+    """Return the function that types a call: it returns nothing."""
+    return lambda _address, _x, _u, _t, _period, _out: types.none
+
+
+_emit: Any = lower_builtin
+_KINDS = types.Integer, types.Array, types.Array, types.Number, types.Number, types.Array
+
+
+@_emit(call_function, *_KINDS)  # type: ignore[untyped-decorator]
+def _lower_call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Emit the call of an address with the data of arrays."""
+    double, data = ir.DoubleType(), ir.DoubleType().as_pointer()
+    arguments = []
+    for value, kind in zip(args[1:], sig.args[1:], strict=True):
+        if isinstance(kind, types.Array):
+            array = context.make_array(kind)(context, builder, value)
+            arguments.append(builder.bitcast(array.data, data))
+        else:
+            arguments.append(context.cast(builder, value, kind, types.float64))
+    function = ir.FunctionType(ir.VoidType(), [data, data, double, double, data])
+    builder.call(builder.inttoptr(args[0], function.as_pointer()), arguments)
+    return context.get_dummy_value()

@@ -1,0 +1,24 @@
+"""Functions of vectors that kernels call by their address, such as a user's dynamics.
+
+A kernel becomes part of the kernels that call it, which are compiled for it. A function with an
+address (``vector_functions``) is called instead, so that one compiled loop serves all of them,
+kernels and plain Python alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from netkf.linalg.arrays import FloatArray
+
+plain_functions: dict[int, Callable[..., None]] = {}
+"""Functions by address where kernels are plain Python; addresses are mere numbers then."""
+
+
+def call_function(
+    address: int, x: FloatArray, u: FloatArray, t: float, period: float, out: FloatArray
+) -> None:
+    """Write the value at ``x``, ``u``, ``t`` and ``period`` of the function with this ``address``
+    into ``out``, all C-contiguous.
+    """
+    plain_functions[int(address)](x, u, t, period, out)

@@ -1,0 +1,125 @@
+"""Dynamics of plants that need not be linear: the motions that netkf knows, and users' own.
+
+A user's class has ``f(x, u, t)`` and ``jacobian(x, u, t)``, the derivatives of f with respect to x
+(n, n): of a plant in slots the state (n,) one slot after ``x`` (n,), in continuous time its rate of
+change; ``u`` (m,) is the input and ``t`` the time in seconds. Instead of both it may have
+``kernels``, a pair of kernels ``f(x, u, t, out)`` and ``jacobian(x, u, t, out)`` (netkf.kernels),
+which write their results into ``out``: then runs need no Python between two samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from netkf.core.contracts import place_of_error
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import Component, Rule
+from netkf.linalg.vector_functions import VectorFunction
+from netkf.plants import motion
+
+Pair = tuple[Callable[..., Any], Callable[..., Any]]
+
+
+class Motion(NamedTuple):
+    """A motion that netkf knows.
+
+    n, m : numbers of states and of components of the input
+    states, inputs : what they are
+    flow, rate : the exact flow over a period, the rate of change, each with its Jacobian
+    """
+
+    n: int
+    m: int
+    states: str
+    inputs: str
+    flow: Pair
+    rate: Pair
+
+
+MOTIONS = {
+    "unicycle": Motion(
+        3, 2, "x, y and heading", "speed and turn rate",
+        (motion.move_unicycle, motion.unicycle_jacobian),
+        (motion.unicycle_rate, motion.unicycle_rate_jacobian),
+    ),
+    "coordinated-turn": Motion(
+        5, 0, "x, y, vx, vy and turn rate", "",
+        (motion.move_turning, motion.turning_jacobian),
+        (motion.turning_rate, motion.turning_rate_jacobian),
+    ),
+}  # fmt: skip
+"""Unicycle and coordinated turn, by the names that scenarios use."""
+
+
+@dataclass(frozen=True, eq=False)
+class CustomDynamics(Component):
+    """An object ``part`` of a user's class whose ``name`` is "module:Class"."""
+
+    name: str
+    part: Any
+
+    def __eq__(self, other: object) -> bool:
+        """Return True if classes and attributes of both objects are equal."""
+        if not isinstance(other, CustomDynamics):
+            return NotImplemented
+        mine, others = (getattr(one.part, "__dict__", {}) for one in (self, other))
+        same = self.name == other.name
+        return same and (self.part is other.part or str(mine) == str(others))
+
+    def __hash__(self) -> int:
+        """Return a hash that equal dynamics share."""
+        return hash(self.name)
+
+    def __repr__(self) -> str:
+        """Return the name of the class."""
+        return repr(self.name)
+
+
+def _convert(value: Any) -> str | CustomDynamics:
+    if isinstance(value, CustomDynamics) or value in tuple(MOTIONS):
+        dynamics: str | CustomDynamics = value
+        return dynamics
+    if value is None or isinstance(value, (str, bytes, int, float, list, tuple, dict)):
+        raise TypeError
+    cls = value if isinstance(value, type) else type(value)
+    name = f"{cls.__module__}:{cls.__qualname__}"
+    try:
+        part = value() if isinstance(value, type) else value
+    except Exception as error:
+        place = place_of_error(error)
+        rule = f"could not be made ({type(error).__name__}: {error}{'; ' if place else ''}{place})"
+        raise ScenarioError("", rule, name, "give it an __init__ without arguments") from error
+    wanted = () if hasattr(part, "kernels") else ("f", "jacobian")
+    for method in wanted:
+        if not callable(getattr(part, method, None)):
+            rule = f"must have a method {method}(x, u, t)"
+            raise ScenarioError("", rule, name, "write it; x is (n,), u (m,) and t in seconds")
+    return CustomDynamics(name, part)
+
+
+_listed = ", ".join(f'"{name}"' for name in MOTIONS)
+dynamics = Rule(
+    f'must be one of {_listed}, or "module:Class", a class with f(x, u, t) and jacobian(x, u, t)',
+    _convert,
+    "choose one of them",
+    {"type": "string"},
+)
+
+
+def functions_of(f: str | CustomDynamics, n: int, m: int, in_slots: bool) -> Any:
+    """Return f and its Jacobian for n states and m components of the input, as two functions that
+    kernels can call: in slots the map of one, else the rate of change.
+    """
+    shapes = [((n,), (m,), out) for out in ((n,), (n, n))]
+    if isinstance(f, str):
+        pair: Pair = MOTIONS[f].flow if in_slots else MOTIONS[f].rate
+        is_kernel = takes_period = True
+    else:
+        is_kernel, takes_period = hasattr(f.part, "kernels"), False
+        pair = f.part.kernels if is_kernel else (f.part.f, f.part.jacobian)
+    return tuple(
+        VectorFunction(function, shape, is_kernel, takes_period)
+        for function, shape in zip(pair, shapes, strict=True)
+    )

@@ -1,0 +1,141 @@
+"""Plants in slots that need not be linear, x[k+1] = f(x[k], u[k], t_k) + w[k]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from netkf.core.contracts import place_of_error
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import covariance, field, seconds
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import apply
+from netkf.linalg.vector_functions import VectorFunction
+from netkf.plants.dynamics import MOTIONS, dynamics, functions_of
+from netkf.plants.linear import BLOCK, Blocks, SlotPlant
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearPlant(SlotPlant):
+    """``x[k+1] = f(x[k], u[k], t_k) + w[k]``, cov(w) = Q; slot k is at time ``k * period`` seconds,
+    u[k] is the ``input`` then.
+
+    f       "unicycle" (x, y, heading, with speed and turn rate as input; over a period with both
+            held the path is an arc), "coordinated-turn" (x, y, vx, vy, turn rate, without input),
+            or "module:Class", the map of one slot
+    Q       (n, n)
+    period  seconds
+
+    Headings are not wrapped: they count whole turns.
+    """
+
+    linear: ClassVar[bool] = False
+
+    f: Any = field(dynamics)
+    Q: FloatArray = field(covariance)
+    period: float = field(seconds)
+
+    @property
+    def n(self) -> int:
+        """Dimension of the state."""
+        return len(self.Q)
+
+    @property
+    def m(self) -> int:
+        """Number of components of the input, 0 without one."""
+        return 0 if self.input is None else self.input.m
+
+    @cached_property
+    def functions(self) -> tuple[VectorFunction, VectorFunction]:
+        """The map f and its Jacobian."""
+        f, jacobian = functions_of(self.f, self.n, self.m, in_slots=True)
+        return f, jacobian
+
+    def inputs(self, slots: int) -> FloatArray:
+        """Return u (S, m) of the slots 0 to S - 1."""
+        if self.input is None:
+            return np.zeros((slots, 0))
+        return np.array(self.input.values(self.time_grid.snap(self.period * np.arange(slots))))
+
+    def check_dynamics(self) -> None:
+        """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
+        check_dynamics(self, self.functions)
+
+    def truth(self, random: np.random.Generator, frames: bool = False) -> MapPath:
+        """Return the true states of one run, drawn from ``random``; ``frames`` are for linear
+        plants only.
+        """
+        start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
+        return MapPath(self, start, random)
+
+
+def check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction]) -> None:
+    """Raise ScenarioError if f does not fit the state or the input of a plant, or fails."""
+    n, m = plant.n, plant.m
+    if plant.input is not None and plant.input.G is not None:
+        remedy = "leave it out: u is what f takes"
+        raise ScenarioError("input.G", "means nothing with a nonlinear plant", None, remedy)
+    known = MOTIONS.get(plant.f) if isinstance(plant.f, str) else None
+    if known is not None and known.n != n:
+        key = "Q" if hasattr(plant, "Q") else "B"
+        rule = f"must have {known.n} rows, for {known.states}"
+        raise ScenarioError(key, rule, f"{n} rows", f'that is the state of "{plant.f}"')
+    if known is not None and known.m != m:
+        rule = f'must have {known.m} components for "{plant.f}", {known.inputs}'
+        if not known.m:
+            raise ScenarioError("input", f'means nothing with "{plant.f}"', None, "leave it out")
+        got = f"{m} components" if m else None
+        remedy = 'give [plant.input], such as kind = "constant" and value = [v, w]'
+        raise ScenarioError("input", rule if m else f"is missing: it {rule}", got, remedy)
+    if known is not None:
+        return
+    u = np.zeros(m) if plant.input is None else plant.input.at(0.0)
+    for name, function in zip(("f", "jacobian"), functions, strict=True):
+        try:
+            value = function(plant.start_mean, u, 0.0, 0.0)
+        except Exception as error:
+            place = place_of_error(error)
+            rule = f"{name} failed at plant.mean ({type(error).__name__}: {error}"
+            rule = " ".join(f"{rule}{'; ' if place else ''}{place})".split())
+            remedy = f"{name}(x, u, t) takes x ({n},), u ({m},) and t in seconds"
+            raise ScenarioError("f", rule, plant.f, remedy) from error
+        if not np.isfinite(value).all():
+            rule = f"{name} must be finite at plant.mean, not {value.tolist()}"
+            raise ScenarioError("f", rule, plant.f, "give plant.mean, or correct the class")
+
+
+class MapPath:
+    """The path of one run from x[0] = ``start`` (n,) on, with noise drawn from ``random``. Slots
+    must be asked for in order.
+    """
+
+    frame_slots: int | None = None
+
+    def __init__(
+        self, plant: NonlinearPlant, start: FloatArray, random: np.random.Generator
+    ) -> None:
+        self._plant, self._noise = plant, Blocks(random, plant.noise_root.shape[1])
+        self._slot, self._x, self._u = 0, start, plant.inputs(BLOCK)
+
+    def state(self, slot: int) -> FloatArray:
+        """Return x (n,) in slot number ``slot``."""
+        plant = self._plant
+        f = plant.functions[0]
+        # States beyond the horizon may overflow.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(self._slot, slot):
+                if k == len(self._u):
+                    self._u = plant.inputs(2 * k)
+                noise = apply(plant.noise_root, self._noise.draw())
+                self._x = f(self._x, self._u[k], k * plant.period, plant.period) + noise
+        self._slot = slot
+        return self._x
+
+    local = absolute = state
+
+    def rebase(self, slot: int) -> FloatArray:
+        """Raise IndexError: there are no frames, so that none begins at ``slot``."""
+        raise IndexError(slot)
