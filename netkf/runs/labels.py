@@ -60,4 +60,9 @@ def mismatch_note(scenario: Scenario) -> str:
         return ""
     if not scenario.is_random:
         return "whether P fits the errors depends on the model: the state or readings are recorded"
+    if scenario.plant.input is not None and not scenario.knows_input:
+        return (
+            "the filters do not know the input of the plant: errors have a bias that neither P nor "
+            "its bound counts"
+        )
     return "the filters' model differs from the truth: P and its bound need not bound the errors"

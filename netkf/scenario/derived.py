@@ -267,19 +267,29 @@ class DerivedScenario(ScenarioModel):
         """The responses to the input of the plant; None if it has none, or is not linear: f takes u
         then.
         """
-        u, believed, true = self.plant.input, None, None
-        if u is None or not self.plant.linear:
+        if self.plant.input is None or not self.plant.linear:
             return None
-        if self.knows_input and not self.tells_models:
-            believed = self.believed_response
-        # In recorded states the true response is contained.
-        if self.plant.is_random:
-            A = self.linear_plant.F if self.slotted else self.diffusion.A
-            true = self._response(A)
-            if believed is not None:
-                same = np.array_equal(A, self.slot_belief[0] if self.slotted else self.belief[0])
-                true = None if same else Difference(true, believed)
-        return InputResponses(believed, true)
+        # Recorded states have the true response in them.
+        surprise = self.surprise if self.plant.is_random else None
+        return InputResponses(self.believed_response if self._moves_along else None, surprise)
+
+    @property
+    def _moves_along(self) -> bool:
+        return self.knows_input and not self.tells_models
+
+    @cached_property
+    def surprise(self) -> Response | None:
+        """The part of the response to the input, by the matrices of the plant, that is left in the
+        state in the coordinates of the filters; None if it is 0, or the plant is not linear.
+        """
+        if self.plant.input is None or not self.plant.linear:
+            return None
+        A = self.linear_plant.F if self.slotted else self.diffusion.A
+        if not self._moves_along:
+            return self._response(A)
+        if np.array_equal(A, self.slot_belief[0] if self.slotted else self.belief[0]):
+            return None
+        return Difference(self._response(A), self.believed_response)
 
     @cached_property
     def believed_response(self) -> FlowResponse | SlotResponse:

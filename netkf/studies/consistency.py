@@ -211,6 +211,9 @@ class _Innovations:
         # = F e + w + (F - F') xhat.
         if not model_is_true:
             predicted = predicted + (plant.F - F) @ run.xhat[k, i]
+        u = plant.input
+        if u is not None and not self._scenario.knows_input:
+            predicted, Sigma = predicted + u.G @ u.at(float(run.times[k])), None
         return predicted, F @ P @ F.T + Q, Sigma
 
 
@@ -403,6 +406,8 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
 
 def _explain_bias(scenario: Scenario, conservative: bool) -> str:
     """Return why P is larger (``conservative``) or smaller than the covariance of the errors."""
+    if scenario.plant.input is not None and not scenario.knows_input:
+        return "filters do not know the input of the plant, a bias that P does not count"
     if not scenario.filters_know_the_truth:
         return f"the filters' model makes P {'conservative' if conservative else 'overconfident'}"
     bias = covariance_bias(scenario)

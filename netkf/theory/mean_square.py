@@ -144,6 +144,8 @@ def _require_known_law(scenario: Scenario) -> None:
     )
     if not np.array_equal(believed, true):
         raise TheoryError("the filters' plant is not the true one: errors follow the state")
+    if scenario.surprise is not None:
+        raise TheoryError("the filters do not know the input of the plant: errors follow it")
 
 
 def has_linear_errors(scenario: Scenario) -> bool:

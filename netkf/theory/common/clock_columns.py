@@ -88,6 +88,8 @@ class ClockColumns(ErrorColumns):
         # F and the root of the noise of the plant, by gap between readings or samples.
         self._laws = dict(zip(gaps.tolist(), laws, strict=True))
         self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators)
+        # What increments make of a state that an unknown input moves is not computed.
+        self.has_means = self._flows is None or scenario.surprise is None
         index = scenario.topology.index
         self._index = index
         clock = cast(Any, scenario.network.activation)
@@ -144,6 +146,9 @@ class ClockColumns(ErrorColumns):
         first = forms.inputs(self.n)
         forms.table[self._x, : forms.used] = F @ forms.table[self._x, : forms.used]
         forms.table[self._x, first : first + self.n] = root
+        if self._scenario.surprise is not None:
+            before, after = self._scenario.surprise.states(np.array([self._now, time]))
+            forms.table[self._x, MEAN] += after - F @ before
         self._now = time
 
     def _keep_digits(self, nodes: Sequence[int]) -> None:

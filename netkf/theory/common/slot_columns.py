@@ -87,9 +87,9 @@ class SlotColumns(ErrorColumns):
                 slot = processed if predicts else processed + 1
                 if predicts:
                     self._simulate(slot, self._observe(slot), arrivals)
-                    self._move_truth()
+                    self._move_truth(processed)
                 else:
-                    self._move_truth()
+                    self._move_truth(processed)
                     self._simulate(slot, self._observe(slot), arrivals)
                 if self._x.shape[1] > max(FEW, 2 * self._fewest):
                     self._compress()
@@ -97,8 +97,12 @@ class SlotColumns(ErrorColumns):
                 processed += 1
             yield
 
-    def _move_truth(self) -> None:
+    def _move_truth(self, slot: int) -> None:
+        """Move the true state from ``slot`` to the next."""
         self._x = np.column_stack([self._F @ self._x, self._noise])
+        if self._scenario.surprise is not None:
+            before, after = self._scenario.surprise.states(np.array([slot, slot + 1]))
+            self._x[:, MEAN] += after - self._F @ before
         self._fit(self._x.shape[1])
 
     def _fit(self, columns: int) -> None:
