@@ -59,8 +59,9 @@ class FlowResponse:
 
     def __init__(self, A: FloatArray, u: Input) -> None:
         assert u.G is not None
-        self.n, self._exogenous = len(A), u.exogenous
-        _, S, C, z = self._exogenous
+        self.A, self.n, self._u, self._G = A, len(A), u, u.G
+        self._exogenous = u.exogenous
+        self.jumps, S, C, z = self._exogenous
         q = len(S)
         self.joint = np.block([[A, u.G @ C], [np.zeros((q, self.n)), S]])
         self._moves = Transitions(self.joint, np.zeros((len(self.joint), 1)))
@@ -82,6 +83,10 @@ class FlowResponse:
     def states(self, times: FloatArray) -> FloatArray:
         """Return m (K, n) at K ``times`` (K,) in seconds."""
         return self.joint_states(times)[:, : self.n]
+
+    def drive(self, times: FloatArray) -> FloatArray:
+        """Return what drives m, ``m' - A m`` (K, n), at K ``times`` (K,) in seconds."""
+        return np.asarray(self._u.values(times) @ self._G.T)
 
     def _starts(self, last: int) -> FloatArray:
         """Return m and the state of the input (last + 1, n + q) at its jumps up to ``last``."""
@@ -159,6 +164,15 @@ class Difference:
     def states(self, times: np.ndarray) -> FloatArray:
         """Return the difference (K, n) at K ``times`` (K,) in seconds, or in K slots."""
         return np.asarray(self._true.states(times) - self._believed.states(times))
+
+    @property
+    def jumps(self) -> FloatArray:
+        """Times (J,) in seconds at which the input jumps."""
+        return np.asarray(self._true.jumps)
+
+    def drive(self, times: FloatArray) -> FloatArray:
+        """Return what drives the difference in the plant, (K, n), at K ``times`` (K,)."""
+        return np.asarray(self._believed.states(times) @ (self._true.A - self._believed.A).T)
 
     def over_pieces(
         self, start: FloatArray, end: FloatArray, grid: TimeGrid

@@ -396,6 +396,8 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
         return "no NEES: P is singular, or P or the errors are not finite"
     if expected is None:
         side = "near n" if abs(excess) <= width else "above n" if excess > 0.0 else "below n"
+        if scenario.plant.input is not None and not scenario.knows_input:
+            return f"{side}; filters do not know the input"
         return f"{side}; the expected NEES is unknown"
     if abs(excess) > width:
         return f"BROKEN: errors are {'larger' if excess > 0.0 else 'smaller'} than expected"
@@ -407,7 +409,7 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
 def _explain_bias(scenario: Scenario, conservative: bool) -> str:
     """Return why P is larger (``conservative``) or smaller than the covariance of the errors."""
     if scenario.plant.input is not None and not scenario.knows_input:
-        return "filters do not know the input of the plant, a bias that P does not count"
+        return "filters do not know the input, P is overconfident"
     if not scenario.filters_know_the_truth:
         return f"the filters' model makes P {'conservative' if conservative else 'overconfident'}"
     bias = covariance_bias(scenario)

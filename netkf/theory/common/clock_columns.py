@@ -88,8 +88,6 @@ class ClockColumns(ErrorColumns):
         # F and the root of the noise of the plant, by gap between readings or samples.
         self._laws = dict(zip(gaps.tolist(), laws, strict=True))
         self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators)
-        # What increments make of a state that an unknown input moves is not computed.
-        self.has_means = self._flows is None or scenario.surprise is None
         index = scenario.topology.index
         self._index = index
         clock = cast(Any, scenario.network.activation)
@@ -177,7 +175,7 @@ class ClockColumns(ErrorColumns):
         flows, filters, forms = self._flows, self._filters, self._forms_of_all
         if flows is None or time <= self._now:
             return
-        flows.advance(forms, self._x, filters.xhat_rows, filters.roots, time - self._now)
+        flows.advance(forms, self._x, filters.xhat_rows, filters.roots, (self._now, time))
         self._now = time
         for h in flows.reading:
             self._times[h] = time

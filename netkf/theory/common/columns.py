@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from netkf.algorithms.filter import commutes, compiled_kernels
-from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import Observation
@@ -31,7 +30,6 @@ class ErrorColumns:
 
     estimators: int
     n: int
-    has_means = True
 
     def __init__(self) -> None:
         self._kept: list[FloatArray] = []
@@ -69,20 +67,11 @@ class ErrorColumns:
 
     def second_moments(self) -> FloatArray:
         """Return the joint second moments (M n, M n): covariances and products of means."""
-        self._require_means()
         forms = self._forms()
         return np.asarray(forms @ forms.T)
 
-    def _require_means(self) -> None:
-        if not self.has_means:
-            raise TheoryError(
-                "filters that read increments do not know the whole response to the input of the "
-                "plant: the mean of their errors is not computed"
-            )
-
     def law(self) -> tuple[FloatArray, FloatArray]:
         """Return the mean (K M n,) and the covariance of the errors at the K times of ``keep``."""
-        self._require_means()
         width = max(form.shape[1] for form in self._kept)
         # Columns that came after a time are zero there.
         forms = np.concatenate([padded(form, width - form.shape[1]) for form in self._kept])

@@ -7,7 +7,7 @@ the verbs of filters go in short steps.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from netkf.algorithms.kernels import run as standard
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray, square_root
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.forms import Forms
+from netkf.theory.common.forms import MEAN, Forms
 from netkf.theory.common.observations import increment_observations
-from netkf.theory.numerics.prediction import ErrorFlow, StateFlow
+from netkf.theory.numerics.prediction import NODES, WEIGHTS, ErrorFlow, StateFlow
 
 
 class IncrementFlows(NamedTuple):
@@ -30,12 +30,15 @@ class IncrementFlows(NamedTuple):
     plant : the flow of the true state
     follows : whether errors depend on the state, because the filters' A is not the plant's: flows
               are then those of the state and the error together, of which only the error has a P
+    surprise : the response to an input that is left in the state, or None; n more noises of the
+               plant then stand for what drives it, which is known
     """
 
     groups: list[tuple[ErrorFlow, IntArray]]
     reading: list[int]
     plant: StateFlow
     follows: bool
+    surprise: Any
 
     @property
     def unit(self) -> float:
@@ -43,17 +46,35 @@ class IncrementFlows(NamedTuple):
         return min(flow.unit for flow, _ in self.groups)
 
     def advance(
-        self, forms: Forms, state: IntArray, estimates: IntArray, roots: FloatArray, gap: float
+        self,
+        forms: Forms,
+        state: IntArray,
+        estimates: IntArray,
+        roots: FloatArray,
+        until: tuple[float, float],
     ) -> None:
-        """Move state and estimates that read increments, rows of ``forms``, over ``gap`` (s)."""
-        steps = math.ceil(gap / self.unit)
-        for _ in range(steps):
-            self._step(forms, state, estimates, roots, gap / steps)
+        """Move state and estimates that read increments, rows of ``forms``, from the first to the
+        second time of ``until`` (s).
+        """
+        now, end = until
+        jumps = np.empty(0) if self.surprise is None else self.surprise.jumps
+        for stop in [*jumps[(jumps > now) & (jumps < end)].tolist(), end]:
+            steps = math.ceil((stop - now) / self.unit)
+            gap = (stop - now) / steps
+            for k in range(steps):
+                self._step(forms, state, estimates, roots, (now + k * gap, gap))
+            now = stop
 
     def _step(
-        self, forms: Forms, state: IntArray, estimates: IntArray, roots: FloatArray, gap: float
+        self,
+        forms: Forms,
+        state: IntArray,
+        estimates: IntArray,
+        roots: FloatArray,
+        over: tuple[float, float],
     ) -> None:
-        """Advance over ``gap`` seconds, at most the ``unit``."""
+        """Advance from a time on over a gap of seconds, at most the ``unit``."""
+        start, gap = over
         # The plant's noise at the 8 nodes of the quadrature enters all errors; the noises of the
         # increments take n inputs for each estimate.
         n, common = len(state), self.plant.inputs
@@ -75,6 +96,12 @@ class IncrementFlows(NamedTuple):
             forms.table[rows, :used] = (moved - errors[:, -n:]).reshape(-1, used)
             noise += size * len(members)
         forms.table[state, :used] = moved
+        if self.surprise is not None:
+            # What drives the state is known: its inputs belong to the mean.
+            drive = np.sqrt(WEIGHTS * gap)[:, None] * self.surprise.drive(start + NODES * gap)
+            known = first + np.arange(common).reshape(len(NODES), -1)[:, -n:].reshape(-1)
+            forms.table[:, MEAN] += forms.table[:, known] @ drive.reshape(-1)
+            forms.table[:, known] = 0.0
 
 
 def integration_steps(scenario: Scenario) -> int:
@@ -95,7 +122,10 @@ def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | Non
         raise TheoryError("the exact errors of this filter are known for sampled sensors")
     A, Q = scenario.belief
     plant = (scenario.diffusion.A, scenario.diffusion.B)
-    B, noise = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q), plant[1]
+    B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
+    if scenario.surprise is not None:
+        plant = (plant[0], np.column_stack([plant[1], np.eye(len(A))]))
+    noise = plant[1]
     follows = not np.array_equal(A, plant[0])
     if follows:
         # d(x, e) = (A x, (A - A_f) x + (A_f - L H) e) dt + (B, B) dw, less the noise of L dv in e.
@@ -117,4 +147,4 @@ def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | Non
             flows[key] = ErrorFlow(A, B, H, observation.R, observation.root, noise)
     groups = [(flows[key], np.array(members[key])) for key in flows]
     reading = [h for indices in members.values() for h in indices]
-    return IncrementFlows(groups, reading, StateFlow(*plant), follows)
+    return IncrementFlows(groups, reading, StateFlow(*plant), follows, scenario.surprise)
