@@ -149,7 +149,7 @@ class SineInput(Input):
         """The system whose output is u: an oscillator (sin, cos) for each component."""
         amplitude, omega, phase = self._components
         blocks = [np.array([[0.0, w], [-w, 0.0]]) for w in omega]
-        C = np.kron(np.diag(amplitude), [1.0, 0.0])
+        C = np.asarray(np.kron(np.diag(amplitude), [1.0, 0.0]), dtype=np.float64)
         z = np.stack([np.sin(phase), np.cos(phase)], axis=1).reshape(1, -1)
         return Exogenous(np.zeros(1), block_diagonal(blocks), C, z)
 

@@ -27,7 +27,7 @@ SLOTS = 256  # slots computed at once, at least
 class Response(Protocol):
     """The response m to an input."""
 
-    def states(self, times: FloatArray) -> FloatArray:
+    def states(self, times: np.ndarray) -> FloatArray:
         """Return m (K, n) at K ``times`` (K,) in seconds; of a plant in slots, at K slots."""
 
 
@@ -80,7 +80,7 @@ class FlowResponse:
             out[chunk] = apply(self._moves.transitions(gaps), starts[last[chunk]])
         return out
 
-    def states(self, times: FloatArray) -> FloatArray:
+    def states(self, times: np.ndarray) -> FloatArray:
         """Return m (K, n) at K ``times`` (K,) in seconds."""
         return self.joint_states(times)[:, : self.n]
 

@@ -213,7 +213,7 @@ class _Innovations:
             predicted = predicted + (plant.F - F) @ run.xhat[k, i]
         u = plant.input
         if u is not None and not self._scenario.knows_input:
-            predicted, Sigma = predicted + u.G @ u.at(float(run.times[k])), None
+            predicted, Sigma = predicted + np.asarray(u.G) @ u.at(float(run.times[k])), None
         return predicted, F @ P @ F.T + Q, Sigma
 
 

@@ -425,11 +425,11 @@ class SlotRuns:
         rebased = np.zeros(count, dtype=bool)
         if self._path is None:
             # A recorded truth is the same in all runs.
-            local, absolute = (
+            both = [
                 in_lanes(np.stack([state(slot) for slot in slots]), self._blocks)
                 for state in (self._truth.local, self._truth.absolute)
-            )
-            return local, absolute, rebased
+            ]
+            return both[0], both[1], rebased
         # At the end of a frame the origin moves to the state.
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])

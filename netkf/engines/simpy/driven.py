@@ -20,7 +20,8 @@ class DrivenModel:
     """
 
     def __init__(self, scenario: Scenario, model: Any) -> None:
-        self._model, self._response = model, scenario.believed_response
+        response: Any = scenario.believed_response
+        self._model, self._response = model, response
         self._grid = scenario.time_grid
         self._period = scenario.slot_plant.period if scenario.slotted else None
         self.start = self.end = 0.0

@@ -245,7 +245,8 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``."""
-    model, first = scenario.believed_models[entity], scenario.nodes[entity]
+    model: Any = scenario.believed_models[entity]
+    first = scenario.nodes[entity]
     # -1: the pooled filter, which is not a node of the graph.
     if node < 0:
         model = scenario.believed_pooled_model
