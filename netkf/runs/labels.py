@@ -60,7 +60,7 @@ def mismatch_note(scenario: Scenario) -> str:
         return ""
     if not scenario.is_random:
         return "whether P fits the errors depends on the model: the state or readings are recorded"
-    if scenario.plant.input is not None and not scenario.knows_input:
+    if scenario.misses_input:
         return (
             "the filters do not know the input of the plant: errors have a bias that neither P nor "
             "its bound counts"

@@ -256,6 +256,11 @@ class DerivedScenario(ScenarioModel):
         return self.plant.input is not None and self.filter.model.input
 
     @property
+    def misses_input(self) -> bool:
+        """True if the plant has an input that the filters do not know."""
+        return self.plant.input is not None and not self.filter.model.input
+
+    @property
     def tells_models(self) -> bool:
         """True if the models of nodes tell filters of the input: such in plain Python that do not
         commute with a shift, so that their coordinates cannot move along with it.
@@ -462,7 +467,7 @@ class DerivedScenario(ScenarioModel):
         False if states or readings are recorded: their true matrices are unknown.
         """
         plant = self.plant
-        if not self.is_random or (plant.input is not None and not self.knows_input):
+        if not self.is_random or self.misses_input:
             return False
         if isinstance(plant, NonlinearPlant):
             pairs = [(plant.Q if self.filter.model.Q is None else self.filter.model.Q, plant.Q)]

@@ -212,7 +212,7 @@ class _Innovations:
         if not model_is_true:
             predicted = predicted + (plant.F - F) @ run.xhat[k, i]
         u = plant.input
-        if u is not None and not self._scenario.knows_input:
+        if u is not None and self._scenario.misses_input:
             predicted, Sigma = predicted + np.asarray(u.G) @ u.at(float(run.times[k])), None
         return predicted, F @ P @ F.T + Q, Sigma
 
@@ -396,7 +396,7 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
         return "no NEES: P is singular, or P or the errors are not finite"
     if expected is None:
         side = "near n" if abs(excess) <= width else "above n" if excess > 0.0 else "below n"
-        if scenario.plant.input is not None and not scenario.knows_input:
+        if scenario.misses_input:
             return f"{side}; filters do not know the input"
         return f"{side}; the expected NEES is unknown"
     if abs(excess) > width:
@@ -408,7 +408,7 @@ def _verdict(scenario: Scenario, excess: float, width: float, expected: float | 
 
 def _explain_bias(scenario: Scenario, conservative: bool) -> str:
     """Return why P is larger (``conservative``) or smaller than the covariance of the errors."""
-    if scenario.plant.input is not None and not scenario.knows_input:
+    if scenario.misses_input:
         return "filters do not know the input, P is overconfident"
     if not scenario.filters_know_the_truth:
         return f"the filters' model makes P {'conservative' if conservative else 'overconfident'}"
