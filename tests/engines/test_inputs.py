@@ -13,10 +13,12 @@ import scipy.linalg
 
 import netkf
 from netkf.algorithms.traits import Timing
-from netkf.core.errors import NetkfError
+from netkf.core.errors import NetkfError, TheoryError
 from netkf.parts import Filter, Filtering, Local
+from netkf.runs.labels import mismatch_note
 from netkf.scenario.reading import from_table
 from netkf.scenario.usage import record_usage
+from netkf.theory.errors import error_law
 from tests.engines.agreement import assert_agree
 from tests.reference import kalman_update, kcf
 from tests.scenario.test_preconditions import ALL
@@ -318,3 +320,47 @@ def test_a_log_in_other_units_gives_the_same_run(tmp_path):
         assert np.array_equal(run.x, runs[0].x)
     use = [record_usage(run.scenario, None)["plant.input"] for run in runs]
     assert [(one["rows"], one["unused"]) for one in use] == [(3, 0), (3, 0), (4, 1)]
+
+
+UNKNOWN = {
+    "kcf": ("slots", {"input": False}, 1e-9),
+    "gossip": ("slots", {"input": False}, 1e-9),
+    "diffusion-kalman": ("slots", {"F": [[0.9, 0.3], [-0.2, 0.8]]}, 1e-9),
+    "covariance-intersection": ("clocks", {"input": False}, 1e-9),
+    "hybrid": ("clocks", {"A": [[0.0, 0.5], [-0.4, -0.2]]}, 1e-9),
+    "local": ("increments", {"input": False}, 1e-4),  # gains of increments are of third order
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_filters_do_not_know_is_the_mean_of_their_errors(name):
+    time, model, tolerance = UNKNOWN[name]
+    driven = fitting(name, "slots" if time == "slots" else "clocks", model=model)
+    if time == "increments":
+        driven = driven.replace({"sensors": [{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.3]]}]})
+    free = driven.undriven
+    runs = [netkf.simulate(one, engine="simpy") for one in (driven, free)]
+    laws = [error_law(one, run) for one, run in zip((driven, free), runs, strict=True)]
+    bias, means = runs[0].error - runs[1].error, laws[0].mean - laws[1].mean
+    assert np.abs(bias).max() > 1.0
+    np.testing.assert_allclose(means.reshape(bias.shape), bias, atol=tolerance * np.abs(bias).max())
+    np.testing.assert_allclose(laws[0].covariance, laws[1].covariance, atol=1e-9)
+
+
+def test_an_unknown_input_shows_where_promises_are_judged():
+    driven = fitting("kcf", "slots", model={"input": False})
+    told = fitting("kcf", "slots")
+    assert driven.undriven.filters_know_the_truth
+    assert told.filters_know_the_truth
+    rows = netkf.theory.assumptions(driven)
+    row = rows[rows["assumption"] == "the filters know the plant and the sensors"]
+    assert row["holds"].tolist() == [False]
+    with pytest.raises(TheoryError, match="do not know the input of the plant"):
+        netkf.theory.steady_error_covariance(driven.replace({"filter.share_readings": False}))
+    verdict = netkf.consistency(driven, runs=12)
+    for node in verdict.rows:
+        assert node.nees > 5.0 * driven.plant.n
+        assert abs(node.nees - node.expected) < node.width
+        assert "filters do not know the input" in node.verdict
+    assert "bias" in mismatch_note(driven)
+    assert mismatch_note(told) == ""
