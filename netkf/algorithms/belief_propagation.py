@@ -448,6 +448,8 @@ class BeliefPropagation(Filter):
             samples=True,
             inverts=True,
             linear_plant=self.memory == ALL,
+            one_model=self.memory == ALL,
+            one_model_under_clocks=True,
             check=self._check_scenario,
             notes=self._scenario_notes,
         )
@@ -459,7 +461,7 @@ class BeliefPropagation(Filter):
         """
         if scenario.slotted and self.memory == SLOT:
             return
-        key, Q = ("Q", scenario.slot_belief[1]) if scenario.slotted else ("B", scenario.belief[1])
+        key, (A, Q) = "Q" if scenario.slotted else "B", scenario.believed_pieces[0]
         # Process noise that two messages share would count as independent evidence.
         if Q.any():
             slots = 'memory = "slot"'
@@ -470,7 +472,7 @@ class BeliefPropagation(Filter):
                 float(np.abs(Q).max()),
                 f"write {slots}" if scenario.slotted else f"use a plant in slots with {slots}",
             )
-        key, A = ("F", scenario.slot_belief[0]) if scenario.slotted else ("A", scenario.belief[0])
+        key = "F" if scenario.slotted else "A"
         frame = slot_frame(A) if scenario.slotted else flow_frame(A)
         steps = scenario.horizon / (scenario.slot_plant.period if scenario.slotted else 1.0)
         if frame.excess * steps > MAX_LOSS:

@@ -429,6 +429,7 @@ class ConsensusInnovations(Filter):
         """Its demands on a scenario."""
         return Needs(
             one_way=True,
+            one_model=True,
             fixed_sensors=True,
             linear_plant=True,
             every_reading=True,

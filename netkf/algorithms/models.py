@@ -8,8 +8,9 @@ compute a flow over any gap without matrix exponentials at run time.
 
 from __future__ import annotations
 
+import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import ClassVar
@@ -27,6 +28,8 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, aligned
 from netkf.linalg.vector_functions import VectorFunction
 
+CLOSE = 1e-12
+"""Share of a time by which sums of gaps may miss it."""
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
 
@@ -250,6 +253,97 @@ class MapModel(SlotModel):
             move_estimate(tables, np.zeros(n), ONE, x, S, 0, self.slot + k, scratch)
         self.raise_error()
         return x.reshape(n), S.reshape(n, n)
+
+
+class ChangingFlowModel(FlowModel):
+    """A model in continuous time whose matrices change: the ``pieces`` of it, of which the first
+    holds before ``changes[0]`` seconds, the second before ``changes[1]``, and so on. All fields are
+    those of the present piece. Engines predict to each change, let the next piece ``begin``, and
+    say the time of what comes next by ``move_to``.
+    """
+
+    pieces: Sequence[FlowModel]
+    changes: Sequence[float]
+    piece: int
+    now: float
+
+    def __init__(self, pieces: Sequence[FlowModel], changes: Sequence[float]) -> None:
+        self.__dict__.update(pieces=pieces, changes=changes, now=0.0)
+        self.begin(0)
+
+    def move_to(self, time: float) -> None:
+        """Make ``time`` (seconds) the end of predictions."""
+        self.__dict__["now"] = time
+
+    def begin(self, piece: int) -> None:
+        """Go to a piece, by number."""
+        for name in ("information", "gains", "flow", "unobserved_flow"):
+            self.__dict__.pop(name, None)
+        self.__dict__.update(vars(self.pieces[piece]), piece=piece)
+
+    def predict(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate (n,) and the root (n, n) as ``FlowModel.predict``, ``gap`` seconds up
+        to now.
+        """
+        for model, length in self._parts(gap):
+            xhat, root = model.predict(xhat, root, length)
+        return xhat, root
+
+    def extrapolate(
+        self, xhat: FloatArray, root: FloatArray, age: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate (n,) and the root (n, n) as ``FlowModel.extrapolate``, ``age``
+        seconds up to now.
+        """
+        for model, length in self._parts(age):
+            xhat, root = model.extrapolate(xhat, root, length)
+        return xhat, root
+
+    def _parts(self, gap: float) -> Iterator[tuple[FlowModel, float]]:
+        """Yield the pieces of the last ``gap`` seconds, and how long each of them holds."""
+        edges = self.changes[: self.piece]
+        first = bisect.bisect_right(edges, (self.now - gap) * (1.0 + CLOSE))
+        for change, model in zip(edges[first:], self.pieces[first:], strict=False):
+            yield model, change - (self.now - gap)
+            gap = self.now - change
+        yield self.pieces[self.piece], gap
+
+
+class ChangingSlotModel(SlotModel):
+    """A model in slots whose matrices change: the ``pieces`` of it, of which the first holds before
+    slot number ``slots[0]``, the second before ``slots[1]``, and so on. ``F`` and ``Q`` are those
+    by which the next prediction moves; engines say its slot by ``move_to``.
+    """
+
+    pieces: Sequence[SlotModel]
+    slots: Sequence[int]
+    piece: int
+    slot: int
+
+    def __init__(self, pieces: Sequence[SlotModel], slots: Sequence[int]) -> None:
+        self.__dict__.update(pieces=pieces, slots=slots)
+        self.move_to(0)
+
+    def move_to(self, slot: int) -> None:
+        """Go to the piece by which the prediction of ``slot`` moves."""
+        piece = bisect.bisect_right(self.slots, slot)
+        self.__dict__.update(slot=slot, piece=piece)
+        self.__dict__.pop("root_Q", None)
+        self.__dict__.update(vars(self.pieces[piece]))
+
+    def predict(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate (n,) and the root (n, n) as ``SlotModel.predict``: over several slots
+        the last of them is the present one.
+        """
+        count = round(gap / self.period)
+        for slot in range(self.slot + 1 - count, self.slot + 1):
+            piece = self.pieces[bisect.bisect_right(self.slots, slot)]
+            xhat, root = piece.predict(xhat, root, piece.period)
+        return xhat, root
 
 
 def first_root(cov: FloatArray) -> FloatArray:

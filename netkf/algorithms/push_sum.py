@@ -587,6 +587,8 @@ class PushSum(Filter):
             linear_plant=True,
             every_reading=True,
             inverts_under_clocks=True,
+            one_model=self.asymptotic,
+            one_model_under_clocks=True,
             ways_between_all=True,
             samples=True,
             check=self._check_scenario,
@@ -625,7 +627,7 @@ class PushSum(Filter):
         check_information(scenario)
         # P (12) may have no solution, as for an unstable plant that the sensors do not see.
         if self.asymptotic:
-            F, Q = scenario.slot_belief
+            F, Q = scenario.believed_pieces[0]
             self._check_limit(F, Q, scenario.node_infos[0].information)
 
     def _check_limit(self, F: FloatArray, Q: FloatArray, information: FloatArray) -> None:

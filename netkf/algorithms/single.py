@@ -25,7 +25,14 @@ from netkf.algorithms.kernels.run import (
     scratch_of,
     size_of,
 )
-from netkf.algorithms.models import FlowModel, MapModel, first_root, whiten_reading
+from netkf.algorithms.models import (
+    ChangingFlowModel,
+    ChangingSlotModel,
+    FlowModel,
+    MapModel,
+    first_root,
+    whiten_reading,
+)
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE
@@ -151,6 +158,7 @@ class Surroundings:
         n, self.info, self.node_fields = len(model.information), info, node_fields
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
+        self._piece = 0
         # Not unrolled: one compiled kernel serves all n.
         size, cls = size_of(n, unrolled=False), _run_class(model)
         degree = max(1, info.degree, len(info.senders))
@@ -184,8 +192,19 @@ class Surroundings:
             phase=-1,
             step=-1,
             gap=0.0,
+            now=0.0,
             **scratch_of(n, 1),
         )
+
+    def follow(self) -> None:
+        """Take the matrices of the present piece of a model that changes."""
+        model, tables = self.model, self.struct.model
+        if isinstance(model, ChangingFlowModel):
+            self.struct.now, tables.piece = model.now, model.piece
+            tables.models[0] = model.piece * tables.stride
+        elif isinstance(model, ChangingSlotModel) and self._piece != model.piece:
+            self._piece = model.piece
+            tables.F[:], tables.root_Q[:] = model.F, model.root_Q
 
     def set_readings(self, readings: Sequence[tuple[FloatArray, FloatArray]]) -> None:
         """Make these whitened readings (y (p,), H (p, n)) the numbers 0, 1, ... of the run."""
@@ -250,10 +269,14 @@ def _tables_of(model: Any, size: Size) -> SlotTables | MapTables | ClockTables:
     if isinstance(model, MapModel):
         return model.tables()
     if not isinstance(model, FlowModel):
-        F, root_Q = map(np.ascontiguousarray, (model.F, model.root_Q))
+        F, root_Q = (np.array(part, order="C") for part in (model.F, model.root_Q))
         return SlotTables(F=F, root_Q=root_Q)
-    table = stack_tables([model.flow, model.unobserved_flow])
-    return clock_tables(size, table, np.zeros(1, dtype=np.int64), stack_gains([model.gains]))
+    pieces = model.pieces if isinstance(model, ChangingFlowModel) else [model]
+    table = stack_tables([flow for m in pieces for flow in (m.flow, m.unobserved_flow)])
+    # As many of gains: those beside tables without readings are not used.
+    gains = stack_gains([m.gains for m in pieces for _ in range(min(2, len(pieces)))])
+    changes = np.array(getattr(model, "changes", ()), dtype=np.float64)
+    return clock_tables(size, table, np.zeros(1, dtype=np.int64), gains, changes)
 
 
 def begin(filtering: Any, model: Any, mean: FloatArray, cov: FloatArray, info: Any) -> NodeState:
@@ -284,6 +307,7 @@ def predict(state: NodeState, gap: float) -> NodeState:
     """Return the state ``gap`` seconds later."""
     new = state.copied()
     new.reading = None
+    state.run.follow()
     run, model = state.run.struct, state.model
     run.gap = gap
     for k in range(1 if state.run.clocked else round(gap / state.run.period)):
@@ -298,6 +322,7 @@ def predict(state: NodeState, gap: float) -> NodeState:
 def update(state: NodeState, reading: Any) -> NodeState:
     """Return the state after a reading or increments."""
     new, surroundings = state.copied(events=1), state.run
+    surroundings.follow()
     run = surroundings.struct
     if hasattr(reading, "moments"):
         run.model.moments = np.array(reading.moments)
@@ -317,6 +342,7 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     """Return the state after sending, and the payload, None if the node sends nothing."""
     new, surroundings = state.copied(), state.run
     record, run = new.record, surroundings.struct
+    surroundings.follow()
     surroundings.set_exchange(exchange)
     surroundings.prepare(record, exchange.slot)
     surroundings.set_readings([new.reading or _NO_READING])
@@ -339,6 +365,7 @@ def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeStat
     """Return the state after all messages of this instant."""
     new, surroundings = state.copied(events=len(messages)), state.run
     record, run = new.record, surroundings.struct
+    surroundings.follow()
     surroundings.set_exchange(exchange)
     surroundings.prepare(record, exchange.slot)
     surroundings.set_inbox(new.reading, messages, exchange.slot >= 0)

@@ -49,7 +49,7 @@ def _information_condition(scenario: Any) -> float:
     if not scenario.slotted:
         return 1.0
     try:
-        F, Q = scenario.slot_belief
+        F, Q = scenario.linear_plant and scenario.believed_pieces[0]
         pairs = [
             scenario.observation_matrices(node, believed=True) for node in scenario.sensing_nodes
         ]

@@ -16,6 +16,9 @@ class Needs:
 
     inverts : covariances must never be singular
     inverts_under_clocks : the same, in continuous time only
+    one_model : it computes with the matrices of the plant before a run, so that it cannot follow
+                changes of them
+    one_model_under_clocks : the same, in continuous time only
     samples : it cannot use increment sensors
     fixed_sensors : it computes with H before there are readings, so H must not vary: no nonlinear
                     sensors, regressors or columns phi
@@ -36,6 +39,8 @@ class Needs:
 
     inverts: bool = False
     inverts_under_clocks: bool = False
+    one_model: bool = False
+    one_model_under_clocks: bool = False
     samples: bool = False
     fixed_sensors: bool = False
     linear_plant: bool = False

@@ -127,7 +127,9 @@ def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
 
 
 UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=summarise_drift)
-"""Filters under clocks whose papers are about slots, and filters that hear nothing."""
+"""Filters under clocks whose papers are about slots, filters that hear nothing, and plants that
+change.
+"""
 
 
 def _summarise_bits(scenario: Scenario, run: Run) -> ReplicaSummary:

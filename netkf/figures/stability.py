@@ -333,7 +333,7 @@ def _sample_invariant_law(data: FigureData) -> FloatArray | None:
     is_intermittent = type(scenario.filter.algorithm) is built_in_filters()["intermittent"]
     if not (is_intermittent and scenario.slotted and len(scenario.sensors) == 1):
         return None
-    if not isinstance(loss, Bernoulli):
+    if not isinstance(loss, Bernoulli) or len(scenario.plant.changes):
         return None
     H = getattr(scenario.sensors[0], "H", None)
     if H is None or not _hears_one_sensor(scenario).any() or not scenario.filters_know_the_truth:

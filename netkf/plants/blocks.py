@@ -6,6 +6,7 @@ one after the other: that of a scenario with ``[[plants]]`` is an ordinary plant
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -222,19 +223,45 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
         _check_shapes(k, block)
     mean = np.concatenate([plant.start_mean for plant in plants])
     cov = block_diagonal([plant.start_cov for plant in plants])
-    M = block_diagonal([np.asarray(_dynamics(plant)) for plant in plants])
-    _add_couplings(M, blocks, layout)
-    shared = {"mean": mean, "cov": cov, "input": _stacked_input(blocks, layout)}
+    parts = {
+        **_stacked_matrices(blocks, layout),
+        **{"mean": mean, "cov": cov, "input": _stacked_input(blocks, layout)},
+        "schedule": _stacked_schedule(blocks, layout),
+    }
     if slotted:
-        Q = block_diagonal([plant.Q for plant in plants])  # type: ignore[attr-defined]
-        return LinearPlant(F=M, Q=Q, period=_one(blocks, "period"), **shared)
-    B = block_diagonal([np.asarray(plant.B) for plant in plants])  # type: ignore[attr-defined]
-    period = _one(blocks, "sensing_period")
-    return Diffusion(A=M, B=B, sensing_period=period, **shared)
+        return LinearPlant(period=_one(blocks, "period"), **parts)
+    return Diffusion(sensing_period=_one(blocks, "sensing_period"), **parts)
 
 
-def _dynamics(plant: Any) -> FloatArray:
-    return plant.F if isinstance(plant, LinearPlant) else plant.A
+def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]:
+    """Return F and Q, or A and B, of all blocks together."""
+    plants: list[Any] = [block.plant for block in blocks for _ in block.nodes or (None,)]
+    names = ("F", "Q") if isinstance(plants[0], LinearPlant) else ("A", "B")
+    M, noise = (
+        block_diagonal([np.asarray(getattr(plant, name)) for plant in plants]) for name in names
+    )
+    _add_couplings(M, blocks, layout)
+    return dict(zip(names, (M, noise), strict=True))
+
+
+def _stacked_schedule(blocks: Sequence[Block], layout: Layout) -> list[dict[str, Any]]:
+    """Return the changes of all blocks together."""
+    plants: list[Any] = [block.plant for block in blocks]
+    schedule = []
+    for start in sorted({change.start for plant in plants for change in plant.schedule}):
+        present = []
+        for block, plant in zip(blocks, plants, strict=True):
+            k = sum(change.start <= start for change in plant.schedule)
+            u = plant.input
+            if u is not None:
+                u = dataclasses.replace(u, G=plant.input_gains[k])
+            piece = dataclasses.replace(plant.pieces[k], input=u)
+            present.append(dataclasses.replace(block, plant=piece))
+        entry = {"from": start, **_stacked_matrices(present, layout)}
+        if (stacked := _stacked_input(present, layout)) is not None:
+            entry["G"] = stacked.G
+        schedule.append(entry)
+    return schedule
 
 
 def _check_shapes(k: int, block: Block) -> None:
@@ -242,13 +269,17 @@ def _check_shapes(k: int, block: Block) -> None:
     n, is_slotted = plant.n, isinstance(plant, LinearPlant)
     shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (n, n)}
     shapes |= {"Q": (n, n)} if is_slotted else {"B": (n, plant.B.shape[1])}
-    for name, shape in shapes.items():
-        value = getattr(plant, name)
+    given = [(name, name, getattr(plant, name)) for name in shapes]
+    for c, change in enumerate(plant.schedule):
+        given += [(f"schedule[{c}].{name}", name, one) for name, one in change.matrices.items()]
+    shapes |= {"F": (n, n), "A": (n, n)}
+    for key, name, value in given:
+        shape = (n, value.shape[-1]) if name in "BG" else shapes[name]
         if value is not None and value.shape != shape:
-            wanted, given = (" x ".join(map(str, one)) for one in (shape, value.shape))
+            wanted, actual = (" x ".join(map(str, one)) for one in (shape, value.shape))
             why = f"because {'F' if is_slotted else 'A'} has {n} rows"
-            rule = f"must be {wanted}, not {given}, {why}"
-            raise ScenarioError(f"[{k}].{name}", rule, value, "correct the shape")
+            rule = f"must be {wanted}, not {actual}, {why}"
+            raise ScenarioError(f"[{k}].{key}", rule, value, "correct the shape")
 
 
 def _one(blocks: Sequence[Block], key: str) -> Any:

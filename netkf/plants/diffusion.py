@@ -20,12 +20,13 @@ import numpy as np
 from netkf.core.fields import field, matrix, of_time, positive, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import eigenvalues
+from netkf.plants.changes import DiffusionChange, matrices_of_pieces, schedule_of
 from netkf.plants.laws import GridLaws
 from netkf.plants.paths import DiffusionPath, DiffusionPaths
 from netkf.plants.plant import Plant
 from netkf.plants.transitions import Transitions, decimal_below, frame_period
 from netkf.plants.tree import Tree
-from netkf.plants.truth import SampledTruth, multiples
+from netkf.plants.truth import ChangingTruth, SampledTruth, multiples
 from netkf.rng.normals import GeneratorNormals, Normals
 from netkf.rng.streams import state_of
 
@@ -37,14 +38,27 @@ NO_TIMES = np.empty(0)
 class Diffusion(Plant):
     """``dx = A x dt + B dw``, Tanwani, H (1), with x(0) Gaussian of ``mean`` and ``cov``.
 
-    ``A`` (n, n), ``B`` (n, m); ``sensing_period`` is the step h of the sensors in seconds.
+    ``A`` (n, n), ``B`` (n, m); ``sensing_period`` is the step h of the sensors in seconds, and
+    ``schedule`` has other matrices from some times on (``plants.changes``).
     """
 
     A: FloatArray = field(square)
     B: FloatArray = field(matrix)
     sensing_period: float | None = field(of_time(positive), default=None)
+    schedule: tuple[DiffusionChange, ...] = field(schedule_of(DiffusionChange), default=())
 
-    grid_values: ClassVar[tuple[str, ...]] = ("laws",)
+    grid_values: ClassVar[tuple[str, ...]] = ("laws", "pieces")
+
+    @cached_property
+    def pieces(self) -> tuple[Diffusion, ...]:
+        """The plants before the first change and after each, without changes of their own."""
+        all_matrices = matrices_of_pieces({"A": self.A, "B": self.B}, self.schedule)
+        return tuple(
+            Diffusion(A=m["A"], B=m["B"], sensing_period=self.sensing_period).on_grid(
+                self.time_grid
+            )
+            for m in all_matrices
+        )
 
     @property
     def n(self) -> int:
@@ -65,7 +79,7 @@ class Diffusion(Plant):
     @property
     def longest_period(self) -> float:
         """The longest sensing period (seconds) for which the path is exact to rounding."""
-        norm = float(np.abs(self.A).sum(axis=0).max())
+        norm = max(float(np.abs(piece.A).sum(axis=0).max()) for piece in self.pieces)
         return MAX_STEP / norm if norm > 0.0 else math.inf
 
     @cached_property
@@ -113,8 +127,14 @@ class Diffusion(Plant):
         start = self.starts(normals)
         cuts = [] if sampling is None or not len(sampled) else [(sampled, sampling)]
         steps = self.frame_steps if frames else None
-        cuts.append((probe_times, probing))
-        return DiffusionPaths(self.laws, start, normals, cuts, steps, forcing)
+        laws = {self.step_of(t): p.laws for t, p in zip(self.changes, self.pieces[1:], strict=True)}
+        cuts = [*cuts, (probe_times, probing)]
+        return DiffusionPaths(self.laws, start, normals, cuts, steps, laws, forcing)
+
+    def step_of(self, time: float) -> int:
+        """Return the number of steps of the sensing grid up to ``time``, one of its points."""
+        assert self.sensing_period is not None
+        return round(time / self.sensing_period)
 
     def start(self, random: np.random.Generator) -> FloatArray:
         """Return x(0) (n,), drawn from ``random``."""
@@ -135,15 +155,19 @@ class Diffusion(Plant):
         draws x(0), and names the streams of all else. With ``frames`` states are relative to the
         origin of their frame.
         """
-        stream, tree = state_of(random), self._tree(horizon)
+        stream = state_of(random)
         start = self.start(random)
+        if len(self.changes):
+            trees = [piece._tree(horizon, k) for k, piece in enumerate(self.pieces)]
+            return ChangingTruth(trees, self.changes, start, stream, times, self.time_grid)
+        tree = self._tree(horizon)
         frame_times = multiples(tree.frame, horizon, self.time_grid)
         return SampledTruth(self.moves, tree, start, stream, times, frame_times, frames)
 
-    def _tree(self, horizon: float) -> Tree:
+    def _tree(self, horizon: float, piece: int = 0) -> Tree:
         """Return the cells of paths up to a horizon (seconds), made once for all runs."""
         if horizon not in self._trees:
-            self._trees[horizon] = Tree(self.moves, horizon, frame_period(self.A))
+            self._trees[horizon] = Tree(self.moves, horizon, frame_period(self.A), piece)
         return self._trees[horizon]
 
     @cached_property

@@ -10,9 +10,10 @@ so many slots, the *rebase*. The interval between two rebases is a *frame* (``tr
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ import numpy as np
 from netkf.core.fields import covariance, field, seconds, square
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply, cholesky, noise_root
+from netkf.plants.changes import LinearChange, matrices_of_pieces, schedule_of
 from netkf.plants.plant import Plant
 from netkf.plants.transitions import frame_slots
 
@@ -33,6 +35,11 @@ class SlotPlant(Plant):
 
     Q: FloatArray
     period: float
+
+    @property
+    def change_slots(self) -> tuple[int, ...]:
+        """The slots (C,) from which on the matrices are those of the next piece."""
+        return tuple(round(change / self.period) for change in self.changes.tolist())
 
     def slot_time(self, k: int) -> float:
         """Return the start of slot k in seconds, on the grid of the scenario."""
@@ -63,12 +70,19 @@ class SlotPlant(Plant):
 class LinearPlant(SlotPlant):
     """``x[k+1] = F x[k] + w[k]``, cov(w) = Q; slot k is at time ``k * period`` seconds.
 
-    ``F`` (n, n), ``Q`` (n, n).
+    ``F`` (n, n), ``Q`` (n, n); ``schedule`` has others from some times on, ``plants.changes``.
     """
 
     F: FloatArray = field(square)
     Q: FloatArray = field(covariance)
     period: float = field(seconds)
+    schedule: tuple[LinearChange, ...] = field(schedule_of(LinearChange), default=())
+
+    @cached_property
+    def pieces(self) -> tuple[LinearPlant, ...]:
+        """The plants before the first change and after each, without changes of their own."""
+        all_matrices = matrices_of_pieces({"F": self.F, "Q": self.Q}, self.schedule)
+        return tuple(LinearPlant(F=m["F"], Q=m["Q"], period=self.period) for m in all_matrices)
 
     @property
     def n(self) -> int:
@@ -79,7 +93,9 @@ class LinearPlant(SlotPlant):
         """Return the true states of one run, drawn from ``random``, with ``frames`` or without."""
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         slots = frame_slots(self.F) if frames else None
-        return LinearPath(self.F, self.noise_root, start, random, slots)
+        later = zip(self.change_slots, self.pieces[1:], strict=True)
+        changes = {slot: (piece.F, piece.noise_root) for slot, piece in later}
+        return LinearPath(self.F, self.noise_root, start, random, slots, changes)
 
 
 class Truth(Protocol):
@@ -127,7 +143,8 @@ class LinearPath:
     """The path ``x[k+1] = F x[k] + root z[k]`` of one run from x[0] = ``start`` (n,) on.
 
     ``F`` is (n, n), ``root`` (n, q), and z[k] are standard normals of ``random``. With
-    ``frame_slots``, a frame begins every ``frame_slots`` slots. Slots must be asked for in order.
+    ``frame_slots``, a frame begins every ``frame_slots`` slots. ``changes`` are other F and roots,
+    by the slot from which on they hold. Slots must be asked for in order.
     """
 
     def __init__(
@@ -137,8 +154,10 @@ class LinearPath:
         start: FloatArray,
         random: np.random.Generator,
         frame_slots: int | None = None,
+        changes: Mapping[int, tuple[FloatArray, FloatArray]] = MappingProxyType({}),
     ) -> None:
         self._F, self._root, self._noise = F, root, Blocks(random, root.shape[1])
+        self._changes = changes
         self.frame_slots = frame_slots
         # The present slot, its local state and the origin of that, both before a rebase.
         self._slot, self._x, self._origin = 0, start, np.zeros(len(start))
@@ -148,6 +167,8 @@ class LinearPath:
         # States beyond the horizon may overflow.
         with np.errstate(over="ignore", invalid="ignore"):
             for k in range(self._slot, slot):
+                if k in self._changes:
+                    self._F, self._root = self._changes[k]
                 # The origin moves to the state where a frame begins.
                 if self.frame_slots and k and k % self.frame_slots == 0:
                     self._origin, self._x = self._origin + self._x, np.zeros(len(self._x))

@@ -22,7 +22,8 @@ known when they are compiled.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,8 +100,9 @@ class DiffusionPaths:
     overwritten: it holds the state at the end of the last step drawn.
 
     With ``frame_steps`` states are local: they restart from zero after every ``frame_steps`` steps,
-    so that a piece may end at a state from which the next one does not start. ``forcing`` is a
-    response to an input that is added to all paths (``response``), or None.
+    so that a piece may end at a state from which the next one does not start. Other laws may hold
+    from some steps on, ``later`` by the number of the first; a block ends where they begin.
+    ``forcing`` is a response to an input that is added to all paths (``response``), or None.
 
     A path has the same bits alone or among others, and however many steps one call draws.
     """
@@ -112,9 +114,10 @@ class DiffusionPaths:
         normals: Normals,
         cuts: Sequence[tuple[FloatArray, Normals]],
         frame_steps: int | None = None,
+        later: Mapping[int, GridLaws] = MappingProxyType({}),
         forcing: Any = None,
     ) -> None:
-        self.laws, self._normals, self._cuts = laws, normals, cuts
+        self.laws, self._normals, self._cuts, self._later = laws, normals, cuts, later
         self._forcing = forcing
         self.frame_steps = frame_steps
         self._x, self._drawn = start, 0
@@ -129,9 +132,14 @@ class DiffusionPaths:
         return np.asarray(times[times < horizon])
 
     def following(self, blocks: int = 1, most: int | None = None) -> StepBlock:
-        """Return the next ``blocks`` times BLOCK steps, at most ``most``, with their cuts."""
-        laws, (paths, n) = self.laws, self._x.shape
-        total = blocks * BLOCK if most is None else min(most, blocks * BLOCK)
+        """Return the next ``blocks`` times BLOCK steps, at most ``most`` and up to where other laws
+        begin, with their cuts; ``laws`` are theirs.
+        """
+        self.laws = laws = self._later.get(self._drawn, self.laws)
+        paths, n = self._x.shape
+        changes = (step - self._drawn for step in self._later if step > self._drawn)
+        limits = blocks * BLOCK, blocks * BLOCK if most is None else most, *changes
+        total = min(limits)
         x_start, x_end = (np.empty((paths, total, n)) for _ in range(2))
         moments, cubic = np.empty((paths, total, 2, n)), np.empty((paths, total, 3, n))
         # One kernel call draws all steps of all runs: end, moments and cubic.
@@ -422,10 +430,10 @@ class DiffusionPath:
     """
 
     def __init__(self, paths: DiffusionPaths, horizon: float = 0.0) -> None:
-        self.laws, self.period, self._paths = paths.laws, paths.laws.period, paths
+        self.period, self._paths = paths.laws.period, paths
         self.time_grid = paths.laws.time_grid
         self.frame_times = paths.frame_times(horizon)
-        self._moves = Transitions(self.laws.A, self.laws.B) if len(self.frame_times) else None
+        self._moves = Transitions(paths.laws.A, paths.laws.B) if len(self.frame_times) else None
         # The local states just before the frames so far began.
         self._offsets: list[FloatArray] = []
         self._block: StepBlock | None = None
@@ -433,6 +441,11 @@ class DiffusionPath:
         # piece, of which there is none yet, and the end of its step.
         self._first = self._piece = 0
         self._step, self._step_end = PathStep(0.0, 0.0, *[np.empty(0)] * 4), 0.0
+
+    @property
+    def laws(self) -> GridLaws:
+        """The laws of the steps that were drawn last."""
+        return self._paths.laws
 
     def grid(self, k: int) -> float:
         """Return the time (seconds) of the k-th point of the sensing grid."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from netkf.core.fields import Component, covariance, field, instance_of, vector
 from netkf.core.instants import OnGrid, TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root, product
+from netkf.plants.changes import matrices_of_pieces
 from netkf.plants.inputs import Input
 from netkf.rng.normals import Normals
 
@@ -49,6 +50,24 @@ class Plant(Component, OnGrid):
     @abstractmethod
     def n(self) -> int:
         """Dimension of the state."""
+
+    @property
+    def pieces(self) -> tuple[Any, ...]:
+        """The plants before the first change and after each, without changes of their own."""
+        return (self,)
+
+    @property
+    def input_gains(self) -> list[FloatArray]:
+        """G (n, m) of the input before the first change and after each."""
+        assert self.input is not None
+        first = {"G": self.input.G}
+        return [piece["G"] for piece in matrices_of_pieces(first, getattr(self, "schedule", ()))]
+
+    @property
+    def changes(self) -> FloatArray:
+        """(C,) times in seconds, increasing, at which the matrices of the plant change."""
+        starts = [change.start for change in getattr(self, "schedule", ())]
+        return self.time_grid.snap(np.array(starts, dtype=np.float64))
 
     @property
     def start_mean(self) -> FloatArray:

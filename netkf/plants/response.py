@@ -8,15 +8,17 @@ together are a linear system that nothing drives, and its state moves by one exp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
+import scipy.linalg
 
 from netkf.core.instants import TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.portable import apply
-from netkf.plants.inputs import Input
+from netkf.plants.inputs import Exogenous, Input
 from netkf.plants.linear import LinearPlant
 from netkf.plants.transitions import Transitions
 
@@ -55,45 +57,74 @@ def _follow(start: FloatArray, moves: FloatArray, drive: FloatArray) -> FloatArr
 
 
 class FlowResponse:
-    """The response to the input ``u`` of a diffusion with this ``A`` (n, n)."""
+    """The response to the input ``u`` of a diffusion with A (n, n) and G (n, m) of ``pieces``, the
+    first up to ``changes[0]`` seconds, the second from there on, and so on.
+    """
 
-    def __init__(self, A: FloatArray, u: Input) -> None:
-        assert u.G is not None
-        self.A, self.n, self._u, self._G = A, len(A), u, u.G
-        self._exogenous = u.exogenous
-        self.jumps, S, C, z = self._exogenous
-        q = len(S)
-        self.joint = np.block([[A, u.G @ C], [np.zeros((q, self.n)), S]])
-        self._moves = Transitions(self.joint, np.zeros((len(self.joint), 1)))
+    def __init__(
+        self, pieces: Sequence[tuple[FloatArray, FloatArray]], changes: FloatArray, u: Input
+    ) -> None:
+        times, S, C, z = u.exogenous
+        self.n, self._changes, self._u, q = len(pieces[0][0]), changes, u, len(S)
+        self._A, self._G = (np.array(parts) for parts in zip(*pieces, strict=True))
+        # The input begins anew, as it is, where the plant changes.
+        added = np.setdiff1d(changes, times)
+        if len(added):
+            last = u.exogenous.last(added)
+            gaps = (added - times[last])[:, None, None]
+            moved = scipy.linalg.expm(gaps * S) @ z[last][:, :, None]
+            z = np.concatenate([z, np.where(last[:, None] >= 0, moved[:, :, 0], 0.0)])
+            times = np.concatenate([times, added])
+            z, times = z[np.argsort(times)], np.sort(times)
+        self._exogenous, self.jumps = Exogenous(times, S, C, z), times
+        self.joint = [np.block([[A, G @ C], [np.zeros((q, self.n)), S]]) for A, G in pieces]
+        self._moves = [Transitions(joint, np.zeros((len(joint), 1))) for joint in self.joint]
         # m where the input jumps, as far as it has been asked for.
         self._at_jumps = np.zeros((min(len(z), 1), self.n))
+
+    def _transitions(self, starts: FloatArray, gaps: FloatArray) -> FloatArray:
+        """Return the transitions (K, n + q, n + q) over ``gaps`` from ``starts`` on, both (K,)."""
+        if len(self._moves) == 1:
+            return self._moves[0].transitions(gaps)
+        pieces = np.searchsorted(self._changes, starts, side="right")
+        out = np.empty((len(gaps), *self.joint[0].shape))
+        for piece in np.unique(pieces).tolist():
+            inside = pieces == piece
+            out[inside] = self._moves[piece].transitions(gaps[inside])
+        return out
 
     def joint_states(self, times: FloatArray) -> FloatArray:
         """Return m and the state of the input, (K, n + q), at K ``times`` (K,) in seconds."""
         last = self._exogenous.last(times)
         starts = self._starts(int(last.max(initial=-1)))
-        out = np.zeros((len(times), len(self.joint)))
+        out = np.zeros((len(times), len(self.joint[0])))
         begun = np.flatnonzero(last >= 0)
         for k in range(0, len(begun), CHUNK):
             chunk = begun[k : k + CHUNK]
-            gaps = times[chunk] - self._exogenous.times[last[chunk]]
-            out[chunk] = apply(self._moves.transitions(gaps), starts[last[chunk]])
+            begin = self._exogenous.times[last[chunk]]
+            moves = self._transitions(begin, times[chunk] - begin)
+            out[chunk] = apply(moves, starts[last[chunk]])
         return out
 
     def states(self, times: np.ndarray) -> FloatArray:
         """Return m (K, n) at K ``times`` (K,) in seconds."""
         return self.joint_states(times)[:, : self.n]
 
+    def A_at(self, times: FloatArray) -> FloatArray:
+        """Return A (K, n, n) at K ``times`` (K,) in seconds."""
+        return np.asarray(self._A[np.searchsorted(self._changes, times, side="right")])
+
     def drive(self, times: FloatArray) -> FloatArray:
         """Return what drives m, ``m' - A m`` (K, n), at K ``times`` (K,) in seconds."""
-        return np.asarray(self._u.values(times) @ self._G.T)
+        piece = np.searchsorted(self._changes, times, side="right")
+        return apply(self._G[piece], self._u.values(times))
 
     def _starts(self, last: int) -> FloatArray:
         """Return m and the state of the input (last + 1, n + q) at its jumps up to ``last``."""
         times, z, n = self._exogenous.times, self._exogenous.z, self.n
         for first in range(len(self._at_jumps) - 1, last, CHUNK):
             stop = min(first + CHUNK, last)
-            moves = self._moves.transitions(np.diff(times[first : stop + 1]))
+            moves = self._transitions(times[first:stop], np.diff(times[first : stop + 1]))
             drive = apply(moves[:, :n, n:], z[first:stop])
             driven = _follow(self._at_jumps[-1], np.array(moves[:, :n, :n]), drive)
             self._at_jumps = np.concatenate([self._at_jumps, driven])
@@ -102,10 +133,11 @@ class FlowResponse:
     def over_pieces(
         self, start: FloatArray, end: FloatArray, grid: TimeGrid
     ) -> tuple[FloatArray, FloatArray]:
-        """Return m (K, n) at the ``start`` of K pieces of time, which follow each other, and end
-        state and both moments (K, 3, n) of each, see ``paths``.
+        """Return m (K, n) at the ``start`` of K pieces of time, which follow each other without a
+        change of the plant, and end state and both moments (K, 3, n) of each, see ``paths``.
         """
-        n, N, jumps = self.n, len(self.joint), self._exogenous.times
+        joint = self.joint[int(np.searchsorted(self._changes, start[0], side="right"))]
+        n, N, jumps = self.n, len(joint), self._exogenous.times
         inside = jumps[(jumps > start[0]) & (jumps < end[-1])]
         first = np.unique(np.concatenate([start, inside]))
         last = np.append(first[1:], end[-1])
@@ -114,7 +146,7 @@ class FlowResponse:
         # s} over the gap g in its first row of blocks.
         nested = np.zeros((3 * N, 3 * N))
         nested[:N, :N], nested[:N, N : 2 * N], nested[N : 2 * N, 2 * N :] = (
-            self.joint,
+            joint,
             np.eye(N),
             np.eye(N),
         )
@@ -134,14 +166,20 @@ class FlowResponse:
 
 
 class SlotResponse:
-    """The response to the input of a ``plant`` in slots, moved by ``F`` (n, n)."""
+    """The response to the input of a ``plant`` in slots, moved by F (n, n) and G (n, m) of
+    ``pieces``, the first before slot ``changes[0]``, the second from there on, and so on.
+    """
 
-    def __init__(self, F: FloatArray, plant: LinearPlant) -> None:
-        u = plant.input
-        assert u is not None
-        assert u.G is not None
-        self._F, self._G, self._u, self._plant = F, u.G, u, plant
-        self._states = np.zeros((1, len(F)))
+    def __init__(
+        self,
+        pieces: Sequence[tuple[FloatArray, FloatArray]],
+        changes: Sequence[int],
+        plant: LinearPlant,
+    ) -> None:
+        assert plant.input is not None
+        self._F, self._G = (np.array(parts) for parts in zip(*pieces, strict=True))
+        self._changes, self._u, self._plant = changes, plant.input, plant
+        self._states = np.zeros((1, len(self._F[0])))
 
     def states(self, slots: np.ndarray) -> FloatArray:
         """Return m (K, n) in K ``slots`` (K,) by number."""
@@ -149,8 +187,10 @@ class SlotResponse:
         if needed > known:
             driving = np.arange(known - 1, max(needed, known + SLOTS) - 1)
             starts = self._plant.time_grid.snap(driving * self._plant.period)
-            drive = apply(self._G, self._u.values(starts))
-            driven = _follow(self._states[-1], np.array(self._F[None]), drive)
+            piece = np.searchsorted(self._changes, driving, side="right")
+            drive = apply(self._G[piece], self._u.values(starts))
+            moves = self._F if len(self._F) == 1 else self._F[piece]
+            driven = _follow(self._states[-1], np.array(moves), drive)
             self._states = np.concatenate([self._states, driven])
         return np.asarray(self._states[slots])
 
@@ -172,7 +212,9 @@ class Difference:
 
     def drive(self, times: FloatArray) -> FloatArray:
         """Return what drives the difference in the plant, (K, n), at K ``times`` (K,)."""
-        return np.asarray(self._believed.states(times) @ (self._true.A - self._believed.A).T)
+        true, believed = self._true, self._believed
+        moved = apply(true.A_at(times) - believed.A_at(times), believed.states(times))
+        return np.asarray(moved + true.drive(times) - believed.drive(times))
 
     def over_pieces(
         self, start: FloatArray, end: FloatArray, grid: TimeGrid

@@ -37,6 +37,8 @@ LEVELS = 64
 """The second id of the stream of a point that divides a cell is this plus the power of ten of its
 unit in seconds; the first is the number of units from time 0.
 """
+PIECE_LEVELS = 256
+"""What is added to second ids, also to that of knots, -1, in the next piece of a plant."""
 _ZERO, _ONE, _FULL = np.uint64(0), np.uint64(1), np.uint64(BLOCK_WORDS)
 
 
@@ -46,6 +48,7 @@ class Cells(NamedTuple):
     length, before, unit : (C,), ticks of a cell and of its first part, and the unit of its decade
     parts : (C, 2), kinds of its parts; -1: a tick, which is not divided
     level : (C,), second id of the streams of points that divide it
+    knot_level : second id of the streams of knots
     Phi : (C, n, n), transposed, of the first part
     middle : (C, 2 n, n), transposed, the effect of [z; w] on the state at the end of the first part
     inner : (C, 2, 2 n, n), transposed, the effect of [z; w] on the normals of each part
@@ -57,6 +60,7 @@ class Cells(NamedTuple):
     unit: FloatArray
     parts: IntArray
     level: IntArray
+    knot_level: int
     Phi: FloatArray
     middle: FloatArray
     inner: FloatArray
@@ -85,10 +89,13 @@ class Walk(NamedTuple):
 
 class Tree:
     """The cells of a plant up to a ``horizon`` in seconds. Frames are ``frame`` seconds long, 1, 2
-    or 5 times a power of ten; None without frames.
+    or 5 times a power of ten; None without frames. Trees of another ``piece`` of a plant have other
+    normals.
     """
 
-    def __init__(self, moves: Transitions, horizon: float, frame: float | None) -> None:
+    def __init__(
+        self, moves: Transitions, horizon: float, frame: float | None, piece: int = 0
+    ) -> None:
         self.frame = frame
         digits = math.floor(math.log10(MAX_TICKS / horizon))
         top = max(KNOTS, math.ceil(math.log10(horizon)) - 6)
@@ -97,7 +104,7 @@ class Tree:
         if frame is not None:
             top = min(top, math.floor(math.log10(frame) + 1e-9))
         self._per_second = float(f"1e{digits}")
-        self._cells = _cells(moves, digits, max(top + digits, 1))
+        self._cells = _cells(moves, digits, max(top + digits, 1), piece * PIECE_LEVELS)
         # Cells between knots in a frame.
         self._every = 0 if frame is None else round(frame / float(f"1e{top}"))
 
@@ -199,7 +206,7 @@ def enter_knot(
     kind = len(cells.length) - 1
     walk.kind[0], walk.start[0] = kind, knot * cells.length[kind]
     walk.end[0] = walk.start[0] + cells.length[kind]
-    draw_normals_of_point(size, stream, knot, -1, ziggurat, walk.v[0], 0)
+    draw_normals_of_point(size, stream, knot, cells.knot_level, ziggurat, walk.v[0], 0)
 
 
 @kernel
@@ -261,8 +268,10 @@ def divide_cell(size: Size, cells: Cells, walk: Walk, depth: int) -> None:
         walk.v[inner, i] = z[i]
 
 
-def _cells(moves: Transitions, digits: int, decades: int) -> Cells:
-    """Return the cells of ``decades`` powers of ten of a tick of 10^-``digits`` s."""
+def _cells(moves: Transitions, digits: int, decades: int, first_level: int) -> Cells:
+    """Return the cells of ``decades`` powers of ten of a tick of 10^-``digits`` s, whose second ids
+    are larger by ``first_level``.
+    """
     share, exponent = np.tile(np.arange(4), decades), np.repeat(np.arange(decades), 4)
     unit = np.array([10**e for e in exponent.tolist()], dtype=np.int64)
     before, after = (np.array(parts)[share] * unit for parts in (LEFT, RIGHT))
@@ -278,7 +287,8 @@ def _cells(moves: Transitions, digits: int, decades: int) -> Cells:
         before=before,
         unit=unit.astype(np.float64),
         parts=np.stack([np.maximum(4 * exponent + part, -1) for part in (left, right)], axis=1),
-        level=exponent - digits + LEVELS,
+        level=exponent - digits + LEVELS + first_level,
+        knot_level=first_level - 1,
         Phi=_transposed(Phi_1),
         middle=np.ascontiguousarray(product(turn[:, :, :n], _transposed(L_1))),
         inner=np.ascontiguousarray(np.stack([turn[:, :, :n], turn[:, :, n:]], axis=1)),

@@ -13,6 +13,7 @@ run records it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -141,6 +142,38 @@ class SampledTruth:
         """
         indices = np.searchsorted(self._times, times)
         return self._local[indices], self._absolute[indices]
+
+
+class ChangingTruth(SampledTruth):
+    """A path of a plant that changes, drawn from the tree of each of its pieces, which begins at
+    its change with the state in which the piece before it ends; its origin does not move.
+    """
+
+    def __init__(
+        self,
+        trees: Sequence[Tree],
+        changes: FloatArray,
+        start: FloatArray,
+        stream: np.ndarray,
+        times: FloatArray,
+        grid: TimeGrid,
+    ) -> None:
+        """Draw the path from ``start`` (n,) on at ``times`` (K,) in seconds, with the state
+        ``stream`` (1, WIDTH) of its random stream; ``changes`` (C,) are where its pieces end.
+        """
+        self._times = np.unique(np.concatenate([[0.0], times]))
+        self._local, x = np.empty((len(self._times), len(start))), start
+        edges = [0.0, *changes.tolist(), math.inf]
+        for tree, begin, end in zip(trees, edges[:-1], edges[1:], strict=True):
+            inside = (self._times >= begin) & (self._times < end)
+            last = [end] if end < self._times[-1] or end == self._times[-1] else []
+            moments = grid.snap(np.concatenate([self._times[inside], last]) - begin)
+            if not len(moments):
+                break
+            states, _ = tree.states(moments, x, stream, 0)
+            self._local[inside], x = states[: inside.sum()], states[-1]
+        self._absolute, self.offsets = self._local, np.empty((0, len(start)))
+        self.frame_times = np.empty(0)
 
 
 class RecordedTruth:

@@ -23,7 +23,14 @@ from netkf.scenario.preconditions import check_preconditions
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import explain_time_mismatch, kind_name
 from netkf.scenario.sampling import check_sampling, uses_grid
-from netkf.scenario.shapes import check_nonlinear, check_regressor, check_weights, require_shape
+from netkf.scenario.shapes import (
+    check_changes_on_grid,
+    check_nonlinear,
+    check_regressor,
+    check_schedule,
+    check_weights,
+    require_shape,
+)
 from netkf.scenario.time_grid import check_grid
 
 MAX_SAMPLES = 10_000_000  # state samples of one run
@@ -120,6 +127,7 @@ def _check_plant(scenario: DerivedScenario) -> None:
     else:
         why = f"plant.F has {n} rows"
         require_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
+    check_schedule(scenario, why)
     if plant.mean is not None:
         require_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
@@ -170,15 +178,17 @@ def _check_sensors(scenario: DerivedScenario) -> None:
 
 
 def _check_speed(scenario: DerivedScenario) -> None:
-    delay, A = scenario.network.channel.delay.fixed or 0.0, scenario.diffusion.A
+    delay = scenario.network.channel.delay.fixed or 0.0
     # A message with a fixed delay is predicted over the delay, which may exceed the horizon.
     longest = max(scenario.horizon, delay)
-    believed_A, Q = scenario.belief  # A and B B' that the filters assume
+    believed = scenario.believed_pieces  # A and B B' that the filters assume
     linear_sensors = [sensor for sensor in scenario.sensors if sensor.linear]
     informations = [sensor.H.T @ np.linalg.solve(sensor.R, sensor.H) for sensor in linear_sensors]
     max_information = max((float(np.abs(G).max()) for G in informations), default=0.0)
-    filter_rate = np.sqrt(max_information * float(np.abs(Q).max()))
-    plant_rate = max(float(np.abs(M).sum(axis=0).max()) for M in (A, believed_A))
+    filter_rate = np.sqrt(max_information * max(float(np.abs(Q).max()) for _, Q in believed))
+    true = [piece.A for piece in scenario.diffusion.pieces]
+    A = max(true, key=growth_rate)
+    plant_rate = max(float(np.abs(M).sum(axis=0).max()) for M in (*true, *(M for M, _ in believed)))
     if (plant_rate + filter_rate) * longest > MAX_CONSTANTS:
         raise ScenarioError(
             "plant.A",
@@ -374,11 +384,11 @@ def _check_sensing_period(scenario: DerivedScenario) -> None:
             period,
             f"give at most {scenario.diffusion.longest_period:.3g}, or leave it out",
         )
-    pooled = scenario.filter.algorithm.timing.pooled
-    models = [scenario.pooled_model] if pooled else scenario.models
-    distinct_models = {id(model): model for model in models if len(model.H)}.values()
-    A, Q = scenario.belief
-    steps = (longest_interval(A, Q, model.information) for model in distinct_models)
+    check_changes_on_grid(scenario, period)
+    distinct_models = {
+        id(model): model for models in scenario.model_pieces for model in models if len(model.H)
+    }.values()
+    steps = (longest_interval(m.A, m.Q, m.information) for m in distinct_models)
     longest = min(steps, default=period)
     if min(period, horizon) <= longest * (1.0 + 1e-9):
         return

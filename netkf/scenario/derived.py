@@ -8,7 +8,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -19,7 +19,13 @@ import scipy.linalg
 
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval
-from netkf.algorithms.models import FlowModel, MapModel, SlotModel
+from netkf.algorithms.models import (
+    ChangingFlowModel,
+    ChangingSlotModel,
+    FlowModel,
+    MapModel,
+    SlotModel,
+)
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
 from netkf.core.contracts import ContractError
@@ -27,6 +33,7 @@ from netkf.core.errors import TheoryError, quote
 from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
+from netkf.plants.changes import dividing_period
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.driven import InputResponses, MovedReadings, driven
 from netkf.plants.linear import LinearPlant, Readings
@@ -64,27 +71,193 @@ class DerivedScenario(ScenarioModel):
     reads the sensors of all nodes.
     """
 
-    @cached_property
+    @property
     def slot_belief(self) -> tuple[FloatArray, FloatArray]:
-        """The matrices ``F`` and ``Q`` (n, n) that the filters use in slots."""
-        plant, model = self.linear_plant, self.filter.model
-        F = plant.F if model.F is None else model.F
-        Q = plant.Q if model.Q is None else model.Q
-        return F, Q
+        """The matrices ``F`` and ``Q`` (n, n) that the filters use in slots; raises TheoryError if
+        the plant changes.
+        """
+        _ = self.linear_plant
+        self._require_one_piece()
+        return self.believed_pieces[0]
+
+    @property
+    def belief(self) -> tuple[FloatArray, FloatArray]:
+        """The matrices ``A`` and ``Q = B B'`` (n, n) that the filters use in continuous time;
+        raises TheoryError if the plant changes.
+        """
+        _ = self.diffusion
+        self._require_one_piece()
+        return self.believed_pieces[0]
+
+    def _require_one_piece(self) -> None:
+        if len(self.plant.changes):
+            raise TheoryError(
+                "this is about plants that do not change, and this one does (plant.schedule); "
+                "scenario.last_piece is the one after all changes"
+            )
 
     @cached_property
+    def last_piece(self) -> Self:
+        """The scenario with the plant after all its changes, and filters that believe then what
+        its own do; itself if the plant does not change.
+        """
+        return self.piece(len(self.plant.changes)) if len(self.plant.changes) else self
+
+    def piece(self, number: int, cov: tuple[FloatArray, ...] | None = None) -> Self:
+        """Return this scenario with a plant that is always as in one of its pieces, by number, and
+        filters that believe then what these do; they start with ``cov``, (n, n) of each node.
+        """
+        names = "FQ" if self.slotted else "AB"
+        plants: Any = self.plant.pieces
+        now, believed = plants[number], plants[number if self.filter.model.schedule else 0]
+        matrices: dict[str, Any] = {name: getattr(now, name) for name in names}
+        if not self.slotted:
+            matrices["sensing_period"] = self.diffusion.sensing_period
+        if (u := self.plant.input) is not None:
+            matrices["input"] = dataclasses.replace(u, G=self.plant.input_gains[number])
+        wrong = {
+            name: getattr(believed, name)
+            for name in names
+            if believed is not now and getattr(self.filter.model, name) is None
+        }
+        filtering = dataclasses.replace(
+            self.filter, model=dataclasses.replace(self.filter.model, **wrong)
+        )
+        if cov is not None:
+            filtering = dataclasses.replace(filtering, cov=cov)
+        plant = dataclasses.replace(self.plant, **matrices, schedule=())  # type: ignore[call-arg]
+        # The stacked plant and its sensors, where the state consists of blocks.
+        blocks: dict[str, Any] = {"plants": (), "sensors": self.sensors} if self.plants else {}
+        return dataclasses.replace(self, plant=plant, filter=filtering, **blocks)
+
+    @cached_property
+    def followed_changes(self) -> FloatArray:
+        """(C,) times in seconds, below the horizon, of the changes of the plant that filters
+        follow.
+        """
+        changes = self.plant.changes
+        return changes[changes < self.horizon] if self.filter.model.schedule else changes[:0]
+
+    @cached_property
+    def believed_pieces(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """The matrices that the filters use at first, and after each of the ``followed_changes``:
+        F and Q in slots, A and Q = B B' in continuous time, all (n, n). F of a plant that is not
+        linear is nan.
+        """
+        model, plant = self.filter.model, self.plant
+        pieces: Any = plant.pieces[: 1 + len(self.followed_changes)]
+        if isinstance(plant, NonlinearPlant):
+            unknown = np.full((plant.n, plant.n), math.nan)
+            return ((unknown, plant.Q if model.Q is None else model.Q),)
+        if isinstance(plant, LinearPlant):
+            return tuple(
+                (p.F if model.F is None else model.F, p.Q if model.Q is None else model.Q)
+                for p in pieces
+            )
+        roots = [p.B if model.B is None else model.B for p in pieces]
+        return tuple(
+            (p.A if model.A is None else model.A, np.asarray(B @ B.T))
+            for p, B in zip(pieces, roots, strict=True)
+        )
+
+    @cached_property
+    def model_pieces(self) -> tuple[tuple[Any, ...], ...]:
+        """The believed models of all nodes, or that of a pooled filter, at first and after each of
+        the ``followed_changes``.
+        """
+        pooled, names = self.node_filter.timing.pooled, "FQ" if self.slotted else "AQ"
+        first = (self._pooled_model,) if pooled else self._node_models
+        pieces: list[tuple[Any, ...]] = [first]
+        for matrices in self.believed_pieces[1:]:
+            changed = dict(zip(names, matrices, strict=True))
+            # Equal models stay one object.
+            models = {id(model): dataclasses.replace(model, **changed) for model in first}
+            pieces.append(tuple(models[id(model)] for model in first))
+        return tuple(pieces)
+
+    def model_of(self, entity: int) -> Any:
+        """Return the believed model of the node with this index, 0 for a pooled filter: of one run
+        where it changes.
+        """
+        pieces = [models[entity] for models in self.model_pieces]
+        if len(pieces) == 1:
+            return pieces[0]
+        if self.slotted:
+            return ChangingSlotModel(pieces, self.followed_slots)
+        return ChangingFlowModel(pieces, self.followed_changes.tolist())
+
+    @property
+    def followed_slots(self) -> tuple[int, ...]:
+        """The slots (C,) of the changes of the plant that filters follow."""
+        period = self.slot_plant.period
+        return tuple(round(t / period) for t in self.followed_changes.tolist())
+
+    @property
+    def model_slots(self) -> tuple[int, ...]:
+        """The slots (C,) from which on filters believe the matrices of the next piece: that of a
+        change, or the one after it where slots begin with the prediction from the slot before.
+        """
+        later = not self.node_filter.timing.predicts
+        return tuple(slot + later for slot in self.followed_slots)
+
+    @property
     def slot_models(self) -> tuple[SlotModel, ...]:
         """The believed model of each node in slots, in the order of ``nodes``: F, Q, and H and R of
-        its sensors together; equal models are one object.
+        its sensors together; raises TheoryError if the plant changes.
 
         A random H is that of slot 0.
         """
-        return _shared(self._slot_model, self._believed_stacks)
+        self._require_one_piece()
+        _ = self.slot_plant
+        return self._node_models
+
+    @property
+    def models(self) -> tuple[FlowModel, ...]:
+        """The believed model of each node in continuous time; equal models are one object. Raises
+        TheoryError if the plant changes.
+        """
+        self._require_one_piece()
+        _ = self.diffusion
+        return self._node_models
+
+    @cached_property
+    def _node_models(self) -> tuple[Any, ...]:
+        """The first believed models of all nodes."""
+        if self.slotted:
+            return _shared(self._slot_model, self._believed_stacks)
+        stacks = (self.observation_matrices(node, believed=True) for node in self.nodes)
+        return _shared(self._flow_model, stacks)
+
+    @property
+    def pooled_slot_model(self) -> SlotModel:
+        """The believed model of a central filter, which reads the sensors of all nodes, in slots;
+        raises TheoryError if the plant changes.
+        """
+        self._require_one_piece()
+        _ = self.slot_plant
+        pooled: SlotModel = self._pooled_model
+        return pooled
+
+    @property
+    def pooled_model(self) -> FlowModel:
+        """The believed model of a central filter, which reads the increments of all nodes, in
+        continuous time; raises TheoryError if the plant changes.
+        """
+        self._require_one_piece()
+        _ = self.diffusion
+        pooled: FlowModel = self._pooled_model
+        return pooled
+
+    @cached_property
+    def _pooled_model(self) -> Any:
+        """The first believed model of a central filter."""
+        stacked = self._stack_sensors(self._pooled_sensors, believed=True)
+        return self._slot_model(*stacked) if self.slotted else self._flow_model(*stacked)
 
     def _slot_model(self, H: FloatArray, R: FloatArray) -> SlotModel:
         plant = self.slot_plant
         if not isinstance(plant, NonlinearPlant):
-            return SlotModel(*self.slot_belief, H, R, plant.period)
+            return SlotModel(*self.believed_pieces[0], H, R, plant.period)
         (f, jacobian), Q = plant.functions, self.filter.model.Q
         return MapModel(
             np.full((plant.n, plant.n), math.nan), plant.Q if Q is None else Q, H, R,
@@ -162,23 +335,6 @@ class DerivedScenario(ScenarioModel):
         sender_indices = tuple(tuple(sorted(senders[node])) for node in self.nodes)
         return NetworkInfo(np.stack(self.informations), sender_indices)
 
-    @property
-    def believed_models(self) -> tuple[SlotModel, ...] | tuple[FlowModel, ...]:
-        """The believed model of each node, in the order of ``nodes``."""
-        return self.slot_models if self.slotted else self.models
-
-    @property
-    def believed_pooled_model(self) -> SlotModel | FlowModel:
-        """The believed model of a central filter, which reads the sensors of all nodes at once."""
-        return self.pooled_slot_model if self.slotted else self.pooled_model
-
-    @cached_property
-    def pooled_slot_model(self) -> SlotModel:
-        """The believed model of a central filter, which reads the sensors of all nodes, in
-        slots.
-        """
-        return self._slot_model(*self._stack_sensors(self._pooled_sensors, believed=True))
-
     @cached_property
     def diffusion(self) -> Diffusion:
         """The plant in continuous time, with the default mean, covariance and sensing period
@@ -201,8 +357,13 @@ class DerivedScenario(ScenarioModel):
         informations = [np.asarray(H.T @ np.linalg.solve(R, H)) for H, R in stacks]
         weighted = (k * G for k, G in zip(counts.values(), informations, strict=True))
         total_information = sum(weighted, 0.0 * plant.A)
-        max_period = longest_interval(plant.A, plant.Q, total_information)
-        period = default_sensing_period(plant, informations, max_period)
+        period = min(
+            default_sensing_period(
+                piece, informations, longest_interval(piece.A, piece.Q, total_information)
+            )
+            for piece in plant.pieces
+        )
+        period = dividing_period(plant.changes[plant.changes < self.horizon], period)
         return dataclasses.replace(plant, sensing_period=period).on_grid(self.time_grid)
 
     def continuous_truth(
@@ -289,22 +450,31 @@ class DerivedScenario(ScenarioModel):
         """
         if self.plant.input is None or not self.plant.linear:
             return None
-        A = self.linear_plant.F if self.slotted else self.diffusion.A
+        pieces: Any = self.plant.pieces[: 1 + int((self.plant.changes < self.horizon).sum())]
+        matrices = [piece.F if self.slotted else piece.A for piece in pieces]
+        true = self._response(matrices)
         if not self._moves_along:
-            return self._response(A)
-        if np.array_equal(A, self.slot_belief[0] if self.slotted else self.belief[0]):
+            return true
+        known = [M for M, _ in self.believed_pieces]
+        if len(known) == len(matrices) and all(map(np.array_equal, matrices, known)):
             return None
-        return Difference(self._response(A), self.believed_response)
+        return Difference(true, self.believed_response)
 
     @cached_property
     def believed_response(self) -> FlowResponse | SlotResponse:
         """The response to the input by the matrices that filters believe."""
-        return self._response(self.slot_belief[0] if self.slotted else self.belief[0])
+        return self._response([M for M, _ in self.believed_pieces])
 
-    def _response(self, A: FloatArray) -> FlowResponse | SlotResponse:
-        u = self.plant.input
+    def _response(self, matrices: Sequence[FloatArray]) -> FlowResponse | SlotResponse:
+        """Return the response by F or A (n, n) of so many of the first pieces of the plant."""
+        u, count = self.plant.input, len(matrices)
         assert u is not None
-        return SlotResponse(A, self.linear_plant) if self.slotted else FlowResponse(A, u)
+        pieces = list(zip(matrices, self.plant.input_gains[:count], strict=True))
+        if self.slotted:
+            return SlotResponse(
+                pieces, self.linear_plant.change_slots[: count - 1], self.linear_plant
+            )
+        return FlowResponse(pieces, self.plant.changes[: count - 1], u)
 
     def origins(self, times: np.ndarray, local: FloatArray, x: FloatArray) -> FloatArray:
         """Return where the coordinates of filters begin at K ``times`` (K,), in seconds or slots:
@@ -335,6 +505,9 @@ class DerivedScenario(ScenarioModel):
         """
         # Nonlinear readings depend on the absolute state.
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):
+            return False
+        # A frame would have to end where the plant changes.
+        if len(self.plant.changes):
             return False
         if self.input_responses is not None and self.input_responses.surprise is not None:
             return False
@@ -451,48 +624,27 @@ class DerivedScenario(ScenarioModel):
             return None
         return responses.believed
 
-    @cached_property
-    def belief(self) -> tuple[FloatArray, FloatArray]:
-        """The matrices ``A`` and ``Q = B B'`` (n, n) that the filters use in continuous time."""
-        model = self.filter.model
-        plant = self.diffusion
-        A = plant.A if model.A is None else model.A
-        B = plant.B if model.B is None else model.B
-        return A, np.asarray(B @ B.T)
-
     @property
     def filters_know_the_truth(self) -> bool:
         """True if the believed matrices, of the plant and R of all sensors, are the true ones.
 
         False if states or readings are recorded: their true matrices are unknown.
         """
-        plant = self.plant
         if not self.is_random or self.misses_input:
             return False
-        if isinstance(plant, NonlinearPlant):
-            pairs = [(plant.Q if self.filter.model.Q is None else self.filter.model.Q, plant.Q)]
-        elif isinstance(plant, LinearPlant):
-            pairs = [*zip(self.slot_belief, (plant.F, plant.Q), strict=True)]
-        else:
-            pairs = [*zip(self.belief, (self.diffusion.A, self.diffusion.Q), strict=True)]
+        pieces: Any = self.plant.pieces[: 1 + int((self.plant.changes < self.horizon).sum())]
+        if len(pieces) > len(self.believed_pieces):
+            return False
+        pairs: list[tuple[FloatArray, FloatArray]] = []
+        for piece, matrices in zip(pieces, self.believed_pieces, strict=True):
+            pairs.append((matrices[1], piece.Q))
+            if self.plant.linear:
+                pairs.append((matrices[0], piece.F if self.slotted else piece.A))
         pairs += [
             (self.noise_covariance(k, believed=True), self.noise_covariance(k, believed=False))
             for k in range(len(self.sensors))
         ]
         return all(np.array_equal(believed, true) for believed, true in pairs)
-
-    @cached_property
-    def models(self) -> tuple[FlowModel, ...]:
-        """The believed model of each node in continuous time; equal models are one object."""
-        stacks = (self.observation_matrices(node, believed=True) for node in self.nodes)
-        return _shared(self._flow_model, stacks)
-
-    @cached_property
-    def pooled_model(self) -> FlowModel:
-        """The believed model of a central filter, which reads the increments of all nodes, in
-        continuous time.
-        """
-        return self._flow_model(*self._stack_sensors(self._pooled_sensors, believed=True))
 
     @property
     def _pooled_sensors(self) -> tuple[PlacedSensor, ...]:
@@ -502,7 +654,7 @@ class DerivedScenario(ScenarioModel):
     def _flow_model(self, H: FloatArray, R: FloatArray) -> FlowModel:
         # The longest gap to predict over, and the longest step whose increment is used at once.
         period = self.diffusion.sensing_period or 0.0
-        return FlowModel(*self.belief, H, R, self.horizon, min(period, self.horizon))
+        return FlowModel(*self.believed_pieces[0], H, R, self.horizon, min(period, self.horizon))
 
     def initial_estimate(self, node: int) -> tuple[FloatArray, FloatArray]:
         """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0.

@@ -76,6 +76,7 @@ class Belief(Component):
     Q  (n, n) of a linear plant
     R  of the sensors: one matrix for all, or a list with one per ``[[sensors]]`` entry
     input  false: they do not know the input of the plant
+    schedule  false: filters do not know that the plant changes, and keep its first matrices
     """
 
     A: FloatArray | None = field(square, default=None)
@@ -89,6 +90,7 @@ class Belief(Component):
         default=None,
     )
     input: bool = field(boolean, default=True)
+    schedule: bool = field(boolean, default=True)
 
 
 @dataclass(frozen=True, eq=False)

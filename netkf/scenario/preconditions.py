@@ -29,6 +29,8 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     the key, the filter, the value and a remedy.
     """
     needs = scenario.node_filter.needs
+    if needs.one_model or (needs.one_model_under_clocks and not scenario.slotted):
+        _check_one_model(scenario)
     if not scenario.slotted:
         _check_increments(scenario)
     if needs.linear_plant and not scenario.plant.linear:
@@ -51,6 +53,17 @@ def check_preconditions(scenario: DerivedScenario) -> None:
         _check_ways(scenario)
     if needs.reads_what_it_sends:
         _check_heard(scenario)
+
+
+def _check_one_model(scenario: DerivedScenario) -> None:
+    if len(scenario.followed_changes):
+        raise ScenarioError(
+            "plant.schedule",
+            f"cannot be followed by the {filter_name(scenario)}, which computes with the matrices "
+            "of the plant before a run",
+            f"{len(scenario.followed_changes)} changes",
+            f"write model = {{ schedule = false }} in [filter], or {ANOTHER}",
+        )
 
 
 def _check_increments(scenario: DerivedScenario) -> None:
@@ -121,11 +134,13 @@ def _check_invertible(scenario: DerivedScenario) -> None:
     initial = {node: scenario.initial_estimate(node)[1] for node in scenario.nodes}
     singular = next((node for node, P in initial.items() if not bool(is_definite(P))), None)
     if scenario.slotted:
-        model = scenario.slot_models[0]
-        is_regular = scenario.plant.linear and np.linalg.matrix_rank(model.F) == n
-        nonsingular = bool(is_definite(model.Q)) or (singular is None and is_regular)
+        nonsingular = all(
+            bool(is_definite(Q))
+            or (singular is None and scenario.plant.linear and np.linalg.matrix_rank(F) == n)
+            for F, Q in scenario.believed_pieces
+        )
     else:
-        A, Q = scenario.belief
+        A, Q = scenario.believed_pieces[0]
         # (A, Q) is controllable if and only if (A', Q) is observable.
         nonsingular = singular is None or hidden_mode(A.T, outputs_of(Q)) is None
     if not nonsingular:

@@ -26,6 +26,48 @@ def require_shape(key: str, value: FloatArray, shape: tuple[int | None, ...], wh
         raise ScenarioError(key, rule, value, "correct the shape")
 
 
+def check_schedule(scenario: DerivedScenario, why: str) -> None:
+    """Raise ScenarioError if matrices of ``plant.schedule`` have wrong shapes, for the reason
+    ``why``, or in slots a change is between two.
+    """
+    plant, n = scenario.plant, scenario.plant.n
+    for k, change in enumerate(getattr(plant, "schedule", ())):
+        for name, value in change.matrices.items():
+            key, width = f"plant.schedule[{k}].{name}", None if name == "B" else n
+            if name == "G":
+                if plant.input is None:
+                    rule = "belongs to a plant with an input"
+                    raise ScenarioError(key, rule, value, "add [plant.input], or leave it out")
+                width = plant.input.m
+            require_shape(key, value, (n, width), why)
+        if not scenario.slotted:
+            continue
+        period, start = scenario.slot_plant.period, float(plant.changes[k])
+        if scenario.slot_plant.slot_time(round(start / period)) != start:
+            raise ScenarioError(
+                f"plant.schedule[{k}].from",
+                f"must be a multiple of plant.period = {period:.15g}, where a slot begins",
+                start,
+                f"give {period * round(start / period):.15g}",
+            )
+
+
+def check_changes_on_grid(scenario: DerivedScenario, period: float) -> None:
+    """Raise ScenarioError unless each change of the plant is a point of the sensing grid, which has
+    this ``period`` (seconds).
+    """
+    for k, change in enumerate(scenario.plant.changes.tolist()):
+        nearest = scenario.time_grid.instant(round(change / period) * period)
+        if change < scenario.horizon and nearest != change:
+            raise ScenarioError(
+                f"plant.schedule[{k}].from",
+                f"must be a multiple of plant.sensing_period = {period:.15g}, where sensors read "
+                "increments",
+                change,
+                f"give {nearest:.15g}, or another plant.sensing_period",
+            )
+
+
 def check_regressor(scenario: DerivedScenario, key: str, sensor: RegressorSensor) -> None:
     """Raise ScenarioError if a regressor's matrices have wrong shapes or the plant is continuous.
 

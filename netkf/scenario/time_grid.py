@@ -98,8 +98,11 @@ def _times_of(key: str, part: Any) -> Iterator[TimeConstant]:
         value, rule = getattr(part, field.name), field.metadata.get("rule")
         if isinstance(value, Component):
             yield from _times_of(f"{key}.{field.name}", value)
+        elif isinstance(value, tuple):
+            for k, item in enumerate(value):
+                yield from _times_of(f"{key}.{field.name}[{k}]", item)
         elif isinstance(value, float) and rule is not None and rule.of_time:
-            yield _constant(f"{key}.{field.name}", value)
+            yield _constant(f"{key}.{part.written_keys.get(field.name, field.name)}", value)
     gaps = getattr(part, "gaps", None)
     if isinstance(gaps, Lattice):
         yield _constant(key, gaps.period)

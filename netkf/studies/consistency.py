@@ -8,6 +8,7 @@ and less for those that are conservative by design, which are then not called in
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import dataclasses
 import math
@@ -15,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -160,7 +161,9 @@ class _Innovations:
         self._slots = [slots[k] for k in self._samples]
         # With F = 0 the state is the noise of the last step, with the same draws.
         plant = scenario.linear_plant
-        memoryless = dataclasses.replace(plant, F=np.zeros_like(plant.F))
+        still: dict[str, Any] = {"F": np.zeros_like(plant.F)}
+        schedule = tuple(dataclasses.replace(change, **still) for change in plant.schedule)
+        memoryless = dataclasses.replace(plant, **still, schedule=schedule)
         path = memoryless.truth(self._streams.generator("plant"))
         self._noise = [path.state(slot) for slot in self._slots]
 
@@ -184,7 +187,8 @@ class _Innovations:
             if self._blurred[k, i] or self._blurred[source, i]:
                 continue
             H = np.concatenate([sensor.matrix(slot) for sensor in sensors])
-            e, P, Sigma = self._prediction(source, i, noise if self._steps else None)
+            last = (slot - 1, noise) if self._steps else None
+            e, P, Sigma = self._prediction(source, i, last)
             # The innovation H e + noise: sensors read the error in place of the state.
             v = np.concatenate([sensor.reading(slot, e) for sensor in sensors])
             S = H @ P @ H.T + believed_R
@@ -194,15 +198,21 @@ class _Innovations:
             yield float(v @ np.linalg.solve(S, v)), expected
 
     def _prediction(
-        self, k: int, i: int, noise: FloatArray | None
+        self, k: int, i: int, last: tuple[int, FloatArray] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """Return error (n,), P (n, n) and E[e e'] of sample k, or of its prediction by one slot."""
-        run, plant = self._run, self._scenario.linear_plant
+        """Return error (n,), P (n, n) and E[e e'] of sample k, or of its prediction by one slot:
+        ``last``, its number and the noise (n,) of the plant in it.
+        """
+        run, scenario = self._run, self._scenario
         e, P = run.error[k, i], run.P[k, i]
         Sigma = None if self._sigma is None else self._sigma[k, i]
-        if noise is None:
+        if last is None:
             return e, P, Sigma
-        F, Q = self._scenario.slot_belief  # of the filters' model, which may differ from the plant
+        slot, noise = last
+        whole = scenario.linear_plant
+        plant = whole.pieces[bisect.bisect_right(whole.change_slots, slot)]
+        # Of the filters' model, which may differ from the plant.
+        F, Q = scenario.believed_pieces[bisect.bisect_right(scenario.followed_slots, slot)]
         model_is_true = np.array_equal(F, plant.F)
         if Sigma is not None:
             Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if model_is_true else None

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -151,9 +153,9 @@ def bound_traces(scenario: Scenario) -> FloatArray:
     _require_fixed_H(scenario)
     # A pooled filter has the readings of all nodes.
     pooled = scenario.filter.algorithm.timing.pooled
-    models = [scenario.pooled_slot_model] * len(scenario.nodes) if pooled else scenario.slot_models
+    entities = [0] * len(scenario.nodes) if pooled else range(len(scenario.nodes))
     starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    columns = [_slot_traces(scenario, m, P) for m, P in zip(models, starts, strict=True)]
+    columns = [_slot_traces(scenario, k, P) for k, P in zip(entities, starts, strict=True)]
     return time_average(scenario, np.stack(columns, axis=1))
 
 
@@ -168,7 +170,7 @@ def central_trace(scenario: Scenario) -> float:
     if not scenario.slotted:
         return float(bound_traces(central)[0])
     _require_fixed_H(scenario)
-    traces = _slot_traces(scenario, central.pooled_slot_model, scenario.plant.start_cov)
+    traces = _slot_traces(scenario, 0, scenario.plant.start_cov, central.model_pieces)
     return float(time_average(scenario, traces[:, None])[0])
 
 
@@ -181,15 +183,22 @@ def _require_fixed_H(scenario: Scenario) -> None:
         scenario.observation_matrices(node)  # raises where H is random
 
 
-def _slot_traces(scenario: Scenario, model: SlotModel, start: FloatArray) -> FloatArray:
-    """Return the traces (T,) of P of a Kalman filter in slots from P(0) = ``start``."""
+def _slot_traces(
+    scenario: Scenario, entity: int, start: FloatArray, pieces: Sequence[Any] = ()
+) -> FloatArray:
+    """Return the traces (T,) of P of a Kalman filter in slots from P(0) = ``start``, of the node
+    with an index in the models of all ``pieces``, by default those of the scenario.
+    """
     predicts = scenario.filter.algorithm.timing.predicts
+    models: list[SlotModel] = [piece[entity] for piece in pieces or scenario.model_pieces]
     # At most n rows with the same information: a central filter may read hundreds.
-    F, Q, H = model.F, model.Q, whiten_observation(model.H, model.R)
-    R = np.eye(len(H))
+    H = whiten_observation(models[0].H, models[0].R)
+    R, changes = np.eye(len(H)), scenario.slot_plant.change_slots
     P, traces = start, np.empty(max(scenario.sampled_slots) + 1)
     traces[0] = np.trace(start)
     for slot in range(1, len(traces)):
+        piece = bisect.bisect_right(changes, slot - 1, hi=len(models) - 1)
+        F, Q = models[piece].F, models[piece].Q
         if predicts:
             P = riccati_step(P, F, Q, H, R) if len(H) else F @ P @ F.T + Q
         else:

@@ -11,6 +11,7 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import (
+    TRUE_MODEL,
     AssumptionRow,
     judge_plant,
     nonlinear_rows,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = ["assumption", "source", "holds", "evidence"]
+CONSTANT = "the plant does not change"
 ANY = "any filter"
 """The source of assumptions that no paper makes for the scenario's filter."""
 
@@ -51,7 +53,18 @@ def assumptions(scenario: Scenario) -> pd.DataFrame:
 
 
 def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return a row for each assumption: text, equation, whether it holds, and why."""
+    """Return a row for each assumption: text, equation, whether it holds, and why. Of a plant that
+    changes the rows are about the last piece, but for that on the filters' model.
+    """
+    changes = scenario.plant.changes
+    if len(changes):
+        first = f"at {changes[0]:g} s" if len(changes) == 1 else f"{len(changes)} times"
+        evidence = f"it changes {first}; rows on the plant are of that from {changes[-1]:g} s on"
+        rows = [(CONSTANT, ANY, False, evidence), *assumption_rows(scenario.last_piece)]
+        return [
+            true_model_row(scenario, row[1], row[3]) if row[0] == TRUE_MODEL else row
+            for row in rows
+        ]
     nonlinear = nonlinear_rows(scenario)
     if not scenario.plant.linear:
         return [*nonlinear, *start_rows(scenario, ANY)]

@@ -53,7 +53,8 @@ LIMITS: dict[str, Callable[[Scenario], FloatArray]] = {
 def compute_promises(scenario: Scenario) -> dict[str, Any]:
     """Return what theory states about a scenario without simulation as plain JSON (`netkf theory
     --json`): assumptions, bounds, link rates and limits, results of the paper, exact steady errors.
-    Matrices have ``value`` and ``trace``, None with a ``reason`` if there is none.
+    Matrices have ``value`` and ``trace``, None with a ``reason`` if there is none. Of a plant that
+    changes all but the bound at the horizon is about the last piece.
     """
     promises: dict[str, Any] = {
         "scenario": scenario.name,
@@ -69,6 +70,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
             for assumption, source, holds, evidence in assumption_rows(scenario)
         ],
     }
+    whole, scenario = scenario, scenario.last_piece
     if scenario.slotted:
         slot_promises = theory_of(scenario).slot_promises
         if slot_promises is not None:
@@ -81,7 +83,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
         promises["steady_error"] = _steady_error(scenario)
     if not scenario.slotted:
         ends = np.array([scenario.horizon])
-        promises["bound_at_horizon"] = _value_or_reason(lambda: covariance_bound(scenario, ends)[0])
+        promises["bound_at_horizon"] = _value_or_reason(lambda: covariance_bound(whole, ends)[0])
         promises["steady_bound"] = _steady_bound(scenario)
         promises["link_rate"] = _sufficient_link_rate(scenario)
         for name, function in LIMITS.items():
@@ -168,6 +170,10 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
     lines += paper_legend(row["source"] for row in promises["assumptions"])
+    if len(scenario.plant.changes):
+        since = f"{scenario.plant.changes[-1]:g} s"
+        lines += ["", f"steady states and limits: of the plant from {since} on"]
+        scenario = scenario.last_piece
     paper = scenario.node_filter.analysis.paper
     slot_lines = theory_of(scenario).slot_lines
     if paper in promises and slot_lines is not None:

@@ -39,13 +39,14 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
             bound = np.trace(covariance_bound(scenario, times), axis1=2, axis2=3)
     except TheoryError as error:
         reason = str(error)
-    steady_note = _steady_note(scenario)
+    last = scenario.last_piece
+    steady_note, label = _steady_note(last), limit_label(last)
     return PromisedTraces(
         bound=bound,
-        limit=_trace_or_nan(limit_covariance, scenario),
-        central=_trace_or_nan(central_covariance, scenario),
-        reason=reason or reason_without_bound(scenario) or "",
-        limit_label=limit_label(scenario),
+        limit=_trace_or_nan(limit_covariance, last),
+        central=_trace_or_nan(central_covariance, last),
+        reason=reason or reason_without_bound(last) or "",
+        limit_label=label if last is scenario else f"{label}, after all changes",
         notes=(*([steady_note] if steady_note else []), *covariance_notes(scenario)),
     )
 

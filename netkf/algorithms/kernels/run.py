@@ -47,6 +47,9 @@ from netkf.linalg.structs import Size, Struct, sized
 
 MAX_RELATIVE_GAIN = 1.0
 """Largest integral of trace(P G), G = H' R^-1 H, over the increments that one update uses."""
+NO_CHANGES = np.zeros(0)
+CLOSE = 1e-12
+"""Share of a time by which sums of gaps may miss it."""
 ALL = -2
 """``run.receiver`` where a message is for all receivers."""
 
@@ -78,6 +81,7 @@ class SlotRun(Struct):
     uniform : (L,), uniform numbers for ``emit`` of a randomised filter
     offset : (n, L), by which ``shift`` moves estimates
     gap, slot, phase, step : seconds of a prediction, numbers of slot, exchange and repetition
+    now : under clocks the end of the prediction, or the time to which messages are predicted
     row, gains, moved_mean, moved, noise, whitened, total : scratch, (n, L) three times, (n, n, L)
         twice, (n, n + 1, L) twice
     """
@@ -118,6 +122,7 @@ class SlotRun(Struct):
     phase: int
     step: int
     gap: float
+    now: float
 
 
 class SingleSlotRun(Struct):
@@ -127,10 +132,14 @@ class SingleSlotRun(Struct):
 
 
 class ClockTables(Struct):
-    """The models of H nodes under clocks.
+    """The models of H nodes under clocks. A plant that changes has several *pieces*, and each node
+    a model in each.
 
-    table : tables of all models, the last without sensors, for messages and copies
-    models : (H,), index of each node's model
+    table : tables of all models of the first piece, the last without sensors, for messages and
+            copies, then those of the next piece, and so on
+    changes : (C,) times in seconds at which the next piece begins
+    piece, stride : the number of the present piece, and how many models a piece has
+    models : (H,), index of each node's model in the present piece
     gains, moments, increments : for nodes that read increments: the tables of their gains, the
         moments (2 p,) of the reading of ``update``, and 1 where that is one of increments
     scratch, values, mean, mean_root : scratch of predictions, of gains, and of means (1, n) and
@@ -138,6 +147,9 @@ class ClockTables(Struct):
     """
 
     table: FlowTable
+    changes: FloatArray
+    piece: int
+    stride: int
     models: IntArray
     gains: Gains
     moments: FloatArray
@@ -184,15 +196,25 @@ def opposite_links(first: IntArray, sender: IntArray) -> IntArray:
     return np.where(ends[order[place]] == turned, order[place], -1).astype(np.int64)
 
 
-def clock_tables(size: Size, table: FlowTable, models: IntArray, gains: Gains) -> ClockTables:
+def clock_tables(
+    size: Size,
+    table: FlowTable,
+    models: IntArray,
+    gains: Gains,
+    changes: FloatArray = NO_CHANGES,
+) -> ClockTables:
     """Return the models of H nodes under clocks for a run of this ``size``, with scratch: the
-    ``table`` of M models and the ``gains`` of theirs, and the index ``models`` (H,) of each node's.
+    ``table`` of M models and the ``gains`` of theirs, and the index ``models`` (H,) of each node's;
+    M counts the models of all pieces between the ``changes`` (C,) of the plant, in seconds.
     """
     n, unrolled = len(size), isinstance(size, tuple)
     # The types of structs in it depend on a size that is known when kernels are compiled.
     cls = ClockTables.of_size(n) if unrolled else ClockTables
     made: ClockTables = cls(
         table=table,
+        changes=changes,
+        piece=0,
+        stride=len(table.unit) // (1 + len(changes)),
         models=models,
         gains=gains,
         moments=np.zeros(max(1, int(gains.moments.max()))),
@@ -270,16 +292,16 @@ def carry_mean_in_slot(model: SlotTables, run: Any, x: FloatArray, m: int, age: 
 
 @carry_mean.register(ClockTables)
 @kernel
-def _carry_mean_over_age(model: ClockTables, _run: Any, x: FloatArray, m: int, age: float) -> None:
+def _carry_mean_over_age(model: ClockTables, run: Any, x: FloatArray, m: int, age: float) -> None:
     if not age > 0.0:
         return
-    n, last = x.shape[1], len(model.table.unit) - 1
+    n = x.shape[1]
     for i in range(n):
         model.mean[0, i] = x[m, i, 0]
         for j in range(i + 1):
             # A root of zero: the mean does not depend on it.
             model.mean_root[0, i, j] = 0.0
-    propagate_root(model.table, last, model.mean_root, model.mean, 0, age, model.scratch)
+    move(model, run, model.stride - 1, model.mean_root, model.mean, 0, age)
     for i in range(n):
         x[m, i, 0] = model.mean[0, i]
 
@@ -298,8 +320,8 @@ def update_in_slot(
 def _predict_over_gap(
     model: ClockTables, run: Any, x: FloatArray, root: FloatArray, k: int, h: int
 ) -> None:
-    m = model.models[h]
-    propagate_root(model.table, m, drop_lane(root), drop_lane(x), k, run.gap, model.scratch)
+    m = model.models[h] - model.piece * model.stride
+    move(model, run, m, drop_lane(root), drop_lane(x), k, run.gap)
 
 
 @predict_copy.register(ClockTables)
@@ -313,11 +335,46 @@ def _predict_copy_over_gap(
 @carry.register(ClockTables)
 @kernel
 def _carry_over_age(
-    model: ClockTables, _run: Any, x: FloatArray, root: FloatArray, m: int, age: float
+    model: ClockTables, run: Any, x: FloatArray, root: FloatArray, m: int, age: float
 ) -> None:
     if age > 0.0:
-        last = len(model.table.unit) - 1
-        propagate_root(model.table, last, drop_lane(root), drop_lane(x), m, age, model.scratch)
+        move(model, run, model.stride - 1, drop_lane(root), drop_lane(x), m, age)
+
+
+@kernel(inlined=True)
+def move(
+    model: ClockTables, run: Any, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
+) -> None:
+    """Predict estimate ``k`` of ``x`` (K, n) and ``root`` (K, n, n) over the ``gap`` seconds up to
+    ``run.now`` by model number ``m`` of each piece.
+    """
+    piece = model.piece
+    if piece > 0 and begins_before(model, run.now - gap, piece):
+        move_over_pieces(model, run.now, m, root, x, k, gap)
+    else:
+        propagate_root(model.table, piece * model.stride + m, root, x, k, gap, model.scratch)
+
+
+@kernel
+def begins_before(model: ClockTables, time: float, piece: int) -> bool:
+    """Return True if a gap from ``time`` on (seconds) begins before this piece does."""
+    return bool(time * (1.0 + CLOSE) < model.changes[piece - 1])
+
+
+@kernel
+def move_over_pieces(
+    model: ClockTables, now: float, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
+) -> None:
+    """Predict an estimate over a ``gap`` that begins before the present piece, cut at changes."""
+    time, piece = now - gap, model.piece
+    while piece > 0 and begins_before(model, time, piece):
+        piece -= 1
+    while time < now:
+        end = now
+        if piece < model.piece:
+            end = min(now, model.changes[piece])
+        propagate_root(model.table, piece * model.stride + m, root, x, k, end - time, model.scratch)
+        time, piece = end, piece + 1
 
 
 @update_estimate.register(ClockTables)

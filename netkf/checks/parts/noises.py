@@ -7,7 +7,9 @@ formulas that share no code with the plant.
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
+import itertools
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -35,14 +37,15 @@ VISIBLE = 1e-5
 
 class PathLaw(NamedTuple):
     """The law of S steps ``x(t + gap) = Phi x(t) + w`` of a path: ``times`` (S + 1,) of the states
-    in seconds, Phi (n, n), ``white`` (d, n) that whitens w of rank d, the largest standard
-    ``deviation`` of an entry of w, and the root mean squares ``sizes`` (S, n) of states before.
+    in seconds, Phi (S, n, n), ``white`` (S, d, n) that whitens w of rank d (rows of nan where the
+    rank is less), the largest standard ``deviation`` (S,) of an entry of w, and the root mean
+    squares ``sizes`` (S, n) of states before.
     """
 
     times: FloatArray
     Phi: FloatArray
     white: FloatArray
-    deviation: float
+    deviation: FloatArray
     sizes: FloatArray
 
 
@@ -56,17 +59,40 @@ def path_law(scenario: Scenario) -> PathLaw | None:
     stated: Any = stated_part(scenario.plant, "plant")
     if scenario.slotted:
         slots = min(MAX_STEPS, int(scenario.horizon / stated.period))
-        times, Phi, W = stated.period * np.arange(slots + 1), np.asarray(stated.F), stated.Q
+        times, n = stated.period * np.arange(slots + 1), stated.n
+        numbers = [bisect.bisect_right(stated.change_slots, slot) for slot in range(slots)]
+        laws = [(np.asarray(piece.F), np.asarray(piece.Q)) for piece in stated.pieces]
+        steps = [laws[number] for number in numbers]
     else:
         even = np.linspace(0.0, scenario.horizon * (1.0 - 1e-9), MAX_STEPS + 1)
-        times = scenario.time_grid.snap(even)
-        Phi, W = transition_law(stated.A, stated.B, float(times[1]))
+        times, n = scenario.time_grid.snap(even), stated.n
+        if len(stated.changes):
+            steps = [_step_law(stated, *ends) for ends in itertools.pairwise(times.tolist())]
+        else:
+            steps = [transition_law(stated.A, stated.B, float(times[1]))] * MAX_STEPS
     mean, covariance, sizes = stated.start_mean, stated.start_cov, []
-    for _ in times[1:]:
+    factors = {id(W): whiten(W, MIN_VARIANCE_SHARE).factor for _, W in steps}
+    rank = max((len(factor) for factor in factors.values()), default=0)
+    white = np.full((len(steps), rank, n), np.nan)
+    for k, (Phi, W) in enumerate(steps):
         sizes.append(np.sqrt(np.diagonal(covariance) + mean**2))
         mean, covariance = Phi @ mean, Phi @ covariance @ Phi.T + W
-    white, deviation = whiten(W, MIN_VARIANCE_SHARE).factor, float(np.sqrt(np.diagonal(W).max()))
-    return PathLaw(times, Phi, white, deviation, np.array(sizes).reshape(-1, len(W)))
+        white[k, : len(factors[id(W)])] = factors[id(W)]
+    deviation = np.array([np.sqrt(np.diagonal(W).max()) for _, W in steps])
+    Phi_of_steps = np.array([Phi for Phi, _ in steps]).reshape(-1, n, n)
+    return PathLaw(times, Phi_of_steps, white, deviation, np.array(sizes).reshape(-1, n))
+
+
+def _step_law(plant: Diffusion, start: float, end: float) -> tuple[FloatArray, FloatArray]:
+    """Return the transition matrix and the covariance of the noise of a plant that changes."""
+    changes = plant.changes.tolist()
+    cuts = [change for change in changes if start < change < end]
+    Phi, W = np.eye(plant.n), np.zeros((plant.n, plant.n))
+    for begin, stop in itertools.pairwise([start, *cuts, end]):
+        piece = plant.pieces[bisect.bisect_right(changes, begin)]
+        F, Q = transition_law(piece.A, piece.B, stop - begin)
+        Phi, W = F @ Phi, F @ W @ F.T + Q
+    return Phi, W
 
 
 def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
@@ -74,14 +100,14 @@ def plant_noises(scenario: Scenario, streams: Streams) -> NoiseDraws | None:
     covariance to d entries; None for plants without noise and for recorded states.
     """
     law = path_law(scenario)
-    if law is None or not len(law.white):
+    if law is None or not law.white.size:
         return None
     x = _states(scenario, streams, law)
-    noise = x[1:] - x[:-1] @ law.Phi.T
+    noise = x[1:] - np.einsum("kij,kj->ki", law.Phi, x[:-1])
     # Where the state has outgrown the noise, x(t + gap) - Phi x(t) is mostly rounding.
     accurate = np.abs(x[1:]).max(axis=1) * np.finfo(float).eps < VISIBLE * law.deviation
     usable = np.logical_and.accumulate(accurate)
-    whitened = np.where(usable[:, None], noise @ law.white.T, np.nan)
+    whitened = np.where(usable[:, None], np.einsum("kij,kj->ki", law.white, noise), np.nan)
     return noise_draws(whitened, _standardise(x[:-1], law.sizes)[:, :, None])
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import hashlib
+import itertools
 from collections import Counter
 from typing import Any
 
@@ -88,13 +90,17 @@ def drawn_states(
     if not plant.linear:
         # How far roundings grow is unknown: kernels and Python draw the same numbers.
         return x, 1e3 * allowed
-    A = np.asarray(plant.F if scenario.slotted else plant.A)
+    changes = plant.change_slots if scenario.slotted else plant.changes.tolist()
     for k in range(1, len(x)):
-        gap = moments[k] - moments[k - 1]
+        cuts = [change for change in changes if moments[k - 1] < change < moments[k]]
+        step = np.eye(scenario.plant.n)
         with np.errstate(all="ignore"):
-            step = (
-                np.linalg.matrix_power(A, gap) if scenario.slotted else scipy.linalg.expm(A * gap)
-            )
+            for start, end in itertools.pairwise([moments[k - 1], *cuts, moments[k]]):
+                piece = plant.pieces[bisect.bisect_right(changes, start)]
+                if scenario.slotted:
+                    step = np.linalg.matrix_power(piece.F, end - start) @ step
+                else:
+                    step = scipy.linalg.expm(piece.A * (end - start)) @ step
             growth = float(np.linalg.norm(step, 2)) if np.isfinite(step).all() else np.inf
         allowed[k] = max(allowed[k], growth * (allowed[k - 1] + ROUNDINGS * EPS * sizes[k - 1]))
     return x, allowed

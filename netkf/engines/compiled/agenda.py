@@ -93,6 +93,7 @@ def is_immediate(scenario: Scenario) -> bool:
         and kernels.is_convex
         and node_filter.timing.talks
         and not scenario.sampled_sensors
+        and not len(scenario.followed_changes)
         and ticks_apart(network.activation)
         and delay_is_zero(network.channel)
         # A negative max_age makes even messages of age 0 too old.

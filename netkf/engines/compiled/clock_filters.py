@@ -39,7 +39,7 @@ class ClockFilters:
         self._p = 1
         pooled = scenario.node_filter.timing.pooled
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
-        models = (scenario.pooled_model,) if pooled else scenario.models
+        models = scenario.model_pieces[0]
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
         count = len(links["sender"])
@@ -49,11 +49,16 @@ class ClockFilters:
         self.record, self.start = self.records.struct, self.records.copied()
         n, size = start.xhat.shape[1], size_of(start.xhat.shape[1], kernels.unrolled)
         cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
+        self._first_models = np.ascontiguousarray(start.nodes["model"])
         self.run = cls(
             size=size,
             lanes=ONE,
             model=clock_tables(
-                size, start.table, np.ascontiguousarray(start.nodes["model"]), start.gains
+                size,
+                start.table,
+                self._first_models.copy(),
+                start.gains,
+                np.array(scenario.followed_changes),
             ),
             **links,
             **self._inbox(messages, n),
@@ -68,6 +73,7 @@ class ClockFilters:
             phase=-1,
             step=-1,
             gap=0.0,
+            now=0.0,
             **scratch_of(n, 1),
         )
         self._conserved: tuple[str, ...] = ()
@@ -82,6 +88,7 @@ class ClockFilters:
     def begin(self, instants: Instants) -> None:
         """Go back to time 0, for a run whose sensors take samples at these ``instants``."""
         copy_arrays(self.record, self.start)
+        self.begin_piece(0)
         # Rows of the reading of each sample, then the largest sum over one instant.
         rows = np.concatenate([instants.rows, [0]])[instants.sensor]
         totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
@@ -89,6 +96,13 @@ class ClockFilters:
         if p > self._p:
             self._p = p
             self.grow(len(self.run.message))
+
+    def begin_piece(self, piece: int) -> None:
+        """Let nodes believe the models of a piece of the plant, to whose begin they are
+        predicted.
+        """
+        model = self.run.model
+        model.piece, model.models[:] = piece, self._first_models + piece * model.stride
 
     @property
     def estimates(self) -> tuple[FloatArray, FloatArray]:

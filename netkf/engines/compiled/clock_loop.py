@@ -112,6 +112,7 @@ def clock_loop(kernels: Kernels) -> Any:
             if request != GO_ON:
                 return request
             seek_piece(state, now)
+            run.now = now
             predict_participants(state, record, run, event, now)
             if event == ON_TICK:
                 on_tick(state, record, run, now)

@@ -208,15 +208,20 @@ class Noise:
             **ziggurat._asdict(),
         )
 
-    def following(self) -> None:
-        """Draw the noise of the next block of steps of all runs and sensors into ``sensing``."""
+    def following(self, count: int | None = None) -> None:
+        """Draw the noise of the next block of steps of all runs and sensors into ``sensing``, or
+        only of its first ``count`` steps.
+        """
         sensing = self.sensing
         # Streams of all runs and sensors, run by run.
         shape = len(sensing.cuts), sensing.steps, *sensing.noise.shape[1:]
-        normals = sensing.noise.reshape(shape)
+        normals, steps = sensing.noise.reshape(shape), count or sensing.steps
+        noise = normals if steps == sensing.steps else np.ascontiguousarray(normals[:, :steps])
         # Standard normals become moments of white noise over one step: variances h and h / 3.
         scales = step_noise(np.ones((2, 1)), self._period)[:, 0]
-        fill_noise(self._noise, sensing.rows, normal_ziggurat(), scales, normals)
+        fill_noise(self._noise, sensing.rows, normal_ziggurat(), scales, noise)
+        if noise is not normals:
+            normals[:, :steps] = noise
 
 
 @kernel

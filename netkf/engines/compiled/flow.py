@@ -111,8 +111,9 @@ class Source:
         if not self._grid:
             return self._no_block
         # Noise and path advance together, a block of steps at a time.
-        self._noise.following()
-        path = self._paths.block(self._paths.following(), together)
+        block = self._paths.following()
+        self._noise.following(len(block.ends))
+        path = self._paths.block(block, together)
         self.states.path = path
         # Samples in (read_until, end]: a time at the border of two blocks is read once.
         first, last = np.searchsorted(self._sampled, [self._read_until, path.end], side="right")
@@ -170,6 +171,7 @@ class Workspace:
         which write samples into ``buffer`` (None: the workspace's own), and rows if ``traced``.
         """
         start, instants, window = self._start, draws.instants, draws.window()
+        changes = np.array(self._scenario.followed_changes)
         entities, directions = self._records
         # Records of links belong to the workspace: the numbers of their messages start again.
         directions["messages"] = 0
@@ -208,7 +210,8 @@ class Workspace:
             path=path,
             ticks=window,
             ticks_stop=len(window.t),
-            frames=draws.states.frame_times,
+            # Plants that change have no frames.
+            frames=draws.states.frame_times if not len(changes) else changes,
             probes=self._probes,
             buffer=self._buffer if buffer is None else buffer,
             # The recorder keeps the rows of a traced run, so the next one gets others.
@@ -323,6 +326,11 @@ class FlowRun:
 
     def _rebase(self) -> None:
         state, k = self._state, self._state.frame_at
+        if len(self._scenario.followed_changes):
+            assert self._clocked is not None
+            self._clocked.begin_piece(k + 1)
+            state.frame_at = k + 1
+            return
         offset = -self._draws.states.rebase(k)
         if self._clocked is not None:
             self._clocked.shift(self._scenario, state, offset)

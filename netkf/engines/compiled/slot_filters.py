@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 from typing import Any
 
 import numpy as np
@@ -61,7 +63,8 @@ class SlotFilters:
             lanes=LANES,
         )
         size = size_of(n, kernels.unrolled)
-        model: Any = SlotTables(F=setup.F, root_Q=setup.root_Q)
+        F, root_Q = setup.tables[0]
+        model: Any = SlotTables(F=F.copy(), root_Q=root_Q.copy())
         cls: Any = SlotRun
         if isinstance(setup.models[0], MapModel):
             delay = 0 if setup.algorithm.timing.predicts else 1
@@ -99,6 +102,7 @@ class SlotFilters:
             phase=0,
             step=0,
             gap=setup.period,
+            now=0.0,
             **scratch_of(n, LANES),
         )
         # L entries are copied at a time, so that the last copy may go beyond the last entry.
@@ -152,10 +156,15 @@ class SlotFilters:
         step = 1 if self._kernels.slotwise else max(1, count)
         assert setup.algorithm.kernels is not None
         prepare = setup.algorithm.kernels.prepare
-        for start in range(0, count, step):
-            first = plan.first + start
-            prepare(setup.algorithm, record, setup.infos, setup.models, first, step)
-            part = plan._replace(start=start, end=start + step)
+        slots = [slot - plan.first for slot in setup.model_slots]
+        starts = sorted({*range(0, count, step), *(slot for slot in slots if 0 < slot < count)})
+        for start, end in itertools.pairwise([*starts, count]):
+            piece, first = bisect.bisect_right(slots, start), plan.first + start
+            if len(setup.tables) > 1:
+                self._run.model.F[:], self._run.model.root_Q[:] = setup.tables[piece]
+            models = setup.model_pieces[piece]
+            prepare(setup.algorithm, record, setup.infos, models, first, end - start)
+            part = plan._replace(start=start, end=end)
             loop(record, self.records.memories, self._run, part, samples, rows)
         if isinstance(setup.models[0], MapModel):
             setup.models[0].raise_error()

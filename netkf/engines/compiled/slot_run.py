@@ -8,6 +8,7 @@ messages of one run at a time (engines.compiled.slot_events).
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -166,6 +167,10 @@ class SlotRuns:
             return
         F = np.array(self._scenario.linear_plant.F, order="C")
         self._path = Path(F, noise, setup.frame, x, origin)
+        self._changes = {
+            slot: (np.array(piece.F, order="C"), np.array(piece.noise_root, order="C"))
+            for slot, piece in zip(plant.change_slots, plant.pieces[1:], strict=True)
+        }
 
     def _begin_readings(self) -> None:
         setup, streams = self.setup, self._streams
@@ -433,17 +438,22 @@ class SlotRuns:
         # At the end of a frame the origin moves to the state.
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
-        shape = self._blocks, count, setup.n, LANES
-        local = unset(shape)
         if isinstance(self._path, MapPaths):
+            local = unset((self._blocks, count, setup.n, LANES))
             scratch = aligned((self._path.root.shape[1], LANES))
             first, states = self._slot, self._plant_states
             draw_map_paths(MANY, self._path, states, normal_ziggurat(), first, scratch, local)
             self._map.raise_error()
             return local, local, rebased
-        # Without frames both are the same array.
-        absolute = unset(shape) if setup.frame else local
-        self._draw_path(self._path, self._plant_states, local, absolute)
+        stop = self._slot + count
+        cuts = [slot for slot in self._changes if self._slot < slot < stop]
+        ends = itertools.pairwise([self._slot, *cuts, stop])
+        parts = [self._piece_of_path(*part) for part in ends]
+        local, absolute = parts[0]
+        # Plants that change have no frames.
+        if len(parts) > 1:
+            local = absolute = unset((self._blocks, count, setup.n, LANES))
+            np.concatenate([part for part, _ in parts], axis=1, out=local)
         if (responses := self._scenario.input_responses) is not None:
             believed, surprise = (
                 None if one is None else one.states(np.array(slots))[..., None] for one in responses
@@ -454,11 +464,29 @@ class SlotRuns:
                 absolute = absolute + believed
         return local, absolute, rebased
 
+    def _piece_of_path(self, first: int, stop: int) -> tuple[FloatArray, FloatArray]:
+        """Return local and absolute states (B, S, n, L) of slots between two changes."""
+        assert isinstance(self._path, Path)
+        if first in self._changes:
+            F, root = self._changes[first]
+            self._path = self._path._replace(F=F, root=root)
+        shape = self._blocks, stop - first, self.setup.n, LANES
+        local: FloatArray = unset(shape)
+        # Without frames both are the same array.
+        absolute: FloatArray = unset(shape) if self.setup.frame else local
+        self._draw_path(self._path, self._plant_states, local, absolute, first)
+        return local, absolute
+
     def _draw_path(
-        self, path: Path, states: np.ndarray, local: FloatArray, absolute: FloatArray
+        self,
+        path: Path,
+        states: np.ndarray,
+        local: FloatArray,
+        absolute: FloatArray,
+        first: int = 0,
     ) -> None:
         scratch = aligned((2, max(path.root.shape), LANES))
-        draw_paths(MANY, path, states, normal_ziggurat(), self._slot, scratch, local, absolute)
+        draw_paths(MANY, path, states, normal_ziggurat(), first, scratch, local, absolute)
 
     def _draw_readings(
         self, times: SlotTimes, local: FloatArray, rebased: np.ndarray

@@ -232,17 +232,19 @@ class SlotSetup:
 
     def _set_states(self, scenario: Scenario) -> None:
         infos: Sequence[NodeInfo] = scenario.node_infos
-        models: Sequence[Any] = scenario.slot_models
         if self.algorithm.timing.pooled:
-            infos, models = infos[:1], [scenario.pooled_slot_model]
-        models = [
-            _widened(model, rows) for model, rows in zip(models, self.rows.tolist(), strict=True)
+            infos = infos[:1]
+        self.model_pieces: list[Sequence[Any]] = [
+            [_widened(model, rows) for model, rows in zip(piece, self.rows.tolist(), strict=True)]
+            for piece in scenario.model_pieces
         ]
+        models = self.model_pieces[0]
         self.infos, self.models = infos, models
+        self.model_slots = scenario.model_slots
         self.period = scenario.slot_plant.period
         starts = [scenario.initial_estimate(info.node) for info in infos]
-        # All filters of a scenario believe one F and Q.
-        self.F, self.root_Q = np.array(models[0].F), lower_root(models[0].root_Q)
+        # All filters of a scenario believe one F and Q at a time.
+        self.tables = [(np.array(m.F), lower_root(m.root_Q)) for m, *_ in self.model_pieces]
         # Exchanges conserve quantities with these names.
         first = self.algorithm.init(models[0], *starts[0], infos[0])
         self.conserved_names = tuple(self.algorithm.analysis.conserved(first))

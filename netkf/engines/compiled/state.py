@@ -326,10 +326,10 @@ def filters_at_start(scenario: Scenario) -> Filters:
     """Return all N filters at time 0, or the one that reads all sensors if they are pooled."""
     # A pooled filter is one node with the id -1, which belongs to no node of the network.
     ids, pooled = scenario.nodes, scenario.node_filter.timing.pooled
-    models = (scenario.pooled_model,) if pooled else scenario.models
-    # Nodes that share a model share its table.
-    distinct = list({id(model): model for model in models}.values())
-    index = {id(model): k for k, model in enumerate(distinct)}
+    models = scenario.model_pieces[0]
+    # Nodes that share a model share its table, in each piece of the plant.
+    pieces = [list({id(m): m for m in piece}.values()) for piece in scenario.model_pieces]
+    index = {id(model): k for k, model in enumerate(pieces[0])}
     filtering_nodes = ids[:1] if pooled else ids
     starts = [scenario.initial_estimate(node) for node in filtering_nodes]
     counts = [len(scenario.increment_sensors.get(node, ())) for node in ids]
@@ -342,16 +342,21 @@ def filters_at_start(scenario: Scenario) -> Filters:
     nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
     nodes["inbox"] = nodes["reading"] = -1
     # One table for each distinct model.
-    table, gains = _stack_model_tables(distinct)
+    table, gains = _stack_model_tables(pieces)
     xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
     return Filters(nodes, xhat, first_roots([cov for _, cov in starts]), table, gains)
 
 
-def _stack_model_tables(models: list[FlowModel]) -> tuple[FlowTable, Gains]:
-    """Return the tables of M models, with one without sensors at the end, and of gains."""
-    # The last model of the stack has no sensors: it predicts messages under way.
-    table = stack_tables([*(model.flow for model in models), models[0].unobserved_flow])
-    return table, stack_gains([model.gains for model in models])
+def _stack_model_tables(pieces: list[list[FlowModel]]) -> tuple[FlowTable, Gains]:
+    """Return the tables of the M models of each piece, with one without sensors at its end, and of
+    gains.
+    """
+    # The last model of a piece has no sensors: it predicts messages under way.
+    flows = [[*(model.flow for model in models), models[0].unobserved_flow] for models in pieces]
+    gains = [model.gains for models in pieces for model in (*models, models[0])]
+    # Without changes the gains of the last model are left out: they are not used.
+    gains = gains if len(pieces) > 1 else gains[:-1]
+    return stack_tables([flow for piece in flows for flow in piece]), stack_gains(gains)
 
 
 @once_per_scenario

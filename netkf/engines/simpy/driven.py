@@ -27,6 +27,11 @@ class DrivenModel:
         self.start = self.end = 0.0
         self._predicted = False
 
+    @property
+    def undriven(self) -> Any:
+        """The model that knows no input."""
+        return self._model
+
     def __getattr__(self, name: str) -> Any:
         """Return what the input does not change."""
         return getattr(self.__dict__["_model"], name)

@@ -115,6 +115,7 @@ class _Simulation:
         return [
             self._sampling(truth, nodes, sums),
             self._moving_origin(truth, nodes),
+            self._changing(nodes),
             *sensor_processes(*shared, truth, nodes),
             *clock_processes(*shared, self._transmitter, nodes),
         ]
@@ -138,6 +139,13 @@ class _Simulation:
                 node.shift(offset)
             # Payloads under way refer to the old origin too.
             self._transmitter.shift(self._scenario.node_filter, offset)
+
+    def _changing(self, nodes: dict[int, ClockedNode]) -> Process:
+        for k, time in enumerate(self._scenario.followed_changes.tolist()):
+            yield self.timeline.at(time, Rank.REBASE, 0)
+            for node in distinct(nodes):
+                node.predict_to(time)
+                node.moving_model.begin(k + 1)
 
     def slots(self) -> list[Process]:
         """Return the SimPy processes of a scenario in slots."""
@@ -245,11 +253,8 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``."""
-    model: Any = scenario.believed_models[entity]
-    first = scenario.nodes[entity]
     # -1: the pooled filter, which is not a node of the graph.
-    if node < 0:
-        model = scenario.believed_pooled_model
+    model = scenario.model_of(entity)
     if scenario.tells_models:
         model = DrivenModel(scenario, model)
     if isinstance(model, MapModel):
@@ -260,7 +265,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         node,
         entity,
         model,
-        scenario.initial_estimate(first),
+        scenario.initial_estimate(scenario.nodes[entity]),
         scenario.node_infos[entity],
         spread_of(scenario.filter.linearise, scenario.plant.n),
     )

@@ -19,7 +19,7 @@ from netkf.algorithms.filter import (
 )
 from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
-from netkf.algorithms.models import MapModel, first_root
+from netkf.algorithms.models import ChangingFlowModel, MapModel, first_root
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.timeline import Timeline
@@ -75,6 +75,8 @@ class Node:
         """
         self._points = points
         self.node, self.entity, self.info, self.model = node, entity, info, model
+        self.moving_model = model.undriven if isinstance(model, DrivenModel) else model
+        """The model in which matrices may change."""
         self.algorithm, self._timing = algorithm, algorithm.timing
         self._interval = interval_rule(algorithm)
         self.state = algorithm.init(model, *start, info)
@@ -168,6 +170,8 @@ class ClockedNode(Node):
         """Predict the filter to ``time`` (seconds), using the increments since its last event."""
         if self._now >= time:
             return
+        if isinstance(self.moving_model, ChangingFlowModel):
+            self.moving_model.move_to(time)
         if not self._increments:
             self._advance(self._now, time - self._now)
             self._now = time

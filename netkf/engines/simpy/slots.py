@@ -14,6 +14,7 @@ import numpy as np
 import simpy
 
 from netkf.algorithms.filter import Exchange, Reading
+from netkf.algorithms.models import ChangingSlotModel
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope, Node, distinct
 from netkf.engines.simpy.timeline import Timeline
@@ -161,6 +162,7 @@ class SlotNode(Node):
             slot += 1
 
     def _perform(self, stage: Stage, slot: int) -> None:
+        self._follow(slot)
         if stage.kind == "predict":
             # A filtered estimate is of the slot before.
             start = self._schedule.start(slot - (not self._timing.predicts))
@@ -169,6 +171,13 @@ class SlotNode(Node):
             self._update(stage.time)
         else:
             self._close(stage, slot)
+
+    def _follow(self, slot: int) -> None:
+        """Let a model that changes go to the piece of a slot, or to that of the slot before if that
+        is from where a slot is predicted.
+        """
+        if isinstance(self.moving_model, ChangingSlotModel):
+            self.moving_model.move_to(slot if self._timing.predicts else slot - 1)
 
     def read(self, y: FloatArray, H: Any, R: FloatArray) -> None:
         """Store the reading y (p,) of one sensor with its H (p, n), or the function that linearises
@@ -193,6 +202,7 @@ class SlotNode(Node):
 
     def emit(self, exchange: Exchange) -> Any:
         """Return the payload that the node sends in an exchange."""
+        self._follow(exchange.slot)
         if self._uniforms is not None:
             exchange = exchange._replace(uniform=float(self._uniforms.random()))
         self.state, payload = self.algorithm.emit(self.state, exchange)

@@ -78,16 +78,12 @@ class ClockColumns(ErrorColumns):
         self._sent: dict[tuple[int, int, int], Sent] = {}
         self._inboxes: dict[int, list[Sent]] = {}
         self._read: dict[int, tuple[float, FloatArray, IntArray]] = {}
-        self._transitions = Transitions(plant.A, plant.B)
         # The state grows by less than e in between; other filters do not commute with a shift.
         rate = max(np.abs(plant.A).sum(axis=0).max(), CHECKS / scenario.horizon)
-        movable = np.array_equal(scenario.belief[0], plant.A)
+        movable = not len(plant.changes) and np.array_equal(scenario.belief[0], plant.A)
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
-        gaps = np.unique(np.diff(np.unique([0.0, *self._samples, *run.times.tolist()])))
-        laws = zip(*self._transitions.laws(gaps), strict=True)
-        # F and the root of the noise of the plant, by gap between readings or samples.
-        self._laws = dict(zip(gaps.tolist(), laws, strict=True))
-        self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators)
+        self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
+        self._begin_piece(0)
         index = scenario.topology.index
         self._index = index
         clock = cast(Any, scenario.network.activation)
@@ -100,20 +96,45 @@ class ClockColumns(ErrorColumns):
             for w in range(links.first[h], links.first[h + 1])
         }
 
+    def _begin_piece(self, piece: int) -> None:
+        """Take the laws of a piece of the plant, from its first instant on."""
+        scenario, plant = self._scenario, cast(Any, self._scenario.plant).pieces[piece]
+        if piece < len(scenario.model_pieces):
+            self._filters.clocked.begin_piece(piece)
+        self._transitions = Transitions(plant.A, plant.B)
+        times = np.unique([0.0, *self._changes, *self._samples, *self._run.times.tolist()])
+        gaps = np.unique(np.diff(times))
+        laws = zip(*self._transitions.laws(gaps), strict=True)
+        # F and the root of the noise of the plant, by gap between readings, samples and changes.
+        self._laws = dict(zip(gaps.tolist(), laws, strict=True))
+        self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators, piece)
+        self._piece = piece
+
+    def _pass_changes(self, time: float) -> None:
+        """Move all to each change of the plant up to ``time``, where its next piece begins."""
+        for change in [c for c in self._changes[self._piece :] if c <= time]:
+            self._move_all(change)
+            self._begin_piece(self._piece + 1)
+
+    def _move_all(self, time: float) -> None:
+        self._move_truth(time)
+        self._move_increments(time)
+        for h in range(self.estimators):
+            gap = self._gap(h, time)
+            if gap > 0.0:
+                self._filters.predict(h, gap)
+
     def replay(self) -> Iterator[None]:
         """Repeat the log of the run; yield at each of ``run.times``."""
         rows = iter(zip(*self._log, strict=True))
         row = next(rows, None)
         for until in self._run.times.tolist():
             while row is not None and row[0] <= until:
+                self._pass_changes(row[0])
                 self._apply(*row)
                 row = next(rows, None)
-            self._move_truth(until)
-            self._move_increments(until)
-            for h in range(self.estimators):
-                gap = self._gap(h, until)
-                if gap > 0.0:
-                    self._filters.predict(h, gap)
+            self._pass_changes(until)
+            self._move_all(until)
             yield
 
     def _apply(self, time: float, kind: int, node: int, peer: int, message: int) -> None:
@@ -184,6 +205,7 @@ class ClockColumns(ErrorColumns):
     def _gap(self, h: int, time: float) -> float:
         """Return by how many seconds node h has to be predicted to ``time``, where it is then."""
         self._move_increments(time)
+        self._filters.run.now = time
         gap, self._times[h] = time - self._times[h], time
         return gap
 

@@ -45,7 +45,10 @@ def true_model_row(scenario: Scenario, source: str, matrices: str) -> Assumption
     if not scenario.is_random:
         return TRUE_MODEL, source, None, UNKNOWN_LAW
     same = scenario.filters_know_the_truth
-    return TRUE_MODEL, source, same, matrices if same else "filter.model differs from the truth"
+    wrong = "filter.model differs from the truth"
+    if len(scenario.plant.changes) and not scenario.filter.model.schedule:
+        wrong = "filters do not know that the plant changes, and keep its first matrices"
+    return TRUE_MODEL, source, same, matrices if same else wrong
 
 
 def judge_plant(scenario: Scenario, holds: bool, evidence: str) -> tuple[bool | None, str]:

@@ -108,20 +108,25 @@ def integration_steps(scenario: Scenario) -> int:
     """Return the least number of steps in which errors are propagated; 0 without increments."""
     if scenario.slotted:
         return 0
-    flows = increment_flows(scenario, len(scenario.nodes))
-    return 0 if flows is None else math.ceil(scenario.horizon / flows.unit)
+    pieces = range(len(scenario.diffusion.pieces))
+    flows = [increment_flows(scenario, len(scenario.nodes), piece) for piece in pieces]
+    units = [flow.unit for flow in flows if flow is not None]
+    return math.ceil(scenario.horizon / min(units)) if units else 0
 
 
-def increment_flows(scenario: Scenario, estimators: int) -> IncrementFlows | None:
-    """Return how errors of the first ``estimators`` evolve; None if no sensor has increments."""
+def increment_flows(scenario: Scenario, estimators: int, piece: int = 0) -> IncrementFlows | None:
+    """Return how errors of the first ``estimators`` evolve in a ``piece`` of the plant; None if no
+    sensor has increments.
+    """
     observations = increment_observations(scenario)
     if not any(len(observation.H) for observation in observations):
         return None
     kernels = compiled_kernels(scenario.node_filter, clocked=True)
     if kernels and (kernels.predict, kernels.update) != (standard.predict, standard.update):
         raise TheoryError("the exact errors of this filter are known for sampled sensors")
-    A, Q = scenario.belief
-    plant = (scenario.diffusion.A, scenario.diffusion.B)
+    believed, true = scenario.believed_pieces, scenario.diffusion.pieces[piece]
+    A, Q = believed[min(piece, len(believed) - 1)]
+    plant = true.A, true.B
     B = plant[1] if np.array_equal(plant[1] @ plant[1].T, Q) else square_root(Q)
     if scenario.surprise is not None:
         plant = (plant[0], np.column_stack([plant[1], np.eye(len(A))]))

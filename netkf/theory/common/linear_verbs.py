@@ -205,14 +205,14 @@ class LinearVerbs:
         self.forms, start = forms, filters_at_start(scenario)
         self.estimators, self.n = start.xhat.shape
         with_means = ClockFilters(scenario, kernels, start, messages)
-        self.run, self._p = with_means.run, max(1, rows)
+        self.clocked, self.run, self._p = with_means, with_means.run, max(1, rows)
         self.messages = len(self.run.message)
         pooled = scenario.node_filter.timing.pooled
         records = make_records(
             scenario.node_filter,
             [(np.zeros(self.n), root) for root in start.root],
             scenario.node_infos[:1] if pooled else scenario.node_infos,
-            (scenario.pooled_model,) if pooled else scenario.models,
+            scenario.model_pieces[0],
             links=len(self.run.sender),
             messages=messages,
         )

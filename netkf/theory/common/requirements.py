@@ -10,6 +10,14 @@ from typing import Any
 from netkf.core.errors import ScenarioError
 from netkf.scenario.scenario import Scenario
 
+WITH_TIME = (
+    *("assumptions", "constant_gain_bound", "covariance_bound", "error_covariance"),
+    *("information_level", "leader_agreement", "mean_matching"),
+)
+"""Functions that are given a scenario as it is; all others are about steady states and limits,
+which are those of the plant after all its changes.
+"""
+
 
 def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
     """Return ``functions`` by name, each of which refuses anything but a Scenario first."""
@@ -24,7 +32,9 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the public ``function`` with a check that its first argument is a Scenario."""
+    """Return the public ``function`` with a check that its first argument is a Scenario, of which
+    it gets the last piece where that counts.
+    """
 
     @wraps(function)
     def checked(scenario: Any, *args: Any, **kwargs: Any) -> Any:
@@ -32,7 +42,7 @@ def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[.
         if not isinstance(scenario, Scenario):
             remedy = f"load it first: netkf.theory.{name}(netkf.load(path))"
             raise ScenarioError("", f"theory.{name} takes a netkf.Scenario", scenario, remedy)
-        return function(scenario, *args, **kwargs)
+        return function(scenario if name in WITH_TIME else scenario.last_piece, *args, **kwargs)
 
     # Pickle finds a function by these two names: the wrapper replaces the original under them.
     checked.__module__, checked.__qualname__ = "netkf.theory", name

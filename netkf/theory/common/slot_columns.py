@@ -9,6 +9,7 @@ turned into as few as their rank allows, which leaves the sum of products as it 
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import cast
@@ -50,7 +51,7 @@ class SlotColumns(ErrorColumns):
         self._setup: SlotSetup = slot_setup(scenario)
         self.estimators, self.n = self._setup.estimators, self._setup.n
         plant = scenario.linear_plant
-        self._F, self._noise = plant.F, square_root(plant.Q)
+        self._laws = [(piece.F, square_root(piece.Q)) for piece in plant.pieces]
         self._kernels = replace(kernels, decides=False)
         super().__init__()
         self._fewest = 0
@@ -98,11 +99,12 @@ class SlotColumns(ErrorColumns):
             yield
 
     def _move_truth(self, slot: int) -> None:
-        """Move the true state from ``slot`` to the next."""
-        self._x = np.column_stack([self._F @ self._x, self._noise])
+        """Move the true state from ``slot`` to the next one."""
+        F, noise = self._laws[bisect.bisect_right(self._scenario.slot_plant.change_slots, slot)]
+        self._x = np.column_stack([F @ self._x, noise])
         if self._scenario.surprise is not None:
             before, after = self._scenario.surprise.states(np.array([slot, slot + 1]))
-            self._x[:, MEAN] += after - self._F @ before
+            self._x[:, MEAN] += after - F @ before
         self._fit(self._x.shape[1])
 
     def _fit(self, columns: int) -> None:

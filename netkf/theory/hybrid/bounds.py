@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -60,6 +61,8 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
         raise TheoryError("times must be a list of finite numbers that is not empty")
     if (np.diff(instants) < 0.0).any() or instants[0] < 0.0:
         raise TheoryError("times must be increasing and not negative")
+    if len(scenario.plant.changes):
+        return _bound_over_pieces(scenario, instants)
     equations = coupled_riccati(scenario)
     if equations.jumps and instants[-1] > scenario.horizon:
         raise TheoryError("samples at known times are known up to the horizon")
@@ -71,6 +74,38 @@ def covariance_bound(scenario: Scenario, times: Any) -> FloatArray:
     if not np.abs(P).max() < OVERFLOW:
         raise TheoryError(f"Tanwani's H(12) grows beyond {OVERFLOW:g} before {instants[-1]:g} s")
     return P
+
+
+def _bound_over_pieces(scenario: Scenario, times: FloatArray) -> FloatArray:
+    """Return the bound (T, N, n, n) of a plant that changes: each piece begins with the bound at
+    the end of the one before it.
+    """
+    edges, bounds = [0.0, *scenario.plant.changes.tolist(), math.inf], []
+    cov: tuple[FloatArray, ...] | None = None
+    for k, (start, end) in enumerate(itertools.pairwise(edges)):
+        piece = scenario.piece(k, cov)
+        equations = coupled_riccati(piece)
+        if equations.talks and equations.delay > 0.0:
+            raise TheoryError(
+                "Tanwani's H(12) with delays is not known across changes of the plant, where "
+                "messages are under way"
+            )
+        if equations.jumps:
+            raise TheoryError(
+                "Tanwani's H(12) with samples at known times is not known across changes of the "
+                "plant"
+            )
+        inside = times[(times >= start) & (times < end)] - start
+        last = [end - start] if end <= times[-1] else []
+        moments = np.concatenate([inside, last])
+        if not moments.size:
+            break
+        bound = covariance_bound(piece, moments)
+        bounds.append(bound[: len(inside)])
+        cov = tuple(bound[-1])
+        if piece.node_filter.timing.pooled:
+            cov = cov[:1]
+    return np.concatenate(bounds)
 
 
 def _solve_coupled(packed: PackedRiccati, times: FloatArray) -> FloatArray:

@@ -1,0 +1,355 @@
+"""Plants that change at stated times: both engines against the textbook recursions, in which the
+matrices of the piece that holds stand for those of the plant.
+"""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import netkf
+from netkf.scenario.reading import from_table
+
+ENGINES = ("simpy", "compiled")
+H, R = np.array([[1.0, 0.3]]), np.array([[0.4]])
+F = [np.array([[1.0, 0.4], [-0.1, 0.9]]), np.array([[0.7, -0.5], [0.6, 0.8]]), 0.95 * np.eye(2)]
+Q = [np.array([[0.2, 0.05], [0.05, 0.1]]), np.array([[0.05, 0.0], [0.0, 0.6]]), np.eye(2)]
+CHANGES = (6, 13)  # slots
+SCHEDULE = [
+    {"from": 3.0, "F": F[1].tolist(), "Q": Q[1].tolist()},
+    {"from": 6.5, "F": F[2].tolist(), "Q": Q[2].tolist()},
+]
+
+
+def slots(kind, folder=None, horizon=10.0, **changes):
+    """Three nodes on a line, a slot each half second, with recorded readings if in a ``folder``."""
+    sensor = {"H": H.tolist(), "R": R.tolist(), "nodes": [0, 1, 2]}
+    plant = {"kind": "linear", "cov": np.eye(2).tolist(), "F": F[0].tolist(), "Q": Q[0].tolist()}
+    if folder is not None:
+        sensor |= {"kind": "recorded", "path": "readings.csv"}
+        plant["kind"] = "unknown"
+    table = {
+        "format": 1,
+        "name": "changes",
+        "horizon": horizon,
+        "probe": 0.5,
+        "plant": {**plant, "period": 0.5, "schedule": SCHEDULE, **changes.pop("plant", {})},
+        "sensors": [sensor],
+        "network": {
+            "graph": {"kind": "path", "nodes": 3},
+            "activation": {"kind": "broadcast"},
+            **changes.pop("network", {}),
+        },
+        "filter": {"kind": kind, **changes.pop("filter", {})},
+    }
+    return from_table({**table, **changes}, folder or Path())
+
+
+def record(folder, instants, seed=3):
+    """Readings of all nodes at ``instants``, and their table in the folder."""
+    y = np.random.default_rng(seed).normal(size=(len(instants), 3))
+    rows = [f"{t!r},{i},{float(y[k, i])!r}" for k, t in enumerate(instants) for i in range(3)]
+    (folder / "readings.csv").write_text("\n".join(["t,node,y0", *rows]) + "\n")
+    return y
+
+
+def piece(slot):
+    """The matrices by which slot ``slot`` is predicted to the next one."""
+    k = int(np.searchsorted(CHANGES, slot, side="right"))
+    return F[k], Q[k]
+
+
+def predict(x, P, slot):
+    Fk, Qk = piece(slot)
+    return Fk @ x, Fk @ P @ Fk.T + Qk
+
+
+def update(x, P, y):
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return x + K @ (y - H @ x), (np.eye(2) - K @ H) @ P
+
+
+def agree(run, node, k, x, P, tolerance=1e-9):
+    np.testing.assert_allclose(run.xhat[k, node], x, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(run.P[k, node], P, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_in_slots_local_filters_follow_the_changes(tmp_path, engine):
+    y = record(tmp_path, [0.5 * k for k in range(20)])
+    run = netkf.simulate(slots("local", tmp_path), engine=engine)
+    for node in range(3):
+        x, P = np.zeros(2), np.eye(2)
+        for k in range(1, 20):
+            x, P = update(*predict(x, P, k - 1), y[k, node : node + 1])
+            agree(run, node, k, x, P)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_filters_that_are_predictions_follow_the_changes(tmp_path, engine):
+    # Of the intermittent filter the state of slot k is its prediction from slot k - 1.
+    y = record(tmp_path, [0.5 * k for k in range(20)])
+    run = netkf.simulate(slots("intermittent", tmp_path), engine=engine)
+    for node, heard in enumerate([(0, 1), (0, 1, 2), (1, 2)]):
+        x, P = np.zeros(2), np.eye(2)
+        for k in range(20):
+            agree(run, node, k, x, P)
+            for j in heard:
+                x, P = update(x, P, y[k, j : j + 1])
+            x, P = predict(x, P, k)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_kalman_consensus_filter_follows_the_changes(tmp_path, engine):
+    y = record(tmp_path, [0.5 * k for k in range(20)])
+    filtering = {"epsilon": 0.3, "share_readings": False}
+    run = netkf.simulate(slots("kcf", tmp_path, filter=filtering), engine=engine)
+    states = [(np.zeros(2), np.eye(2)) for _ in range(3)]
+    for k in range(1, 20):
+        priors = [predict(x, P, k - 1) for x, P in states]
+        states = []
+        for i, (x, P) in enumerate(priors):
+            new, updated = update(x, P, y[k, i : i + 1])
+            near = [priors[j][0] - x for j in (i - 1, i + 1) if 0 <= j < 3]
+            term = 0.3 / (1.0 + np.linalg.norm(P)) * P @ np.sum(near, axis=0)
+            states.append((new + term, updated))
+            agree(run, i, k, *states[-1])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_covariance_intersection_in_slots_follows_the_changes(tmp_path, engine):
+    y = record(tmp_path, [0.5 * k for k in range(20)])
+    run = netkf.simulate(slots("diffusion", tmp_path), engine=engine)
+    weights = np.array([[2.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 2.0]]) / 3.0
+    states = [(np.zeros(2), np.eye(2)) for _ in range(3)]
+    # Of this filter, too, the state of slot k is the prediction from slot k - 1.
+    for k in range(1, 20):
+        sent = [predict(*update(*s, y[k - 1, i : i + 1]), k - 1) for i, s in enumerate(states)]
+        inverses = [np.linalg.inv(P) for _, P in sent]
+        states = []
+        for i in range(3):
+            P = np.linalg.inv(sum(w * Y for w, Y in zip(weights[i], inverses, strict=True)))
+            z = sum(w * Y @ x for w, Y, (x, _) in zip(weights[i], inverses, sent, strict=True))
+            states.append((P @ z, P))
+            agree(run, i, k, *states[-1])
+
+
+def test_filters_that_do_not_know_keep_the_first_matrices(tmp_path):
+    record(tmp_path, [0.5 * k for k in range(20)])
+    unaware = slots("diffusion", tmp_path, filter={"model": {"schedule": False}})
+    unchanged = slots("diffusion", tmp_path, plant={"schedule": []})
+    for engine in ENGINES:
+        runs = [netkf.simulate(s, engine=engine) for s in (unaware, unchanged)]
+        np.testing.assert_array_equal(runs[0].P, runs[1].P)
+        np.testing.assert_array_equal(runs[0].xhat, runs[1].xhat)
+
+
+SLOT_FILTERS = {
+    "central": {},
+    "local": {},
+    "intermittent": {},
+    "kcf": {},
+    "diffusion": {},
+    "diffusion-kalman": {},
+    "icf": {},
+    "hcmci": {},
+    "one-bit": {},
+    "push-sum": {"gamma": 3, "delta": 4.0},
+    "push-sum running": {"gamma": 4, "delta": 4.0, "running_sums": True},
+    "event-triggered ci": {"trigger": "consensus"},
+    "event-triggered": {"trigger": "stochastic", "Y": 1.0, "inner": {"kind": "intermittent"}},
+    "belief-propagation": {"memory": "slot"},
+    "track-fusion ici": {"rule": "ici"},
+    "track-fusion cross": {"rule": "cross-covariance"},
+    "constant-gain": {"gain": [[0.4], [0.2]]},
+}
+
+
+def make_of(name):
+    kind, filtering = name.split()[0], dict(SLOT_FILTERS[name])
+    return slots(kind, filter=filtering)
+
+
+@pytest.mark.parametrize("name", SLOT_FILTERS)
+def test_both_engines_agree_in_slots(name):
+    s = make_of(name)
+    a, b = (netkf.simulate(s, engine=engine) for engine in ENGINES)
+    assert a.events.equals(b.events)
+    np.testing.assert_allclose(a.x, b.x, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(a.P, b.P, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(a.xhat, b.xhat, rtol=1e-10, atol=1e-12)
+
+
+A = [np.array([[0.0, 1.0], [-0.3, -0.1]]), np.array([[-0.5, -2.0], [2.0, 0.1]]), -0.2 * np.eye(2)]
+B = [np.array([[0.1], [0.7]]), np.array([[0.3, 0.0], [0.1, 0.5]]), np.array([[0.6], [0.0]])]
+TIMES = (2.3, 4.1)
+CLOCKED = [{"from": t, "A": A[k + 1].tolist(), "B": B[k + 1].tolist()} for k, t in enumerate(TIMES)]
+
+
+def clocks(kind, folder=None, **changes):
+    """Three nodes on a line in continuous time."""
+    sensor = {"H": H.tolist(), "R": R.tolist(), "nodes": [0, 1, 2]}
+    plant = {"kind": "diffusion", "cov": np.eye(2).tolist(), "A": A[0].tolist(), "B": B[0].tolist()}
+    if folder is not None:
+        sensor |= {"kind": "recorded", "path": "readings.csv"}
+        plant["kind"] = "unknown"
+    else:
+        sensor |= changes.pop("sensor", {"sampling": {"kind": "poisson", "rate": 2.0}})
+    table = {
+        "format": 1,
+        "name": "changes",
+        "horizon": 6.0,
+        "probe": 0.5,
+        "plant": {**plant, "schedule": CLOCKED, **changes.pop("plant", {})},
+        "sensors": [sensor],
+        "network": {
+            "graph": {"kind": "path", "nodes": 3},
+            "activation": {"kind": "poisson", "at": "nodes", "rate": 2.0},
+            **changes.pop("network", {}),
+        },
+        "filter": {"kind": kind, **changes.pop("filter", {})},
+    }
+    return from_table({**table, **changes}, folder or Path())
+
+
+def flow(x, P, start, end):
+    """Van Loan over each piece between ``start`` and ``end``."""
+    edges = [start, *(t for t in TIMES if start < t < end), end]
+    for a, b in itertools.pairwise(edges):
+        k = int(np.searchsorted(TIMES, a, side="right"))
+        block = expm(np.block([[-A[k], B[k] @ B[k].T], [np.zeros((2, 2)), A[k].T]]) * (b - a))
+        Phi = block[2:, 2:].T
+        x, P = Phi @ x, Phi @ P @ Phi.T + Phi @ block[:2, 2:]
+    return x, P
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_under_clocks_local_filters_follow_the_changes(tmp_path, engine):
+    instants = [0.2, 1.7, 2.3, 2.9, 5.5]
+    y = record(tmp_path, instants)
+    run = netkf.simulate(clocks("local", tmp_path), engine=engine)
+    for node in range(3):
+        x, P, now = np.zeros(2), np.eye(2), 0.0
+        for k, t in enumerate(run.times.tolist()):
+            for j, instant in enumerate(instants):
+                if now < instant <= t:
+                    x, P = update(*flow(x, P, now, instant), y[j, node : node + 1])
+                    now = instant
+            agree(run, node, k, *flow(x, P, now, t))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_late_readings_are_used_exactly_across_changes(tmp_path, engine):
+    # Messages take 1.1 s, and all changes lie between a reading and its arrival.
+    instants = [0.3, 1.9, 2.1, 3.9, 4.05]
+    y = record(tmp_path, instants)
+    network = {
+        "activation": {"kind": "readings"},
+        "channel": {"delay": {"kind": "constant", "seconds": 1.1}},
+    }
+    run = netkf.simulate(clocks("intermittent", tmp_path, network=network), engine=engine)
+    for node, heard in enumerate([(0, 1), (0, 1, 2), (1, 2)]):
+        for k, t in enumerate(run.times.tolist()):
+            x, P, now = np.zeros(2), np.eye(2), 0.0
+            for j, instant in enumerate(instants):
+                used = [i for i in heard if instant + 1.1 * (i != node) <= t]
+                if used:
+                    x, P = flow(x, P, now, instant)
+                    now = instant
+                for i in used:
+                    x, P = update(x, P, y[j, i : i + 1])
+            agree(run, node, k, *flow(x, P, now, t))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("delay", [0.0, 0.7])
+@pytest.mark.parametrize("kind", ["hybrid", "gossip", "covariance-intersection"])
+def test_messages_under_way_are_predicted_over_changes(tmp_path, kind, delay, engine):
+    instants = [0.3, 1.9, 2.1, 3.9, 4.05]
+    y = record(tmp_path, instants)
+    channel = {"delay": {"kind": "constant", "seconds": delay}} if delay else {}
+    at = "links" if kind == "gossip" else "nodes"
+    activation = {"kind": "poisson", "at": at, "rate": 2.0}
+    options = {} if kind == "gossip" else {"epsilon": 0.3}
+    network = {"activation": activation, "channel": channel}
+    s = clocks(kind, tmp_path, network=network, filter=options)
+    run = netkf.simulate(s, engine=engine)
+    states, sent, inbox = [(np.zeros(2), np.eye(2), 0.0) for _ in range(3)], {}, {}
+
+    def move(i, t):
+        x, P, now = states[i]
+        states[i] = (*flow(x, P, now, t), t)
+        return states[i][:2]
+
+    rows, k, used = list(run.events.itertuples()), 0, set()
+    for t in run.times.tolist():
+        while k < len(rows) and rows[k].t <= t:
+            e = rows[k]
+            k += 1
+            if e.kind == "sense":
+                j = instants.index(e.t)
+                states[e.node] = (*update(*move(e.node, e.t), y[j, e.node : e.node + 1]), e.t)
+            elif e.kind == "send":
+                sent[e.node, e.peer, e.message] = (*move(e.node, e.t), e.t)
+            elif e.kind == "deliver":
+                inbox.setdefault(e.node, {})[e.peer] = sent[e.peer, e.node, e.message]
+            elif e.kind == "absorb":
+                own = move(e.node, e.t)
+                messages = [inbox[e.node][peer] for peer in sorted(inbox[e.node])]
+                heard = [flow(x, P, start, e.t) for x, P, start in messages]
+                del inbox[e.node]
+                states[e.node] = (*combine(kind, own, heard), e.t)
+        for i in range(3):
+            agree(run, i, used.add(t) or len(used) - 1, *move(i, t))
+
+
+def combine(kind, own, heard):
+    if kind == "gossip":
+        return heard[-1]
+    weights = [1.0 - 0.3 * len(heard), *[0.3] * len(heard)]
+    terms = list(zip(weights, [own, *heard], strict=True))
+    if kind == "hybrid":
+        return sum(w * x for w, (x, _) in terms), sum(w * P for w, (_, P) in terms)
+    P = np.linalg.inv(sum(w * np.linalg.inv(P) for w, (_, P) in terms))
+    return P @ sum(w * np.linalg.inv(Pj) @ x for w, (x, Pj) in terms), P
+
+
+CLOCK_FILTERS = {
+    "central": {},
+    "local": {},
+    "hybrid": {"epsilon": 0.3},
+    "gossip": {},
+    "covariance-intersection": {"epsilon": 0.3},
+    "diffusion": {},
+    "kcf": {},
+    "icf": {},
+    "intermittent": {},
+    "event-triggered": {"trigger": "consensus"},
+    "track-fusion": {"rule": "ici"},
+}
+SAMPLES_ONLY = ("kcf", "icf", "intermittent", "event-triggered")
+INCREMENTS = {"sampling": "continuous"}
+DELAYS = {"none": {"kind": "none"}, "random": {"kind": "exponential", "mean": 0.4}}
+CASES = [
+    (kind, sensor, delay)
+    for kind in CLOCK_FILTERS
+    for sensor in ("samples", "increments")
+    for delay in DELAYS
+    if sensor == "samples" or kind not in SAMPLES_ONLY
+]
+
+
+@pytest.mark.parametrize(("kind", "sensor", "delay"), CASES)
+def test_both_engines_agree_under_clocks(kind, sensor, delay):
+    at = {"intermittent": "readings", "gossip": "links"}.get(kind, "nodes")
+    activation = {"kind": at} if at == "readings" else {"kind": "poisson", "at": at, "rate": 2.0}
+    network = {"activation": activation, "channel": {"delay": DELAYS[delay]}}
+    own = {"sensor": INCREMENTS} if sensor == "increments" else {}
+    s = clocks(kind, filter=CLOCK_FILTERS[kind], network=network, **own)
+    a, b = (netkf.simulate(s, engine=engine) for engine in ENGINES)
+    assert a.events.equals(b.events)
+    np.testing.assert_allclose(a.x, b.x, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(a.P, b.P, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(a.xhat, b.xhat, rtol=1e-9, atol=1e-11)
