@@ -126,10 +126,25 @@ def _shift(
 
 
 class MovedFunction:
-    """What linearises the readings of a sensor, for estimates that are counted from ``m`` (n,)."""
+    """What linearises the readings of a sensor, for estimates that are counted from ``m`` (n,), see
+    ``nonlinear.Linearised``.
+    """
 
     def __init__(self, function: Any, m: FloatArray) -> None:
         self._function, self._m = function, m
+
+    @property
+    def size(self) -> int:
+        """The number p of values of a reading."""
+        return int(self._function.size)
+
+    def value(self, x: FloatArray) -> FloatArray:
+        """Return the reading (p,) without noise at the state x (n,)."""
+        return np.asarray(self._function.value(x + self._m))
+
+    def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
+        """Return the innovation (p,): a reading y (p,) minus the ``expected`` one (p,)."""
+        return np.asarray(self._function.difference(y, expected))
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the reading ``y`` (p,) linearised at the estimate ``xhat`` (n,), and H (p, n)."""
@@ -171,6 +186,10 @@ class MovedReadings:
     def covariance(self, k: int, R: FloatArray) -> FloatArray:
         """Return the covariance of reading number ``k``, see ``covariance_of``."""
         return covariance_of(self._path, k, R)
+
+    def readings_at(self, slot: int, R: FloatArray) -> Any:
+        """Return the readings of a nonlinear sensor in a slot, which no origin changes."""
+        return self._path.readings_at(slot, R)
 
     def several(self, numbers: Sequence[int], x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (S, p) and H (S, p, n) of increasing ``numbers``, states x (S, n)."""

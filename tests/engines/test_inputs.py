@@ -35,6 +35,7 @@ FLOW = {"kind": "diffusion", "A": [[0.05, 0.4], [-0.5, -0.3]], "B": [[0.5, 0.0],
 START = {"mean": [1.0, -1.0], "cov": [[1.0, 0.2], [0.2, 0.8]]}
 SAMPLING = {"kind": "periodic", "period": 0.4, "jitter": 0.1}
 HYBRID = {"kind": "hybrid", "epsilon": 0.3}
+RANGES = [{"kind": "range", "nodes": [0, 2], "positions": [[3.0, -4.0], [60.0, 9.0]], "R": [[0.3]]}]
 
 
 def scenario(filtering, plant, activation, u=INPUT, horizon=8.0, model=None, **more):
@@ -197,6 +198,21 @@ def test_kcf_replays_recorded_readings_of_a_driven_plant(engine, tmp_path):
     assert (use["rows"], use["unused"]) == (8, 1)  # 3.9 is over in slot 4
 
 
+@pytest.mark.parametrize("linearise", ["ekf", "ckf"])
+@pytest.mark.parametrize("recorded", [False, True])
+def test_both_engines_read_ranges_of_a_driven_plant(linearise, recorded, tmp_path):
+    driven = scenario(
+        {**ALL["kcf"], "linearise": linearise}, LINEAR, {"kind": "broadcast"}, sensors=RANGES
+    )
+    if recorded:
+        rows = [f"{k},{node},{10.0 + k + node}" for k in range(1, 9) for node in (0, 2)]
+        (tmp_path / "y.csv").write_text("\n".join(["t,node,y0", *rows]) + "\n")
+        object.__setattr__(driven, "_folder", tmp_path)
+        driven = driven.replace({"sensors.0.path": "y.csv"})
+    run = assert_agree(driven)
+    assert np.abs(run.x).max() > 10.0
+
+
 @pytest.mark.parametrize("slotted", [True, False])
 @pytest.mark.parametrize("truth", ["drawn", "recorded"])
 def test_ranges_of_a_driven_plant_are_linearised_where_its_state_is(slotted, truth, tmp_path):
@@ -276,16 +292,21 @@ class Louder(Local):
 
 
 @pytest.mark.parametrize("model", [None, {"R": [[0.1]]}])
-@pytest.mark.parametrize("plant", ["slots", "samples", "increments"])
+@pytest.mark.parametrize("plant", ["slots", "samples", "increments", "ekf", "ukf"])
 def test_a_filter_that_does_not_move_is_told_by_its_model(plant, model):
-    if plant == "slots":
+    if plant in ("slots", "ekf", "ukf"):
         driven = scenario(ALL["kcf"], LINEAR, {"kind": "broadcast"}, model=model)
     else:
         driven = scenario(HYBRID, FLOW, {"kind": "poisson", "rate": 2.0}, model=model)
     if plant == "increments":
         driven = driven.replace({"sensors": [{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.3]]}]})
+    how = {}
+    if plant in ("ekf", "ukf"):
+        driven, how = driven.replace({"sensors": RANGES}), {"linearise": plant}
     plain, moved = (
-        netkf.simulate(driven.replace({"filter": Filtering(cls(), model=driven.filter.model)}))
+        netkf.simulate(
+            driven.replace({"filter": Filtering(cls(), model=driven.filter.model, **how)})
+        )
         for cls in (Plain, Shifted)
     )
     assert plain.events.equals(moved.events)

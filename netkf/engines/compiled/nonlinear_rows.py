@@ -36,6 +36,7 @@ class NonlinearRows(Struct):
     length, functions : (H, p) and (H, p, 3), of the first row of a user's sensor the number of its
         rows, and the addresses of h, its Jacobian and the difference of two readings
     R : (S or 1, H, p, p), the covariance of the noise in each slot, in nonlinear rows
+    origin : (S or 1, n), where states are counted from in each slot
     active : runs side by side that there are, at most L
     distance, weight, center : ``kernels.maps.Spread``
     x, y, value, mean, points, G, J, C, part, matrix, nothing : scratch, (n,), (p,) three times,
@@ -50,6 +51,7 @@ class NonlinearRows(Struct):
     length: np.ndarray
     functions: np.ndarray
     R: FloatArray
+    origin: FloatArray
     active: int
     distance: float
     weight: float
@@ -114,8 +116,8 @@ class NonlinearSetup:
         (_, p), n = self._shape, self._n
         return NonlinearRows(
             kind=self.kind, states=self.states, dimensions=self.dimensions, relative=self.relative,
-            heading=self.heading, length=self.length,
-            functions=self.addresses, R=self.R.copy(), active=active, distance=points.distance,
+            heading=self.heading, length=self.length, functions=self.addresses, R=self.R.copy(),
+            origin=np.zeros((1, n)), active=active, distance=points.distance,
             weight=points.weight, center=points.center, x=np.zeros(n), y=np.zeros(p),
             value=np.zeros(p), mean=np.zeros(p), points=np.zeros((2 * n + 1, p)),
             G=np.zeros((p, n)), J=np.zeros((p, n)), C=np.zeros((p, p)), part=np.zeros(p),
@@ -272,6 +274,15 @@ def subtract_rows(
                 out[i + k] = rows.part[k]
 
 
+@kernel(inlined=True)
+def move_state(rows: NonlinearRows, x: FloatArray, k: int, q: int, s: int) -> None:
+    """Write the state ``x[k]`` (n, L) of lane ``q`` in slot number ``s`` of the plan into
+    ``rows.x``, in the coordinates of the plant.
+    """
+    for j in range(len(rows.x)):
+        rows.x[j] = x[k, j, q] + rows.origin[min(s, len(rows.origin) - 1), j]
+
+
 @kernel
 def linearise_rows(rows: NonlinearRows, record: Any, h: int, run: Any, s: int) -> None:
     """Replace the nonlinear rows of the reading of filter ``h`` in slot number ``s`` of the plan by
@@ -279,15 +290,14 @@ def linearise_rows(rows: NonlinearRows, record: Any, h: int, run: Any, s: int) -
     """
     n, p, r = len(run.size), rows.kind.shape[1], run.first_y + h
     for q in range(rows.active):
-        for j in range(n):
-            rows.x[j] = record.xhat[h, j, q]
+        move_state(rows, record.xhat, h, q, s)
         for i in range(p):
             rows.y[i] = run.y[r, i, q]
             for k in range(p):
                 rows.C[i, k] = rows.R[min(s, len(rows.R) - 1), h, i, k]
         read_rows(rows, h, run.H, r, q, rows.mean)
         if rows.distance > 0.0:
-            _use_points(rows, record, h, run.H, r, q)
+            _use_points(rows, record, h, run.H, r, q, s)
         else:
             differentiate_rows(rows, h, run.H, r, q)
         subtract_rows(rows, h, rows.y, rows.mean, rows.value)
@@ -303,10 +313,14 @@ def linearise_rows(rows: NonlinearRows, record: Any, h: int, run: Any, s: int) -
 
 
 @kernel
-def _use_points(rows: NonlinearRows, record: Any, h: int, H: FloatArray, r: int, q: int) -> None:
+def _use_points(
+    rows: NonlinearRows, record: Any, h: int, H: FloatArray, r: int, q: int, s: int
+) -> None:
     n, p, points = rows.J.shape[1], rows.kind.shape[1], rows.points
     for k in range(1, 2 * n + 1):
         set_point(record.xhat, record.root, h, q, rows.distance, k, rows.x)
+        for j in range(n):
+            rows.x[j] += rows.origin[min(s, len(rows.origin) - 1), j]
         read_rows(rows, h, H, r, q, rows.value)
         subtract_rows(rows, h, rows.value, rows.mean, points[k])
     for i in range(p):
@@ -385,8 +399,7 @@ def add_values(
     for b in range(x.shape[0]):
         for s in range(x.shape[1]):
             for q in range(rows.active):
-                for j in range(x.shape[2]):
-                    rows.x[j] = x[b, s, j, q]
+                move_state(rows, x[b], s, q, s)
                 for h in range(filters):
                     r = (b * x.shape[1] + s) * filters + h
                     read_rows(rows, h, H, r, q, rows.value)

@@ -516,6 +516,10 @@ class SlotRuns:
             MANY, setup.sensors, noise, normal_ziggurat(), x, regressor_states, scratch, y, H
         )
         if self._nonlinear is not None and setup.nonlinear is not None:
+            responses = self._scenario.input_responses
+            if responses is not None and responses.believed is not None:
+                slots_of_all = np.arange(self._slot, self._slot + count)
+                self._nonlinear.origin = responses.believed.states(slots_of_all)
             flat_y, flat_H = y.reshape(-1, *y.shape[3:]), H.reshape(-1, *H.shape[3:])
             add_values(self._nonlinear, x, flat_y, flat_H, setup.nonlinear.drawn)
             setup.nonlinear.raise_error()
