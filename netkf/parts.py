@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.belief_propagation import BeliefPropagation
+from netkf.algorithms.block_intersection import BlockIntersection
 from netkf.algorithms.consensus_innovations import ConsensusInnovations
 from netkf.algorithms.constant_gain import ConstantGain
 from netkf.algorithms.covariance_intersection import CovarianceIntersection
@@ -24,6 +25,7 @@ from netkf.algorithms.filter import (
     Model,
     NetworkInfo,
     NodeInfo,
+    PairReading,
     Reading,
     State,
 )
@@ -140,6 +142,7 @@ __all__ = [
     "BeliefPropagation",
     "Bernoulli",
     "Block",
+    "BlockIntersection",
     "Broadcast",
     "Central",
     "Chain",
@@ -204,6 +207,7 @@ __all__ = [
     "OnReadings",
     "OneBit",
     "OptimisedIntersection",
+    "PairReading",
     "PathGraph",
     "PerLink",
     "Periodic",

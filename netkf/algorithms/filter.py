@@ -89,6 +89,8 @@ class NodeInfo(NamedTuple):
     senders : ids of the nodes that it can hear, sorted
     network : the whole network, if ``Needs.network`` of the filter says so
     rows : the most rows that a reading of any node has
+    blocks : its blocks of ``[[plants]]`` at their places in its own state (plants.blocks.Place)
+    alone : no other node estimates one of these
     sampled : H (p, n) and R (p, p) of its sensors that take samples (in slots: of all) together, as
               the node believes them, where they are fixed; p = 0 without such sensors
     """
@@ -105,6 +107,8 @@ class NodeInfo(NamedTuple):
     network: NetworkInfo | None = None
     rows: int = 1
     sampled: tuple[FloatArray, FloatArray] = (np.zeros((0, 0)), np.zeros((0, 0)))
+    blocks: tuple[Any, ...] = ()
+    alone: bool = True
 
 
 class Exchange(NamedTuple):
@@ -137,18 +141,37 @@ class Message(NamedTuple):
     age: float
 
 
+class PairReading(NamedTuple):
+    """A reading of a block that the node estimates and of one that it does not.
+
+    other : name and owner (id) of the latter
+    y, R : values (p,), and their noise covariance (p, p)
+    H : ``H(x, x_other)`` returns y linearised at the estimates x (n,) of the node and x_other (n',)
+        of the other block: z (p,), and H (p, n) and H_other (p, n') with ``z = H x + H_other
+        x_other + v``
+    """
+
+    other: tuple[str, int]
+    y: FloatArray
+    R: FloatArray
+    H: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+
+
 class Reading(NamedTuple):
     """A sample ``y = H x + v``, cov(v) = R.
 
     y : values (p,); p may be 0
     H, R : (p, n) and (p, p) as the node believes them
     time : when it was taken, in seconds
+    pairs : readings of this instant that also depend on blocks which the node does not estimate,
+            for filters that say so (``Needs.blocks``)
     """
 
     y: FloatArray
     H: FloatArray
     R: FloatArray
     time: float = math.nan
+    pairs: tuple[PairReading, ...] = ()
 
 
 class Increments(NamedTuple):

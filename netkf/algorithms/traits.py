@@ -32,6 +32,8 @@ class Needs:
                           sensor must be heard by another one
     network : its nodes are given ``NodeInfo.network``
     one_way : in slots links may go one way, and the graph need not be connected
+    blocks : its nodes may estimate different blocks of ``[[plants]]``, and it knows what to do with
+             readings of a block that a node does not estimate (``Reading.pairs``)
     check : ``check(scenario)`` raises ScenarioError where settings of the filter do not fit a
             ``netkf.Scenario``
     notes : ``notes(scenario)`` returns notes on the filter for the user, one line each
@@ -50,6 +52,7 @@ class Needs:
     reads_what_it_sends: bool = False
     network: bool = False
     one_way: bool = False
+    blocks: bool = False
     check: Callable[[Any], None] | None = None
     notes: Callable[[Any], tuple[str, ...]] | None = None
 

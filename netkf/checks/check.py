@@ -57,6 +57,7 @@ from netkf.runs.simulate import choose_engine, require_scenario, simulate
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
+from netkf.theory.common.requirements import require_whole_state
 from netkf.trace.run import Run
 
 if TYPE_CHECKING:
@@ -388,6 +389,7 @@ def check(
     Raises TheoryError if nothing is promised, ScenarioError for bad arguments.
     """
     require_scenario(scenario, "check")
+    require_whole_state(scenario)
     count = integer(low=MIN_RUNS)("runs", runs)
     confident = number(above=0.0, below=1.0)("confidence", confidence)
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)

@@ -101,8 +101,9 @@ class Engine(ABC):
 def batch_sink(scenario: Scenario, replicas: range) -> BatchSink:
     """Return a sink that collects the samples of the runs ``replicas`` in one RunBatch."""
     # A pooled filter is sampled once, not once for each node.
-    filters = 1 if scenario.node_filter.timing.pooled else len(scenario.nodes)
-    return BatchSink(replicas, scenario.times, (filters, scenario.plant.n))
+    pooled = scenario.node_filter.timing.pooled and scenario.views is None
+    filters = 1 if pooled else len(scenario.nodes)
+    return BatchSink(replicas, scenario.times, (filters, scenario.plant.n, scenario.width))
 
 
 def broken(

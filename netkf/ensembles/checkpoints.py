@@ -182,7 +182,7 @@ class BlockCheckpoints:
 
     def _has_form(self, statistics: RunStatistics) -> bool:
         """Return True if the arrays of ``statistics`` have the shapes and types they should."""
-        count, n = len(self._scenario.nodes), self._scenario.plant.n
+        count, n = len(self._scenario.nodes), self._scenario.width
         # Columns and rows of moments; those that are not listed have one row.
         columns = {"samples": count * (n * (n + 1) + 1), "averages": 3 * (count + 1)}
         rows = {"samples": len(self._scenario.times)}
@@ -199,7 +199,7 @@ class BlockCheckpoints:
 
     def _has_numbers(self, statistics: RunStatistics) -> bool:
         """Return True if ``statistics`` of the right form have no nan or impossible count."""
-        n, u = self._scenario.plant.n, self._scenario.plant.n * (self._scenario.plant.n + 1) // 2
+        n, u = self._scenario.width, self._scenario.width * (self._scenario.width + 1) // 2
         moments = [getattr(statistics, name) for name in PARTS]
         moments += [sums for sums, _ in statistics.conserved.values()]
         counts = [statistics.totals, *(quantity.size for quantity in moments)]
@@ -225,7 +225,7 @@ class BlockCheckpoints:
     def _restore_trace(self, arrays: Any, k: int) -> Trace:
         """Return the k-th trace of a block from its stored ``arrays``."""
         trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
-        T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.plant.n
+        T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.width
         # replica, log, times, x, xhat, P, error
         shapes = [(), (len(trace.log),), (T,), (T, n), (T, N, n), (T, N, n, n), (T, N, n)]
         types = [np.dtype(np.int64), EVENT, *[np.dtype(np.float64)] * 5]

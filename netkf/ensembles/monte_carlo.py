@@ -146,9 +146,12 @@ def ensemble_of(scenario: Scenario, statistics: RunStatistics, seed: int, engine
     # Columns of the samples: for each node the upper triangles of P and e e', and NEES.
     samples, shape = statistics.samples, (len(scenario.times), len(scenario.nodes), -1)
     means = np.where(samples.size[:, None] > 0.0, samples.mean, np.nan)
-    n = scenario.plant.n
+    n = scenario.width
     mean_P, mean_error, mean_nees = _unpack_samples(means.reshape(shape), n)
     se_P, se_error, se_nees = _unpack_samples(samples.standard_error().reshape(shape), n)
+    for k, view in enumerate(scenario.views or ()):
+        for matrices in (mean_P, mean_error, se_P, se_error):
+            matrices[:, k, len(view) :] = matrices[:, k, :, len(view) :] = np.nan
     for errors in (mean_error, mean_nees, se_error, se_nees):
         errors[scenario.times >= statistics.rounding_from] = np.nan
     # Numbers of messages in all runs, from their means over runs.

@@ -16,7 +16,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Size, Struct, sized
 from netkf.trace.batch import RunBatch
-from netkf.trace.nees import blurred_from, nees_of_runs
+from netkf.trace.nees import blurred_from, nees_of_runs, without_padding
 
 NUMBERS_AT_ONCE = 512
 """Number of columns, over all samples, of a run that are processed together: 4 KiB."""
@@ -79,6 +79,11 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     P, error = np.ascontiguousarray(batch.P), np.ascontiguousarray(batch.error)
     exact = batch.exact_errors
     rounding_from = blurred_from(batch.times, batch.x, P, error, batch.lengths, exact)
+    # States that a node does not estimate: error 0 and variance 1 for the NEES, 0 for averages.
+    whole_error, whole_P = without_padding(error, P)
+    of_nees = whole_error.reshape(runs, -1, n), whole_P.reshape(runs, -1, n, n)
+    if whole_error is not error:
+        error, P = whole_error, np.where(np.isnan(P) & ~np.isnan(whole_P), 0.0, P)
     flat = error.reshape(runs, -1, n), P.reshape(runs, -1, n, n)
     bounds = np.array([0, *(piece.stop for piece in pieces)])
     columns, depth = n * (n + 1) + 1, int(np.diff(bounds).max()).bit_length() + 1
@@ -86,7 +91,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     samples = Samples(
         P=flat[1],
         error=flat[0],
-        nees=nees_of_runs(*flat, kept * filters),
+        nees=nees_of_runs(*of_nees, kept * filters),
         kept=kept,
         spans=_averaged_spans(batch, kept, rounding_from),
         averages=np.zeros((runs, filters, 3)),

@@ -133,7 +133,7 @@ def _read_averages(rows: list[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
 
 
 def _read_samples(path: Path, scenario: Scenario) -> dict[str, Any]:
-    n, N = scenario.plant.n, len(scenario.nodes)
+    n, N = scenario.width, len(scenario.nodes)
     names = ensemble_columns(n)
     if not scenario.plant.truth_known:
         # Time, node, runs, and means and standard errors of P only: no errors, no NEES.

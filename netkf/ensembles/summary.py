@@ -64,7 +64,7 @@ def summarise_ensemble(
 
 
 def _chi_square(scenario: Scenario, statistics: RunStatistics) -> dict[str, float]:
-    n, runs = scenario.plant.n, statistics.runs
+    n, runs = scenario.width, statistics.runs
     low, high = nees_bounds(n, runs)
     clear = (scenario.times > 0.0) & (scenario.times < statistics.rounding_from)
     usable = clear & (statistics.samples.size == runs)

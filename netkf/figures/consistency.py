@@ -40,7 +40,7 @@ def nees_figure(data: FigureData) -> Picture:
     data.require_samples()
     data.require_truth()
     data.require_covariance()
-    n = data.scenario.plant.n
+    n = data.scenario.width
     low, high = nees_bounds(n, data.runs)
     values = data.nees[data.averaged]
     values = values[np.isfinite(values)]

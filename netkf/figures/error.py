@@ -184,7 +184,7 @@ def ratios_figure(data: FigureData) -> Picture:
     scale = 1.0
     if not rows:
         data.require_truth()
-        key, n = "mean_nees", data.scenario.plant.n
+        key, n = "mean_nees", data.scenario.width
         label, reference_label = f"mean NEES / n, n = {n}", "errors as P says"
         scale = 1.0 / n
         rows = [row for row in data.node_averages if _is_known(row.get(key))]

@@ -152,7 +152,7 @@ def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
 
 def draw_nees(axes: Any, data: FigureData) -> None:
     """Draw NEES over time with its interval if P is exact, or a message if it is unknown."""
-    values, n, runs = data.nees, data.scenario.plant.n, data.runs
+    values, n, runs = data.nees, data.scenario.width, data.runs
     if not np.isfinite(values).any():
         draw_message(axes, "NEES is unavailable: it needs an error and a regular P")
         return

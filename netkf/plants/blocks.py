@@ -27,6 +27,7 @@ from netkf.core.fields import (
     text,
 )
 from netkf.core.instants import TimeGrid
+from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import Exogenous, Input
@@ -88,22 +89,6 @@ class Block(Component):
     plant: Plant = field(instance_of(Diffusion, LinearPlant))
     nodes: tuple[int, ...] | None = field(list_of(node_id(), "node ids"), default=None)
     coupling: tuple[Coupling, ...] = field(_couplings, default=())
-
-
-class Place(NamedTuple):
-    """A block of the stacked state: ``name``, the ``node`` (id) that owns it, None if all share it,
-    and its entries ``first`` to ``first + n`` - 1.
-    """
-
-    name: str
-    node: int | None
-    first: int
-    n: int
-
-    @property
-    def entries(self) -> slice:
-        """Its entries in the stacked state."""
-        return slice(self.first, self.first + self.n)
 
 
 class Layout:
@@ -223,7 +208,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
         _check_shapes(k, block)
     mean = np.concatenate([plant.start_mean for plant in plants])
     cov = block_diagonal([plant.start_cov for plant in plants])
-    parts = {
+    parts: dict[str, Any] = {
         **_stacked_matrices(blocks, layout),
         **{"mean": mean, "cov": cov, "input": _stacked_input(blocks, layout)},
         "schedule": _stacked_schedule(blocks, layout),
@@ -305,7 +290,7 @@ def _stacked_input(blocks: Sequence[Block], layout: Layout) -> StackedInput | No
             inputs.append(one)
             parts.append(np.zeros((layout.n, one.m)))
             parts[-1][place.entries] = one.G
-    return StackedInput(inputs=inputs, G=np.concatenate(parts, axis=1)) if inputs else None
+    return StackedInput(inputs=tuple(inputs), G=np.concatenate(parts, axis=1)) if inputs else None
 
 
 def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:

@@ -151,7 +151,7 @@ class SineInput(Input):
         blocks = [np.array([[0.0, w], [-w, 0.0]]) for w in omega]
         C = np.asarray(np.kron(np.diag(amplitude), [1.0, 0.0]), dtype=np.float64)
         z = np.stack([np.sin(phase), np.cos(phase)], axis=1).reshape(1, -1)
-        return Exogenous(np.zeros(1), block_diagonal(blocks), C, z)
+        return Exogenous(np.zeros(1), block_diagonal(blocks), np.asarray(C), z)
 
     def values(self, times: FloatArray) -> FloatArray:
         """Return u (K, m) at K ``times`` (K,) in seconds."""

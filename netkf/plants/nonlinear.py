@@ -64,6 +64,11 @@ class Linearised:
         """The number p of values of a reading."""
         return int(self._present.sum())
 
+    def support(self, n: int) -> np.ndarray:
+        """Return the entries (k,) of a state of ``n`` that the reading depends on."""
+        entries: np.ndarray = self._sensor.support(n, self._node)
+        return entries
+
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the reading ``y`` (p,) of a sensor linearised at the estimate ``xhat`` (n,):
         ``y - h(xhat) + J xhat`` (p,) and the Jacobian J (p, n), which a linear filter uses as
@@ -180,6 +185,12 @@ class NonlinearSensor(Sensor):
 
     def check_state(self, n: int) -> None:
         """Raise ScenarioError if the sensor cannot read a state of n components."""
+
+    def support(self, n: int, node: int) -> np.ndarray:
+        """Return the entries (k,) of a state of ``n`` that readings on ``node`` (id) depend on: by
+        default all.
+        """
+        return np.arange(n)
 
     def located(self, positions: dict[int, tuple[float, float]] | None) -> NonlinearSensor:
         """Return the sensor with its nodes at the ``positions`` of the graph, coordinates by node
@@ -346,6 +357,10 @@ class PositionedSensor(NonlinearSensor):
         if self.R.shape != (self.rows, self.rows):
             rule = f"must be {self.rows} x {self.rows}"
             raise ScenarioError("R", rule, "{} x {}".format(*self.R.shape), "add or remove")
+
+    def support(self, n: int, node: int) -> np.ndarray:
+        """Return the entries (k,) of the state that readings depend on: position and heading."""
+        return np.unique([*self.states, *(() if self.heading is None else (self.heading,))])
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
         """Return the position (d,) of the target in the state x (n,) relative to ``node`` (id);

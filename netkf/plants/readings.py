@@ -397,7 +397,7 @@ class Stacked:
     """A function that linearises several readings, each by its own function of ``parts``."""
 
     def __init__(self, parts: Sequence[Any]) -> None:
-        self._parts = parts
+        self.parts = parts
 
     def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the readings ``y`` (p,) linearised at the estimate ``xhat`` (n,), and H (p, n)."""
@@ -407,7 +407,7 @@ class Stacked:
 
     def value(self, x: FloatArray) -> FloatArray:
         """Return the readings (p,) without noise at the state x (n,)."""
-        return np.concatenate([np.zeros(0), *(part.value(x) for part in self._parts)])
+        return np.concatenate([np.zeros(0), *(part.value(x) for part in self.parts)])
 
     def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
         """Return the innovations (p,) of readings y (p,) minus the ``expected`` ones (p,)."""
@@ -417,12 +417,12 @@ class Stacked:
     @property
     def size(self) -> int:
         """The number p of values."""
-        return sum(part.size for part in self._parts)
+        return sum(part.size for part in self.parts)
 
     def _rows(self) -> Iterator[tuple[Any, slice]]:
         """Yield each part, and its values among all."""
         first = 0
-        for part in self._parts:
+        for part in self.parts:
             yield part, slice(first, first + part.size)
             first += part.size
 

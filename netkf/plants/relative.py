@@ -31,8 +31,9 @@ from netkf.core.fields import (
     text,
     tuple_of,
 )
+from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray
-from netkf.plants.blocks import Layout, Place
+from netkf.plants.blocks import Layout
 from netkf.plants.nonlinear import (
     BearingSensor,
     NonlinearSensor,
@@ -230,6 +231,10 @@ class RelativePositionSensor(PositionedSensor):
         others = self._others
         assert others is not None
         return others[node] if node in others else next(iter(others.values()))
+
+    def support(self, n: int, node: int) -> np.ndarray:
+        """Return the entries (k,) of the state of both blocks that readings depend on."""
+        return np.union1d(super().support(n, node), self.other_states(node))
 
     def offset(self, x: FloatArray, node: int) -> FloatArray:
         """Return the other's position (d,) relative to the own one in the stacked state x (n,);

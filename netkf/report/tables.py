@@ -27,6 +27,7 @@ from netkf.studies.compare import Comparison, Entry
 from netkf.studies.compare_filters import QUANTITIES
 from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
+from netkf.trace.nees import traces
 
 MAX_ROWS = 2_000
 """Rows of a table on a page."""
@@ -237,7 +238,7 @@ def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
         }
         if ensemble.bound is not None:
             nodes[str(node)]["bound"] = to_json_value(ensemble.bound[:, k].tolist())
-    interval = list(nees_bounds(source.scenario.plant.n, max(1, source.runs)))
+    interval = list(nees_bounds(source.scenario.width, max(1, source.runs)))
     return {"times": ensemble.times.tolist(), "nodes": nodes, "nees_interval": interval}
 
 
@@ -270,7 +271,7 @@ def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[st
 
 def _matrix_traces(matrices: FloatArray) -> FloatArray:
     """Return the traces (T, N) of ``matrices`` (T, N, n, n)."""
-    return np.asarray(np.trace(matrices, axis1=2, axis2=3))
+    return traces(matrices)
 
 
 def averages(source: ReportSource) -> list[dict[str, Any]] | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import SampleIndices, select_averaged_samples
+from netkf.trace.nees import traces as traces_of
 
 START_UP_RATIO, LATE_SHARE = 0.8, 0.25
 """Trace P has a start-up if its mean over the last quarter of the samples is below this share of
@@ -64,7 +65,7 @@ def find_worst_samples(run: StoredRun, summary: Mapping[str, Any]) -> WorstSampl
     if not len(run.times) or not run.nodes:
         return None
     by_error, averaged = run.truth_known, summary_samples(run, summary)
-    traces = np.trace(run.P, axis1=2, axis2=3)
+    traces = traces_of(run.P)
     square, rows = (run.sq_error, averaged.errors) if by_error else (traces, averaged.covariances)
     with np.errstate(all="ignore"):
         means = square[rows].mean(axis=0) if len(rows) else np.full(len(run.nodes), np.nan)

@@ -30,7 +30,7 @@ def nees_note(scenario: Scenario) -> str:
     """Return a note for users on NEES if P differs from the covariance of the error by design; else
     an empty text.
     """
-    n, design = scenario.plant.n, covariance_bias(scenario)
+    n, design = scenario.width, covariance_bias(scenario)
     if design == "smaller":
         return (
             "until others hear of its samples a node counts them as if all nodes had taken them: "

@@ -148,6 +148,7 @@ class ParquetSink(Sink):
         """Prepare both files in ``directory``; the first run has the number ``replica``."""
         self._nodes, self._replica, self._event_count = scenario.nodes, replica, 0
         self._truth_known = scenario.plant.truth_known
+        self._views = scenario.views
         self._events = _Table(directory / "events.parquet", EVENT_ENCODING)
         self._states = _Table(directory / "states.parquet", STATE_ENCODING)
         self._samples: list[tuple[FloatArray, ...]] = []
@@ -183,7 +184,7 @@ class ParquetSink(Sink):
             samples = StateSamples(*map(np.concatenate, zip(*self._samples, strict=True)))
             self._samples.clear()
             self._rows = 0
-            table = state_table(self._replica, self._nodes, samples, self._truth_known)
+            table = state_table(self._replica, self._nodes, samples, self._truth_known, self._views)
             self._states.collect(table)
 
     def _flush(self) -> None:

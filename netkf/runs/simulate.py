@@ -98,8 +98,8 @@ def collect_run(
     It is number ``replica`` of the runs of ``seed``; ``engine`` is the name of the engine,
     ``status`` "complete" or "diverged".
     """
-    count, n = len(scenario.nodes), scenario.plant.n
-    shapes = (), (n,), (count, n), (count, n, n), (count, n)
+    count, width = len(scenario.nodes), scenario.width
+    shapes = (), (scenario.plant.n,), (count, width), (count, width, width), (count, width)
     # Concatenated with empty arrays, the arrays of a run without samples have the right shapes.
     empty = tuple(np.empty((0, *shape)) for shape in shapes)
     columns = zip(empty, *memory.samples, strict=True)

@@ -187,7 +187,7 @@ def _read_states(
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
     import pandas as pd
 
-    n, N = scenario.plant.n, len(scenario.nodes)
+    n, N = scenario.width, len(scenario.nodes)
     names = state_columns(n)
     if not scenario.plant.truth_known:
         names = names[:-2]  # without sq_error and nees
@@ -209,9 +209,15 @@ def _read_states(
         raise DamagedError(f"{path.name} does not have a row for each time and node")
     # After run, t and node: x, xhat and the upper triangle of P, row by row.
     values = table[names[3:]].to_numpy(dtype=np.float64).reshape(T, N, len(names) - 3)
-    x, xhat = values[:, 0, :n], values[:, :, n : 2 * n]
+    seen, xhat = values[:, :, :n], values[:, :, n : 2 * n]
     P = from_upper(values[:, :, 2 * n : 2 * n + n * (n + 1) // 2], n)
-    return table, {"times": times, "x": x, "xhat": xhat, "P": P, "error": x[:, None] - xhat}
+    x = seen[:, 0]
+    if scenario.views is not None:
+        # Blocks that nobody estimates are not stored.
+        x = np.full((T, scenario.plant.n), np.nan)
+        for k, view in enumerate(scenario.views):
+            x[:, view] = seen[:, k, : len(view)]
+    return table, {"times": times, "x": x, "xhat": xhat, "P": P, "error": seen - xhat}
 
 
 def _read_events(path: Path, scenario: Scenario, replica: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from netkf.network.graphs import node_columns
 from netkf.runs.labels import covariance_notes
 from netkf.runs.transmissions import Transmissions, count_pairs
 from netkf.scenario.scenario import Scenario
-from netkf.trace.nees import blurred_from, errors
+from netkf.trace.nees import blurred_from, errors, traces
 from netkf.trace.recorder import Sink
 from netkf.trace.schema import CODES
 
@@ -76,7 +76,7 @@ class SummarySink(Sink):
         self.sq_error += list(sq_error)
         self.nees += list(nees)
         self.first_component += list(np.array(xhat[:, :, 0]))
-        self.trace += list(np.trace(P, axis1=2, axis2=3))
+        self.trace += list(traces(P))
         blocks = tuple(values[-2:].copy() for values in (x, xhat, P, error))
         pairs = zip(self.last or blocks, blocks, strict=True)
         self.last = tuple(np.concatenate(pair)[-2:] for pair in pairs)

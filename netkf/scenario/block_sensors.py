@@ -6,9 +6,12 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
+
 from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.places import Place
 from netkf.network.graphs import Topology
-from netkf.plants.blocks import Layout, Place
+from netkf.plants.blocks import Layout
 from netkf.plants.nonlinear import PositionedSensor
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.relative import RelativePositionSensor, RelativeSensor
@@ -42,6 +45,46 @@ def stacked_sensors(
                 stacked.append(one)
                 entries.append(k)
     return tuple(stacked), tuple(entries)
+
+
+def support_of(sensor: Any, n: int) -> np.ndarray:
+    """Return the entries (k,) of a state of ``n`` that readings of a sensor depend on."""
+    if not sensor.linear:
+        anchors = sensor.record.anchors if sensor.record is not None else sensor.nodes
+        return np.unique(np.concatenate([sensor.support(n, one) for one in anchors]))
+    matrices = [*getattr(sensor, "_pairs", {}).values()]
+    if not matrices and not hasattr(sensor, "C"):
+        matrices = [sensor.matrix_of(n)]
+    if not matrices or (sensor.record is not None and sensor.record.regressors):
+        return np.arange(n)
+    return np.flatnonzero(np.concatenate(matrices).any(axis=0))
+
+
+def estimated_blocks(
+    estimates: str | tuple[str, ...], layout: Layout, topology: Topology
+) -> tuple[tuple[Place, ...], ...]:
+    """Return the blocks that each node estimates, in the order of nodes, for ``filter.estimates``.
+
+    Raises ScenarioError for a node without any.
+    """
+    blocks = []
+    for node in topology.nodes:
+        if estimates == "all":
+            own: tuple[Place, ...] = layout.places
+        elif estimates == "shared":
+            own = layout.shared
+        elif estimates == "own":
+            own = layout.owned(node)
+        elif estimates == "own+neighbours":
+            linked = {*topology.senders(node), *topology.receivers(node)}
+            own = tuple(p for one in (node, *sorted(linked)) for p in layout.owned(one))
+        else:
+            own = tuple(layout.require(name, node) for name in dict.fromkeys(estimates))
+        if not own:
+            rule = f"must give every node a block, and node {node} has none"
+            raise ScenarioError("", rule, estimates, "give it one in [[plants]], or choose others")
+        blocks.append(own)
+    return tuple(blocks)
 
 
 def _stacked(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:

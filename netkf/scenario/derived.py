@@ -30,6 +30,7 @@ from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
 from netkf.core.contracts import ContractError
 from netkf.core.errors import TheoryError, quote
+from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
@@ -44,6 +45,7 @@ from netkf.plants.sampling import Samples
 from netkf.plants.sensors import Sensor
 from netkf.plants.transitions import frame_period, frame_slots
 from netkf.rng.streams import Streams
+from netkf.scenario.block_sensors import support_of
 from netkf.scenario.model import PlacedSensor, ScenarioModel
 from netkf.scenario.sampling import (
     all_sample_times,
@@ -169,6 +171,20 @@ class DerivedScenario(ScenarioModel):
         first = (self._pooled_model,) if pooled else self._node_models
         pieces: list[tuple[Any, ...]] = [first]
         for matrices in self.believed_pieces[1:]:
+            if self.views is not None and not pooled:
+                pieces.append(
+                    tuple(
+                        dataclasses.replace(
+                            model,
+                            **{
+                                name: M[view][:, view]
+                                for name, M in zip(names, matrices, strict=True)
+                            },
+                        )
+                        for model, view in zip(first, self.views, strict=True)
+                    )
+                )
+                continue
             changed = dict(zip(names, matrices, strict=True))
             # Equal models stay one object.
             models = {id(model): dataclasses.replace(model, **changed) for model in first}
@@ -223,6 +239,13 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def _node_models(self) -> tuple[Any, ...]:
         """The first believed models of all nodes."""
+        if self.views is not None:
+            placed = self.placed_sensors if self.slotted else self.increment_sensors
+            make = self._slot_model if self.slotted else self._flow_model
+            return tuple(
+                make(*self._own_sensors(k, placed.get(node, ())), self.views[k])
+                for k, node in enumerate(self.nodes)
+            )
         if self.slotted:
             return _shared(self._slot_model, self._believed_stacks)
         stacks = (self.observation_matrices(node, believed=True) for node in self.nodes)
@@ -254,13 +277,35 @@ class DerivedScenario(ScenarioModel):
         stacked = self._stack_sensors(self._pooled_sensors, believed=True)
         return self._slot_model(*stacked) if self.slotted else self._flow_model(*stacked)
 
-    def _slot_model(self, H: FloatArray, R: FloatArray) -> SlotModel:
+    def view(self, k: int) -> Any:
+        """Return the entries (n',) of the state that node number ``k`` estimates, or a slice."""
+        return slice(None) if self.views is None else self.views[k]
+
+    def _own_sensors(
+        self, k: int, placed: tuple[PlacedSensor, ...]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return H (p, n') and R (p, p) of those sensors of node ``k`` that read what it estimates
+        and nothing else.
+        """
+        if self.views is None:
+            return self._stack_sensors(placed, believed=True)
+        view = self.views[k]
+        own = tuple(p for p in placed if np.isin(self.support(p), view).all())
+        H, R = self._stack_sensors(own, believed=True)
+        return np.ascontiguousarray(H[:, view]), R
+
+    def support(self, placed: PlacedSensor) -> np.ndarray:
+        """Return the entries (k,) of the state that readings of a sensor depend on."""
+        return support_of(self.sensors[placed.entry], self.plant.n)
+
+    def _slot_model(self, H: FloatArray, R: FloatArray, view: Any = slice(None)) -> SlotModel:
         plant = self.slot_plant
         if not isinstance(plant, NonlinearPlant):
-            return SlotModel(*self.believed_pieces[0], H, R, plant.period)
-        (f, jacobian), Q = plant.functions, self.filter.model.Q
+            F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
+            return SlotModel(F, Q, H, R, plant.period)
+        (f, jacobian), model_Q = plant.functions, self.filter.model.Q
         return MapModel(
-            np.full((plant.n, plant.n), math.nan), plant.Q if Q is None else Q, H, R,
+            np.full((plant.n, plant.n), math.nan), plant.Q if model_Q is None else model_Q, H, R,
             plant.period, f=f, jacobian=jacobian, u=self.believed_inputs,
             linearise=self.filter.linearise,
         )  # fmt: skip
@@ -294,14 +339,30 @@ class DerivedScenario(ScenarioModel):
         ]
         most_rows = max([1, *rows])
         sampled = self.placed_sensors if self.slotted else self.sampled_sensors
+        counts = Counter(itertools.chain.from_iterable(self.estimated)) if self.plants else None
         return tuple(
             NodeInfo(
                 node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
                 total_information, max_delay, k, tuple(sorted(senders[node])), network, most_rows,
-                self._stack_sensors(sampled.get(node, ()), believed=True),
+                self._own_sensors(k, sampled.get(node, ())), self._own_places(k),
+                self._is_alone(k, counts),
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip
+
+    def _is_alone(self, k: int, counts: Counter[Place] | None) -> bool:
+        """Return True if node number ``k`` alone estimates its blocks, which ``counts`` count."""
+        if counts is None:
+            return len(self.nodes) == 1
+        return all(counts[place] == 1 for place in self.estimated[k])
+
+    def _own_places(self, k: int) -> tuple[Place, ...]:
+        """Return the blocks of node number ``k`` at their places in its own state."""
+        places, first = [], 0
+        for place in self.estimated[k] if self.plants else ():
+            places.append(place._replace(first=first))
+            first += place.n
+        return tuple(places)
 
     def most_rows(self, node: int, placed: PlacedSensor) -> int:
         """Return the most rows that a sensor of ``node`` (id) has at one instant: in slots a
@@ -507,7 +568,7 @@ class DerivedScenario(ScenarioModel):
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):
             return False
         # A frame would have to end where the plant changes.
-        if len(self.plant.changes):
+        if self.views is not None or len(self.plant.changes):
             return False
         if self.input_responses is not None and self.input_responses.surprise is not None:
             return False
@@ -651,10 +712,11 @@ class DerivedScenario(ScenarioModel):
         sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
         return tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
 
-    def _flow_model(self, H: FloatArray, R: FloatArray) -> FlowModel:
+    def _flow_model(self, H: FloatArray, R: FloatArray, view: Any = slice(None)) -> FlowModel:
+        A, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
         # The longest gap to predict over, and the longest step whose increment is used at once.
         period = self.diffusion.sensing_period or 0.0
-        return FlowModel(*self.believed_pieces[0], H, R, self.horizon, min(period, self.horizon))
+        return FlowModel(A, Q, H, R, self.horizon, min(period, self.horizon))
 
     def initial_estimate(self, node: int) -> tuple[FloatArray, FloatArray]:
         """Return ``xhat`` (n,) and ``P`` (n, n) of a node at time 0.
@@ -669,7 +731,10 @@ class DerivedScenario(ScenarioModel):
             cov = self.plant.start_cov
         xhat = mean[index] if isinstance(mean, tuple) else mean
         P = cov[index] if isinstance(cov, tuple) else cov
-        return xhat, P
+        if self.views is None or self.node_filter.timing.pooled:
+            return xhat, P
+        view = self.views[index]
+        return xhat[view], P[np.ix_(view, view)]
 
     def weight(self, receiver: int, sender: int) -> float:
         """Return the weight that ``receiver`` (id) gives to the estimate of ``sender`` (id) when it

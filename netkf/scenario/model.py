@@ -33,6 +33,7 @@ from netkf.core.fields import (
     vector,
 )
 from netkf.core.instants import OnGrid, TimeGrid
+from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
@@ -44,7 +45,7 @@ from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.scenario.block_sensors import require_no_blocks, stacked_sensors
+from netkf.scenario.block_sensors import estimated_blocks, require_no_blocks, stacked_sensors
 from netkf.scenario.names import bind_names
 from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
@@ -93,6 +94,13 @@ class Belief(Component):
     schedule: bool = field(boolean, default=True)
 
 
+_estimates = either(
+    one_of("all", "own", "own+neighbours", "shared"),
+    list_of(text, "names of blocks"),
+    has_depth(1),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Filtering(Component):
     """The filter of every node: its ``algorithm``, its initial estimate and its model.
@@ -105,6 +113,8 @@ class Filtering(Component):
     linearise  how they use dynamics and sensors that are not linear: "ekf", by Jacobians at the
                estimate; "ukf" and "ckf", by sigma points, unscented (alpha = 1, beta = 2,
                kappa = 0) or cubature
+    estimates  with [[plants]], which blocks a node estimates: "all" (default), "own",
+               "own+neighbours", "shared", or a list of names of blocks that it owns or shares
     """
 
     algorithm: Filter = field(instance_of(Filter))
@@ -117,6 +127,7 @@ class Filtering(Component):
     )
     model: Belief = field(instance_of(Belief), default=Belief())
     linearise: str = field(one_of(*METHODS), default=METHODS[0])
+    estimates: str | tuple[str, ...] = field(_estimates, default="all")
 
 
 class PlacedSensor(NamedTuple):
@@ -216,6 +227,27 @@ class ScenarioModel(Component):
             return Layout([Block(name="plant", plant=self.plant)])
         with errors_under("plants"):
             return Layout(self.plants)
+
+    @cached_property
+    def estimated(self) -> tuple[tuple[Place, ...], ...]:
+        """The blocks that each node estimates, in the order of ``nodes``."""
+        with errors_under("filter.estimates"):
+            return estimated_blocks(self.filter.estimates, self.layout, self.topology)
+
+    @cached_property
+    def views(self) -> tuple[np.ndarray, ...] | None:
+        """The entries (n',) of the state that each node estimates; None if all estimate all."""
+        entries = [
+            np.concatenate([np.arange(place.first, place.first + place.n) for place in places])
+            for places in self.estimated
+        ]
+        whole = np.arange(self.plant.n)
+        return None if all(np.array_equal(one, whole) for one in entries) else tuple(entries)
+
+    @property
+    def width(self) -> int:
+        """The largest number of states that a node estimates."""
+        return self.plant.n if self.views is None else max(map(len, self.views))
 
     def _put_on_grid(self) -> None:
         grid = self.time_grid

@@ -31,6 +31,8 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     needs = scenario.node_filter.needs
     if needs.one_model or (needs.one_model_under_clocks and not scenario.slotted):
         _check_one_model(scenario)
+    if scenario.views is not None:
+        _check_blocks(scenario)
     if not scenario.slotted:
         _check_increments(scenario)
     if needs.linear_plant and not scenario.plant.linear:
@@ -64,6 +66,38 @@ def _check_one_model(scenario: DerivedScenario) -> None:
             f"{len(scenario.followed_changes)} changes",
             f"write model = {{ schedule = false }} in [filter], or {ANOTHER}",
         )
+
+
+def _check_blocks(scenario: DerivedScenario) -> None:
+    """Check that nodes that estimate some blocks can do so with what they are given."""
+    name, talks = filter_name(scenario), scenario.node_filter.timing.talks
+    if scenario.node_filter.timing.pooled:
+        return
+    knows_blocks = scenario.node_filter.needs.blocks
+    if talks and not knows_blocks and len(set(scenario.estimated)) > 1:
+        rule = f"must be the same blocks for all nodes for the {name}, whose messages say no blocks"
+        remedy = 'write "all", or kind = "block-intersection"'
+        raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
+    for k, node in enumerate(scenario.nodes):
+        view = scenario.view(k)
+        others = np.setdiff1d(np.arange(scenario.plant.n), view)
+        if any(M[np.ix_(view, others)].any() for M, _ in scenario.believed_pieces):
+            rule = f"must contain all that drives the blocks of node {node}"
+            remedy = 'estimate the coupled blocks too, as "all" does'
+            raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
+        for placed in scenario.placed_sensors.get(node, ()):
+            support = scenario.support(placed)
+            if np.isin(support, view).all():
+                continue
+            key = f"sensors[{scenario.sensor_entries[placed.entry]}]"
+            if not knows_blocks or not np.isin(support, view).any():
+                rule = f"must read blocks that node {node} estimates, for the {name}"
+                remedy = 'write filter.estimates = "own+neighbours" or "all"'
+                raise ScenarioError(key, rule, scenario.filter.estimates, remedy)
+            sensor = scenario.sensors[placed.entry]
+            if not (scenario.slotted or takes_samples(sensor)):
+                rule = "is missing: increments of two blocks need both estimates"
+                raise ScenarioError(f"{key}.sampling", rule, None, f"add {SAMPLING}")
 
 
 def _check_increments(scenario: DerivedScenario) -> None:

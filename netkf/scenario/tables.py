@@ -34,8 +34,8 @@ MAX_DEPTH = 30  # of tables and lists inside one another
 UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 BLOCK_KEYS = ("name", "nodes", "coupling")  # in one of [[plants]], beside those of its plant
-FILTERING_KEYS = ("mean", "cov", "model", "linearise")
-"""Keys in the table of a filter beside those of its kind."""
+FILTERING_KEYS = ("mean", "cov", "model", "linearise", "estimates")
+"""Keys of the table of a filter, beside those of its kind."""
 
 NOT_IMPORTED = object()
 """Stands for an object whose class is not imported yet, or that contains such an object."""

@@ -42,7 +42,7 @@ from netkf.studies.filter_values import (
 if TYPE_CHECKING:
     import pandas as pd
 
-CARRIED = ("mean", "cov", "model")
+CARRIED = ("mean", "cov", "model", "estimates")
 """Keys of ``[filter]`` that every compared filter takes over from the scenario."""
 QUANTITIES = ("rms_error", "worst_instant", "nees_ratio")
 MAX_FILTERS = 200

@@ -111,7 +111,7 @@ def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
 
 
 def _count_errors(scenario: Scenario) -> int:
-    return len(scenario.nodes) * scenario.plant.n
+    return len(scenario.nodes) * scenario.width
 
 
 def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
@@ -334,7 +334,7 @@ def judge_consistency(
 ) -> Consistency:
     """Return the consistency of each node over ``runs``, together at ``confidence``."""
     # ``level`` is the probability that some interval misses.
-    n, count, level = scenario.plant.n, len(runs), 1.0 - confidence
+    n, count, level = scenario.width, len(runs), 1.0 - confidence
     low, high = nees_bounds(n, count, confidence)
     shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
     means = np.mean([run.samples[:shortest] for run in runs], axis=0)
@@ -378,7 +378,7 @@ def _judge_node(
     expected = np.array([run.expected[i] for run in runs])
     is_known = bool(np.isfinite(expected).all())
     # NEES of an exact P has the mean n.
-    excesses = nees - (expected if is_known else scenario.plant.n)
+    excesses = nees - (expected if is_known else scenario.width)
     width = quantile * float(excesses.std(ddof=1)) / math.sqrt(len(runs))
     if not any(run.covariance_given[0] for run in runs):
         verdict = NO_COVARIANCE
@@ -401,7 +401,7 @@ def _judge_node(
 
 def _verdict(scenario: Scenario, excess: float, width: float, expected: float | None) -> str:
     """Return the verdict on NEES that is ``excess`` (+- ``width``) above ``expected`` (None: n)."""
-    n = scenario.plant.n
+    n = scenario.width
     if not math.isfinite(excess):
         return "no NEES: P is singular, or P or the errors are not finite"
     if expected is None:

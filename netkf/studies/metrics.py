@@ -88,7 +88,7 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
 
 def expected_errors_known(scenario: Scenario) -> bool:
     """Return True if ``expected_metrics`` take about as long as a few runs."""
-    errors = len(scenario.nodes) * scenario.plant.n
+    errors = len(scenario.nodes) * scenario.width
     if not scenario.is_random or errors > MAX_ERRORS:
         return False
     short = scenario

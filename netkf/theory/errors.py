@@ -19,6 +19,7 @@ from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.theory.common.clock_columns import ClockColumns
 from netkf.theory.common.columns import ErrorColumns, has_columns
 from netkf.theory.common.evidence import require_linear
+from netkf.theory.common.requirements import require_whole_state
 from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.folders import theory_of
 from netkf.trace.run import Run
@@ -92,6 +93,7 @@ def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray
 
 def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     """Return the errors at time 0 of all estimators (the filters of the nodes, or a pooled one)."""
+    require_whole_state(scenario)
     if not isinstance(run, Run):
         raise TheoryError(
             f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"

@@ -32,6 +32,7 @@ from netkf.theory import (
 )
 from netkf.theory.assumptions import assumption_rows
 from netkf.theory.common.papers import paper_legend
+from netkf.theory.common.requirements import require_whole_state
 from netkf.theory.folders import theory_of
 from netkf.theory.hybrid.coupled import concerns_hybrid_paper
 from netkf.theory.hybrid.steady import steady_by_node
@@ -56,6 +57,7 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
     Matrices have ``value`` and ``trace``, None with a ``reason`` if there is none. Of a plant that
     changes all but the bound at the horizon is about the last piece.
     """
+    require_whole_state(scenario)
     promises: dict[str, Any] = {
         "scenario": scenario.name,
         "filter": name_of("filter", scenario.filter.algorithm),

@@ -15,6 +15,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.labels import covariance_notes
 from netkf.runs.summary import PromisedTraces
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.requirements import require_whole_state
 from netkf.theory.hybrid.bounds import covariance_bound
 from netkf.theory.hybrid.coupled import (
     concerns_hybrid_paper,
@@ -33,6 +34,11 @@ MAX_STEADY_ENTRIES = 100_000
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     """Return traces at ``times``: bound on P, its limit, a central filter's; or the reason."""
     bound, reason = None, ""
+    try:
+        require_whole_state(scenario)
+    except TheoryError as error:
+        notes = tuple(covariance_notes(scenario))
+        return PromisedTraces(None, np.nan, np.nan, str(error), limit_label="", notes=notes)
     try:
         if len(times):
             _require_small_bound(scenario, len(times))

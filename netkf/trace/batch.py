@@ -65,18 +65,18 @@ class RunBatch:
 class BatchSink(Sink):
     """Collects the samples of recorded runs into a batch; ``finish`` ends each run.
 
-    ``times`` (T,) are the sample times of a run that completes, ``shape`` = (F, n) is the number of
-    filters and of states.
+    ``times`` (T,) are the sample times of a run that completes, ``shape`` = (F, n, n') the number
+    of filters, of states, and the largest number of those that one filter estimates.
     """
 
     thread_safe: ClassVar[bool] = True
 
-    def __init__(self, replicas: range, times: FloatArray, shape: tuple[int, int]) -> None:
-        (filters, n), count = shape, (len(replicas), len(times))
+    def __init__(self, replicas: range, times: FloatArray, shape: tuple[int, int, int]) -> None:
+        (filters, n, width), count = shape, (len(replicas), len(times))
         self._replicas, self._times, self._filters = replicas, times, filters
         self._x = np.full((*count, n), np.nan)
-        self._xhat, self._error = (np.full((*count, filters, n), np.nan) for _ in range(2))
-        self._P = np.full((*count, filters, n, n), np.nan)
+        self._xhat, self._error = (np.full((*count, filters, width), np.nan) for _ in range(2))
+        self._P = np.full((*count, filters, width, width), np.nan)
         self._lengths = np.zeros(len(replicas), dtype=np.int64)
         self._counts = np.zeros((len(replicas), len(KINDS)), dtype=np.int64)
         self._status: list[str] = []

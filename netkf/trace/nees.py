@@ -22,11 +22,36 @@ def errors(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     singular, it is also nan where others are singular up to rounding.
     """
     n, shape = e.shape[-1], e.shape[:-1]
+    e, P = without_padding(e, P)
     with np.errstate(all="ignore"):
         square = (e * e).sum(axis=-1)
         flat = e.reshape(1, -1, n), P.reshape(1, -1, n, n)
         nees = nees_of_runs(*flat, np.array([flat[0].shape[1]]))
     return np.asarray(square), nees.reshape(shape)
+
+
+def without_padding(e: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return errors e (..., n) and covariances P (..., n, n) in which states that a node does not
+    estimate, nan in both beside others that it does, have the error 0 and the variance 1.
+    """
+    missing = np.isnan(e)
+    if not missing.any():
+        return e, P
+    padded = missing & ~missing.all(axis=-1, keepdims=True)
+    padded &= np.isnan(np.diagonal(P, axis1=-2, axis2=-1))
+    outside = padded[..., :, None] | padded[..., None, :]
+    return np.where(padded, 0.0, e), np.where(outside, np.eye(e.shape[-1]), P)
+
+
+def traces(P: FloatArray) -> FloatArray:
+    """Return the traces (...) of covariances P (..., n, n) over the states that a node estimates,
+    nan where all of P is.
+    """
+    variances = np.diagonal(P, axis1=-2, axis2=-1)
+    missing = np.isnan(variances)
+    if not missing.any():
+        return np.asarray(variances.sum(axis=-1))
+    return np.where(missing.all(axis=-1), np.nan, np.nansum(variances, axis=-1))
 
 
 def nees_of_runs(e: FloatArray, P: FloatArray, lengths: np.ndarray) -> FloatArray:
@@ -128,9 +153,10 @@ def blurred_from(
     samples.
     """
     first = np.full(len(x), np.inf)
+    e, P = without_padding(e, P)
     sizes = (e if exact else x).reshape(*x.shape[:2], -1)
     sizes, P, e = (np.ascontiguousarray(part) for part in (sizes, P, e))
-    find_blurred(sized(x.shape[2]), np.ascontiguousarray(times), sizes, P, e, lengths, first)
+    find_blurred(sized(P.shape[-1]), np.ascontiguousarray(times), sizes, P, e, lengths, first)
     return first
 
 

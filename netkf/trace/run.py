@@ -12,7 +12,7 @@ from netkf.core.errors import ScenarioError, errors_under, quote
 from netkf.core.notebook import NotebookTable
 from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
-from netkf.trace.nees import BLUR, ROUNDING, blurred_from, errors
+from netkf.trace.nees import BLUR, ROUNDING, blurred_from, errors, traces
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 
 if TYPE_CHECKING:
@@ -27,9 +27,11 @@ class Run(NotebookTable):
     """The samples and events of one run.
 
     times (T,), nodes (N,), x (T, n), xhat (T, N, n), P (T, N, n, n), nan where the filter gives no
-    covariance, error (T, N, n); ``log`` holds the events as a structured array
-    (trace.schema.EVENT). ``error`` is x - xhat; with ``exact_errors`` it has digits even where x
-    and xhat are so large that their difference has lost them, else digits are lost from
+    covariance, error (T, N, n), where nodes that estimate some blocks of the state have these
+    (``scenario.views``), nan beyond them, and n is the largest number of their states.
+    ``log`` holds the events as a structured array (trace.schema.EVENT). ``error`` is x - xhat; with
+    ``exact_errors`` it has digits even where x and xhat are so large that their difference has lost
+    them, else digits are lost from
     ``rounding_from`` on. ``status`` is complete, interrupted or diverged. ``sums`` holds the sums
     over all nodes that exchanges should conserve: at the start and at the last sample. Unless
     ``truth_known``, x is nan and tables have no columns of errors. ``stats`` holds the counts that
@@ -79,7 +81,8 @@ class Run(NotebookTable):
         import pandas as pd
 
         samples = StateSamples(self.times, self.x, self.xhat, self.P, self.error)
-        return pd.DataFrame(state_table(self.replica, self.nodes, samples, self.truth_known))
+        views = None if self.scenario is None else self.scenario.views
+        return pd.DataFrame(state_table(self.replica, self.nodes, samples, self.truth_known, views))
 
     @cached_property
     def sq_error(self) -> FloatArray:
@@ -120,9 +123,7 @@ class Run(NotebookTable):
         after = self.times > 0.0
         columns = {
             "RMS error": np.sqrt(self.sq_error[after].mean(axis=0)) if after.any() else np.nan,
-            "mean trace P": np.trace(self.P[after], axis1=2, axis2=3).mean(axis=0)
-            if after.any()
-            else np.nan,
+            "mean trace P": traces(self.P[after]).mean(axis=0) if after.any() else np.nan,
         }
         return pd.DataFrame(columns, index=pd.Index(self.nodes, name="node"))
 
@@ -140,14 +141,21 @@ class Run(NotebookTable):
             if one not in self.nodes:
                 raise ScenarioError(key, "must be a node of the run", one, "give another id")
         with errors_under("name"):
-            entries = self.scenario.layout.require(name, node).entries
-        k = self.nodes.index(by)
+            place = self.scenario.layout.require(name, node)
+        k, first = self.nodes.index(by), place.first
+        if self.scenario.views is not None:
+            found = np.flatnonzero(self.scenario.views[k] == first)
+            if not found.size:
+                rule, remedy = f"must estimate block {name!r}", "name one that does, as the owner"
+                raise ScenarioError("by", rule, by, remedy)
+            first = int(found[0])
+        own = slice(first, first + place.n)
         return BlockSamples(
             times=self.times,
-            x=self.x[:, entries],
-            xhat=self.xhat[:, k, entries],
-            P=self.P[:, k, entries, entries],
-            error=self.error[:, k, entries],
+            x=self.x[:, place.entries],
+            xhat=self.xhat[:, k, own],
+            P=self.P[:, k, own, own],
+            error=self.error[:, k, own],
         )
 
     def count(self, kind: str) -> int:
@@ -223,16 +231,21 @@ class StateSamples(NamedTuple):
 
 
 def state_table(
-    replica: int, nodes: tuple[int, ...], samples: StateSamples, truth_known: bool = True
+    replica: int,
+    nodes: tuple[int, ...],
+    samples: StateSamples,
+    truth_known: bool = True,
+    views: tuple[np.ndarray, ...] | None = None,
 ) -> dict[str, Any]:
     """Return T samples of N ``nodes`` (ids) as named columns (T N,), those of
     trace.schema.state_columns, with a row for each time and node; ``replica`` is the number of the
     run. They are the table of states that is stored and that ``Run.states`` returns.
 
-    Without known truth there are no columns of errors.
+    Without known truth there are no columns of errors. ``views`` are the entries of the state that
+    each node estimates, if not all: the columns are those of the node with most, nan in others.
     """
     times, x, xhat, P, error = samples
-    count, n = len(nodes), x.shape[1]
+    count, n = len(nodes), xhat.shape[2]
     rows = len(times) * count
     upper = np.triu_indices(n)
     sq_error, nees = errors(error, P)
@@ -240,7 +253,7 @@ def state_table(
         np.full(rows, replica, dtype=np.int64),
         np.repeat(times, count),
         np.tile(np.array(nodes, dtype=np.int64), len(times)),
-        *np.repeat(x, count, axis=0).T,
+        *_states_of_nodes(x, count, n, views).T,
         *xhat.reshape(rows, n).T,
         *P[:, :, upper[0], upper[1]].reshape(rows, -1).T,
         sq_error.reshape(rows),
@@ -250,6 +263,18 @@ def state_table(
     if not truth_known:
         del table["sq_error"], table["nees"]
     return table
+
+
+def _states_of_nodes(
+    x: FloatArray, count: int, n: int, views: tuple[np.ndarray, ...] | None
+) -> FloatArray:
+    """Return x (T N, n) as each of N nodes sees it, from states x (T, n) of the plant."""
+    if views is None:
+        return np.repeat(x, count, axis=0)
+    seen = np.full((len(x), count, n), np.nan)
+    for k, view in enumerate(views):
+        seen[:, k, : len(view)] = x[:, view]
+    return seen.reshape(-1, n)
 
 
 def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None:

@@ -58,6 +58,8 @@ class CompiledEngine(Engine):
         remedy = 'use engine="simpy", or "auto", which chooses'
         if not has_numba():
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
+        if scenario.views is not None:
+            return f'engine "compiled" needs filters that all estimate the whole state; {remedy}'
         # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
         unknown: list[tuple[str, Component]] = []
         if type(scenario.plant) not in PLANTS:

@@ -17,7 +17,7 @@ from netkf.algorithms.models import MapModel
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
-from netkf.engines.simpy.nodes import ClockedNode, Node, distinct
+from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import (
     FIRST_RANK,
@@ -28,7 +28,8 @@ from netkf.engines.simpy.slots import (
 )
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import Transmitter
-from netkf.engines.soundness import stack_estimates
+from netkf.engines.soundness import sound_mask, stack_estimates
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.plain import announce_plain
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -222,6 +223,10 @@ class _Simulation:
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]
+        views = scenario.views
+        if views is not None:
+            self._record_views(time, x, local, nodes, estimates)
+            return
         local_estimates, P, has_no_P = stack_estimates(estimates)
         # The trace has absolute states. Adding the origin loses digits, so the error is computed
         # from local ones.
@@ -233,10 +238,41 @@ class _Simulation:
         # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
         if sums.start:
             recorder.sums = sums.pairs()
+        # An estimate that is not sound ends the run; it is noticed at samples only.
+        self._end_sample(time, broken(scenario, xhat, P, error, without=has_no_P))
+
+    def _record_views(
+        self,
+        time: float,
+        x: FloatArray,
+        local: FloatArray,
+        nodes: dict[int, Any],
+        estimates: list[tuple[FloatArray, FloatArray | None]],
+    ) -> None:
+        """Record a sample of nodes that estimate different parts of the state, nan beyond them."""
+        scenario, diverged = self._scenario, list[int]()
+        N, width = len(scenario.nodes), scenario.width
+        xhat, error = (np.full((N, width), np.nan) for _ in range(2))
+        P = np.full((N, width, width), np.nan)
+        for k, (node, (mean, cov)) in enumerate(zip(scenario.nodes, estimates, strict=True)):
+            view = scenario.view(k)
+            # A pooled filter estimates all.
+            chosen = view if nodes[node].view is None else slice(None)
+            n, own = len(view), mean[chosen]
+            error[k, :n] = local[view] - own
+            xhat[k, :n] = own + (x - local)[view]
+            if cov is not None:
+                P[k, :n, :n] = cov[chosen][:, chosen]
+            known = error[k, :n] if scenario.plant.truth_known else None
+            if not sound_mask(xhat[k, :n], P[k, :n, :n], cov is None, known):
+                diverged.append(node)
+        self._recorder.sample(time, x, xhat, P, error)
+        self._end_sample(time, diverged)
+
+    def _end_sample(self, time: float, diverged: list[int]) -> None:
+        recorder = self._recorder
         recorder.flush_if_full()
         self._progress(time)
-        # An estimate that is not sound ends the run; it is noticed at samples only.
-        diverged = broken(scenario, xhat, P, error, without=has_no_P)
         # Recorded after the sample, which has the diverged estimate.
         for node in diverged:
             recorder.append((time, DIVERGED, node, -1, -1, -1, NAN))
@@ -253,6 +289,8 @@ def _nodes(scenario: Scenario, make: Callable[[int, int, tuple[int, ...]], Any])
 
 def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``."""
+    views = scenario.views
+    view = None if node < 0 or views is None else views[entity]
     # -1: the pooled filter, which is not a node of the graph.
     model = scenario.model_of(entity)
     if scenario.tells_models:
@@ -267,7 +305,8 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         model,
         scenario.initial_estimate(scenario.nodes[entity]),
         scenario.node_infos[entity],
-        spread_of(scenario.filter.linearise, scenario.plant.n),
+        spread_of(scenario.filter.linearise, scenario.plant.n if view is None else len(view)),
+        None if view is None else View(view, scenario.layout.places),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,12 +14,14 @@ from netkf.algorithms.filter import (
     Increments,
     Message,
     NodeInfo,
+    PairReading,
     Reading,
     interval_rule,
 )
 from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
 from netkf.algorithms.models import ChangingFlowModel, MapModel, first_root
+from netkf.core.places import Place
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.timeline import Timeline
@@ -52,6 +54,107 @@ class Envelope(NamedTuple):
     age: float = 0.0
 
 
+class View:
+    """The part of the state that a node estimates: its ``entries`` (n',) in that of the plant."""
+
+    def __init__(self, entries: np.ndarray, places: Sequence[Place]) -> None:
+        """``places`` are all blocks of the state."""
+        self.entries, self._places = entries, places
+        self._n = sum(place.n for place in places)
+
+    def readings(
+        self, y: FloatArray, H: Any, R: FloatArray
+    ) -> Iterator[tuple[FloatArray, Any, FloatArray] | PairReading]:
+        """Yield the parts of a reading y (p,) with H (p, n), or a function that linearises it, and
+        R (p, p): those of the node's states alone, with H of these, and a PairReading for each that
+        depends on another block too.
+        """
+        for rows, part in self._parts(H):
+            others = np.setdiff1d(self._support(part), self.entries)
+            z, C = y[rows], R[rows][:, rows]
+            if others.size:
+                place = next(p for p in self._places if p.first <= others[0] < p.first + p.n)
+                owner = -1 if place.node is None else place.node
+                of_pair: Any = PairFunction(z, part, (self.entries, place.entries), self._n)
+                yield PairReading((place.name, owner), z, C, of_pair)
+            elif isinstance(part, np.ndarray):
+                yield z, np.ascontiguousarray(part[:, self.entries]), C
+            else:
+                yield z, SeenPart(part, self.entries, self._n), C
+
+    def _parts(self, H: Any) -> Iterator[tuple[np.ndarray, Any]]:
+        """Yield the rows of parts that each depend on one other block at most, with their H."""
+        if isinstance(H, np.ndarray):
+            outside = np.ones(self._n, dtype=bool)
+            outside[self.entries] = False
+            owners = np.repeat(np.arange(len(self._places)), [place.n for place in self._places])
+            firsts = [owners[outside & (row != 0.0)][:1].tolist() if row.any() else [] for row in H]
+            keys = np.array([first[0] if first else -1 for first in firsts], dtype=np.int64)
+            for key in np.unique(keys):
+                rows = np.flatnonzero(keys == key)
+                yield rows, H[rows]
+            return
+        first = 0
+        for part in getattr(H, "parts", [H]):
+            rows = np.arange(first, first + part.size)
+            first += part.size
+            yield rows, part
+
+    def _support(self, part: Any) -> np.ndarray:
+        if isinstance(part, np.ndarray):
+            return np.flatnonzero(part.any(axis=0))
+        entries: np.ndarray = part.support(self._n)
+        return entries
+
+
+class SeenPart:
+    """A ``function`` that linearises readings of a state of n components, for a node that estimates
+    its ``entries`` (n',).
+    """
+
+    def __init__(self, function: Any, entries: np.ndarray, n: int) -> None:
+        self._function, self._entries, self._n = function, entries, n
+        self.size: int = function.size
+
+    def _whole(self, x: FloatArray) -> FloatArray:
+        whole = np.zeros(self._n)
+        whole[self._entries] = x
+        return whole
+
+    def __call__(self, y: FloatArray, xhat: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return readings ``y`` (p,) linearised at the estimate ``xhat`` (n',), and H (p, n')."""
+        z, J = self._function(y, self._whole(xhat))
+        return z, J[:, self._entries]
+
+    def value(self, x: FloatArray) -> FloatArray:
+        """Return the readings (p,) without noise at the node's states x (n',)."""
+        return np.asarray(self._function.value(self._whole(x)))
+
+    def difference(self, y: FloatArray, expected: FloatArray) -> FloatArray:
+        """Return the innovations (p,) of readings y (p,) minus the ``expected`` ones (p,)."""
+        return np.asarray(self._function.difference(y, expected))
+
+
+class PairFunction(NamedTuple):
+    """``PairReading.H`` of a reading y (p,) with ``H`` (p, n), or the function that linearises it;
+    ``entries`` are those of the node's states and of the other block.
+    """
+
+    y: FloatArray
+    H: Any
+    entries: tuple[np.ndarray, slice]
+    n: int
+
+    def __call__(
+        self, xhat: FloatArray, other: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return z (p,), and its matrices of both parts of the state, see PairReading."""
+        whole, (own, others) = np.zeros(self.n), self.entries
+        whole[own], whole[others] = xhat, other
+        z, J = (self.y, self.H) if isinstance(self.H, np.ndarray) else self.H(self.y, whole)
+        return z, J[:, own], J[:, others]
+
+
 class Node:
     """A filter with its inbox.
 
@@ -68,12 +171,14 @@ class Node:
         start: tuple[FloatArray, FloatArray],
         info: NodeInfo,
         points: Spread,
+        view: View | None = None,
     ) -> None:
         """Set up the filter with its ``model`` and its estimate ``start`` = (xhat (n,), P (n, n))
-        at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index, and ``points`` are
-        those by which nonlinear sensors are linearised.
+        at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index, ``points`` are those
+        by which nonlinear sensors are linearised, and ``view`` says which states it estimates, if
+        not all.
         """
-        self._points = points
+        self._points, self.view = points, view
         self.node, self.entity, self.info, self.model = node, entity, info, model
         self.moving_model = model.undriven if isinstance(model, DrivenModel) else model
         """The model in which matrices may change."""
@@ -161,6 +266,7 @@ class ClockedNode(Node):
         self._now = 0.0
         # The samples of the present instant, until the update that uses all of them.
         self._samples: list[tuple[int, FloatArray, Any, FloatArray]] = []
+        self._pairs: list[tuple[int, PairReading]] = []
         self.after_sample: Any = None
         """Function called with the time in seconds once the node has used its samples of an
         instant; None unless readings make the node transmit.
@@ -207,22 +313,34 @@ class ClockedNode(Node):
         or a function that linearises it, and R (p, p): one update uses all samples of this instant.
         """
         # The first sample of an instant schedules the update, which then uses all of them.
-        if not self._samples:
+        if not self._samples and not self._pairs:
             self._timeline.call_at(self._timeline.now, Rank.UPDATE, self.entity, self._use_samples)
+        if self.view is not None:
+            for part in self.view.readings(y, H, R):
+                if isinstance(part, PairReading):
+                    self._pairs.append((node, part))
+                else:
+                    self._samples.append((node, part[0], part[1], part[2]))
+            return
         self._samples.append((node, y, H, R))
 
     def _use_samples(self, _: simpy.Event) -> None:
-        time, samples = self._timeline.now, self._samples
-        self._samples = []
+        time, samples, pairs = self._timeline.now, self._samples, self._pairs
+        self._samples, self._pairs = [], []
         self.predict_to(time)
-        sensing = sorted({node for node, *_ in samples})
+        sensing = sorted({sample[0] for sample in samples} | {node for node, _ in pairs})
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
         known = self.linearise([sample[1:] for sample in samples])
-        y, H = (np.concatenate([sample[part] for sample in known]) for part in range(2))
+        nothing = np.empty(0), np.empty((0, len(self.model.information)))
+        y, H = (
+            np.concatenate([nothing[part], *(sample[part] for sample in known)])
+            for part in range(2)
+        )
         R = block_diagonal([R for *_, R in known])
-        self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
+        reading = Reading(y, H, R, time, tuple(pair for _, pair in pairs))
+        self.state = self.algorithm.update(self.state, reading)
         # Under activation by readings the node transmits now.
         if self.after_sample is not None:
             self.after_sample(time)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import simpy
 
-from netkf.algorithms.filter import Exchange, Reading
+from netkf.algorithms.filter import Exchange, PairReading, Reading
 from netkf.algorithms.models import ChangingSlotModel
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope, Node, distinct
@@ -148,6 +148,7 @@ class SlotNode(Node):
         self._open = -1
         self._stopped, self._has_stopped = False, self.algorithm.analysis.stopped
         self._samples: list[tuple[FloatArray, Any, FloatArray]] = []
+        self._pairs: list[PairReading] = []
 
     def run_process(self, timeline: Timeline) -> Process:
         """Follow the schedule, slot after slot, as a SimPy process."""
@@ -183,6 +184,15 @@ class SlotNode(Node):
         """Store the reading y (p,) of one sensor with its H (p, n), or the function that linearises
         it, and R (p, p), until the update of this slot.
         """
+        if self.view is not None:
+            if not len(y):
+                return
+            for part in self.view.readings(y, H, R):
+                if isinstance(part, PairReading):
+                    self._pairs.append(part)
+                else:
+                    self._samples.append(part)
+            return
         self._samples.append((y, H, R))
 
     def _update(self, time: float) -> None:
@@ -197,8 +207,8 @@ class SlotNode(Node):
         # Rows without a value are left out of y, H and R alike.
         if not present.all():
             y, H, R = y[present], H[present], R[np.ix_(present, present)]
-        self._samples = []
-        self.state = self.algorithm.update(self.state, Reading(y, H, R, time))
+        pairs, self._samples, self._pairs = tuple(self._pairs), [], []
+        self.state = self.algorithm.update(self.state, Reading(y, H, R, time, pairs))
 
     def emit(self, exchange: Exchange) -> Any:
         """Return the payload that the node sends in an exchange."""

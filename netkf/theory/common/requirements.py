@@ -1,4 +1,4 @@
-"""The check that functions of ``netkf.theory`` are called with a scenario."""
+"""The checks that functions of ``netkf.theory`` are called with a scenario that they are about."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
-from netkf.core.errors import ScenarioError
+from netkf.core.errors import ScenarioError, TheoryError
 from netkf.scenario.scenario import Scenario
 
 WITH_TIME = (
@@ -31,6 +31,15 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
     return wrapped
 
 
+def require_whole_state(scenario: Scenario) -> None:
+    """Raise TheoryError if nodes of a scenario estimate some blocks of the state only."""
+    if scenario.views is not None:
+        raise TheoryError(
+            "nothing is promised of nodes that estimate some blocks of the state; with "
+            'filter.estimates = "all" theory is about the whole state'
+        )
+
+
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the public ``function`` with a check that its first argument is a Scenario, of which
     it gets the last piece where that counts.
@@ -42,6 +51,7 @@ def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[.
         if not isinstance(scenario, Scenario):
             remedy = f"load it first: netkf.theory.{name}(netkf.load(path))"
             raise ScenarioError("", f"theory.{name} takes a netkf.Scenario", scenario, remedy)
+        require_whole_state(scenario)
         return function(scenario if name in WITH_TIME else scenario.last_piece, *args, **kwargs)
 
     # Pickle finds a function by these two names: the wrapper replaces the original under them.

@@ -1,0 +1,319 @@
+"""Nodes that estimate blocks of their own: readings of pairs, covariance intersection of three
+kinds, and samples of nodes with states of different size.
+
+The truth is not ours: plain scalar recursions in information form, the Kalman filter of all blocks,
+and the errors of many runs.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+import netkf
+from netkf.scenario.writing import as_table, to_toml
+
+RULES = ["split", "ci", "naive"]
+ROBOTS = """
+format = 1
+name = "robots on a line"
+horizon = 12.0
+probe = 1.0
+seed = 5
+[[plants]]
+name = "pose"
+nodes = [1, 2, 3]
+F = [[0.9]]
+Q = [[0.2]]
+period = 1.0
+cov = [[1.0]]
+[[sensors]]
+of = "pose"
+nodes = [1]
+H = [[1.0]]
+R = [[0.1]]
+[[sensors]]
+kind = "relative"
+of = "pose"
+R = [[0.3]]
+[network]
+graph = { kind = "edges", edges = [[1, 2], [2, 3]] }
+activation = { kind = "broadcast" }
+[filter]
+kind = "block-intersection"
+estimates = "own"
+"""
+CLOCKED = ROBOTS.replace("F = [[0.9]]\nQ = [[0.2]]\nperiod = 1.0", "A = [[-0.1]]\nB = [[0.5]]")
+CLOCKED = CLOCKED.replace(
+    "R = [[0.1]]", "R = [[0.1]]\nsampling = { kind = 'periodic', period = 1.0 }"
+)
+CLOCKED = CLOCKED.replace(
+    "R = [[0.3]]", "R = [[0.3]]\nsampling = { kind = 'periodic', period = 0.5 }"
+)
+CLOCKED = CLOCKED.replace('"broadcast"', '"readings"')
+
+
+def load(text: str, folder: Path, **changes: object) -> netkf.Scenario:
+    path = folder / "scenario.toml"
+    path.write_text(text)
+    return netkf.load(path, {key.replace("__", "."): value for key, value in changes.items()})
+
+
+class Scalar:
+    """A scalar estimate with the variance P = told + own in information form."""
+
+    def __init__(self, rule: str) -> None:
+        self.rule, self.x, self.told, self.own = rule, 0.0, 0.0, 1.0
+        self._join()
+
+    @property
+    def P(self) -> float:
+        return self.told + self.own
+
+    def _join(self) -> None:
+        if self.rule == "ci":
+            self.told, self.own = self.P, 0.0
+        if self.rule == "naive":
+            self.told, self.own = 0.0, self.P
+
+    def predict(self) -> None:
+        self.x, self.told, self.own = 0.9 * self.x, 0.81 * self.told, 0.81 * self.own + 0.2
+        self._join()
+
+    def use(self, z: float, dependent: float, heard: float, noise: float) -> None:
+        """Use z = x + e, with parts of var(e) that are unknown to correlate, kept by the sender and
+        nobody else's.
+        """
+
+        def parts(w: float, v: float) -> tuple[float, float]:
+            return self.told / w + self.own, dependent / v + heard + noise
+
+        def variance(w: float) -> float:
+            P, C = parts(w, 1.0 - w)
+            return 1.0 / (1.0 / P + 1.0 / C)
+
+        P, C = parts(1.0, 1.0)
+        if self.told and dependent:
+            w = minimize_scalar(variance, bounds=(1e-6, 1 - 1e-6), options={"xatol": 1e-11}).x
+            w = min((w, 1e-6, 1 - 1e-6), key=variance)
+            if variance(w) >= self.P:
+                return
+            P, C = parts(w, 1.0 - w)
+        K = P / (P + C)
+        after = P * C / (P + C)
+        self.x += K * (z - self.x)
+        own = (1.0 - K) ** 2 * self.own + K**2 * noise
+        self.told, self.own = after - own, own
+        self._join()
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_own_states_follow_a_scalar_recursion(tmp_path: Path, rule: str) -> None:
+    readings = {
+        (1, None): [0.4, -0.2, 0.3, 0.1, -0.5],
+        (1, 2): [0.7, 0.2, -0.1, 0.3, 0.9],
+        (2, 1): [-0.6, -0.4, 0.2, 0.1, -0.8],
+        (2, 3): [1.1, 0.8, 1.3, 0.6, 0.2],
+        (3, 2): [-0.9, -1.2, -1.0, -0.7, -0.1],
+    }
+    pairs = [f"{k + 1},{i},{j},{y[k]}" for (i, j), y in readings.items() if j for k in range(5)]
+    (tmp_path / "pairs.csv").write_text("t,node,to,y0\n" + "\n".join(pairs) + "\n")
+    own = [f"{k + 1},1,{y}" for k, y in enumerate(readings[1, None])]
+    (tmp_path / "own.csv").write_text("t,node,y0\n" + "\n".join(own) + "\n")
+    text = ROBOTS.replace('of = "pose"\nnodes = [1]', 'kind = "recorded"\npath = "own.csv"')
+    text = text.replace('kind = "relative"', 'kind = "relative"\npath = "pairs.csv"')
+    scenario = load(text, tmp_path, horizon=6.0, filter__rule=rule)
+    run = netkf.simulate(scenario)
+    nodes = {node: Scalar(rule) for node in (1, 2, 3)}
+    for k in range(5):
+        for node in nodes.values():
+            node.predict()
+        nodes[1].use(readings[1, None][k], 0.0, 0.0, 0.1)
+        sent = {i: (node.x, node.told, node.own) for i, node in nodes.items()}
+        for node in nodes.values():
+            node.told, node.own = node.P, 0.0
+            node._join()
+        for j, node in nodes.items():
+            for i in sorted(nodes):
+                if (i, j) in readings:
+                    x, told, unsent = sent[i]
+                    node.use(readings[i, j][k] + x, told, unsent, 0.3)
+        expected = [(node.x, node.P) for node in nodes.values()]
+        seen = np.stack([run.xhat[k + 1, :, 0], run.P[k + 1, :, 0, 0]], axis=1)
+        np.testing.assert_allclose(seen, expected, rtol=1e-7)
+
+
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
+def test_a_first_message_is_used_as_the_central_filter_would(tmp_path: Path, text: str) -> None:
+    text = text.replace("R = [[0.3]]", "R = [[0.3]]\nto = [[1, 2]]").replace(
+        "period = 0.5", "period = 1.0"
+    )
+    own = netkf.simulate(load(text, tmp_path))
+    all_blocks = netkf.simulate(load(text, tmp_path, filter={"kind": "central"}))
+    # Node 1 does not hear of the reading that it took, which is about node 2 alone.
+    assert own.P[1, 1, 0, 0] == pytest.approx(all_blocks.P[1, 0, 1, 1], rel=1e-12)
+    assert own.block("pose", 2).xhat[1, 0] == pytest.approx(all_blocks.xhat[1, 0, 1], rel=1e-9)
+    assert own.P[1, 0, 0, 0] > all_blocks.P[1, 0, 0, 0]
+
+
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours", ["pose"]])
+@pytest.mark.parametrize("rule", ["split", "ci"])
+def test_no_block_filter_is_below_the_stacked_kalman_filter(
+    tmp_path: Path, rule: str, estimates: str | list[str]
+) -> None:
+    changes = {"filter__rule": rule, "filter__estimates": estimates}
+    scenario = load(CLOCKED, tmp_path, **changes)
+    run = netkf.simulate(scenario)
+    central = netkf.simulate(load(CLOCKED, tmp_path, filter={"kind": "central"}))
+    assert scenario.views is not None
+    for k, view in enumerate(scenario.views):
+        n = len(view)
+        above = run.P[:, k, :n, :n] - central.P[:, 0][:, view][:, :, view]
+        assert np.linalg.eigvalsh(above).min() > -1e-12
+        np.testing.assert_array_equal(run.x[:, view] - run.xhat[:, k, :n], run.error[:, k, :n])
+        assert np.isnan(run.xhat[:, k, n:]).all()
+
+
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
+def test_only_the_naive_update_is_overconfident(tmp_path: Path, estimates: str) -> None:
+    runs, level = 60, 1e-4
+    for rule in RULES:
+        # Little noise of the plant: the same errors go round for long.
+        changes = {"filter__rule": rule, "filter__estimates": estimates}
+        changes |= {"plants__0__F": [[1.0]], "plants__0__Q": [[0.01]]}
+        scenario = load(ROBOTS, tmp_path, **changes)
+        assert scenario.views is not None
+        ensemble = netkf.monte_carlo(scenario, runs, workers=1)
+        n = np.array([len(view) for view in scenario.views])
+        # Of all nodes at the last sample, each at a share of the level: the errors of one node at
+        # one time are independent over the runs. A naive P is too small by a third and more.
+        upper = chi2.ppf(1.0 - level / len(n), runs * n) / runs
+        assert (ensemble.mean_nees[-1] > upper).any() == (rule == "naive"), (rule, ensemble)
+
+
+def test_tables_have_the_blocks_of_each_node(tmp_path: Path) -> None:
+    scenario = load(ROBOTS, tmp_path, filter__estimates="own+neighbours")
+    run = netkf.simulate(scenario)
+    assert run.xhat.shape == (13, 3, 3)
+    states = run.states[run.states.t == 12.0].set_index("node")
+    assert states.loc[1, ["x0", "x1"]].tolist() == run.x[-1, [0, 1]].tolist()
+    assert states.loc[3, ["x0", "x1"]].tolist() == run.x[-1, [2, 1]].tolist()
+    assert states.loc[3, ["x2", "xhat2", "P22"]].isna().all()
+    # NEES of the two states that the node has, by hand.
+    e, P = run.error[-1, 2, :2], run.P[-1, 2, :2, :2]
+    assert states.loc[3, "nees"] == pytest.approx(e @ np.linalg.solve(P, e))
+    assert states.loc[3, "sq_error"] == pytest.approx(e @ e)
+    block = run.block("pose", 2, by=3)
+    np.testing.assert_array_equal(block.xhat[:, 0], run.xhat[:, 2, 1])
+    np.testing.assert_array_equal(block.x[:, 0], run.x[:, 1])
+    with pytest.raises(netkf.ScenarioError, match="must estimate block 'pose'"):
+        run.block("pose", 3, by=1)
+    stored = netkf.open(netkf.save(run, scenario, tmp_path / "out"))
+    for name in ("x", "xhat", "P", "nees"):
+        np.testing.assert_array_equal(getattr(stored, name), getattr(run, name))
+    again = load(to_toml(as_table(scenario)), tmp_path)
+    assert netkf.simulate(again).fingerprint == run.fingerprint
+
+
+def test_shared_blocks_are_estimated_by_any_filter(tmp_path: Path) -> None:
+    target = '[[plants]]\nname = "target"\nF = [[0.95]]\nQ = [[0.1]]\nperiod = 1.0\ncov = [[2.0]]\n'
+    sensor = '[[sensors]]\nof = "target"\nnodes = [1, 3]\nH = [[1.0]]\nR = [[0.2]]\n'
+    text = ROBOTS.replace("[[sensors]]", target + sensor + "[[sensors]]", 1)
+    begin, end = text.index('[[sensors]]\nof = "pose"'), text.index("[network]")
+    text = text[:begin] + text[end:]
+    shared = {"filter": {"kind": "kcf", "estimates": "shared"}}
+    run = netkf.simulate(load(text, tmp_path, **shared))
+    alone = text[: text.index("[[plants]]")] + text[text.index(target) :]
+    whole = netkf.simulate(load(alone, tmp_path, filter={"kind": "kcf"}), engine="simpy")
+    np.testing.assert_allclose(run.P, whole.P, rtol=1e-12)
+    assert run.xhat.shape == whole.xhat.shape
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "rule"),
+    [
+        ({"filter": {"kind": "hybrid", "epsilon": 0.2, "estimates": "own"}}, "filter", ""),
+        ({"filter": {"kind": "kcf", "estimates": "own"}}, "filter.estimates", "say no blocks"),
+        ({"filter": {"kind": "local", "estimates": "own"}}, "sensors[1]", "must read blocks"),
+        ({"filter__estimates": "shared"}, "filter.estimates", "node 1 has none"),
+        ({"filter__estimates": "ours"}, "filter.estimates", "must be one of"),
+        ({"filter__estimates": ["poses"]}, "filter.estimates", "name of one of"),
+        ({"plants__0__nodes": [1, 2]}, "filter.estimates", "node 3 has none"),
+        (
+            {"plants__0__coupling": [{"from": [2], "A": [[0.1]]}]},
+            "filter.estimates",
+            "must contain all that drives",
+        ),
+    ],
+)
+def test_mistakes_about_blocks_are_named(
+    tmp_path: Path, changes: dict[str, object], key: str, rule: str
+) -> None:
+    with pytest.raises(netkf.ScenarioError) as caught:
+        load(ROBOTS, tmp_path, **changes)
+    assert caught.value.key.startswith(key)
+    assert rule in str(caught.value)
+
+
+def test_theory_and_checks_say_that_nothing_is_promised(tmp_path: Path) -> None:
+    scenario = load(ROBOTS, tmp_path)
+    run = netkf.simulate(scenario)
+    for function in (netkf.theory.central_covariance, netkf.theory.assumptions, netkf.check):
+        with pytest.raises(netkf.TheoryError, match="some blocks of the state"):
+            function(scenario)
+    with pytest.raises(netkf.TheoryError, match="some blocks of the state"):
+        netkf.theory.error_covariance(scenario, run)
+    with pytest.raises(netkf.EngineError, match="estimate the whole state"):
+        netkf.simulate(scenario, engine="compiled")
+
+
+PLANAR = """
+format = 1
+name = "planar"
+horizon = 4.0
+probe = 1.0
+[[plants]]
+name = "position"
+nodes = [1, 2]
+F = [[1.0, 0.0], [0.0, 1.0]]
+Q = [[0.1, 0.0], [0.0, 0.1]]
+period = 1.0
+cov = [[0.2, 0.0], [0.0, 0.2]]
+[[sensors]]
+kind = "relative-range-bearing"
+path = "sights.csv"
+R = [[0.04, 0.0], [0.0, 0.01]]
+[network]
+graph = { kind = "edges", edges = [[1, 2]] }
+activation = { kind = "broadcast" }
+[filter]
+kind = "block-intersection"
+estimates = "own"
+mean = [0.0, 0.0, 3.0, 4.0]
+"""
+
+
+def test_ranges_and_bearings_of_pairs_are_linearised_at_both_estimates(tmp_path: Path) -> None:
+    (tmp_path / "sights.csv").write_text("t,node,to,y0,y1\n1,1,2,5.2,0.95\n3,1,2,5.1,0.9\n")
+    run = netkf.simulate(load(PLANAR, tmp_path))
+    x, P = np.array([3.0, 4.0]), 0.2
+    one = 0.2  # the variance of node 1, which hears nothing it can use
+    P, one = P + 0.1, one + 0.1
+    d = x
+    r = np.hypot(*d)
+    H = np.array([d / r, [-d[1] / r**2, d[0] / r**2]])
+    R = np.diag([0.04, 0.01])
+    # Nothing has been told before: the Kalman update with node 1's error in the noise.
+    S = H @ (P * np.eye(2)) @ H.T + R + H @ (one * np.eye(2)) @ H.T
+    K = P * H.T @ np.linalg.inv(S)
+    after = P * np.eye(2) - K @ H * P
+    expected = x + K @ (np.array([5.2, 0.95]) - [r, np.arctan2(d[1], d[0])])
+    np.testing.assert_allclose(run.xhat[1, 1], expected, rtol=1e-12)
+    np.testing.assert_allclose(run.P[1, 1], after, rtol=1e-10)
+    np.testing.assert_allclose(run.P[1, 0], one * np.eye(2), rtol=1e-12)
+    np.testing.assert_allclose(run.P[2, 1], after + 0.1 * np.eye(2), rtol=1e-10)
+    assert np.trace(run.P[3, 1]) <= np.trace(run.P[2, 1]) + 0.2 + 1e-12
