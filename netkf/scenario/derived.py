@@ -552,7 +552,12 @@ class DerivedScenario(ScenarioModel):
         """The scenario without input; itself if its plant is not linear."""
         if self.plant.input is None or not self.plant.linear:
             return self
-        return dataclasses.replace(self, plant=dataclasses.replace(self.plant, input=None))
+        plant: Any = self.plant
+        schedule = tuple(dataclasses.replace(change, G=None) for change in plant.schedule)
+        plant = dataclasses.replace(plant, input=None, schedule=schedule)
+        # The stacked plant and its sensors, where the state consists of blocks.
+        blocks: dict[str, Any] = {"plants": (), "sensors": self.sensors} if self.plants else {}
+        return dataclasses.replace(self, plant=plant, **blocks)
 
     @cached_property
     def exact_errors(self) -> bool:

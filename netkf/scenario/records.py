@@ -10,6 +10,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.contacts import Contacts
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.inputs import RecordedInput
+from netkf.plants.plant import Plant
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
@@ -115,17 +116,29 @@ def count_state_rows(scenario: DerivedScenario) -> RowUse | None:
     return count_rows(plant.path.name, plant.row_keys, used.__contains__)
 
 
-def count_input_rows(scenario: DerivedScenario) -> RowUse | None:
-    """Return the use of the rows of a recorded input; None if the input is not recorded."""
-    u, horizon = scenario.plant.input, scenario.horizon
-    if not isinstance(u, RecordedInput):
-        return None
-    starts = None
+def recorded_inputs(scenario: DerivedScenario) -> dict[str, RecordedInput]:
+    """Return the recorded inputs of the plant, or of its blocks, by key path."""
+    plants: list[tuple[str, Plant]] = [("plant", scenario.plant)]
+    if scenario.plants:
+        plants = [(f"plants[{k}]", block.plant) for k, block in enumerate(scenario.plants)]
+    return {
+        f"{key}.input": plant.input.on_grid(scenario.time_grid)
+        for key, plant in plants
+        if isinstance(plant.input, RecordedInput)
+    }
+
+
+def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
+    """Return the use of the rows of recorded inputs by key path."""
+    horizon, starts = scenario.horizon, None
     if scenario.slotted:
         # In slots u counts at their beginnings only.
         period = scenario.slot_plant.period
         starts = scenario.time_grid.before(horizon, period * np.arange(int(horizon / period) + 2))
-    return count_rows(u.path.name, u.row_keys, u.used_keys(horizon, starts).__contains__)
+    return {
+        key: count_rows(u.path.name, u.row_keys, u.used_keys(horizon, starts).__contains__)
+        for key, u in recorded_inputs(scenario).items()
+    }
 
 
 def _state_times(scenario: DerivedScenario) -> FloatArray:

@@ -12,7 +12,6 @@ from netkf.network.contacts import Contacts
 from netkf.network.graphs import Link
 from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedDelay, RecordedLoss
-from netkf.plants.inputs import RecordedInput
 from netkf.plants.readings import ReadingTable
 from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sampling import RecordedSampling
@@ -21,6 +20,7 @@ from netkf.scenario.records import (
     count_input_rows,
     count_state_rows,
     exchange_slots,
+    recorded_inputs,
     sensed_slots,
 )
 
@@ -70,10 +70,7 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
     state_rows = count_state_rows(scenario)
     if state_rows is not None:
         uses["plant"] = _make_use(state_rows)
-    input_rows = count_input_rows(scenario)
-    if input_rows is not None:
-        uses["plant.input"] = _make_use(input_rows)
-    return uses
+    return uses | {key: _make_use(use) for key, use in count_input_rows(scenario).items()}
 
 
 def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
@@ -129,9 +126,8 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
             tables[key] = "node and time", clock.path.name, clock.row_times
     if isinstance(scenario.plant, RecordedDiffusion | RecordedPlant):
         tables["plant"] = "time", scenario.plant.path.name, scenario.plant.row_keys
-    u = scenario.plant.input
-    if isinstance(u, RecordedInput):
-        tables["plant.input"] = "time", u.path.name, u.row_keys
+    for key, u in recorded_inputs(scenario).items():
+        tables[key] = "time", u.path.name, u.row_keys
     uses = [
         (f"network.graph{key}", "node" if key else "link", use)
         for key, use in scenario.topology.tables.items()

@@ -210,9 +210,10 @@ class _Innovations:
             return e, P, Sigma
         slot, noise = last
         whole = scenario.linear_plant
-        plant = whole.pieces[bisect.bisect_right(whole.change_slots, slot)]
-        # Of the filters' model, which may differ from the plant.
-        F, Q = scenario.believed_pieces[bisect.bisect_right(scenario.followed_slots, slot)]
+        # Of the plant, and of the filters' model, which may differ from it.
+        now = bisect.bisect_right(whole.change_slots, slot)
+        believed = bisect.bisect_right(scenario.followed_slots, slot)
+        plant, (F, Q) = whole.pieces[now], scenario.believed_pieces[believed]
         model_is_true = np.array_equal(F, plant.F)
         if Sigma is not None:
             Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if model_is_true else None
@@ -221,9 +222,11 @@ class _Innovations:
         # = F e + w + (F - F') xhat.
         if not model_is_true:
             predicted = predicted + (plant.F - F) @ run.xhat[k, i]
-        u = plant.input
-        if u is not None and self._scenario.misses_input:
-            predicted, Sigma = predicted + np.asarray(u.G) @ u.at(float(run.times[k])), None
+        if whole.input is not None:
+            gains, share = whole.input_gains, float(scenario.knows_input)
+            unknown = (gains[now] - share * gains[believed]) @ whole.input.at(float(run.times[k]))
+            if unknown.any():
+                predicted, Sigma = predicted + unknown, None
         return predicted, F @ P @ F.T + Q, Sigma
 
 

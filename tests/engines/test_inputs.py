@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 
 import netkf
@@ -147,6 +148,48 @@ def test_both_engines_make_the_same_run_of_a_driven_plant(unstable, model, incre
     if model is None:
         free = netkf.simulate(run.scenario.undriven, engine="compiled")
         assert np.array_equal(run.error, free.error)
+
+
+def integrated(A, G, u, m, start):
+    """m a second later, by a Runge-Kutta method."""
+    solved = scipy.integrate.solve_ivp(
+        lambda t, m: A @ m + G @ u.at(t), (start, start + 1), m, "DOP853", rtol=1e-11, atol=1e-11
+    )
+    return solved.y[:, -1]
+
+
+@pytest.mark.parametrize("sensing", ["slots", "samples", "increments"])
+@pytest.mark.parametrize("model", [{}, {"input": False}, {"schedule": False}])
+def test_inputs_of_a_plant_that_changes(sensing, model):
+    if sensing == "slots":
+        driven, name, M = scenario(ALL["kcf"], LINEAR, {"kind": "broadcast"}), "F", LINEAR["F"]
+    else:
+        driven, name, M = scenario(HYBRID, FLOW, {"kind": "poisson", "rate": 2.0}), "A", FLOW["A"]
+    if sensing == "increments":
+        driven = driven.replace({"sensors": [{"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.3]]}]})
+    other, G = [[0.5, 0.2], [-0.3, 0.1]], [[0.0, -1.0], [2.0, 1.0]]
+    changes = [{"from": 3.0, name: other}, {"from": 6.0, name: M, "G": G}]
+    keys = {"plant.schedule": changes} | {f"filter.model.{k}": v for k, v in model.items()}
+    driven = driven.replace(keys)
+    run = assert_agree(driven)
+    free = netkf.simulate(driven.undriven, engine="compiled")
+    assert np.array_equal(run.P, free.P)
+    assert np.array_equal(run.error, free.error) == (not model)
+    u, at, m = driven.plant.input, [0.0, 3.0, 6.0, 8.0], np.zeros(2)
+    matrices, gains = [np.array(one) for one in (M, other, M)], [u.G, u.G, np.array(G)]
+    expected = [m]
+    for matrix, gain, a, b in zip(matrices, gains, at[:-1], at[1:], strict=True):
+        for k in range(int(a), int(b)):
+            if sensing == "slots":
+                m = matrix @ m + gain @ u.at(float(k))
+            else:
+                m = integrated(matrix, gain, u, m, k)
+            expected.append(m)
+    np.testing.assert_allclose(run.x - free.x, expected, atol=1e-8)
+    means = [error_law(one, r).mean for one, r in ((driven, run), (driven.undriven, free))]
+    bias = run.error - free.error
+    tolerance = (1e-4 if sensing == "increments" else 1e-9) * np.abs(run.x).max()
+    np.testing.assert_allclose((means[0] - means[1]).reshape(bias.shape), bias, atol=tolerance)
 
 
 def in_slots(folder, filtering, sensors, network=None, u=INPUT, **more):
