@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
+    Rule,
     boolean,
     field,
     instance_of,
+    matrix,
     number,
     of_time,
+    one_of,
     positive,
     probability,
 )
@@ -36,7 +40,7 @@ class Loss(Component):
     symmetric.
     """
 
-    _called_if = MappingProxyType({"next_state": "stateful"})
+    _called_if = MappingProxyType({"next_state": "stateful", "at_distance": "follows_distance"})
 
     @abstractmethod
     def delivery_probability(
@@ -45,9 +49,19 @@ class Loss(Component):
         """Return the probability that message number ``message`` from link[0] reaches link[1].
 
         ``bad``: the link is in the bad one of its two states, in which losses come in bursts.
-        ``table_probability`` is the entry of the graph's table for that direction, 1 without one.
+        ``table_probability`` is the entry of the graph's table for that direction, 1 without one;
+        of a loss that follows the distance, what ``at_distance`` says when the message is sent.
         """
         raise NotImplementedError
+
+    def at_distance(self, distance: float) -> float:
+        """Return the delivery probability of a message between nodes at this ``distance``."""
+        return 1.0
+
+    @property
+    def follows_distance(self) -> bool:
+        """True if ``at_distance`` gives the ``table_probability`` of each message."""
+        return False
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Return True if the link is in its bad state at the next activation.
@@ -133,6 +147,91 @@ class PerLink(Loss):
                 "per-link",
                 'use graph = { kind = "csv" } with a column delivery_probability',
             )
+
+
+@dataclass(frozen=True, eq=False)
+class Logistic(Component):
+    """The delivery probability ``1 / (1 + exp((d - half) / width))`` at the distance d: one half at
+    ``half``, and 0.73 and 0.27 a ``width`` before and after it.
+    """
+
+    kind: str = field(one_of("logistic"))
+    half: float = field(number(low=0.0))
+    width: float = field(positive)
+
+    def at(self, distance: float) -> float:
+        """Return the delivery probability at a ``distance``."""
+        # At exp(700) the probability is below 1e-300.
+        return 1.0 / (1.0 + math.exp(min((distance - self.half) / self.width, 700.0)))
+
+
+def _convert_delivery(value: Any) -> Logistic | FloatArray:
+    if isinstance(value, Logistic):
+        return value
+    if isinstance(value, Mapping):
+        for key in (f.name for f in dataclasses.fields(Logistic)):
+            if key not in value:
+                raise ScenarioError(key, "is missing", None, f"add {key} = ...")
+        for key in value.keys() - {"kind", "half", "width"}:
+            remedy = "keys are kind, half, width"
+            raise ScenarioError(str(key), "is not a key here", value[key], remedy)
+        return Logistic(**value)
+    table: FloatArray = matrix.convert(value)
+    distances, probabilities = table.T  # of two columns, else a ValueError
+    if distances[0] < 0.0 or (np.diff(distances) <= 0.0).any():
+        raise ScenarioError("", "must have increasing distances from 0", value, "sort the rows")
+    if ((probabilities < 0.0) | (probabilities > 1.0)).any():
+        raise ScenarioError("", "must have probabilities from 0 to 1", value, "correct them")
+    return table
+
+
+_delivery = Rule(
+    "must be a table [[distance, probability], ...] or a logistic function",
+    _convert_delivery,
+    'write delivery = { kind = "logistic", half = ..., width = ... }',
+    {
+        "anyOf": [
+            {
+                "type": "object",
+                "properties": {
+                    "kind": {"const": "logistic"},
+                    "half": {"type": "number", "minimum": 0},
+                    "width": {"type": "number", "exclusiveMinimum": 0},
+                },
+                "required": ["kind", "half", "width"],
+                "additionalProperties": False,
+            },
+            dict(matrix.schema),
+        ]
+    },
+)
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceLoss(Loss):
+    """A message arrives with a probability that depends on how far its ends are apart when it is
+    sent.
+
+    delivery  { kind = "logistic", half = ..., width = ... }: 1 / (1 + exp((d - half) / width)) at
+              the distance d; or a table [[d, p], ...], linear between its rows and constant before
+              the first and after the last
+    """
+
+    follows_distance = True
+
+    delivery: Logistic | FloatArray = field(_delivery)
+
+    def at_distance(self, distance: float) -> float:
+        """Return the delivery probability of a message between nodes at this ``distance``."""
+        if isinstance(self.delivery, Logistic):
+            return self.delivery.at(distance)
+        return float(np.interp(distance, *self.delivery.T))
+
+    def delivery_probability(
+        self, link: Link, message: int, bad: bool, table_probability: float
+    ) -> float:
+        """Return ``table_probability``, which is that of the distance."""
+        return table_probability
 
 
 @dataclass(frozen=True, eq=False)
@@ -470,9 +569,11 @@ def draw_delays(delay: Delay, random: np.random.Generator, count: int) -> FloatA
 
 
 def identical_per_link(loss: Loss) -> bool:
-    """Return True if all messages of a directed link have the same delivery probability."""
+    """Return True if all messages of a directed link have the same delivery probability, as long as
+    nodes stay where they are.
+    """
     # By exact type: a subclass may override delivery_probability.
-    return type(loss) in (NoLoss, Bernoulli, PerLink)
+    return type(loss) in (NoLoss, Bernoulli, PerLink, DistanceLoss)
 
 
 def delivery_probabilities(

@@ -59,6 +59,15 @@ class DeliveringLoss(Loss):
         """The value of the model ``given``, so that the same numbers are drawn."""
         return self.given.stateful
 
+    @property
+    def follows_distance(self) -> bool:
+        """The value of the model ``given``."""
+        return self.given.follows_distance
+
+    def at_distance(self, distance: float) -> float:
+        """Return the delivery probability at a ``distance`` by the model ``given``."""
+        return self.given.at_distance(distance)
+
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Return the next state of the channel, True if it is bad, by the model ``given``."""
         return self.given.next_state(bad, random)

@@ -97,6 +97,7 @@ class Topology:
     left_out  : nodes that the graph's table names but that have no link
     tables    : use of the rows of the graph's tables, by the rest of their key path
     names     : id of each node that the graph's file names by a text
+    radius    : distance up to which the ends of a link hear each other, None for any
     """
 
     nodes: tuple[int, ...]
@@ -108,6 +109,7 @@ class Topology:
     left_out: frozenset[int] = frozenset()
     tables: Mapping[str, RowUse] = dataclasses.field(default_factory=dict)
     names: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    radius: float | None = None
 
     def __post_init__(self) -> None:
         """Put named ids in the place of the ids of nodes that have names."""
@@ -526,6 +528,30 @@ class Edges(Graph):
             raise ScenarioError("positions", rule, got, "list the nodes, and a place for each")
         points = zip(ids.values(), self.positions.tolist(), strict=True)
         return {node: (x, y) for node, (x, y) in points}
+
+
+@dataclass(frozen=True, eq=False)
+class RangeGraph(Graph):
+    """Links between all pairs of nodes, each of which is up while its ends are at most ``radius``
+    apart: over a link that is down nothing is sent.
+
+    nodes   N names the nodes 0 .. N - 1; a list names all nodes
+    radius  in the unit of positions
+    """
+
+    may_name_nodes: ClassVar[bool] = True
+
+    nodes: int | tuple[Any, ...] = field(either(_count, list_of(_node, "node ids"), _is_list))
+    radius: float = field(positive)
+
+    def build(self, seed: int) -> Topology:
+        """Return the topology that links all pairs; ``seed`` is not used."""
+        labels = range(self.nodes) if isinstance(self.nodes, int) else self.nodes
+        ids = assign_ids(labels)
+        _check_size(len(ids), len(ids) * (len(ids) - 1) // 2)
+        names = {name: k for name, k in ids.items() if str(k) != str(name)}
+        pairs = itertools.combinations(ids.values(), 2)
+        return _make_topology(ids.values(), pairs, names=names, radius=self.radius)
 
 
 def assign_ids(labels: Iterable[Any]) -> dict[Any, int]:

@@ -21,6 +21,7 @@ from netkf.core.fields import (
     Rule,
     field,
     instance_of,
+    integer,
     list_of,
     matrix,
     node_id,
@@ -83,12 +84,28 @@ class Block(Component):
     coupling  by which other blocks it is driven: [{ from = "name" or node ids, A = ... }], the
               blocks of that name on the same node or shared, or the own blocks of these nodes;
               A (n, n') multiplies the state of each
+    position  which of its entries, counted from 0, are the coordinates of its node
     """
 
     name: str = field(text)
     plant: Plant = field(instance_of(Diffusion, LinearPlant))
     nodes: tuple[int, ...] | None = field(list_of(node_id(), "node ids"), default=None)
     coupling: tuple[Coupling, ...] = field(_couplings, default=())
+    position: tuple[int, ...] | None = field(
+        list_of(integer(low=0), "numbers of entries"), default=None
+    )
+
+    def check_position(self) -> None:
+        """Raise ScenarioError unless ``position`` names different entries of blocks of nodes."""
+        if self.position is None:
+            return
+        n, given = self.plant.n, list(self.position)
+        if self.nodes is None:
+            rule = "cannot be that of a block that all nodes share"
+            raise ScenarioError("position", rule, given, "add nodes = [...], one block for each")
+        if max(given) >= n or len(set(given)) < len(given):
+            rule = f"must be different entries of the {n} states of the block, 0 .. {n - 1}"
+            raise ScenarioError("position", rule, given, "correct the numbers")
 
 
 class Layout:

@@ -19,6 +19,7 @@ from netkf.engines.base import Engine, Progress, silent
 from netkf.linalg import compiling
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.rng.streams import Streams
+from netkf.runs.connectivity import ConnectivitySink
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failure
 from netkf.runs.files import (
@@ -163,19 +164,23 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class _Output:
-    """A run directory with its sinks; ``links`` is empty unless losses or delays are recorded."""
+    """A run directory with its sinks; ``links`` is empty unless losses or delays are recorded,
+    ``connectivity`` unless links come and go.
+    """
 
     directory: Path
     scenario: Scenario
     samples: SummarySink
     tables: ParquetSink | None
     links: list[SentPerLink]
+    connectivity: list[ConnectivitySink]
     manifest: Manifest
 
     @property
     def sinks(self) -> list[Sink]:
         """All sinks, which receive the events and samples of the run."""
-        return [self.samples, *([] if self.tables is None else [self.tables]), *self.links]
+        tables = [] if self.tables is None else [self.tables]
+        return [self.samples, *tables, *self.links, *self.connectivity]
 
     def close_tables(self) -> None:
         """Finish the Parquet tables, if the run has any; raises WriteError."""
@@ -196,6 +201,8 @@ class _Output:
             "lost": count("lost") + count("late"),
         }
         summary = summarise(self.scenario, self.samples, promised, messages)
+        if self.connectivity:
+            summary["connectivity"] = self.connectivity[0].entry()
         if sums:
             summary["conserved"] = conserved_sums(sums)
         # How much of the recorded tables (readings, losses) the run has used; a run that ended
@@ -232,6 +239,7 @@ def _create_output(
         samples=SummarySink(),
         tables=ParquetSink(directory, scenario, replica) if tables else None,
         links=[SentPerLink()] if is_recorded else [],
+        connectivity=[] if scenario.topology.radius is None else [ConnectivitySink(scenario)],
         manifest=manifest,
     )
 

@@ -19,6 +19,7 @@ from netkf.plants.maps import NonlinearPlant
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.compatibility import check_activation, check_time, filter_name
 from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.positions import check_positions
 from netkf.scenario.preconditions import check_preconditions
 from netkf.scenario.records import check_records
 from netkf.scenario.registry import explain_time_mismatch, kind_name
@@ -57,6 +58,7 @@ def check_scenario(scenario: DerivedScenario) -> None:
     _check_filter(scenario)
     check_records(scenario)
     check_sampling(scenario)
+    check_positions(scenario, uses_grid(scenario))
     check_preconditions(scenario)
     if scenario.slotted:
         _check_slots(scenario)

@@ -47,6 +47,7 @@ from netkf.plants.transitions import frame_period, frame_slots
 from netkf.rng.streams import Streams
 from netkf.scenario.block_sensors import support_of
 from netkf.scenario.model import PlacedSensor, ScenarioModel
+from netkf.scenario.positions import tick_times
 from netkf.scenario.sampling import (
     all_sample_times,
     require_states,
@@ -446,6 +447,8 @@ class DerivedScenario(ScenarioModel):
             by_sensor = sample_times(self, streams)
             require_states(self, by_sensor)
             sampled = all_sample_times(by_sensor)
+        # Of a path that is drawn at some instants only, states do not depend on which.
+        sampled = np.union1d(sampled, tick_times(self, streams))
         random, probes = streams.generator("plant"), self.times
         times, responses = np.union1d(sampled, probes), self.input_responses
         truth: Any
@@ -590,11 +593,9 @@ class DerivedScenario(ScenarioModel):
     @property
     def delivers_all(self) -> bool:
         """True if every message is sure to arrive, after a time known beforehand."""
-        channel = self.network.channel
         # A random delay (``fixed`` is None) may bring a message too late for its slot.
-        return channel.delay.fixed is not None and all(
-            channel.loss.mean_delivery(link, self.table_probability(link)) == 1.0
-            for link in self.topology.directions
+        return self.network.channel.delay.fixed is not None and all(
+            self.mean_delivery(link) == 1.0 for link in self.topology.directions
         )
 
     def move_back(self, offset: FloatArray, age: float) -> FloatArray:
@@ -783,12 +784,11 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def _effective_rates(self) -> dict[Link, float]:
-        clock, loss = self.network.activation, self.network.channel.loss
+        clock = self.network.activation
         if not isinstance(clock, LinkClock) or not self.filter.algorithm.timing.talks:
             return {}
         return {
-            link: self._send_rate(clock, link)
-            * loss.mean_delivery(link, self.table_probability(link))
+            link: self._send_rate(clock, link) * self.mean_delivery(link)
             for link in self.topology.directions
         }
 

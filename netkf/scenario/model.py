@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from netkf.algorithms.kernels.maps import METHODS
 from netkf.core.errors import ScenarioError, TheoryError, errors_under
 from netkf.core.fields import (
     Component,
+    SourceFile,
     array,
     boolean,
     covariance,
@@ -28,6 +30,7 @@ from netkf.core.fields import (
     matrix,
     one_of,
     seconds,
+    source_file,
     square,
     text,
     vector,
@@ -40,6 +43,7 @@ from netkf.network.clocks import LinkClock
 from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, Topology
 from netkf.network.matchings import SlotActivation
+from netkf.network.positions import Positions, PositionTable
 from netkf.plants.blocks import Block, Layout, stack
 from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor
@@ -47,6 +51,7 @@ from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.block_sensors import estimated_blocks, require_no_blocks, stacked_sensors
 from netkf.scenario.names import bind_names
+from netkf.scenario.positions import positions_of, table_of_positions
 from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
 
@@ -56,6 +61,8 @@ class Network(Component):
     """The graph of a network, the activation of its links and the channel of its messages.
 
     graph       nodes and links
+    positions   a table node,x,y of where nodes are, or t,node,x,y, each of whose rows holds until
+                the next of its node; nodes whose plant says it are left out
     activation  when links, directions or nodes send; only filters that do not talk need none
     channel     losses and delays of messages
     """
@@ -65,6 +72,7 @@ class Network(Component):
         instance_of(LinkClock, SlotActivation), default=None
     )
     channel: Channel = field(instance_of(Channel), default=Channel())
+    positions: SourceFile | None = field(source_file, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +205,12 @@ class ScenarioModel(Component):
             object.__setattr__(self, name, bound)
         self._stack_blocks()
         self._put_on_grid()
+        if self.position_table is not None and not self.position_table.timed:
+            points = self.position_table.points
+            placed = {node: points[node] for node in self.nodes if node in points}
+            # Sensors and pictures take these for positions of the graph, if all nodes have one.
+            located = placed if len(placed) == len(self.nodes) else None
+            self.__dict__["topology"] = dataclasses.replace(self.topology, positions=located)
 
     def _stack_blocks(self) -> None:
         declared, entries = self.sensors, tuple(range(len(self.sensors)))
@@ -270,6 +284,27 @@ class ScenarioModel(Component):
             ("filter", filtering),
         ):
             object.__setattr__(self, name, value)
+
+    @cached_property
+    def position_table(self) -> PositionTable | None:
+        """The table ``network.positions``, None without one."""
+        return table_of_positions(self)
+
+    @cached_property
+    def positions(self) -> Positions:
+        """Where nodes are."""
+        return positions_of(self)
+
+    @property
+    def links_move(self) -> bool:
+        """True if it changes in a run who hears whom, or how well: nodes move."""
+        follows = self.network.channel.loss.follows_distance
+        return self.topology.radius is not None or (follows and self.positions.moving)
+
+    @property
+    def links_follow_state(self) -> bool:
+        """True if the true state says who hears whom, or how well."""
+        return self.links_move and self.positions.of_state
 
     @cached_property
     def time_grid(self) -> TimeGrid:
@@ -404,10 +439,23 @@ class ScenarioModel(Component):
     def table_probability(self, link: Link) -> float:
         """Return the delivery probability of a directed link in the graph's CSV table.
 
-        It is 1 if the graph has no such table, 0 if the table does not list the link.
+        It is 1 if the graph has no such table, 0 if the table does not list the link. Of a loss
+        that follows the distance it is that of the distance, nan if nodes move.
         """
+        loss = self.network.channel.loss
+        if loss.follows_distance:
+            moving = self.positions.moving
+            return math.nan if moving else loss.at_distance(self.positions.distance(link))
         delivery = self.topology.delivery
         return 1.0 if delivery is None else delivery.get(link, 0.0)
+
+    def mean_delivery(self, link: Link) -> float:
+        """Return the fraction of messages of a directed link that arrive in the long run, nan if it
+        is unknown before a run.
+        """
+        if self.topology.radius is not None:
+            return math.nan
+        return self.network.channel.loss.mean_delivery(link, self.table_probability(link))
 
     @cached_property
     def increment_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:

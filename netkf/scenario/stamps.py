@@ -148,6 +148,9 @@ def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
         yield scenario.network.activation.rows
     if isinstance(scenario.network.activation, Contacts):
         yield np.array([begin for _, begin, _ in scenario.network.activation.row_keys])
+    positions = scenario.position_table
+    if positions is not None and positions.timed:
+        yield np.array([t for _, t in positions.row_keys])
     plant = scenario.plant
     if isinstance(plant, RecordedDiffusion | RecordedPlant):
         yield plant.row_times

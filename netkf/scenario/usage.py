@@ -57,6 +57,8 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
         for key, use in scenario.topology.tables.items()
         if use.used < use.rows
     }
+    if scenario.position_table is not None:
+        uses["network.positions"] = _make_use(scenario.position_table.use(scenario.horizon))
     activation_use = _find_activation_use(scenario)
     if activation_use is not None:
         uses["network.activation"] = _make_use(activation_use)
@@ -126,6 +128,10 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
             tables[key] = "node and time", clock.path.name, clock.row_times
     if isinstance(scenario.plant, RecordedDiffusion | RecordedPlant):
         tables["plant"] = "time", scenario.plant.path.name, scenario.plant.row_keys
+    positions = scenario.position_table
+    if positions is not None:
+        what = "node and time" if positions.timed else "node"
+        tables["network.positions"] = what, positions.path, positions.row_keys
     for key, u in recorded_inputs(scenario).items():
         tables[key] = "time", u.path.name, u.row_keys
     uses = [

@@ -11,6 +11,7 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import (
+    NO_CHANNEL_LAW,
     TRUE_MODEL,
     AssumptionRow,
     judge_plant,
@@ -193,12 +194,15 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
     # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
     # fixed delay only shifts it; a random delay or dependent losses do neither.
     fixed, symmetric = channel.delay.fixed, has_balanced_rates(scenario)
+    is_unknown = isinstance(channel.loss, RecordedLoss) or scenario.links_move
     return [
         (
             "losses are independent of each other and of the past",
             "H Theorem 2, derived",
-            None if isinstance(channel.loss, RecordedLoss) else channel.loss.independent,
-            "arrivals are Poisson processes of lower rates"
+            None if is_unknown else channel.loss.independent,
+            NO_CHANNEL_LAW
+            if scenario.links_move
+            else "arrivals are Poisson processes of lower rates"
             if channel.loss.independent
             else "losses are recorded or depend on earlier ones: H(12) is not promised",
         ),

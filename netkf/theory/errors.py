@@ -101,6 +101,8 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     require_linear(scenario)
+    if scenario.links_follow_state:
+        raise TheoryError("the true state says who hears whom: events tell of it")
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
     if has_columns(scenario):

@@ -19,6 +19,7 @@ KINDS = (
     "restart",
     "diverged",
     "transmit",
+    "link",
 )
 """Event kinds; a row stores the index of its kind in this tuple.
 
@@ -37,6 +38,8 @@ crash, restart  recorded by no engine; they keep the codes of the kinds after th
 diverged the estimate of node or its squared error was no longer finite, or its covariance no longer
          finite and positive semidefinite
 transmit node transmitted once, as its transmission number ``message``, to all that may hear it
+link     the link node - peer of a range graph is up (``message`` 1) or down (0), and was not when
+         it was looked at last; it is down before the first look
 """
 
 CODES = {kind: code for code, kind in enumerate(KINDS)}

@@ -20,6 +20,7 @@ from netkf.network.channels import (
     Channel,
     ChannelSampler,
     ConstantDelay,
+    DistanceLoss,
     ExponentialDelay,
     GilbertElliott,
     LognormalDelay,
@@ -39,7 +40,7 @@ from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
 LOST = -1.0  # no delay is negative
-LOSSES = (NoLoss, Bernoulli, PerLink, GilbertElliott)
+LOSSES = (NoLoss, Bernoulli, PerLink, DistanceLoss, GilbertElliott)
 DELAYS = (NoDelay, ConstantDelay, ExponentialDelay, UniformDelay, LognormalDelay)
 FIXED, EXPONENTIAL, UNIFORM, LOGNORMAL, LISTED = range(5)
 """Laws of delays; outcomes that are LISTED were drawn in Python."""

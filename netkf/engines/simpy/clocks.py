@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Generator
 from functools import partial
 from typing import Any
@@ -108,8 +109,12 @@ def _link_activations(
 
     def activate(exchange: LinkExchange, i: int, j: int, now: float) -> None:
         recorder.append((now, TICK, i, j, -1, -1, NAN))
-        # Both payloads are computed before either end receives.
-        exchange.exchange((nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))))
+        # The channel takes its step even where nothing is sent.
+        payloads: tuple[Any, Any] = (None, None)
+        if transmitter.connects(i, j):
+            # Both payloads are computed before either end receives.
+            payloads = nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))
+        exchange.exchange(payloads)
 
     # The index of a link orders simultaneous arrivals.
     return [
@@ -131,7 +136,8 @@ def _direction_activations(
         recorder.append((now, TICK, i, j, -1, -1, NAN))
         # Drawn in any case: even if nothing is sent, the channel takes its step.
         outcome = direction.sampler.draw()
-        transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
+        if transmitter.connects(i, j):
+            transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
 
     links = _directed_links(scenario, transmitter, nodes)
     return [(direction.link, partial(activate, direction)) for direction in links]
@@ -163,14 +169,16 @@ def broadcasts(
     def transmit(node: int, now: float) -> None:
         # Drawn even if the filter sends nothing, so that the network does not depend on it.
         outcomes = [direction.sampler.draw() for direction in directions[node]]
-        receivers = tuple(direction.link[1] for direction in directions[node])
+        heard = [transmitter.connects(*direction.link) for direction in directions[node]]
+        receivers = tuple(d.link[1] for d in itertools.compress(directions[node], heard))
         payload = nodes[node].emit(now, receivers)
         if payload is None:
             return
         # A broadcast is one transmission, numbered by sender; its messages are numbered by link.
         recorder.append((now, TRANSMIT, node, -1, sent[node], -1, NAN))
         sent[node] += 1
-        for direction, outcome in zip(directions[node], outcomes, strict=True):
+        sends = zip(directions[node], outcomes, strict=True)
+        for direction, outcome in itertools.compress(sends, heard):
             transmitter.send(direction, payload, outcome)
 
     return {node: partial(transmit, node) for node in scenario.nodes}

@@ -18,6 +18,7 @@ from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
+from netkf.engines.simpy.reach import Reach
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import (
     FIRST_RANK,
@@ -101,6 +102,7 @@ class _Simulation:
         """Return the SimPy processes of a scenario in continuous time."""
         scenario, streams, timeline = self._scenario, self._streams, self.timeline
         truth = scenario.continuous_truth(streams)
+        self._begin_reach(truth)
 
         def make_node(node: int, entity: int, sensing: tuple[int, ...]) -> ClockedNode:
             # A pooled filter has the increment sensors of all nodes.
@@ -120,6 +122,11 @@ class _Simulation:
             *sensor_processes(*shared, truth, nodes),
             *clock_processes(*shared, self._transmitter, nodes),
         ]
+
+    def _begin_reach(self, truth: Any) -> None:
+        if self._scenario.links_move:
+            shared = (self._scenario, self.timeline, self._recorder, truth)
+            self._transmitter.reach = Reach(*shared)
 
     def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
         for time in self._scenario.times.tolist():
@@ -152,6 +159,7 @@ class _Simulation:
         """Return the SimPy processes of a scenario in slots."""
         scenario, streams, recorder = self._scenario, self._streams, self._recorder
         truth = scenario.slot_truth(streams)
+        self._begin_reach(truth)
         schedule, period = SlotSchedule(scenario), scenario.slot_plant.period
 
         def make(node: int, entity: int, _: tuple[int, ...]) -> SlotNode:
@@ -220,6 +228,9 @@ class _Simulation:
         """Record the states at ``time``; ``when`` is that time, or its slot."""
         scenario, recorder = self._scenario, self._recorder
         x, local = truth.absolute(when), truth.local(when)
+        # Half open: links are not looked at at the horizon.
+        if self._transmitter.reach is not None and self.timeline.now < scenario.horizon:
+            self._transmitter.reach.look_at_all(int(when) if scenario.slotted else None)
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]

@@ -302,6 +302,7 @@ class SlotClock:
         self._distinct = distinct(nodes)
         self._matching_random = streams.generator("matching")
         links = scenario.topology.links if scenario.node_filter.timing.talks else ()
+        self._transmitter = transmitter
         # Nodes without links are never asked for a message.
         self._talking = sorted({node for link in links for node in link})
         self._links = {
@@ -331,11 +332,14 @@ class SlotClock:
             (slot, phase, stage.step),
             self._timing.pairwise,
         )
+        if self._transmitter.reach is not None:
+            self._transmitter.reach.slot = slot
+        connected = {pair for pair in pairs if self._transmitter.connects(*pair)}
         senders = self._talking
         if broadcast:
             self._recorder.append((now, ROUND, -1, -1, -1, phase, NAN))
         else:
-            senders = sorted({node for pair in pairs for node in pair})
+            senders = sorted({node for pair in connected for node in pair})
         exchange = Exchange(now, phase, stage.step, slot)
         # All payloads are computed before any message arrives: the order of nodes does not matter.
         payloads = {node: self._nodes[node].emit(exchange) for node in senders}
@@ -346,7 +350,8 @@ class SlotClock:
                 self._recorder.append((now, TICK, i, j, -1, phase, NAN))
             # A recorded link that is down loses its messages, but its channel draws all the same.
             is_up = up is None or (i, j) in up
-            both = payloads[i], payloads[j]
+            # Nothing is sent between nodes that are out of range.
+            both = (payloads[i], payloads[j]) if (i, j) in connected else (None, None)
             self._links[i, j].exchange(
                 both, phase=phase, exchange=stage.number, up=is_up, fresh=fresh
             )

@@ -12,6 +12,7 @@ import simpy
 from netkf.algorithms.filter import Filter
 from netkf.engines.base import Rank
 from netkf.engines.simpy.nodes import Envelope
+from netkf.engines.simpy.reach import Reach
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import ChannelDraw, ChannelSampler, transit_time
@@ -66,8 +67,11 @@ class Transmitter:
         self._scenario, self._streams = scenario, streams
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
+        self._follows_distance = self._channel.loss.follows_distance
         self._horizon, self._until = scenario.horizon, scenario.end_time
         self._instant = scenario.time_grid.instant
+        # Of nodes that move: who hears whom. Set when the true state of the run is known.
+        self.reach: Reach | None = None
         # Payloads under way, by link and number, because a move of the origin shifts them.
         self._under_way: dict[tuple[Link, int], Envelope] = {}
 
@@ -75,6 +79,10 @@ class Transmitter:
         """Return the sampler of ``link``: of both directions if the channel is symmetric."""
         # The sampler makes its streams when it needs them, by purpose.
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
+
+    def connects(self, i: int, j: int) -> bool:
+        """Return True if nodes ``i`` and ``j`` (ids) can hear each other now."""
+        return self.reach is None or self.reach.connects(i, j)
 
     def send(
         self,
@@ -94,12 +102,11 @@ class Transmitter:
         append = self._recorder.append
         # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
+        table = direction.table_probability
+        if self._follows_distance and self.reach is not None:
+            table = self.reach.delivery(direction.link)
         # nan: the message is lost.
-        delay = self._instant(
-            transit_time(
-                self._channel, direction.link, number, outcome, direction.table_probability
-            )
-        )
+        delay = self._instant(transit_time(self._channel, direction.link, number, outcome, table))
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return

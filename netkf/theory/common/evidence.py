@@ -6,7 +6,6 @@ A record is one outcome and does not show the law that it came from: the verdict
 from __future__ import annotations
 
 from netkf.core.errors import TheoryError
-from netkf.network.channels import Channel
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.scenario import Scenario
 
@@ -15,7 +14,7 @@ AssumptionRow = tuple[str, str, bool | None, str]
 
 UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
 FOLLOWS_DATA = "not linear in the state: gains, P and errors follow the data"
-RECORDED_CHANNEL = "losses or delays are recorded: one outcome, not a law"
+NO_CHANNEL_LAW = "losses or delays are recorded, or nodes move: what arrives has no known law"
 TRUE_MODEL = "the filters know the plant and the sensors"
 
 
@@ -35,9 +34,11 @@ def require_linear(scenario: Scenario) -> None:
         raise TheoryError(evidence)
 
 
-def is_recorded(channel: Channel) -> bool:
-    """Return True if losses or delays are read from a table."""
-    return isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
+def lacks_channel_law(scenario: Scenario) -> bool:
+    """Return True if losses or delays are read from a table, or follow nodes that move."""
+    channel = scenario.network.channel
+    recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
+    return recorded or scenario.links_move
 
 
 def true_model_row(scenario: Scenario, source: str, matrices: str) -> AssumptionRow:

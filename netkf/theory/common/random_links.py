@@ -20,7 +20,7 @@ from netkf.network.channels import GilbertElliott, identical_per_link
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import RecordedSlots
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import is_recorded
+from netkf.theory.common.evidence import NO_CHANNEL_LAW, lacks_channel_law
 
 MAX_CHAINS = 10
 """Independent chains of bursty links whose joint states are enumerated."""
@@ -146,8 +146,8 @@ def directions_of(
     """
     channel = scenario.network.channel
     loss, delay = channel.loss, channel.delay.fixed
-    if is_recorded(channel) or has_recorded_broadcasts(scenario):
-        raise TheoryError("losses or delays are recorded: their law is not known")
+    if lacks_channel_law(scenario) or has_recorded_broadcasts(scenario):
+        raise TheoryError(NO_CHANNEL_LAW)
     if delay is None:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
     chained = isinstance(loss, GilbertElliott) and not loss.independent
@@ -175,10 +175,8 @@ def directions_of(
 
 def nothing_is_lost(scenario: Scenario) -> bool:
     """Return True if no message of a scenario in slots is lost, by its losses and its records."""
-    loss = scenario.network.channel.loss
     return not has_recorded_broadcasts(scenario) and all(
-        loss.mean_delivery(link, scenario.table_probability(link)) == 1.0
-        for link in scenario.topology.directions
+        scenario.mean_delivery(link) == 1.0 for link in scenario.topology.directions
     )
 
 
@@ -196,8 +194,7 @@ def all_messages_arrive(scenario: Scenario) -> bool:
 
 def delivery_of(scenario: Scenario, direction: tuple[int, int]) -> float:
     """Return the probability that a message of a link arrives; raises TheoryError if unknown."""
-    loss, table = scenario.network.channel.loss, scenario.table_probability(direction)
-    mean = loss.mean_delivery(direction, table)
+    mean = scenario.mean_delivery(direction)
     if math.isnan(mean):
         raise TheoryError("the losses state no probability before a run")
     if not has_constant_losses(scenario):

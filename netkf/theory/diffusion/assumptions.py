@@ -11,7 +11,12 @@ import scipy.sparse.csgraph
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import is_definite
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import RECORDED_CHANNEL, UNKNOWN_LAW, AssumptionRow, is_recorded
+from netkf.theory.common.evidence import (
+    NO_CHANNEL_LAW,
+    UNKNOWN_LAW,
+    AssumptionRow,
+    lacks_channel_law,
+)
 from netkf.theory.common.plant_assumptions import start_rows
 from netkf.theory.common.random_links import all_messages_arrive
 from netkf.theory.diffusion.information import (
@@ -147,8 +152,8 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
 
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
-    if is_recorded(scenario.network.channel):
-        return ("every message arrives", "D (8)", None, RECORDED_CHANNEL)
+    if lacks_channel_law(scenario):
+        return ("every message arrives", "D (8)", None, NO_CHANNEL_LAW)
     all_arrive = all_messages_arrive(scenario)
     algorithm: Any = scenario.filter.algorithm
     evidence = (

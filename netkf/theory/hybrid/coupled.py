@@ -25,7 +25,7 @@ from netkf.network.clocks import LinkClock
 from netkf.plants.transitions import Transitions
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import nonlinear_rows
+from netkf.theory.common.evidence import NO_CHANNEL_LAW, nonlinear_rows
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
@@ -122,7 +122,10 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     if network.channel.delay.fixed is None:
         return "not promised: Tanwani's H(12) holds for no or fixed delays, and the delay is random"
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
-    return _reason_of_samples(scenario) if network.channel.loss.independent else dependent
+    if scenario.links_move:
+        dependent = f"not promised: {NO_CHANNEL_LAW}"
+    independent = network.channel.loss.independent and not scenario.links_move
+    return _reason_of_samples(scenario) if independent else dependent
 
 
 def _reason_of_samples(scenario: Scenario) -> str | None:

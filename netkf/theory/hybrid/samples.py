@@ -108,12 +108,11 @@ def transmits_at_samples(scenario: Scenario) -> bool:
 
 def _mean_link_weights(scenario: Scenario) -> scipy.sparse.csr_array:
     """Return delivery times weight (receivers, senders), sparse, of messages sent at samples."""
-    index, loss = scenario.topology.index, scenario.network.channel.loss
+    index = scenario.topology.index
     weights = scipy.sparse.lil_array((len(index), len(index)))
     if scenario.filter.algorithm.timing.talks and transmits_at_samples(scenario):
         for i, j in scenario.topology.directions:
-            delivery = loss.mean_delivery((i, j), scenario.table_probability((i, j)))
-            weights[index[j], index[i]] = delivery * scenario.weight(j, i)
+            weights[index[j], index[i]] = scenario.mean_delivery((i, j)) * scenario.weight(j, i)
     return scipy.sparse.csr_array(weights)
 
 

@@ -10,7 +10,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import contracts
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import RECORDED_CHANNEL, AssumptionRow, is_recorded
+from netkf.theory.common.evidence import NO_CHANNEL_LAW, AssumptionRow, lacks_channel_law
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.intermittent.riccati import (
     contraction_radius,
@@ -65,17 +65,14 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     channel = scenario.network.channel
     loss = channel.loss
     # R (12) needs independent arrivals of positive probability.
-    rates = [
-        loss.mean_delivery(link, scenario.table_probability(link))
-        for link in scenario.topology.directions
-    ]
+    rates = [scenario.mean_delivery(link) for link in scenario.topology.directions]
     finite_rates = [rate for rate in rates if np.isfinite(rate)]
     smallest = min(finite_rates, default=1.0)
     holds: bool | None = loss.independent and len(finite_rates) == len(rates) and smallest > 0.0
     evidence = f"delivery from {smallest:g}" if loss.independent else "losses come in bursts"
-    if is_recorded(channel):
+    if lacks_channel_law(scenario):
         # A recording has no probabilities: the assumption is neither true nor false.
-        holds, evidence = None, RECORDED_CHANNEL
+        holds, evidence = None, NO_CHANNEL_LAW
     rows: list[AssumptionRow] = [
         (
             "arrivals are independent of each other and of the past, and not impossible",
@@ -127,8 +124,7 @@ def _bounded_mean_row(scenario: Scenario) -> AssumptionRow:
 
 def _deliveries(scenario: Scenario, heard: list[tuple[int, int]]) -> list[float]:
     """Return the mean delivery probability of each link of ``heard``."""
-    loss = scenario.network.channel.loss
-    return [loss.mean_delivery(link, scenario.table_probability(link)) for link in heard]
+    return [scenario.mean_delivery(link) for link in heard]
 
 
 def _arrival_sets(

@@ -122,9 +122,9 @@ def _gain_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _stop_row(scenario: Scenario) -> AssumptionRow:
     """Return the row that ``stop`` freezes no gain before push-sum has converged."""
-    filter_, loss = push_sum_filter(scenario), scenario.network.channel.loss
+    filter_ = push_sum_filter(scenario)
     lossless = isinstance(scenario.network.activation, Broadcast) and all(
-        loss.mean_delivery(direction, scenario.table_probability(direction)) == 1.0
+        scenario.mean_delivery(direction) == 1.0
         for i, j in scenario.topology.links
         for direction in ((i, j), (j, i))
     )

@@ -180,10 +180,7 @@ def _channel_probabilities(scenario: Scenario) -> dict[Edge, float]:
     """Return the probability that each link is up in both directions; raises TheoryError."""
     channel, probabilities = scenario.network.channel, {}
     for i, j in scenario.topology.links:
-        forward, backward = (
-            channel.loss.mean_delivery(direction, scenario.table_probability(direction))
-            for direction in ((i, j), (j, i))
-        )
+        forward, backward = (scenario.mean_delivery(direction) for direction in ((i, j), (j, i)))
         if math.isnan(forward + backward):
             raise TheoryError("the channel is a record, not a law: give delivery")
         if forward != backward or (not channel.symmetric and 0.0 < forward < 1.0):

@@ -18,7 +18,7 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.spectra import growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import RECORDED_CHANNEL, is_recorded
+from netkf.theory.common.evidence import NO_CHANNEL_LAW, lacks_channel_law
 from netkf.theory.common.random_links import arrival_of
 from netkf.theory.intermittent.riccati import steady_gain
 
@@ -33,8 +33,8 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
     """
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
-    if is_recorded(scenario.network.channel):
-        raise TheoryError(RECORDED_CHANNEL)
+    if lacks_channel_law(scenario):
+        raise TheoryError(NO_CHANNEL_LAW)
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model is not the true one")
     joint, radius = steady_tracks(scenario)

@@ -1,0 +1,109 @@
+"""Where the nodes of a scenario are, and when that must be known."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from netkf.core.clock import generate_ticks
+from netkf.core.errors import ScenarioError, errors_under
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.network.clocks import LinkClock
+from netkf.network.positions import Positions, PositionTable, read_positions
+from netkf.rng.streams import Streams
+
+PLACE = "add position = [...] to the [[plants]] of these nodes, or network.positions"
+
+
+def table_of_positions(scenario: Any) -> PositionTable | None:
+    """Return the table ``network.positions``, None without one; raises ScenarioError for a mistake
+    in it, or unless it places just the nodes that the plant does not.
+    """
+    source = scenario.network.positions
+    if source is None:
+        return None
+    try:
+        table = read_positions(source, scenario.topology, scenario.time_grid)
+    except ScenarioError as error:
+        raise ScenarioError("network.positions", error.rule, error.value, error.remedy) from None
+    moved = _entries_of_nodes(scenario)
+    twice = [node for node in table.rows if node in moved]
+    missing = [node for node in scenario.nodes if node not in table.rows and node not in moved]
+    if twice:
+        rule = f"{source.name} must leave out nodes whose place is part of the state"
+        remedy = "delete their rows, or position of their [[plants]]"
+        raise ScenarioError("network.positions", rule, twice, remedy)
+    if missing:
+        rule = f"{source.name} must place every node"
+        raise ScenarioError("network.positions", rule, missing, "add their rows")
+    return table
+
+
+def positions_of(scenario: Any) -> Positions:
+    """Return where nodes are: by their own plants, else by ``network.positions``, else the graph.
+
+    Raises ScenarioError where these have different numbers of coordinates.
+    """
+    entries, table = _entries_of_nodes(scenario), scenario.position_table
+    fixed = {k: xy for k, xy in (scenario.topology.positions or {}).items() if k not in entries}
+    sizes = {len(one) for one in entries.values()} | ({2} if fixed or table is not None else set())
+    if len(sizes) > 1:
+        k = next(k for k, block in enumerate(scenario.plants) if block.position is not None)
+        rule = "must be as many coordinates as other nodes have"
+        given = scenario.plants[k].position
+        raise ScenarioError(f"plants[{k}].position", rule, list(given), "give all two, say")
+    return Positions(fixed, table, entries)
+
+
+def _entries_of_nodes(scenario: Any) -> dict[int, IntArray]:
+    """Return which entries of the stacked state are the coordinates of each node that says so."""
+    entries: dict[int, IntArray] = {}
+    for k, block in enumerate(scenario.plants):
+        with errors_under(f"plants[{k}]"):
+            block.check_position()
+        for node in block.nodes or () if block.position is not None else ():
+            if node in entries:
+                rule = f"must not place node {node} again"
+                given = list(block.position)
+                raise ScenarioError(f"plants[{k}].position", rule, given, "leave one of them out")
+            first = scenario.layout.find(block.name, node).first
+            entries[node] = first + np.array(block.position, dtype=np.int64)
+    return entries
+
+
+def check_positions(scenario: Any, on_grid: bool) -> None:
+    """Raise ScenarioError unless it is known where all nodes are, if messages depend on it;
+    ``on_grid``: the states of a diffusion are drawn on a grid of sensing periods.
+    """
+    loss, positions = scenario.network.channel.loss, scenario.positions
+    if not loss.follows_distance and scenario.topology.radius is None:
+        return
+    key = "network.channel.loss" if loss.follows_distance else "network.graph"
+    missing = [node for node in scenario.nodes if not positions.has(node)]
+    if missing:
+        rule = "needs the distances of nodes, and it is not known where these are"
+        raise ScenarioError(key, rule, missing, PLACE)
+    if on_grid and positions.of_state:
+        k = next(k for k, block in enumerate(scenario.plants) if block.position is not None)
+        rule = "cannot say who hears whom where sensors give increments, only where they sample"
+        remedy = 'write sampling = { kind = "periodic", period = ... } in all [[sensors]]'
+        given = list(scenario.plants[k].position)
+        raise ScenarioError(f"plants[{k}].position", rule, given, remedy)
+
+
+def tick_times(scenario: Any, streams: Streams) -> FloatArray:
+    """Return the increasing instants (K,), in seconds, at which a clock of the network ticks in one
+    run in continuous time, where the true state says who hears whom; else none. Nodes that
+    transmit after samples do so at sample times.
+    """
+    clock = scenario.network.activation
+    if not (scenario.links_follow_state and isinstance(clock, LinkClock)):
+        return np.empty(0)
+    instants = [np.empty(0)]
+    for entity in clock.entities(scenario.topology):
+        phase = partial(streams.generator, "phase", *entity)
+        random = streams.generator("clock", *entity)
+        instants.append(generate_ticks(clock, entity, phase, random, scenario.horizon))
+    return scenario.time_grid.before(scenario.horizon, np.unique(np.concatenate(instants)))
