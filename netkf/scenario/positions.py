@@ -106,4 +106,6 @@ def tick_times(scenario: Any, streams: Streams) -> FloatArray:
         phase = partial(streams.generator, "phase", *entity)
         random = streams.generator("clock", *entity)
         instants.append(generate_ticks(clock, entity, phase, random, scenario.horizon))
-    return scenario.time_grid.before(scenario.horizon, np.unique(np.concatenate(instants)))
+    return np.asarray(
+        scenario.time_grid.before(scenario.horizon, np.unique(np.concatenate(instants)))
+    )
