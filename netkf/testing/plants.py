@@ -16,10 +16,12 @@ from netkf.linalg.arrays import FloatArray, is_semidefinite
 from netkf.linalg.spectra import eigenvalues, growth_factor, growth_rate
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.paths import BLOCK
 from netkf.plants.plant import Plant
 from netkf.rng.normals import GeneratorNormals
 from netkf.rng.streams import Streams
+from netkf.testing.dynamics import check_dynamics
 from netkf.testing.noise import (
     NoiseLabels,
     check_independent,
@@ -41,6 +43,8 @@ from netkf.testing.watching import (
 
 STARTS, STEPS, LENGTH = 40_000, 100_000, 400
 """Draws of x(0), steps of the state in all runs together, and steps of a run, for statistics."""
+MAP_LENGTH, MAP_RUNS = 40, 100
+"""Steps of a run, and runs, of plants that need not be linear."""
 FEW_STARTS = 10
 """Draws of x(0) where it is not random."""
 GRID_STEPS, MAX_RUNS = 51_200, 2000
@@ -57,7 +61,8 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
     """Check a plant, or a class with its ``settings``.
 
     Its law is x(0) of mean ``mean`` and covariance ``cov``, and x[k+1] = F x[k] + w[k] with
-    cov(w) = Q, or dx = A x dt + B dw.
+    cov(w) = Q, or dx = A x dt + B dw. Where f takes the place of F, it must depend on x, u and t
+    alone, and have the Jacobian that is stated; its noise is judged from 4,000 steps.
 
     Exact checks: shapes; equal streams give equal paths, whether states are read one by one or some
     are left out, in frames or not, alone or with other runs, and at more times or fewer; a start
@@ -90,11 +95,34 @@ def _check_plant(part: Any, seed: int) -> None:
         return
     before = watched.attributes()
     with guard_user_code(name):
-        if isinstance(part, LinearPlant):
+        if not part.linear:
+            check_dynamics(part, name)
+        if isinstance(part, NonlinearPlant):
+            _check_maps(part, copy, name, seed)
+        elif isinstance(part, LinearPlant):
             _check_slots(part, copy, name, seed)
         elif isinstance(part, Diffusion):
             _check_diffusion(part, copy, name, seed)
     watched.demand_unchanged(before)
+
+
+def _check_maps(part: NonlinearPlant, copy: Any, name: str, seed: int) -> None:
+    where, period, steps = f"{name}.truth", part.period, np.arange(MAP_LENGTH)
+    f, u = part.functions[0], part.inputs(MAP_LENGTH)
+
+    def draw(plant: Any, run: int = 0) -> FloatArray:
+        truth = plant.truth(_make_generator(seed, run))
+        return np.array([truth.state(slot) for slot in range(MAP_LENGTH + 1)])
+
+    with guard_user_code(where):
+        _demand_same(where, draw(part), draw(copy), "of a pickled plant")
+        states = np.array([draw(part, run) for run in range(MAP_RUNS)])
+        moved = np.array(
+            [[f(x[k], u[k], k * period, period) for k in steps.tolist()] for x in states]
+        )
+    labels = NoiseLabels(where, "the noise x[k+1] - f(x[k])", "Q")
+    rule = "x[k+1] must be f(x[k], u[k], t_k) where Q has no noise"
+    _check_noise(states[:, 1:] - moved, part.Q, states[:, :-1], labels, rule)
 
 
 def _check_form(part: Any, name: str) -> None:

@@ -496,3 +496,45 @@ def test_what_linear_theory_cannot_promise_is_said(custom):
     first = verdict.table[verdict.table["promise"] == "P and errors follow the equations"]
     assert first["verdict"].tolist() == ["not promised"]
     assert bool(verdict)
+
+
+class Pendulum:
+    def f(self, x, u, t):
+        return np.array([x[0] + 0.1 * x[1], x[1] - 0.1 * math.sin(x[0])])
+
+    def jacobian(self, x, u, t):
+        return np.array([[1.0, 0.1], [-0.1 * math.cos(x[0]), 1.0]])
+
+
+class WrongSlope(Pendulum):
+    def jacobian(self, x, u, t):
+        return np.array([[1.0, 0.1], [-0.1, 1.0]])
+
+
+class Forgetful(Pendulum):
+    def __init__(self):
+        self.calls = 0
+
+    def f(self, x, u, t):
+        self.calls += 1
+        return super().f(x, u, t) + 1e-9 * self.calls
+
+
+def test_check_plant_holds_f_to_its_word():
+    def plant(f):
+        settings = {"Q": np.diag([1e-4, 1e-3]), "period": 0.1, "cov": 0.1 * np.eye(2)}
+        return netkf.parts.NonlinearPlant(f=f, **settings)
+
+    netkf.testing.check_plant(plant(Pendulum))
+    netkf.testing.check_plant(plant(Pendulum()))
+    for cls, words in (
+        (WrongSlope, "WrongSlope.jacobian: must be the derivatives of f; got entry [1, 0] off by"),
+        (Forgetful, "Forgetful.f: must be the same for equal x, u and t"),
+    ):
+        with pytest.raises(AssertionError) as caught:
+            netkf.testing.check_plant(plant(cls))
+        assert words in str(caught.value)
+    u = netkf.parts.ConstantInput(value=[1.0, 0.5])
+    netkf.testing.check_plant(
+        netkf.parts.NonlinearPlant(f="unicycle", Q=0.01 * np.eye(3), period=0.1, input=u)
+    )
