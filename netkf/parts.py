@@ -92,6 +92,7 @@ from netkf.network.graphs import (
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.plants.blocks import Block
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant
@@ -207,6 +208,7 @@ __all__ = [
     "NoDelay",
     "NoLoss",
     "NodeInfo",
+    "NonlinearDiffusion",
     "NonlinearPlant",
     "NonlinearSensor",
     "OnReadings",

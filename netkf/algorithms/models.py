@@ -20,6 +20,7 @@ import numpy as np
 from netkf.algorithms.kernels.estimates import transform_root, update_by_row
 from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.maps import MapTables, move_estimate, spread_of
+from netkf.algorithms.kernels.rates import RateTables, move_by_rate, scratch_of_rates
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import usable
 from netkf.algorithms.kernels.square_root import lower_root
@@ -344,6 +345,76 @@ class ChangingSlotModel(SlotModel):
             piece = self.pieces[bisect.bisect_right(self.slots, slot)]
             xhat, root = piece.predict(xhat, root, piece.period)
         return xhat, root
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RateModel(FlowModel):
+    """Continuous time of a plant that need not be linear: ``dx = f(x, u(t), t) dt + dw``, cov(dw) =
+    Q dt; A is nan, and there are no increment sensors.
+
+    ``f`` and ``jacobian`` are the rate of change and its Jacobian, ``step`` is the longest step of
+    their integration (s), ``tables_of_input`` has the ``times``, ``values`` and ``sine`` of the
+    input as filters know it (``RateTables``), and ``linearise`` is how they predict.
+    """
+
+    f: VectorFunction
+    jacobian: VectorFunction
+    step: float
+    tables_of_input: tuple[FloatArray, FloatArray, FloatArray]
+    linearise: str
+
+    now: ClassVar[float] = 0.0
+    """The end of predictions in seconds; engines say it by ``move_to``, of a copy."""
+
+    def move_to(self, time: float) -> None:
+        """Make ``time`` (seconds) the end of predictions."""
+        self.__dict__["now"] = time
+
+    def tables(self) -> RateTables:
+        """Return the model as kernels take it."""
+        distance, weight, center = spread_of(self.linearise, len(self.Q))
+        times, values, sine = (np.array(part, order="C") for part in self.tables_of_input)
+        return RateTables(
+            f=self.f.address,
+            jacobian=self.jacobian.address,
+            step=self.step,
+            distance=distance,
+            weight=weight,
+            center=center,
+            times=times,
+            values=values,
+            sine=sine,
+            Q=np.array(self.Q, order="C"),
+            **scratch_of_rates(len(self.Q), values.shape[1]),
+        )
+
+    def raise_error(self) -> None:
+        """Raise the error of a user's f or Jacobian, if a call has failed."""
+        for function in (self.f, self.jacobian):
+            function.raise_error()
+
+    def _move(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        n = len(xhat)
+        x, S = np.array(xhat).reshape(1, n, 1), np.array(root).reshape(1, n, n, 1)
+        move_by_rate(self.tables(), x, S, 0, self.now, gap)
+        self.raise_error()
+        return x.reshape(n), S.reshape(n, n)
+
+    def predict(
+        self, xhat: FloatArray, root: FloatArray, gap: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate and the root of its covariance, see ``FlowModel.predict``."""
+        return self._move(xhat, root, gap)
+
+    def extrapolate(
+        self, xhat: FloatArray, root: FloatArray, age: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate and the root of its covariance, see ``FlowModel.extrapolate``."""
+        if age <= 0.0:
+            return xhat, root
+        return self._move(xhat, root, age)
 
 
 def first_root(cov: FloatArray) -> FloatArray:

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.gains import stack_gains
-from netkf.algorithms.kernels.maps import MapTables, SingleMapRun
+from netkf.algorithms.kernels.maps import SingleMapRun
+from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
     ALL,
     ClockRun,
-    ClockTables,
     SingleSlotRun,
     SlotTables,
     clock_tables,
@@ -30,6 +30,7 @@ from netkf.algorithms.models import (
     ChangingSlotModel,
     FlowModel,
     MapModel,
+    RateModel,
     first_root,
     whiten_reading,
 )
@@ -202,6 +203,8 @@ class Surroundings:
         if isinstance(model, ChangingFlowModel):
             self.struct.now, tables.piece = model.now, model.piece
             tables.models[0] = model.piece * tables.stride
+        elif isinstance(model, RateModel):
+            self.struct.now = model.now
         elif isinstance(model, ChangingSlotModel) and self._piece != model.piece:
             self._piece = model.piece
             tables.F[:], tables.root_Q[:] = model.F, model.root_Q
@@ -261,12 +264,14 @@ class Surroundings:
 def _run_class(model: Any) -> Any:
     if isinstance(model, MapModel):
         return SingleMapRun
+    if isinstance(model, RateModel):
+        return RateRun
     return ClockRun if isinstance(model, FlowModel) else SingleSlotRun
 
 
-def _tables_of(model: Any, size: Size) -> SlotTables | MapTables | ClockTables:
+def _tables_of(model: Any, size: Size) -> Any:
     """Return the model of one node as kernels take it."""
-    if isinstance(model, MapModel):
+    if isinstance(model, MapModel | RateModel):
         return model.tables()
     if not isinstance(model, FlowModel):
         F, root_Q = (np.array(part, order="C") for part in (model.F, model.root_Q))
@@ -314,7 +319,7 @@ def predict(state: NodeState, gap: float) -> NodeState:
         if isinstance(model, MapModel):
             run.slot = model.slot + k
         state.kernels.predict(new.record, 0, run)
-    if isinstance(model, MapModel):
+    if isinstance(model, MapModel | RateModel):
         model.raise_error()
     return new
 

@@ -139,7 +139,7 @@ class SineInput(Input):
                 raise ScenarioError(name, rule, value, "add or remove some")
 
     @cached_property
-    def _components(self) -> np.ndarray:
+    def components(self) -> np.ndarray:
         """Amplitude, frequency in rad/s and phase in rows, (3, m)."""
         rows = np.broadcast_arrays(self.amplitude, 2.0 * math.pi * self.frequency, self.phase)
         return np.stack(rows)
@@ -147,7 +147,7 @@ class SineInput(Input):
     @cached_property
     def exogenous(self) -> Exogenous:
         """The system whose output is u: an oscillator (sin, cos) for each component."""
-        amplitude, omega, phase = self._components
+        amplitude, omega, phase = self.components
         blocks = [np.array([[0.0, w], [-w, 0.0]]) for w in omega]
         C = np.asarray(np.kron(np.diag(amplitude), [1.0, 0.0]), dtype=np.float64)
         z = np.stack([np.sin(phase), np.cos(phase)], axis=1).reshape(1, -1)
@@ -155,7 +155,7 @@ class SineInput(Input):
 
     def values(self, times: FloatArray) -> FloatArray:
         """Return u (K, m) at K ``times`` (K,) in seconds."""
-        amplitude, omega, phase = self._components
+        amplitude, omega, phase = self.components
         return np.asarray(amplitude * np.sin(omega * times[:, None] + phase))
 
 

@@ -80,7 +80,7 @@ def check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction])
         raise ScenarioError("input.G", "means nothing with a nonlinear plant", None, remedy)
     known = MOTIONS.get(plant.f) if isinstance(plant.f, str) else None
     if known is not None and known.n != n:
-        key = "Q" if hasattr(plant, "Q") else "B"
+        key = "B" if hasattr(plant, "B") else "Q"
         rule = f"must have {known.n} rows, for {known.states}"
         raise ScenarioError(key, rule, f"{n} rows", f'that is the state of "{plant.f}"')
     if known is not None and known.m != m:
@@ -93,9 +93,10 @@ def check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction])
     if known is not None:
         return
     u = np.zeros(m) if plant.input is None else plant.input.at(0.0)
+    x = plant.start_mean if len(plant.start_mean) == n else np.zeros(n)
     for name, function in zip(("f", "jacobian"), functions, strict=True):
         try:
-            value = function(plant.start_mean, u, 0.0, 0.0)
+            value = function(x, u, 0.0, 0.0)
         except Exception as error:
             place = place_of_error(error)
             rule = f"{name} failed at plant.mean ({type(error).__name__}: {error}"

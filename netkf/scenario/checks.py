@@ -13,6 +13,7 @@ from netkf.core.fields import Component
 from netkf.linalg.spectra import growth_rate
 from netkf.network.clocks import LinkClock
 from netkf.network.matchings import Matching, RecordedSlots
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import Input
 from netkf.plants.maps import NonlinearPlant
@@ -65,7 +66,7 @@ def check_scenario(scenario: DerivedScenario) -> None:
     elif uses_grid(scenario):
         _check_sensing_period(scenario)
     check_grid(scenario)
-    if not scenario.slotted:
+    if not scenario.slotted and scenario.plant.linear:
         _check_speed(scenario)
     check = scenario.node_filter.needs.check
     if check is not None:
@@ -74,6 +75,10 @@ def check_scenario(scenario: DerivedScenario) -> None:
 
 def _check_times(scenario: DerivedScenario) -> None:
     probe, horizon = scenario.probe, scenario.horizon
+    plant = scenario.plant
+    if isinstance(plant, NonlinearDiffusion) and horizon / plant.step > MAX_STEPS:
+        rule, remedy = f"must make at most {MAX_STEPS:,} steps to the horizon", "lengthen it"
+        raise ScenarioError("plant.step", rule, plant.step, remedy)
     if scenario.slotted and horizon / scenario.slot_plant.period > MAX_STEPS:
         raise ScenarioError(
             "plant.period",
@@ -124,20 +129,20 @@ def _check_plant(scenario: DerivedScenario) -> None:
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
         require_shape("plant.B", plant.B, (n, None), why)
-    elif isinstance(plant, NonlinearPlant):
-        why = f"plant.Q has {n} rows"
+    elif not plant.linear:
+        why = f"plant.{'Q' if scenario.slotted else 'B'} has {n} rows"
     else:
         why = f"plant.F has {n} rows"
         require_shape("plant.Q", scenario.slot_plant.Q, (n, n), why)
     check_schedule(scenario, why)
+    if isinstance(plant, NonlinearPlant | NonlinearDiffusion):
+        with errors_under("plant"):
+            plant.check_dynamics()
     if plant.mean is not None:
         require_shape("plant.mean", plant.mean, (n,), why)
     if plant.cov is not None:
         require_shape("plant.cov", plant.cov, (n, n), why)
-    if isinstance(plant, NonlinearPlant):
-        with errors_under("plant"):
-            plant.check_dynamics()
-    elif plant.input is not None:
+    if plant.input is not None and plant.linear:
         _check_input(plant.input, n)
 
 

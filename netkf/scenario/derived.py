@@ -24,6 +24,7 @@ from netkf.algorithms.models import (
     ChangingSlotModel,
     FlowModel,
     MapModel,
+    RateModel,
     SlotModel,
 )
 from netkf.algorithms.modes import rate_groups
@@ -35,6 +36,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
 from netkf.plants.changes import dividing_period
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.driven import InputResponses, MovedReadings, driven
 from netkf.plants.linear import LinearPlant, Readings
@@ -144,14 +146,13 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def believed_pieces(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
         """The matrices that the filters use at first, and after each of the ``followed_changes``:
-        F and Q in slots, A and Q = B B' in continuous time, all (n, n). F of a plant that is not
-        linear is nan.
+        F and Q in slots, A and Q = B B' in continuous time, all (n, n). F and A of a plant that is
+        not linear are nan.
         """
         model, plant = self.filter.model, self.plant
         pieces: Any = plant.pieces[: 1 + len(self.followed_changes)]
-        if isinstance(plant, NonlinearPlant):
-            unknown = np.full((plant.n, plant.n), math.nan)
-            return ((unknown, plant.Q if model.Q is None else model.Q),)
+        if not plant.linear:
+            return ((np.full((plant.n, plant.n), math.nan), self._believed_Q),)
         if isinstance(plant, LinearPlant):
             return tuple(
                 (p.F if model.F is None else model.F, p.Q if model.Q is None else model.Q)
@@ -304,9 +305,9 @@ class DerivedScenario(ScenarioModel):
         if not isinstance(plant, NonlinearPlant):
             F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
             return SlotModel(F, Q, H, R, plant.period)
-        (f, jacobian), model_Q = plant.functions, self.filter.model.Q
+        f, jacobian = plant.functions
         return MapModel(
-            np.full((plant.n, plant.n), math.nan), plant.Q if model_Q is None else model_Q, H, R,
+            *self.believed_pieces[0], H, R,
             plant.period, f=f, jacobian=jacobian, u=self.believed_inputs,
             linearise=self.filter.linearise,
         )  # fmt: skip
@@ -403,6 +404,8 @@ class DerivedScenario(ScenarioModel):
         filled in; raises TheoryError for a plant in slots.
         """
         plant = self.plant
+        if isinstance(plant, NonlinearDiffusion):
+            raise TheoryError("this is about linear plants, and the dynamics are not linear")
         if not isinstance(plant, Diffusion):
             raise TheoryError("this is about scenarios in continuous time, and this one has slots")
         plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
@@ -434,13 +437,18 @@ class DerivedScenario(ScenarioModel):
         """Return the true state of one run in continuous time, a plants.truth.ContinuousTruth.
 
         It can be asked, in increasing order, for the states at sample times, probe times and frame
-        times. Its class is ``DiffusionPath`` if sensors give increments, else ``SampledTruth`` or
-        ``RecordedTruth``. ``frames``, by default ``exact_errors``, says whether local states are
-        relative to an origin that moves. ``sampled`` (K,) are the sample times in seconds, if they
-        have been drawn already. Raises ScenarioError if a recorded truth has no row for one of the
-        times.
+        times. Its class is ``DiffusionPath`` if sensors give increments, else ``SampledTruth``,
+        ``RecordedTruth`` or ``CurvePath``. ``frames``, by default ``exact_errors``, says whether
+        local states are relative to an origin that moves. ``sampled`` (K,) are the sample times in
+        seconds, if they have been drawn already. Raises ScenarioError if a recorded truth has no
+        row for one of the times.
         """
         frames = self.exact_errors if frames is None else frames
+        if isinstance(self.plant, NonlinearDiffusion):
+            if sampled is None:
+                sampled = all_sample_times(sample_times(self, streams))
+            random, *inside = map(streams.generator, ("plant", "samples", "probe"))
+            return self.plant.path(random, (sampled, inside[0]), (self.times, inside[1]))
         plant, horizon = self.diffusion, self.horizon
         recorded, on_grid = not plant.is_random, uses_grid(self)
         if sampled is None or recorded:
@@ -718,7 +726,28 @@ class DerivedScenario(ScenarioModel):
         sensors_of_nodes = self.placed_sensors if self.slotted else self.increment_sensors
         return tuple(itertools.chain.from_iterable(sensors_of_nodes.values()))
 
+    @property
+    def _believed_Q(self) -> FloatArray:
+        """The covariance (n, n) of the noise of a nonlinear plant that filters believe."""
+        plant, model = self.plant, self.filter.model
+        assert isinstance(plant, NonlinearPlant | NonlinearDiffusion)
+        if isinstance(plant, NonlinearPlant):
+            return plant.Q if model.Q is None else model.Q
+        return plant.Q if model.B is None else np.asarray(model.B @ model.B.T)
+
     def _flow_model(self, H: FloatArray, R: FloatArray, view: Any = slice(None)) -> FlowModel:
+        plant = self.plant
+        if isinstance(plant, NonlinearDiffusion):
+            f, jacobian = plant.functions
+            times, values, sine = plant.tables_of_input
+            known = 1.0 if self.filter.model.input else 0.0
+            amplitudes = np.array([known, 1.0, 1.0])[: len(sine), None]
+            return RateModel(
+                *self.believed_pieces[0], H, R, self.horizon, self.horizon, f=f,
+                jacobian=jacobian, step=plant.step,
+                tables_of_input=(times, known * values, sine * amplitudes),
+                linearise=self.filter.linearise,
+            )  # fmt: skip
         A, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
         # The longest gap to predict over, and the longest step whose increment is used at once.
         period = self.diffusion.sensing_period or 0.0

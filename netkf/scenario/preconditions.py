@@ -170,9 +170,11 @@ def _check_invertible(scenario: DerivedScenario) -> None:
     if scenario.slotted:
         nonsingular = all(
             bool(is_definite(Q))
-            or (singular is None and scenario.plant.linear and np.linalg.matrix_rank(F) == n)
+            or (singular is None and (not scenario.plant.linear or np.linalg.matrix_rank(F) == n))
             for F, Q in scenario.believed_pieces
         )
+    elif not scenario.plant.linear:
+        nonsingular = singular is None or bool(is_definite(scenario.believed_pieces[0][1]))
     else:
         A, Q = scenario.believed_pieces[0]
         # (A, Q) is controllable if and only if (A', Q) is observable.

@@ -13,6 +13,7 @@ from netkf.core.contracts import ContractError, is_netkf_class, require_known_me
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
 from netkf.network import channels, clocks, contacts, graph_files, graphs, matchings, recorded
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant, SlotPlant
@@ -61,7 +62,11 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "recorded": RecordedPlant,
         "unknown": UnknownPlant,
     },
-    "continuous plant": {"recorded": RecordedDiffusion, "unknown": UnknownDiffusion},
+    "continuous plant": {
+        "nonlinear": NonlinearDiffusion,
+        "recorded": RecordedDiffusion,
+        "unknown": UnknownDiffusion,
+    },
     "input": {"constant": ConstantInput, "sine": SineInput, "recorded": RecordedInput},
     "sensor": {
         "linear": LinearSensor,

@@ -93,7 +93,7 @@ def uses_grid(scenario: ScenarioModel) -> bool:
 
     They are if sensors give increments, or if no sensor takes samples.
     """
-    is_drawn = not scenario.slotted and scenario.plant.is_random
+    is_drawn = not scenario.slotted and scenario.plant.is_random and scenario.plant.linear
     return is_drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
@@ -131,10 +131,12 @@ def check_sampling(scenario: ScenarioModel) -> None:
                     None,
                     'write sampling = { kind = "periodic", period = ... }',
                 )
-        if not scenario.slotted and not scenario.plant.is_random and not takes_samples(sensor):
+        has_increments = scenario.plant.is_random and scenario.plant.linear
+        if not scenario.slotted and not has_increments and not takes_samples(sensor):
+            kind = "recorded" if scenario.plant.linear else "nonlinear"
             raise ScenarioError(
                 f"{key}.sampling",
-                "must be a clock, since increments of a recorded state are unknown",
+                f"must be a clock, since increments of a {kind} state are unknown",
                 None,
                 'write sampling = { kind = "periodic", period = ... }',
             )

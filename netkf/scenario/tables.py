@@ -256,9 +256,9 @@ def _build_plant(origin: Origin, value: Any) -> Any:
         "input": partial(_build_part, "input", origin),
     }
     table = _build_inner(_as_dict(value), builders)
-    # Two kinds exist for both models of time; the keys tell which one is meant.
-    in_both_times = table.get("kind") in ("recorded", "unknown")
-    continuous = in_both_times and ("A" in table or "B" in table)
+    # Some kinds exist for both models of time; the keys tell which one is meant.
+    in_both_times = table.get("kind") in ("nonlinear", "recorded", "unknown")
+    continuous = in_both_times and not {"A", "B", "step"}.isdisjoint(table)
     return _build_component("continuous plant" if continuous else "plant", origin, table)
 
 

@@ -67,7 +67,8 @@ def resolve_defaults(scenario: DerivedScenario) -> dict[str, Any]:
         cov=plant.start_cov if filtering.cov is None else filtering.cov,
     )
     # A second Scenario of these parts would build and check the whole network again.
-    plant = scenario.plant if scenario.slotted else scenario.diffusion
+    has_matrices = not scenario.slotted and scenario.plant.linear
+    plant = scenario.diffusion if has_matrices else scenario.plant
     resolved_plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
     return _scenario_table(scenario, resolved_plant, network, filtering, _style_of(scenario, True))
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.vector_functions import VectorFunction
 from netkf.plants.dynamics import CustomDynamics
 from netkf.rng.streams import Streams
 from netkf.testing.watching import demand, demand_close, guard_user_code
@@ -37,10 +39,13 @@ def check_dynamics(part: Any, name: str) -> None:
         demand_close(J, f.part.jacobian(x, u, 0.0), f"{name}.kernels", "must compute jacobian", "")
 
 
+def _call(function: VectorFunction, others: tuple[Any, ...], x: FloatArray) -> FloatArray:
+    return function(x, *others)
+
+
 def _check_at(part: Any, name: str, x: FloatArray, u: FloatArray, t: float) -> None:
-    f, jacobian = (
-        lambda x, of=of: of(x, u, t, getattr(part, "period", 0.0)) for of in part.functions
-    )
+    period = getattr(part, "period", 0.0)
+    f, jacobian = (partial(_call, function, (u, t, period)) for function in part.functions)
     value, J = f(x), jacobian(x)
     f(x + 1.0)
     for of, before, method in ((f, value, "f"), (jacobian, J, "jacobian")):

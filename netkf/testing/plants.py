@@ -14,6 +14,7 @@ from netkf.core.errors import NetkfError
 from netkf.laws.noise import moment_law, transition_law, whiten
 from netkf.linalg.arrays import FloatArray, is_semidefinite
 from netkf.linalg.spectra import eigenvalues, growth_factor, growth_rate
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.maps import NonlinearPlant
@@ -99,6 +100,8 @@ def _check_plant(part: Any, seed: int) -> None:
             check_dynamics(part, name)
         if isinstance(part, NonlinearPlant):
             _check_maps(part, copy, name, seed)
+        elif isinstance(part, NonlinearDiffusion):
+            _check_curve(part, copy, name, seed)
         elif isinstance(part, LinearPlant):
             _check_slots(part, copy, name, seed)
         elif isinstance(part, Diffusion):
@@ -123,6 +126,21 @@ def _check_maps(part: NonlinearPlant, copy: Any, name: str, seed: int) -> None:
     labels = NoiseLabels(where, "the noise x[k+1] - f(x[k])", "Q")
     rule = "x[k+1] must be f(x[k], u[k], t_k) where Q has no noise"
     _check_noise(states[:, 1:] - moved, part.Q, states[:, :-1], labels, rule)
+
+
+def _check_curve(part: NonlinearDiffusion, copy: Any, name: str, seed: int) -> None:
+    where, times = f"{name}.path", part.step * np.array([0.4, 1.0, 1.7, 5.2])
+    probes = part.step * np.array([0.2, 1.5, 3.0, 5.0])
+
+    def draw(plant: Any, probes: FloatArray) -> FloatArray:
+        random = [_make_generator(seed, 0, name) for name in ("plant", "samples", "probe")]
+        path = plant.path(random[0], (times, random[1]), (probes, random[2]))
+        return np.array([path.absolute(time) for time in times.tolist()])
+
+    with guard_user_code(where):
+        alone = draw(part, np.empty(0))
+        _demand_same(where, alone, draw(copy, np.empty(0)), "of a pickled plant")
+        _demand_same(where, alone, draw(part, probes), "with states at more times")
 
 
 def _check_form(part: Any, name: str) -> None:

@@ -538,3 +538,10 @@ def test_check_plant_holds_f_to_its_word():
     netkf.testing.check_plant(
         netkf.parts.NonlinearPlant(f="unicycle", Q=0.01 * np.eye(3), period=0.1, input=u)
     )
+    netkf.testing.check_plant(
+        netkf.parts.NonlinearDiffusion(f="unicycle", B=0.1 * np.eye(3), step=0.05, input=u)
+    )
+    with pytest.raises(AssertionError, match="must be the derivatives of f"):
+        netkf.testing.check_plant(
+            netkf.parts.NonlinearDiffusion(f=WrongSlope, B=np.eye(2), step=0.1)
+        )

@@ -164,25 +164,46 @@ def _move_points(
         )
         for i in range(n):
             points[r, i] = model.moved[i]
+    weigh_points(points, model.weight, model.center, x[k], q, work)
+    for i in range(n):
+        for j in range(n):
+            work[i, 2 * n + 1 + j] = model.root_Q[i, j]
+    write_root(work, root[k], q)
+
+
+@kernel
+def weigh_points(
+    points: FloatArray, weight: float, center: float, x: FloatArray, q: int, work: FloatArray
+) -> None:
+    """Write the mean of moved sigma ``points`` (2 n + 1, n) into lane ``q`` of ``x`` (n, L), and a
+    root of their covariance into the first 2 n + 1 columns of ``work``.
+    """
+    count, n = points.shape
     for i in range(n):
         # Weights sum to 1: relative to the middle point nothing large cancels.
         mean = 0.0
-        for r in range(1, 2 * n + 1):
-            mean += model.weight * (points[r, i] - points[0, i])
+        for r in range(1, count):
+            mean += weight * (points[r, i] - points[0, i])
         mean += points[0, i]
-        work[i, 0] = math.sqrt(model.center) * (points[0, i] - mean)
-        for r in range(1, 2 * n + 1):
-            work[i, r] = math.sqrt(model.weight) * (points[r, i] - mean)
-        for j in range(n):
-            work[i, 2 * n + 1 + j] = model.root_Q[i, j]
-        x[k, i, q] = mean
+        work[i, 0] = math.sqrt(center) * (points[0, i] - mean)
+        for r in range(1, count):
+            work[i, r] = math.sqrt(weight) * (points[r, i] - mean)
+        x[i, q] = mean
+
+
+@kernel
+def write_root(work: FloatArray, root: FloatArray, q: int) -> None:
+    """Write the lower triangular root of ``work work'`` into lane ``q`` of ``root`` (n, n, L), with
+    a nonnegative diagonal; ``work`` (n, c) is overwritten.
+    """
+    n, columns = work.shape
     for i in range(n):
-        reflect(work, i, n, 3 * n + 1)
+        reflect(work, i, n, columns)
     for j in range(n):
         # Signs of columns are free: a nonnegative diagonal makes the root unique.
         sign = -1.0 if work[j, j] < 0.0 else 1.0
         for i in range(j, n):
-            root[k, i, j, q] = sign * work[i, j]
+            root[i, j, q] = sign * work[i, j]
 
 
 @kernel

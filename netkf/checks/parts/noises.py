@@ -19,8 +19,10 @@ import numpy as np
 from netkf.laws.noise import MIN_VARIANCE_SHARE, NoiseDraws, noise_draws, transition_law, whiten
 from netkf.laws.stating import stated_part
 from netkf.linalg.arrays import FloatArray, square_root
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant, SlotPlant
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.rng.normals import StreamNormals
 from netkf.rng.streams import ReplicaStreams, Streams
@@ -139,7 +141,7 @@ def start_states(scenario: Scenario, seed: int, count: int) -> FloatArray:
     from the replica's own stream as a run would draw it.
     """
     # Built-in classes draw all replicas in one call, with the same numbers as one by one.
-    if type(scenario.plant) in (LinearPlant, Diffusion):
+    if type(scenario.plant) in (LinearPlant, Diffusion, NonlinearPlant, NonlinearDiffusion):
         states = ReplicaStreams(seed, 0, count).states("plant", [()])
         return scenario.plant.starts(StreamNormals(states))
     starts = []

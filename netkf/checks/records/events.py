@@ -230,7 +230,8 @@ def _read(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
     if run.status != "complete":
         return
     sampled = scenario.sample_times(Streams(run.seed, run.replica))
-    period = scenario.diffusion.sensing_period or math.inf
+    plant = scenario.plant
+    period = (scenario.diffusion.sensing_period if plant.linear else None) or math.inf
     senses = log[log["kind"] == SENSE]
     for node in scenario.sensing_nodes:
         times = [times for (owner, _), times in sampled.items() if owner == node]

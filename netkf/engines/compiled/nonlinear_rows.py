@@ -8,7 +8,7 @@ the node begins with ``linearise_rows``, which writes the whitened linear readin
 from __future__ import annotations
 
 import math
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +86,7 @@ class NonlinearSetup:
         self.R = np.zeros((1, filters, p, p))
         self.functions: list[VectorFunction] = []
 
-    def add(self, sensor: NonlinearSensor, h: int, row: int, R: FloatArray) -> None:
+    def add(self, sensor: Any, h: int, row: int, R: FloatArray) -> None:
         """Add a reading of a sensor with R (p', p') to filter ``h``, from ``row`` on."""
         rows = slice(row, row + len(R))
         self.R[0, h, rows, rows] = R
@@ -125,7 +125,7 @@ class NonlinearSetup:
         )  # fmt: skip
 
 
-def has_known_h(sensor: NonlinearSensor) -> TypeGuard[PositionedSensor]:
+def has_known_h(sensor: NonlinearSensor) -> bool:
     """Return True if kernels know what a sensor reads."""
     base: Any = PositionedSensor
     if isinstance(sensor, RelativePositionSensor):
@@ -136,19 +136,19 @@ def has_known_h(sensor: NonlinearSensor) -> TypeGuard[PositionedSensor]:
     )
 
 
-def reference(sensor: NonlinearSensor, place: int, n: int) -> FloatArray:
+def reference(sensor: Any, place: int, n: int) -> FloatArray:
     """Return what the readings of a sensor are measured from at a ``place`` (id), as rows of H say
     it (n,): coordinates, numbers of states, or for a user's sensor the id.
     """
     made = np.zeros(n)
-    if isinstance(sensor, RelativePositionSensor) and has_known_h(sensor):
+    if not has_known_h(sensor):
+        made[0] = place
+    elif isinstance(sensor, RelativePositionSensor):
         others = sensor.other_states(place)
         made[: len(others)] = others
-    elif has_known_h(sensor):
+    else:
         positions = np.asarray(sensor.positions, dtype=np.float64)
         made[: positions.shape[1]] = positions[sensor.places.index(place)]
-    else:
-        made[0] = place
     return made
 
 
@@ -172,7 +172,7 @@ def _functions_of(sensor: NonlinearSensor, p: int, n: int) -> list[VectorFunctio
 @kernel(inlined=True)
 def offset_of(
     rows: NonlinearRows, h: int, i: int, H: FloatArray, place: tuple[int, int], d: int
-) -> float:
+) -> Any:
     """Return coordinate ``d`` of the offset whose length or direction row ``i`` reads;
     ``place`` = (r, q) says where H tells from what it is measured.
     """

@@ -13,7 +13,7 @@ import simpy
 
 from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.maps import spread_of
-from netkf.algorithms.models import MapModel
+from netkf.algorithms.models import MapModel, RateModel
 from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
@@ -306,8 +306,8 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     model = scenario.model_of(entity)
     if scenario.tells_models:
         model = DrivenModel(scenario, model)
-    if isinstance(model, MapModel):
-        # It follows the slots of one run.
+    if isinstance(model, MapModel | RateModel):
+        # It follows the time of one run.
         model = dataclasses.replace(model)
     return (
         scenario.node_filter,

@@ -20,7 +20,7 @@ from netkf.algorithms.filter import (
 )
 from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
-from netkf.algorithms.models import ChangingFlowModel, MapModel, first_root
+from netkf.algorithms.models import ChangingFlowModel, MapModel, RateModel, first_root
 from netkf.core.places import Place
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.driven import DrivenModel
@@ -276,7 +276,7 @@ class ClockedNode(Node):
         """Predict the filter to ``time`` (seconds), using the increments since its last event."""
         if self._now >= time:
             return
-        if isinstance(self.moving_model, ChangingFlowModel):
+        if isinstance(self.moving_model, ChangingFlowModel | RateModel):
             self.moving_model.move_to(time)
         if not self._increments:
             self._advance(self._now, time - self._now)

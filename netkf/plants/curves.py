@@ -1,0 +1,203 @@
+"""Plants in continuous time that need not be linear, dx = f(x, u(t), t) dt + B dw.
+
+The truth is drawn by the method SRA1 of Roessler (2010, SIAM J. Numer. Anal. 48): with step h it is
+of order 1.5 in the path and 2 in law. Steps begin at multiples of ``step`` and where the input
+jumps, so that states there depend on the plant and the seed alone; noise inside a step is drawn
+given that of the step, for samples first and then for probes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from netkf.core.fields import field, matrix, seconds
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import apply
+from netkf.linalg.vector_functions import VectorFunction
+from netkf.plants.dynamics import dynamics, functions_of
+from netkf.plants.inputs import SineInput
+from netkf.plants.linear import Blocks
+from netkf.plants.maps import check_dynamics
+from netkf.plants.plant import Plant
+from netkf.plants.sensors import cut, step_noise
+
+InputTables = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearDiffusion(Plant):
+    """``dx = f(x, u(t), t) dt + B dw``.
+
+    f     "unicycle" (x, y, heading, with speed and turn rate as input), "coordinated-turn" (x, y,
+          vx, vy, turn rate, without input), or "module:Class", the rate of change
+    B     (n, q)
+    step  seconds: the truth is integrated in steps of this length, by a method of order 1.5 in the
+          path, and filters integrate mean and covariance in steps that are no longer, by one of
+          order 4
+
+    Headings are not wrapped: they count whole turns.
+    """
+
+    linear: ClassVar[bool] = False
+
+    f: Any = field(dynamics)
+    B: FloatArray = field(matrix)
+    step: float = field(seconds)
+
+    @property
+    def n(self) -> int:
+        """Dimension of the state."""
+        return len(self.B)
+
+    @property
+    def m(self) -> int:
+        """Number of components of the input, 0 without one."""
+        return 0 if self.input is None else self.input.m
+
+    @property
+    def Q(self) -> FloatArray:
+        """The covariance B B' (n, n) of the noise over a second."""
+        return np.asarray(self.B @ self.B.T)
+
+    @cached_property
+    def functions(self) -> tuple[VectorFunction, VectorFunction]:
+        """The rate of change f and its Jacobian."""
+        f, jacobian = functions_of(self.f, self.n, self.m, in_slots=False)
+        return f, jacobian
+
+    def check_dynamics(self) -> None:
+        """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
+        check_dynamics(self, self.functions)
+
+    @cached_property
+    def tables_of_input(self) -> InputTables:
+        """The input: times (J,) of its jumps and values (J, m) from each on, and of a sine its
+        amplitudes, rad/s and phases (3, m).
+        """
+        u, nothing = self.input, np.zeros((0, 0))
+        if u is None:
+            return np.zeros(0), nothing, nothing
+        if isinstance(u, SineInput):
+            return np.zeros(0), np.zeros((0, u.m)), u.components
+        times = u.exogenous.times
+        return times, u.values(times), nothing
+
+    def path(
+        self,
+        random: np.random.Generator,
+        sampled: tuple[FloatArray, np.random.Generator],
+        probes: tuple[FloatArray, np.random.Generator],
+    ) -> CurvePath:
+        """Return the true states of one run at the times (K,) in ``sampled`` and ``probes``, each
+        with the stream of the noise inside steps.
+        """
+        start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
+        return CurvePath(self, start, random, sampled, probes)
+
+    def ends(self, end: float) -> FloatArray:
+        """Return the ends (K,) of the steps from 0 on, up to the first not before ``end``."""
+        count = int(end / self.step) + 2
+        even = self.time_grid.snap(self.step * np.arange(1, count + 1))
+        jumps = self.tables_of_input[0]
+        ends = np.union1d(even, jumps[(jumps > 0.0) & (jumps < even[-1])])
+        return np.asarray(ends[: int(np.searchsorted(ends, end)) + 1])
+
+    def move(self, x: FloatArray, time: float, length: float, noise: FloatArray) -> FloatArray:
+        """Return the state (n,) ``length`` seconds after ``x`` (n,); ``noise`` (2, q) are the
+        integrals of dw and, tilted, of P_1 dw over it (``sensors``).
+        """
+        f, g = self.functions[0], self.B
+        # The integral of w(s) - w(time) over the step is h / 2 (dw - tilted).
+        dw, area = noise[0], 0.5 * length * (noise[0] - noise[1])
+        slope = f(x, self._u(time), time, 0.0)
+        stage = x + 0.75 * length * slope + apply(g, 1.5 / length * area)
+        later = time + 0.75 * length
+        return np.asarray(
+            x + length / 3.0 * (slope + 2.0 * f(stage, self._u(later), later, 0.0)) + apply(g, dw)
+        )
+
+    def _u(self, time: float) -> FloatArray:
+        return np.zeros(0) if self.input is None else self.input.at(time)
+
+
+class CurvePath:
+    """The states of one run at some times, from x(0) = ``start`` (n,) on; see
+    ``NonlinearDiffusion.path``.
+    """
+
+    frame_times = np.empty(0)
+
+    def __init__(
+        self,
+        plant: NonlinearDiffusion,
+        start: FloatArray,
+        random: np.random.Generator,
+        sampled: tuple[FloatArray, np.random.Generator],
+        probes: tuple[FloatArray, np.random.Generator],
+    ) -> None:
+        self._plant, self._streams = plant, (sampled[1], probes[1])
+        only_probes = np.setdiff1d(probes[0], sampled[0])
+        self._times = np.union1d(sampled[0], only_probes)
+        self._states: dict[float, FloatArray] = {0.0: start}
+        end = float(self._times[-1]) if len(self._times) else 0.0
+        normals, x = Blocks(random, 2 * plant.B.shape[1]), start
+        # States that grow without bounds end the run as diverged.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for begin, stop in itertools.pairwise([0.0, *plant.ends(end).tolist()]):
+                noise = step_noise(normals.draw().reshape(2, -1), stop - begin)
+                inner = [t[(t > begin) & (t < stop)] for t in (sampled[0], only_probes)]
+                if any(map(len, inner)):
+                    self._cut(x, (begin, stop), noise, inner)
+                x = self._states[stop] = plant.move(x, begin, stop - begin, noise)
+
+    def _cut(
+        self,
+        x: FloatArray,
+        ends: tuple[float, float],
+        noise: FloatArray,
+        inner: list[FloatArray],
+    ) -> None:
+        """Write the states at the times inside a step, in which x (n,) moves with the ``noise``."""
+        pieces = self._divide(ends, noise, inner[0].tolist(), self._streams[0])
+        for begin, stop, own in pieces:
+            within = inner[1][(inner[1] > begin) & (inner[1] < stop)].tolist()
+            at_probe = x
+            for first, last, part in self._divide((begin, stop), own, within, self._streams[1]):
+                if last < stop:
+                    at_probe = self._plant.move(at_probe, first, last - first, part)
+                    self._states[last] = at_probe
+            x = self._plant.move(x, begin, stop - begin, own)
+            if stop < ends[1]:
+                self._states[stop] = x
+
+    def _divide(
+        self,
+        ends: tuple[float, float],
+        noise: FloatArray,
+        times: list[float],
+        random: np.random.Generator,
+    ) -> list[tuple[float, float, FloatArray]]:
+        """Return begin, end and noise of the pieces of an interval that is cut at ``times``."""
+        pieces, (begin, stop) = [], ends
+        for time in times:
+            share = (time - begin) / (stop - begin)
+            normals = random.standard_normal(noise.shape)
+            first, noise = cut(noise, normals, share, stop - begin)
+            pieces.append((begin, time, first))
+            begin = time
+        return [*pieces, (begin, stop, noise)]
+
+    def absolute(self, time: float) -> FloatArray:
+        """Return x (n,) at ``time`` (seconds), a sample or probe time or the end of a step."""
+        return self._states[time]
+
+    local = absolute
+
+    def rebase(self, k: int) -> FloatArray:
+        """Raise IndexError: there are no frames, so that none begins."""
+        raise IndexError(k)
