@@ -88,7 +88,7 @@ class Block(Component):
     """
 
     name: str = field(text)
-    plant: Plant = field(instance_of(Diffusion, LinearPlant))
+    plant: Plant = field(instance_of(Plant))
     nodes: tuple[int, ...] | None = field(list_of(node_id(), "node ids"), default=None)
     coupling: tuple[Coupling, ...] = field(_couplings, default=())
     position: tuple[int, ...] | None = field(
@@ -216,6 +216,9 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     plants = [block.plant for block in copies]
     slotted = isinstance(plants[0], LinearPlant)
     for k, block in enumerate(blocks):
+        if not isinstance(block.plant, LinearPlant | Diffusion):
+            rule = "must be linear or a diffusion: other plants cannot be blocks"
+            raise ScenarioError(f"[{k}].kind", rule, block.name, "give F, Q, period, or A, B")
         if isinstance(block.plant, LinearPlant) != slotted:
             rule = "must be in slots as the others are, or in continuous time"
             raise ScenarioError(f"[{k}]", rule, block.name, "give all F, Q, period, or all A, B")
