@@ -71,11 +71,15 @@ class DrivenTruth:
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""
-        local, absolute = self._truth.states(times)
-        return (
-            local if self._local is None else local + self._local(times),
-            absolute if self._absolute is None else absolute + self._absolute(times),
+        absolute = self._truth.states(times)[1]
+        return self.local_states(times), (
+            absolute if self._absolute is None else absolute + self._absolute(times)
         )
+
+    def local_states(self, times: FloatArray) -> FloatArray:
+        """Return local states (K, n) at ``times`` (K,), in any order."""
+        local: FloatArray = self._truth.states(times)[0]
+        return local if self._local is None else local + self._local(times)
 
 
 def _shifted(x: FloatArray, shift: Shift | None, time: Any) -> FloatArray:
@@ -87,16 +91,17 @@ def driven(
     responses: InputResponses,
     recorded: bool,
     forced: bool = False,
-    times: FloatArray | None = None,
+    times: tuple[FloatArray | None, FloatArray | None] = (None, None),
 ) -> DrivenTruth:
     """Return a ``truth`` without input with it. States that are ``recorded`` have it already, and
-    paths that are ``forced`` the surprise. The shifts at ``times`` (K,) are computed at once.
+    paths that are ``forced`` the surprise. The shifts of local states at the first of ``times``
+    (K,), and those of absolute ones at the second, are computed at once.
     """
-    believed, surprise = responses
+    (believed, surprise), (all_times, shown) = responses, times
     if recorded:
-        return DrivenTruth(truth, _shift(times, believed, -1.0), None)
+        return DrivenTruth(truth, _shift(all_times, believed, -1.0), None)
     local = None if forced else surprise
-    shifts = _shift(times, local), _shift(times, believed, 1.0, local)
+    shifts = _shift(all_times, local), _shift(shown, believed, 1.0, local)
     return DrivenTruth(truth, *shifts, local)
 
 

@@ -471,8 +471,10 @@ class DerivedScenario(ScenarioModel):
             truth = plant.path(
                 random, probe_random, probes, sample_random, sampled, horizon, frames, forcing
             )
+        if responses is None:
+            return truth
         forced = on_grid and not self.tells_models
-        return truth if responses is None else driven(truth, responses, recorded, forced, times)
+        return driven(truth, responses, recorded, forced, (times, probes))
 
     def slot_truth(self, streams: Streams, frames: bool | None = None) -> Any:
         """Return the true state of one run in slots, a plants.linear.Truth; with ``frames``, by

@@ -52,6 +52,7 @@ from netkf.engines.compiled.truth import PathStates
 from netkf.engines.compiled.visits import Visits, empty_visits
 from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
+from netkf.plants.driven import DrivenTruth
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import Streams
 from netkf.scenario.sampling import uses_grid
@@ -100,7 +101,11 @@ class Source:
             self.sensing, self._no_block = no_sensing(scenario), no_block
             self.states = scenario.continuous_truth(streams, sampled=sampled)
             # The truth is complete, so that all samples are read at once.
-            samples.read(self.states.states(sampled)[0], sampled, -math.inf, math.inf)
+            states = self.states
+            # Where an input moves the plant takes longer to tell.
+            is_driven = isinstance(states, DrivenTruth)
+            x = states.local_states(sampled) if is_driven else states.states(sampled)[0]
+            samples.read(x, sampled, -math.inf, math.inf)
 
     def window(self) -> TickArrays:
         """Return the next window of ticks."""
