@@ -78,8 +78,8 @@ def check_plant(plant: Any, /, **settings: Any) -> None:
     0.04), a variance off by 4 % (6 %), and a correlation of 0.03 (0.04) between components, between
     steps 1, 2, 3 or 7 apart, with x(0), or between runs. Errors in only one quarter of a run must
     be twice as large; for unstable plants, whose runs are short, up to three times. Recorded and
-    unknown plants are checked for form and pickle only. A correct class fails once in a million
-    checks.
+    unknown plants are checked for form and pickle only, and plants without a ``schedule``. A
+    correct class fails once in a million checks.
 
     Raises AssertionError with one line: the method, the rule, the value got, what to do.
     """
@@ -94,6 +94,8 @@ def _check_plant(part: Any, seed: int) -> None:
     _check_form(part, name)
     if not part.is_random:
         return
+    rule = "must be left out: plants are checked as they are between two changes"
+    demand(not len(part.changes), f"{name}.schedule", rule, f"{len(part.changes)} changes")
     before = watched.attributes()
     with guard_user_code(name):
         if not part.linear:

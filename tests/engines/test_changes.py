@@ -2,6 +2,7 @@
 matrices of the piece that holds stand for those of the plant.
 """
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -10,6 +11,9 @@ import pytest
 from scipy.linalg import expm
 
 import netkf
+from netkf.algorithms.traits import Timing
+from netkf.core.errors import ScenarioError
+from netkf.parts import Filter, Filtering
 from netkf.scenario.reading import from_table
 
 ENGINES = ("simpy", "compiled")
@@ -353,3 +357,223 @@ def test_both_engines_agree_under_clocks(kind, sensor, delay):
     np.testing.assert_allclose(a.x, b.x, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(a.P, b.P, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(a.xhat, b.xhat, rtol=1e-9, atol=1e-11)
+
+
+GAINS = [np.array([[0.5], [0.0]]), np.array([[0.0], [2.0]])]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_known_inputs_drive_each_piece_in_slots(tmp_path, engine):
+    y = record(tmp_path, [0.5 * k for k in range(20)])
+    schedule = [SCHEDULE[0], {**SCHEDULE[1], "G": GAINS[1].tolist()}]
+    u = {"kind": "sine", "G": GAINS[0].tolist(), "amplitude": 3.0, "frequency": 0.21}
+    plant = {"schedule": schedule, "input": u}
+    run = netkf.simulate(slots("local", tmp_path, plant=plant), engine=engine)
+    x, P = np.zeros(2), np.eye(2)
+    for k in range(1, 20):
+        x, P = predict(x, P, k - 1)
+        G = GAINS[k - 1 >= CHANGES[1]]
+        x = x + G[:, 0] * 3.0 * np.sin(2.0 * np.pi * 0.21 * 0.5 * (k - 1))
+        x, P = update(x, P, y[k, :1])
+        agree(run, 0, k, x, P)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_known_inputs_drive_each_piece_under_clocks(tmp_path, engine):
+    instants = [0.2, 1.7, 2.3, 2.9, 5.5]
+    y = record(tmp_path, instants)
+    schedule = [CLOCKED[0], {**CLOCKED[1], "G": GAINS[1].tolist()}]
+    u = {"kind": "constant", "G": GAINS[0].tolist(), "value": 1.5}
+    plant = {"schedule": schedule, "input": u}
+    run = netkf.simulate(clocks("local", tmp_path, plant=plant), engine=engine)
+
+    def driven(x, P, start, end):
+        for a, b in itertools.pairwise([start, *(t for t in TIMES if start < t < end), end]):
+            k = int(np.searchsorted(TIMES, a, side="right"))
+            block = np.zeros((3, 3))
+            block[:2, :2], block[:2, 2] = A[k], 1.5 * GAINS[k == 2][:, 0]
+            x = (expm(block * (b - a)) @ [*x, 1.0])[:2]
+            P = flow(x, P, a, b)[1]
+        return x, P
+
+    x, P, now = np.zeros(2), np.eye(2), 0.0
+    for k, t in enumerate(run.times.tolist()):
+        for j, instant in enumerate(instants):
+            if now < instant <= t:
+                x, P = update(*driven(x, P, now, instant), y[j, :1])
+                now = instant
+        agree(run, 0, k, *driven(x, P, now, t))
+
+
+@pytest.mark.parametrize("sensor", ["samples", "increments"])
+@pytest.mark.parametrize("unaware", [False, True])
+def test_a_known_input_changes_no_error(sensor, unaware):
+    own = {"sensor": INCREMENTS} if sensor == "increments" else {}
+    u = {"kind": "sine", "G": [[0.5], [1.0]], "amplitude": 2.0, "frequency": 0.4}
+    schedule = [CLOCKED[0], {**CLOCKED[1], "G": [[0.0], [2.0]]}]
+    model = {"model": {"schedule": False}} if unaware else {}
+    plain, driven = (
+        clocks("hybrid", plant=plant, filter={"epsilon": 0.3, **model}, **own)
+        for plant in ({}, {"schedule": schedule, "input": u})
+    )
+    runs = [netkf.simulate(s, engine="compiled") for s in (plain, driven)]
+    assert runs[0].events.equals(runs[1].events)
+    np.testing.assert_array_equal(runs[0].P, runs[1].P)
+    if unaware:
+        # What filters do not know of the plant is an error that the input drives, too.
+        simpy = netkf.simulate(driven, engine="simpy")
+        np.testing.assert_allclose(simpy.xhat, runs[1].xhat, rtol=1e-9, atol=1e-10)
+        assert np.abs(runs[0].error - runs[1].error).max() > 0.1
+    else:
+        np.testing.assert_array_equal(runs[0].error, runs[1].error)
+        assert np.abs(runs[0].x - runs[1].x).max() > 0.5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PlainHybrid(Filter):
+    """The hybrid filter in plain Python, by what its model says."""
+
+    timing = Timing(schedule=None, clocks=("nodes",))
+
+    def absorb(self, state, messages, exchange):
+        """Combine what arrives, predicted to now."""
+        x, P = 0.0 * state.xhat, 0.0 * state.root
+        own = 1.0 - sum(message.weight for message in messages)
+        terms = [(own, state.xhat, state.root)]
+        for message in messages:
+            payload = message.payload
+            terms.append(
+                (message.weight, *state.model.extrapolate(payload.xhat, payload.root, message.age))
+            )
+        for weight, xhat, root in terms:
+            x, P = x + weight * xhat, P + weight * root @ root.T
+        return state._replace(xhat=x, root=np.linalg.cholesky(P))
+
+
+@pytest.mark.parametrize("sensor", ["samples", "increments"])
+def test_models_of_filters_in_python_follow_the_changes(sensor):
+    own = {"sensor": INCREMENTS} if sensor == "increments" else {}
+    delay = {"channel": {"delay": {"kind": "constant", "seconds": 0.7}}}
+    built_in = clocks("hybrid", filter={"epsilon": 1 / 3}, network=delay, **own)
+    own_class = dataclasses.replace(built_in, filter=Filtering(algorithm=PlainHybrid()))
+    a, b = (netkf.simulate(s, engine="simpy") for s in (built_in, own_class))
+    assert a.events.equals(b.events)
+    np.testing.assert_allclose(a.P, b.P, rtol=1e-8)
+    np.testing.assert_allclose(a.xhat, b.xhat, rtol=1e-8, atol=1e-9)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PlainLocal(Filter):
+    """A filter in plain Python that sends nothing."""
+
+    timing = Timing(talks=False)
+
+
+def test_models_of_filters_in_python_follow_the_changes_in_slots():
+    built_in = slots("local")
+    a = netkf.simulate(built_in, engine="simpy")
+    b = netkf.simulate(dataclasses.replace(built_in, filter=Filtering(algorithm=PlainLocal())))
+    np.testing.assert_allclose(a.P, b.P, rtol=1e-9)
+    np.testing.assert_allclose(a.xhat, b.xhat, rtol=1e-9, atol=1e-10)
+
+
+def test_blocks_of_the_state_change_each_for_itself():
+    table = {
+        "format": 1,
+        "name": "blocks",
+        "horizon": 6.0,
+        "probe": 0.5,
+        "plants": [
+            {
+                "name": "target",
+                "A": [[0.0]],
+                "B": [[1.0]],
+                "schedule": [{"from": 2.0, "A": [[-1.0]]}, {"from": 4.0, "B": [[3.0]]}],
+            },
+            {
+                "name": "field",
+                "A": [[-0.5]],
+                "B": [[0.4]],
+                "schedule": [{"from": 4.0, "A": [[0.2]]}],
+            },
+        ],
+        "sensors": [
+            {
+                "of": name,
+                "nodes": [0],
+                "H": [[1.0]],
+                "R": [[0.1]],
+                "sampling": {"kind": "periodic", "period": 0.5},
+            }
+            for name in ("target", "field")
+        ],
+        "network": {"graph": {"kind": "path", "nodes": 2}},
+        "filter": {"kind": "local", "cov": np.eye(2).tolist()},
+    }
+    s = from_table(table, Path())
+    expected = [([0.0, -0.5], [1.0, 0.4]), ([-1.0, -0.5], [1.0, 0.4]), ([-1.0, 0.2], [3.0, 0.4])]
+    assert s.plant.changes.tolist() == [2.0, 4.0]
+    for one, (a, b) in zip(s.plant.pieces, expected, strict=True):
+        np.testing.assert_array_equal(one.A, np.diag(a))
+        np.testing.assert_array_equal(one.B, np.diag(b))
+    runs = [netkf.simulate(s, engine=engine) for engine in ENGINES]
+    np.testing.assert_allclose(runs[0].P, runs[1].P, rtol=1e-9)
+
+
+@pytest.mark.parametrize("make", [slots, clocks])
+def test_pieces_that_are_equal_are_one_plant(tmp_path, make):
+    record(tmp_path, [0.5 * k for k in range(12)])
+    matrices = {"F": F[0].tolist(), "Q": Q[0].tolist()}
+    if make is clocks:
+        matrices = {"A": A[0].tolist(), "B": B[0].tolist()}
+    equal = {"schedule": [{"from": t, **matrices} for t in (1.0, 3.5)]}
+    kind = "diffusion" if make is slots else "hybrid"
+    options = {} if make is slots else {"epsilon": 0.3}
+    a, b = (
+        netkf.simulate(make(kind, tmp_path, plant=plant, filter=options, horizon=6.0))
+        for plant in (equal, {"schedule": []})
+    )
+    assert a.events.equals(b.events)
+    np.testing.assert_allclose(a.P, b.P, rtol=1e-11)
+    np.testing.assert_allclose(a.xhat, b.xhat, rtol=1e-10, atol=1e-12)
+
+
+REFUSED = {
+    "consensus-innovations": {},
+    "push-sum": {"gamma": 3, "delta": 4.0, "asymptotic": True},
+    "belief-propagation": {"memory": "all"},
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_filters_that_compute_before_a_run_refuse(kind):
+    plant = {"Q": np.zeros((2, 2)).tolist()} if kind == "belief-propagation" else {}
+    with pytest.raises(
+        ScenarioError, match=r"plant.schedule: cannot be followed .*schedule = false"
+    ):
+        slots(kind, filter=REFUSED[kind], plant=plant)
+    assert slots(kind, filter={**REFUSED[kind], "model": {"schedule": False}}, plant=plant)
+
+
+def test_a_schedule_in_milliseconds_has_the_same_events():
+    scale, network = 1000.0, {"activation": {"kind": "periodic", "at": "nodes", "period": 0.3}}
+    sampling = {"kind": "periodic", "period": 0.45}
+    s = clocks("hybrid", filter={"epsilon": 0.3}, network=network, sensor={"sampling": sampling})
+    schedule = [
+        {"from": scale * t, "A": (A[k + 1] / scale).tolist(), "B": (B[k + 1] / scale**0.5).tolist()}
+        for k, t in enumerate(TIMES)
+    ]
+    plant = {"A": (A[0] / scale).tolist(), "B": (B[0] / scale**0.5).tolist(), "schedule": schedule}
+    ms = clocks(
+        "hybrid",
+        filter={"epsilon": 0.3},
+        network={"activation": {"kind": "periodic", "at": "nodes", "period": 300.0}},
+        sensor={"sampling": {"kind": "periodic", "period": 450.0}},
+        plant=plant,
+        horizon=6000.0,
+        probe=500.0,
+    )
+    a, b = netkf.simulate(s), netkf.simulate(ms)
+    np.testing.assert_allclose(a.events["t"] * scale, b.events["t"], rtol=1e-12)
+    assert a.events["kind"].equals(b.events["kind"])
+    np.testing.assert_allclose(a.P, b.P, rtol=1e-9)
