@@ -565,12 +565,10 @@ class DerivedScenario(ScenarioModel):
         """The scenario without input; itself if its plant is not linear."""
         if self.plant.input is None or not self.plant.linear:
             return self
-        plant: Any = self.plant
-        schedule = tuple(dataclasses.replace(change, G=None) for change in plant.schedule)
-        plant = dataclasses.replace(plant, input=None, schedule=schedule)
-        # The stacked plant and its sensors, where the state consists of blocks.
-        blocks: dict[str, Any] = {"plants": (), "sensors": self.sensors} if self.plants else {}
-        return dataclasses.replace(self, plant=plant, **blocks)
+        if not self.plants:
+            return dataclasses.replace(self, plant=_undriven(self.plant))
+        blocks = [dataclasses.replace(one, plant=_undriven(one.plant)) for one in self.plants]
+        return dataclasses.replace(self, plants=tuple(blocks), sensors=self.declared_sensors)
 
     @cached_property
     def exact_errors(self) -> bool:
@@ -847,3 +845,8 @@ def _shared(
             made[key] = make(H, R)
         results.append(made[key])
     return tuple(results)
+
+
+def _undriven(plant: Any) -> Any:
+    schedule = tuple(dataclasses.replace(change, G=None) for change in plant.schedule)
+    return dataclasses.replace(plant, input=None, schedule=schedule)

@@ -319,6 +319,16 @@ class Shifted(Plain):
 
 
 @dataclass(frozen=True, eq=False)
+class Mute(Plain):
+    timing = Timing(talks=False)
+
+
+@dataclass(frozen=True, eq=False)
+class MovedMute(Mute):
+    shift = Filter.shift
+
+
+@dataclass(frozen=True, eq=False)
 class Deaf(Plain):
     """Predicts by itself."""
 
@@ -428,3 +438,45 @@ def test_an_unknown_input_shows_where_promises_are_judged():
         assert "filters do not know the input" in node.verdict
     assert "bias" in mismatch_note(driven)
     assert mismatch_note(told) == ""
+
+
+def owned(slotted, estimates, filtering):
+    """Three nodes in a row, each with a driven pose of its own."""
+    u = {"kind": "sine", "G": [[1.0], [2.0]], "amplitude": 5.0, "frequency": 0.1}
+    pose = {**(LINEAR if slotted else FLOW), "name": "pose", "nodes": [0, 1, 2], "input": u}
+    sampling = {} if slotted else {"sampling": SAMPLING}
+    own = {"nodes": [0, 1, 2], "of": "pose", "H": [[1.0, 0.0]], "R": [[0.3]], **sampling}
+    pairs = {"kind": "relative", "to": "neighbours", "of": "pose", "H": [[1.0, 0.0]], "R": [[0.2]]}
+    talks = filtering["kind"] != "local"
+    ticks = {"kind": "broadcast"} if slotted else {"kind": "poisson", "rate": 2.0, "at": "nodes"}
+    network = {"graph": {"kind": "path", "nodes": 3}} | ({"activation": ticks} if talks else {})
+    table = {
+        "format": 1, "name": "owned", "horizon": 8.0, "probe": 1.0, "network": network,
+        "plants": [{**pose, "cov": START["cov"], **({"period": 1.0} if slotted else {})}],
+        "sensors": [own, *([{"nodes": [0, 1, 2], **pairs, **sampling}] if talks else [])],
+        "filter": {**filtering, "estimates": estimates},
+    }  # fmt: skip
+    return from_table(table, Path())
+
+
+@pytest.mark.parametrize("slotted", [True, False])
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
+def test_nodes_know_the_inputs_of_blocks(slotted, estimates):
+    driven = owned(slotted, estimates, {"kind": "block-intersection"})
+    run, free = (netkf.simulate(one, engine="simpy") for one in (driven, driven.undriven))
+    assert np.abs(run.x - free.x).max() > 10.0
+    for name in ("error", "P"):
+        assert np.array_equal(getattr(run, name), getattr(free, name), equal_nan=True)
+    for k in range(3):
+        moved = run.x[:, 2 * k : 2 * k + 2] - run.block("pose", k).xhat
+        np.testing.assert_allclose(moved, run.block("pose", k).error, atol=1e-12)
+
+
+def test_a_filter_of_a_block_is_told_by_its_model():
+    driven = owned(True, "own", {"kind": "local"})
+    plain, moved = (
+        netkf.simulate(driven.replace({"filter": Filtering(cls(), estimates="own")}))
+        for cls in (Mute, MovedMute)
+    )
+    np.testing.assert_allclose(plain.xhat, moved.xhat, atol=1e-11)
+    np.testing.assert_allclose(moved.error, netkf.simulate(driven).error, atol=1e-12)

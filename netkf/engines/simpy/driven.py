@@ -16,12 +16,14 @@ from netkf.scenario.scenario import Scenario
 
 class DrivenModel:
     """The ``model`` of a node that knows the input of a plant, for filters in plain Python that do
-    not commute with a shift. The estimate is predicted from ``start`` to ``end``, in seconds.
+    not commute with a shift. The estimate, of the entries ``view`` (n,) of the state (None: all),
+    is predicted from ``start`` to ``end``, in seconds.
     """
 
-    def __init__(self, scenario: Scenario, model: Any) -> None:
+    def __init__(self, scenario: Scenario, model: Any, view: np.ndarray | None = None) -> None:
         response: Any = scenario.believed_response
         self._model, self._response = model, response
+        self._view: Any = slice(None) if view is None else view
         self._grid = scenario.time_grid
         self._period = scenario.slot_plant.period if scenario.slotted else None
         self.start = self.end = 0.0
@@ -38,7 +40,7 @@ class DrivenModel:
 
     def _m(self, time: float) -> FloatArray:
         at = time if self._period is None else round(time / self._period)
-        return np.asarray(self._response.states(np.array([at]))[0])
+        return np.asarray(self._response.states(np.array([at]))[0, self._view])
 
     def advance(self, algorithm: Filter, state: Any, start: float, gap: float) -> Any:
         """Return the state of the filter ``gap`` seconds after ``start``; raises ContractError if
@@ -79,6 +81,7 @@ class DrivenModel:
         those of the response to the input are known.
         """
         start, end = np.array([self.start]), np.array([self.end])
-        known = self._response.over_pieces(start, end, self._grid)[1][0, 1:] @ self._model.H.T
+        of_m = self._response.over_pieces(start, end, self._grid)[1][0, 1:][:, self._view]
+        known = of_m @ self._model.H.T
         local, m = moments - known.reshape(-1), self._m(self.end)
         return np.asarray(self._model.gain_update(xhat - m, root, local, gap) + m)
