@@ -455,8 +455,9 @@ class DerivedScenario(ScenarioModel):
             by_sensor = sample_times(self, streams)
             require_states(self, by_sensor)
             sampled = all_sample_times(by_sensor)
-        # Of a path that is drawn at some instants only, states do not depend on which.
-        sampled = np.union1d(sampled, tick_times(self, streams))
+        if self.links_follow_state:
+            # Of a path that is drawn at some instants only, states do not depend on which.
+            sampled = np.union1d(sampled, tick_times(self, streams))
         random, probes = streams.generator("plant"), self.times
         times, responses = np.union1d(sampled, probes), self.input_responses
         truth: Any

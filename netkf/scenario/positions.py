@@ -95,14 +95,11 @@ def check_positions(scenario: Any, on_grid: bool) -> None:
 
 def tick_times(scenario: Any, streams: Streams) -> FloatArray:
     """Return the increasing instants (K,), in seconds, at which a clock of the network ticks in one
-    run in continuous time, where the true state says who hears whom; else none. Nodes that
-    transmit after samples do so at sample times.
+    run in continuous time. Nodes that transmit after samples do so at sample times.
     """
     clock = scenario.network.activation
-    if not (scenario.links_follow_state and isinstance(clock, LinkClock)):
-        return np.empty(0)
     instants = [np.empty(0)]
-    for entity in clock.entities(scenario.topology):
+    for entity in clock.entities(scenario.topology) if isinstance(clock, LinkClock) else ():
         phase = partial(streams.generator, "phase", *entity)
         random = streams.generator("clock", *entity)
         instants.append(generate_ticks(clock, entity, phase, random, scenario.horizon))
