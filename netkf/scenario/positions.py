@@ -47,8 +47,9 @@ def positions_of(scenario: Any) -> Positions:
     Raises ScenarioError where these have different numbers of coordinates.
     """
     entries, table = _entries_of_nodes(scenario), scenario.position_table
-    fixed = {k: xy for k, xy in (scenario.topology.positions or {}).items() if k not in entries}
-    sizes = {len(one) for one in entries.values()} | ({2} if fixed or table is not None else set())
+    points = scenario.topology.positions if table is None else table.points
+    fixed = {k: xy for k, xy in (points or {}).items() if k not in entries}
+    sizes = {len(one) for one in entries.values()} | ({2} if fixed else set())
     if len(sizes) > 1:
         k = next(k for k, block in enumerate(scenario.plants) if block.position is not None)
         rule = "must be as many coordinates as other nodes have"

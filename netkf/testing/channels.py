@@ -35,6 +35,8 @@ MESSAGES = (0, 1, 2, 7, 1000)
 TABLE = (1.0, 0.6, 0.85)
 """Delivery probabilities of a graph without a table of its own: directed links take them in turn.
 """
+DISTANCES = (0.0, 1.0, 10.0, 1e3, 1e9)
+"""Distances of nodes at which delivery is checked."""
 PROBABILITY_TOLERANCE, MAX_LAG, FOREVER = 1e-9, 3, 1e300
 """Difference of probabilities that is rounding, messages apart at which outcomes are tested, and
 the end in seconds of a run that shows all delays.
@@ -46,9 +48,10 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
 
     It is checked on every directed link of a complete graph of 4 nodes, or of ``topology``.
 
-    Exact checks: delivery probabilities are numbers from 0 to 1 (0 or 1 if ``deterministic``), use
-    no randomness and do not depend on earlier calls; links with equal entries in the graph's table
-    have equal ones, unless the class defines a ``mean_delivery`` of its own; ``next_state`` and
+    Exact checks: delivery probabilities, also those ``at_distance`` of a loss that follows it, are
+    numbers from 0 to 1 (0 or 1 if ``deterministic``), use no randomness and do not depend on
+    earlier calls; links with equal entries in the graph's table have equal ones, unless the class
+    defines a ``mean_delivery`` of its own; ``next_state`` and
     ``draw`` use only the generator they are given, and make the same draws in each call, none if
     ``stateful`` is False or the delay is ``fixed``; delays are not negative, at most ``longest``,
     and equal to ``fixed`` if it is not None.
@@ -92,6 +95,10 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
             _check_draws(watched)
         _check_delay_law(watched, tuple(links))
         return
+    for distance in DISTANCES if part.follows_distance else ():
+        value = watched.call("at_distance", distance)
+        rule = f"must be a number from 0 to 1 at the distance {distance:g}"
+        demand(0.0 <= value <= 1.0, f"{watched.name}.at_distance", rule, value)
     for link, table_probability in links.items():
         _check_delivery_probabilities(watched, link, table_probability)
     _check_pure(watched, links)

@@ -16,7 +16,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table, parse_toml
 from netkf.scenario.usage import record_usage
 from netkf.scenario.writing import as_table, resolve_defaults, to_toml
-from netkf.theory.errors import error_covariance
+from netkf.theory.errors import error_covariance, error_law
 from netkf.trace.schema import CODES
 from tests.engines.agreement import assert_agree
 from tests.reference import kalman_update
@@ -105,13 +105,13 @@ def place_of(points):
 MOVED = place_of([tuple(map(float, line.split(","))) for line in MOVING.split()[1:]])
 
 
-def from_states(moving, at):
+def from_states(moving, at, owners=(0, 1, 2, 3)):
     """The same of a scenario of robots: its states at ``at`` (K,), asked for as probe times."""
     asked = moving.replace({"probe": np.unique([0.0, *at]).tolist()})
     run = netkf.simulate(asked, engine="simpy")
     states = dict(zip(run.times.tolist(), run.x, strict=True))
-    index = moving.topology.index
-    return lambda node, time: states[time][2 * index[node] : 2 * index[node] + 2]
+    first = {node: 2 * k for k, node in enumerate(owners)}
+    return lambda node, time: states[time][first[node] : first[node] + 2]
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
@@ -174,6 +174,46 @@ def test_delivered_shares_are_the_logistic_curve(tmp_path):
         p = logistic(math.dist(points[i], points[j]))
         assert scipy.stats.binomtest(k, n, p).pvalue > 1e-4
         assert fixed.mean_delivery((i, j)) == pytest.approx(p, abs=1e-15)
+
+
+@pytest.mark.parametrize("timed", [False, True])
+@pytest.mark.parametrize("clock", ["links", "broadcast"])
+def test_nodes_of_a_table_hear_robots(tmp_path, clock, timed):
+    """Nodes 1 and 2 stand where a table says, 0 and 3 are where their state says."""
+    graph = {"kind": "range", "nodes": 4, "radius": 3.0}
+    rows_ = "t,node,x,y\n0,1,1,0\n0,2,0,-1\n" if timed else "node,x,y\n1,1,0\n2,0,-1\n"
+    mixed = scenario(tmp_path, clock, None, graph, rows_, **robots(clock, nodes=(0, 3)))
+    run = netkf.simulate(mixed)
+    sent = rows(run, "send")
+    times = np.floor(sent["t"]) if clock in SLOTTED else sent["t"]
+    moved = from_states(mixed, times, (0, 3))
+    still = {1: (1.0, 0.0), 2: (0.0, -1.0)}
+    for t, (i, j) in zip(times.tolist(), sent[["node", "peer"]].tolist(), strict=True):
+        ends = (still[k] if k in still else moved(k, t) for k in (i, j))
+        assert math.dist(*ends) <= 3.0
+    met = {(i, j) for i, j in sent[["node", "peer"]].tolist()}
+    assert {(0, 1), (3, 2)} <= met
+
+
+@pytest.mark.parametrize(
+    ("clock", "filtering"),
+    [
+        ("links", {"kind": "hybrid", "epsilon": 0.3}),
+        ("directions", {"kind": "kcf", "epsilon": 0.1}),
+        ("nodes", {"kind": "track-fusion", "rule": "ci"}),
+        ("readings", {"kind": "intermittent"}),
+        ("matching", {"kind": "gossip"}),
+        ("broadcast", {"kind": "push-sum", "gamma": 2, "delta": 4.5}),
+        ("broadcast", {"kind": "icf", "steps": 1}),
+    ],
+)
+def test_filters_know_what_they_hear(tmp_path, clock, filtering):
+    """P of filters whose links come and go is what their equations give for the events."""
+    graph = {"kind": "range", "nodes": 4, "radius": 5.5}
+    moving = scenario(tmp_path, clock, None, graph, MOVING, filter=filtering)
+    run = netkf.simulate(moving)
+    law = error_law(moving, run)
+    np.testing.assert_allclose(run.P, law.P, rtol=1e-10)
 
 
 def test_table_of_delivery_is_linear_and_ends_are_constant():

@@ -34,6 +34,17 @@ class TooSure(Loss):
         return 1.2
 
 
+@says(CHANNELS, "Falling.at_distance: must be a number from 0 to 1 at the distance 10; got -9")
+class Falling(Loss):
+    follows_distance = True
+
+    def at_distance(self, distance):
+        return 1.0 - distance
+
+    def delivery_probability(self, link, message, bad, table_probability):
+        return table_probability
+
+
 @says(CHANNELS, "Lossier.mean_delivery: must be the delivered fraction", delivery=0.5)
 class Lossier(Bernoulli):
     def delivery_probability(self, link, message, bad, table_probability):

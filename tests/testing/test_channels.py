@@ -32,6 +32,10 @@ def losses(tables):
             parts.GilbertElliott(mean_loss=0.1, mean_burst=50.0),
         ],
         "recorded": [parts.RecordedLoss(tables["lost"])],
+        "distance": [
+            parts.DistanceLoss({"kind": "logistic", "half": 3.0, "width": 0.1}),
+            parts.DistanceLoss([[0.0, 1.0], [5.0, 0.0]]),
+        ],
     }
 
 
