@@ -98,7 +98,7 @@ def _times_of(key: str, part: Any) -> Iterator[TimeConstant]:
         value, rule = getattr(part, field.name), field.metadata.get("rule")
         if isinstance(value, Component):
             yield from _times_of(f"{key}.{field.name}", value)
-        elif isinstance(value, tuple):
+        elif isinstance(value, tuple) and value and isinstance(value[0], Component):
             for k, item in enumerate(value):
                 yield from _times_of(f"{key}.{field.name}[{k}]", item)
         elif isinstance(value, float) and rule is not None and rule.of_time:

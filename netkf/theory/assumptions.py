@@ -61,11 +61,9 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
     if len(changes):
         first = f"at {changes[0]:g} s" if len(changes) == 1 else f"{len(changes)} times"
         evidence = f"it changes {first}; rows on the plant are of that from {changes[-1]:g} s on"
-        rows = [(CONSTANT, ANY, False, evidence), *assumption_rows(scenario.last_piece)]
-        return [
-            true_model_row(scenario, row[1], row[3]) if row[0] == TRUE_MODEL else row
-            for row in rows
-        ]
+        rows = [row for row in assumption_rows(scenario.last_piece) if row[0] != TRUE_MODEL]
+        known = true_model_row(scenario, ANY, "the same matrices at all times")
+        return [(CONSTANT, ANY, False, evidence), known, *rows]
     nonlinear = nonlinear_rows(scenario)
     if not scenario.plant.linear:
         return [*nonlinear, *start_rows(scenario, ANY)]

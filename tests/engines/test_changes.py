@@ -13,6 +13,7 @@ from scipy.linalg import expm
 import netkf
 from netkf.algorithms.traits import Timing
 from netkf.core.errors import ScenarioError
+from netkf.engines.compiled.engine import CompiledEngine
 from netkf.parts import Filter, Filtering
 from netkf.scenario.reading import from_table
 
@@ -577,3 +578,20 @@ def test_a_schedule_in_milliseconds_has_the_same_events():
     np.testing.assert_allclose(a.events["t"] * scale, b.events["t"], rtol=1e-12)
     assert a.events["kind"].equals(b.events["kind"])
     np.testing.assert_allclose(a.P, b.P, rtol=1e-9)
+
+
+@pytest.mark.parametrize("case", ["slots", "samples", "increments", "unaware"])
+def test_runs_of_a_batch_are_those_of_runs_alone(case):
+    loss = {"channel": {"loss": {"kind": "bernoulli", "delivery": 0.6}}}
+    model = {"model": {"schedule": case != "unaware"}}
+    own = {} if case == "samples" else {"sensor": INCREMENTS}
+    options = {"epsilon": 0.3, **model}
+    s = (
+        slots("diffusion", network=loss)
+        if case == "slots"
+        else clocks("hybrid", filter=options, **own)
+    )
+    errors = np.concatenate([batch.error for batch in CompiledEngine().run_many(s, 3, range(9))])
+    for replica in (0, 8):
+        run = netkf.simulate(s, seed=3, replica=replica, engine="compiled")
+        np.testing.assert_array_equal(run.error, errors[replica])

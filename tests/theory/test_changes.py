@@ -186,8 +186,9 @@ def test_filters_that_do_not_know_are_said_to_be_wrong():
     rows = netkf.theory.assumptions(slots("diffusion", filter=UNAWARE)).set_index("assumption")
     known = netkf.theory.assumptions(clocks("local", filter=UNAWARE)).set_index("assumption")
     name = "the filters know the plant and the sensors"
-    assert not known.loc[name, "holds"]
-    assert "do not know that the plant changes" in known.loc[name, "evidence"]
+    for table in (rows, known):
+        assert not table.loc[name, "holds"]
+        assert "do not know that the plant changes" in table.loc[name, "evidence"]
     assert netkf.theory.assumptions(clocks("local")).set_index("assumption").loc[name, "holds"]
     assert not rows.loc["the plant does not change", "holds"]
     unaware = netkf.consistency(slots("local", filter=UNAWARE), runs=40)
@@ -195,6 +196,21 @@ def test_filters_that_do_not_know_are_said_to_be_wrong():
     assert (unaware.table["expected"] > 4.0).all()
     assert (unaware.table["nees"] > 4.0).all()
     np.testing.assert_allclose(aware.table["expected"], 2.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("aware", [True, False])
+def test_check_follows_the_changes(aware):
+    verdict = netkf.check(slots("diffusion", filter={} if aware else UNAWARE), runs=20)
+    rows = verdict.table.set_index("promise")
+    assert verdict, rows
+    bound = rows.loc["P is at least the covariance of the error, given the events", "verdict"]
+    assert bound == ("holds" if aware else "not promised")
+    for name in (
+        "P follows the equations along the events of each run",
+        "states are those that the plant draws, errors are x - xhat",
+        "both engines make the same events and states",
+    ):
+        assert rows.loc[name, "verdict"] == "holds"
 
 
 def test_a_size_is_found_where_the_plant_changes():
