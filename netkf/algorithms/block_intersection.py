@@ -118,11 +118,8 @@ class BlockIntersection(Filter):
         """Return the state ``gap`` seconds later. The plant's noise is independent of others, if
         nobody else estimates the same blocks.
         """
-        model, n = state.model, len(state.xhat)
-        xhat, root = model.predict(state.xhat, first_root(state.P), gap)
-        still = np.zeros((n, n))
-        origin = model.predict(np.zeros(n), still, gap)[0]
-        Phi = np.stack([model.predict(e, still, gap)[0] - origin for e in np.eye(n)], axis=1)
+        Phi = state.model.transition(state.xhat, gap)
+        xhat, root = state.model.predict(state.xhat, first_root(state.P), gap)
         P = symmetric(root @ root.T)
         independent = P - Phi @ state.dependent @ Phi.T
         if not state.alone:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -114,6 +114,10 @@ class FlowModel:
         root, xhat = flow_root(self.unobserved_flow, root, xhat, age)
         return xhat, root
 
+    def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
+        """Return the derivative (n, n) of the predicted estimate with respect to ``xhat`` (n,)."""
+        return linear_transition(self, len(xhat), gap)
+
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
@@ -178,6 +182,10 @@ class SlotModel:
         """
         return xhat, root
 
+    def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
+        """Return the derivative (n, n) of the predicted estimate with respect to ``xhat`` (n,)."""
+        return linear_transition(self, len(xhat), gap)
+
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
     ) -> FloatArray:
@@ -236,6 +244,15 @@ class MapModel(SlotModel):
             points=np.zeros((2 * n + 1, n)),
             work=np.zeros((n, 3 * n + 1)),
         )
+
+    def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
+        """Return the product (n, n) of the Jacobians along the prediction from ``xhat`` (n,)."""
+        Phi, x = np.eye(len(xhat)), np.array(xhat)
+        for k in range(self.slot, self.slot + round(gap / self.period)):
+            u, t = self.u[min(k, len(self.u) - 1)], k * self.period
+            Phi = self.jacobian(x, u, t, self.period) @ Phi
+            x = self.f(x, u, t, self.period)
+        return Phi
 
     def raise_error(self) -> None:
         """Raise the error of a user's f or Jacobian, if a call has failed."""
@@ -415,6 +432,14 @@ class RateModel(FlowModel):
         if age <= 0.0:
             return xhat, root
         return self._move(xhat, root, age)
+
+
+def linear_transition(model: Any, n: int, gap: float) -> FloatArray:
+    """Return the matrix (n, n) by which a model predicts estimates over ``gap`` seconds."""
+    nothing = np.zeros((n, n))
+    origin = model.predict(np.zeros(n), nothing, gap)[0]
+    columns = [model.predict(e, nothing, gap)[0] - origin for e in np.eye(n)]
+    return np.stack(columns, axis=1)
 
 
 def first_root(cov: FloatArray) -> FloatArray:

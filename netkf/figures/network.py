@@ -74,7 +74,7 @@ def _colour_quantities(data: FigureData) -> dict[str, dict[int, float]]:
 
 
 def _message_bytes(data: FigureData) -> int:
-    n = data.scenario.plant.n
+    n = data.scenario.width
     return 8 * (n + n * (n + 1) // 2)
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import scipy.linalg
 
-from netkf.core.errors import ScenarioError, quote, suggest_nearest
+from netkf.core.errors import ScenarioError, errors_under, quote, suggest_nearest
 from netkf.core.fields import (
     Component,
     Rule,
@@ -32,7 +32,8 @@ from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import Exogenous, Input
-from netkf.plants.linear import LinearPlant
+from netkf.plants.linear import LinearPlant, SlotPlant
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.plant import Plant
 
 
@@ -78,7 +79,7 @@ class Block(Component):
     """One entry of ``[[plants]]``: a plant that all nodes share, or that each of ``nodes`` has.
 
     name      what sensors and results call it
-    plant     its dynamics: a Diffusion or a LinearPlant
+    plant     its dynamics: a Diffusion, a LinearPlant or a NonlinearPlant
     nodes     the nodes of which each has one of its own, with independent noise and start; by
               default all share one
     coupling  by which other blocks it is driven: [{ from = "name" or node ids, A = ... }], the
@@ -177,7 +178,9 @@ def _places(blocks: Sequence[Block]) -> Iterator[Place]:
 
 @dataclass(frozen=True, eq=False)
 class StackedInput(Input):
-    """The ``inputs`` (u_1, u_2, ...) of several blocks together; G (n, m) is that of all states."""
+    """The ``inputs`` (u_1, u_2, ...) of several blocks together; G (n, m) is that of all states,
+    None if blocks are not linear.
+    """
 
     inputs: tuple[Input, ...] = field(list_of(instance_of(Input), "inputs"))
 
@@ -214,18 +217,20 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     """
     copies = [block for block in blocks for _ in block.nodes or (None,)]
     plants = [block.plant for block in copies]
-    slotted = isinstance(plants[0], LinearPlant)
+    slotted = isinstance(plants[0], SlotPlant)
     for k, block in enumerate(blocks):
-        if not isinstance(block.plant, LinearPlant | Diffusion):
-            rule = "must be linear or a diffusion: other plants cannot be blocks"
+        if not isinstance(block.plant, LinearPlant | NonlinearPlant | Diffusion):
+            rule = "must be linear, a map of slots, or a diffusion: other plants cannot be blocks"
             raise ScenarioError(f"[{k}].kind", rule, block.name, "give F, Q, period, or A, B")
-        if isinstance(block.plant, LinearPlant) != slotted:
+        if isinstance(block.plant, SlotPlant) != slotted:
             rule = "must be in slots as the others are, or in continuous time"
             raise ScenarioError(f"[{k}]", rule, block.name, "give all F, Q, period, or all A, B")
         if not block.plant.is_random:
             rule = "must be drawn: recorded or unknown states cannot be blocks"
             raise ScenarioError(f"[{k}].kind", rule, None, "leave kind out")
         _check_shapes(k, block)
+    if not all(plant.linear for plant in plants):
+        return _stack_maps(blocks, layout)
     mean = np.concatenate([plant.start_mean for plant in plants])
     cov = block_diagonal([plant.start_cov for plant in plants])
     parts: dict[str, Any] = {
@@ -236,6 +241,78 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     if slotted:
         return LinearPlant(period=_one(blocks, "period"), **parts)
     return Diffusion(sensing_period=_one(blocks, "sensing_period"), **parts)
+
+
+class BlockMaps:
+    """The map of a slot of some blocks together, for ``plants.dynamics``: that of each plant on its
+    own entries of the state, first of ``entries``, and of the input, second.
+    """
+
+    def __init__(self, plants: Sequence[Any], entries: Sequence[tuple[slice, slice]]) -> None:
+        self._parts = list(zip(plants, entries, strict=True))
+
+    def of_places(self, chosen: Sequence[int]) -> BlockMaps:
+        """Return the map of some of the blocks, by their numbers, with the input of all."""
+        plants, entries, first = [], [], 0
+        for k in chosen:
+            plant, (_, u) = self._parts[k]
+            plants.append(plant)
+            entries.append((slice(first, first + plant.n), u))
+            first += plant.n
+        return BlockMaps(plants, entries)
+
+    def f(self, x: FloatArray, u: FloatArray, t: float) -> FloatArray:
+        """Return the state (n,) one slot after ``x`` (n,), with the input ``u`` (m,)."""
+        parts = []
+        for plant, (own, driven) in self._parts:
+            if plant.linear:
+                moved = plant.F @ x[own]
+                parts.append(moved if plant.input is None else moved + plant.input.G @ u[driven])
+            else:
+                f = plant.functions[0]
+                parts.append(f(x[own].copy(), u[driven].copy(), t, plant.period))
+        return np.concatenate(parts)
+
+    def jacobian(self, x: FloatArray, u: FloatArray, t: float) -> FloatArray:
+        """Return the derivatives (n, n) of ``f`` with respect to x."""
+        return block_diagonal(
+            [
+                plant.F
+                if plant.linear
+                else plant.functions[1](x[own].copy(), u[driven].copy(), t, plant.period)
+                for plant, (own, driven) in self._parts
+            ]
+        )
+
+
+def _stack_maps(blocks: Sequence[Block], layout: Layout) -> NonlinearPlant:
+    """Return the plant of all blocks, of which some are not linear."""
+    plants: list[Any] = [block.plant for block in blocks for _ in block.nodes or (None,)]
+    for k, block in enumerate(blocks):
+        plant: Any = block.plant
+        if block.coupling:
+            rule = "must be left out where blocks are not linear"
+            raise ScenarioError(f"[{k}].coupling", rule, None, "write one f for what is coupled")
+        if plant.linear and plant.schedule:
+            rule = "must be left out where blocks are not linear"
+            raise ScenarioError(f"[{k}].schedule", rule, None, "leave it out")
+        if not plant.linear:
+            with errors_under(f"[{k}]"):
+                plant.check_dynamics()
+    entries, m = [], 0
+    for place, plant in zip(layout.places, plants, strict=True):
+        size = 0 if plant.input is None else plant.input.m
+        entries.append((place.entries, slice(m, m + size)))
+        m += size
+    inputs = tuple(plant.input for plant in plants if plant.input is not None)
+    return NonlinearPlant(
+        f=BlockMaps(plants, entries),
+        Q=block_diagonal([plant.Q for plant in plants]),
+        period=_one(blocks, "period"),
+        mean=np.concatenate([plant.start_mean for plant in plants]),
+        cov=block_diagonal([plant.start_cov for plant in plants]),
+        input=StackedInput(inputs=inputs) if inputs else None,
+    )
 
 
 def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]:
@@ -271,18 +348,18 @@ def _stacked_schedule(blocks: Sequence[Block], layout: Layout) -> list[dict[str,
 
 def _check_shapes(k: int, block: Block) -> None:
     plant: Any = block.plant
-    n, is_slotted = plant.n, isinstance(plant, LinearPlant)
+    n, is_slotted = plant.n, isinstance(plant, SlotPlant)
     shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (n, n)}
     shapes |= {"Q": (n, n)} if is_slotted else {"B": (n, plant.B.shape[1])}
     given = [(name, name, getattr(plant, name)) for name in shapes]
-    for c, change in enumerate(plant.schedule):
+    for c, change in enumerate(plant.schedule if plant.linear else ()):
         given += [(f"schedule[{c}].{name}", name, one) for name, one in change.matrices.items()]
     shapes |= {"F": (n, n), "A": (n, n)}
     for key, name, value in given:
         shape = (n, value.shape[-1]) if name in "BG" else shapes[name]
         if value is not None and value.shape != shape:
             wanted, actual = (" x ".join(map(str, one)) for one in (shape, value.shape))
-            why = f"because {'F' if is_slotted else 'A'} has {n} rows"
+            why = f"because the state has {n} components"
             rule = f"must be {wanted}, not {actual}, {why}"
             raise ScenarioError(f"[{k}].{key}", rule, value, "correct the shape")
 

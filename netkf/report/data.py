@@ -82,7 +82,7 @@ def run_data(
         "truth": run.truth_known,
         # In slots, messages that a node sends at the same time are one transmission.
         "broadcasts": bool(len(run.log)) and (source.scenario.slotted or run.count("transmit") > 0),
-        "n": run.x.shape[1],
+        "n": run.xhat.shape[2],
         "nodes": list(run.nodes),
         "names": [str(node) for node in run.nodes],
         "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],
@@ -201,9 +201,9 @@ def _flow_kind(source: ReportSource) -> str:
 
 
 def _state_axes(source: ReportSource, run: StoredRun, worst: WorstSample | None) -> list[int]:
-    n = run.x.shape[1]
-    observed_states: set[int] = set()
-    for sensor in source.scenario.sensors:
+    n, observed_states = run.xhat.shape[2], set[int]()
+    # Nodes with blocks of their own have other states in the same columns.
+    for sensor in source.scenario.sensors if source.scenario.views is None else ():
         H = getattr(sensor, "H", None)
         if H is not None:
             observed_states |= set(np.flatnonzero(np.any(np.asarray(H) != 0.0, axis=0)).tolist())
@@ -219,7 +219,7 @@ def _sample_columns(
     source: ReportSource, run: StoredRun, rows: np.ndarray, messages: np.ndarray, packer: Packer
 ) -> dict[str, Any]:
     """Return the samples ``rows`` (K,) for the live views; columns are added to ``packer``."""
-    n = run.x.shape[1]
+    n = run.xhat.shape[2]
     i, j = np.triu_indices(n)  # P is symmetric: its upper triangle is enough
     total = len(run.times)
     times = run.times[rows]
@@ -231,7 +231,9 @@ def _sample_columns(
         "age": packer.add(ages, "f8"),
     }
     if run.truth_known:
-        columns["x"] = packer.add(run.x[rows], "f8")
+        # There is no truth that all nodes estimate where each estimates its own blocks.
+        if source.scenario.views is None:
+            columns["x"] = packer.add(run.x[rows], "f8")
         columns["sq_error"] = packer.add(run.sq_error[rows], "f8")
         columns["nees"] = packer.add(run.nees[rows], "f8")
     # (T, N) bound on the trace of P by theory.

@@ -21,6 +21,7 @@ from netkf.runs.simulate import simulate
 from netkf.runs.tables import format_number
 from netkf.studies.explanation import Why, relative_change
 from netkf.studies.why import why
+from netkf.trace.nees import traces
 
 SAME_NUMBERS = 1e-4
 """Relative difference below which numbers of four digits look the same."""
@@ -100,10 +101,9 @@ def central_sample(source: ReportSource) -> CentralSample | None:
     row = int(np.searchsorted(run.times, source.worst.explained.time))
     if row >= len(central_run.times):  # the centralised filter diverged before
         return None
-    error = math.nan
-    if run.truth_known:
-        error = float(np.linalg.norm(central_run.x[row] - central_run.xhat[row, 0]))
-    return CentralSample(float(np.trace(central_run.P[row, 0])), error)
+    node = run.nodes.index(source.worst.explained.node)
+    error = math.sqrt(central_run.sq_error[row, node]) if run.truth_known else math.nan
+    return CentralSample(float(traces(central_run.P[row, node])), error)
 
 
 def describe_central(source: ReportSource, explanation: Why, central: CentralSample) -> str:

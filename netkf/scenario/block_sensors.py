@@ -16,6 +16,8 @@ from netkf.plants.nonlinear import PositionedSensor
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.relative import RelativePositionSensor, RelativeSensor
 
+STACKED = "_is_stacked"
+"""The attribute of sensors that read the stacked state."""
 RELATIVE = (RelativeSensor, RelativePositionSensor)
 
 
@@ -88,12 +90,19 @@ def estimated_blocks(
 
 
 def _stacked(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
+    """Yield sensors of the stacked state; one that is such a sensor already is left as it is."""
+    if getattr(sensor, STACKED, False):
+        yield sensor
+        return
+    for one in _of_blocks(sensor, layout, topology):
+        if one is not sensor:
+            object.__setattr__(one, STACKED, True)
+        yield one
+
+
+def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
     if isinstance(sensor, RELATIVE):
-        # One that was replaced before is left as it is.
-        if getattr(sensor, "_others", None) is not None:
-            yield sensor
-        else:
-            yield from sensor.lowered(layout, list(_pairs(sensor, layout, topology)))
+        yield from sensor.lowered(layout, list(_pairs(sensor, layout, topology)))
         return
     name = _name_of(sensor, layout)
     if name is None:

@@ -39,6 +39,7 @@ from netkf.plants.changes import dividing_period
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.driven import InputResponses, MovedReadings, driven
+from netkf.plants.dynamics import CustomDynamics, functions_of
 from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
@@ -305,11 +306,18 @@ class DerivedScenario(ScenarioModel):
         if not isinstance(plant, NonlinearPlant):
             F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
             return SlotModel(F, Q, H, R, plant.period)
-        f, jacobian = plant.functions
+        (f, jacobian), (F, Q) = plant.functions, self.believed_pieces[0]
+        u = self.believed_inputs
+        if self.views is not None and len(Q[view]) < plant.n:
+            firsts = [place.first for place in self.layout.places]
+            chosen = [k for k, first in enumerate(firsts) if first in view]
+            chosen.sort(key=lambda k: int(np.flatnonzero(view == firsts[k])[0]))
+            maps = CustomDynamics("blocks", plant.f.part.of_places(chosen))
+            f, jacobian = functions_of(maps, len(view), u.shape[1], in_slots=True)
+        F, Q = (np.ascontiguousarray(M[view][:, view]) for M in (F, Q))
         return MapModel(
-            *self.believed_pieces[0], H, R,
-            plant.period, f=f, jacobian=jacobian, u=self.believed_inputs,
-            linearise=self.filter.linearise,
+            F, Q, H, R, plant.period,
+            f=f, jacobian=jacobian, u=u, linearise=self.filter.linearise,
         )  # fmt: skip
 
     @cached_property

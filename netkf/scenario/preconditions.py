@@ -81,7 +81,9 @@ def _check_blocks(scenario: DerivedScenario) -> None:
     for k, node in enumerate(scenario.nodes):
         view = scenario.view(k)
         others = np.setdiff1d(np.arange(scenario.plant.n), view)
-        if any(M[np.ix_(view, others)].any() for M, _ in scenario.believed_pieces):
+        # Blocks of a plant that is not linear drive nobody.
+        pieces = scenario.believed_pieces if scenario.plant.linear else ()
+        if any(M[np.ix_(view, others)].any() for M, _ in pieces):
             rule = f"must contain all that drives the blocks of node {node}"
             remedy = 'estimate the coupled blocks too, as "all" does'
             raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)

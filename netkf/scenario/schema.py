@@ -21,6 +21,7 @@ from netkf.network.contacts import Contacts
 from netkf.plants.blocks import Block
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
+from netkf.plants.maps import NonlinearPlant
 from netkf.plants.plant import Plant
 from netkf.scenario.imports import offered_kinds
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
@@ -181,7 +182,7 @@ def _family_schema(name: str, families: Sequence[str]) -> Schema:
 def _block_schema() -> Schema:
     """Return the schema of one of [[plants]]: its own keys beside those of its plant."""
     own = [key for key in list_keys(Block) if key.name != "plant"]
-    plants: list[type[Component]] = [Diffusion, LinearPlant]
+    plants: list[type[Component]] = [Diffusion, LinearPlant, NonlinearPlant]
     names = {cls: name for name, cls in KINDS["plant"].items()}
     variants = [_kind_schema(names[cls], cls, own, is_default=True) for cls in plants]
     return {"anyOf": variants}

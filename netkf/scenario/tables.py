@@ -276,7 +276,8 @@ def _build_block(origin: Origin, value: Any) -> Any:
         return value
     table = _as_dict(value)
     own = {key: table.pop(key) for key in BLOCK_KEYS if key in table}
-    table.setdefault("kind", "linear" if "F" in table else "diffusion")
+    kinds = {"F": "linear", "f": "nonlinear"}
+    table.setdefault("kind", next((kinds[key] for key in kinds if key in table), "diffusion"))
     return _build_object(Block, {**own, "plant": _build_plant(origin, table)}, origin)
 
 

@@ -92,7 +92,7 @@ def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
     # The exchange of the slot, by which some filters send different things; -1 under clocks.
     phases = sent["phase"].tolist() if slotted else [-1] * len(sent)
     numbers = sum(
-        scenario.node_filter.analysis.payload_numbers(scenario.plant.n, rows.get(node, 0), phase)
+        scenario.node_filter.analysis.payload_numbers(scenario.width, rows.get(node, 0), phase)
         for node, phase in zip(sent["node"].tolist(), phases, strict=True)
     )
     return Traffic(len(sent), BYTES * numbers)

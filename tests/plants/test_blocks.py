@@ -343,3 +343,97 @@ def test_each_block_has_its_own_input(tmp_path: Path, engine: str) -> None:
     np.testing.assert_array_equal(one.error, other.error)
     np.testing.assert_array_equal(one.P, other.P)
     assert one.fingerprint == other.fingerprint
+
+
+UNICYCLES = """
+format = 1
+name = "unicycles"
+horizon = 4.0
+probe = 1.0
+[[plants]]
+name = "pose"
+nodes = [1]
+f = "unicycle"
+input = { kind = "constant", value = [0.5, 0.2] }
+Q = [[0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.004]]
+period = 1.0
+mean = [0.0, 0.0, 0.3]
+cov = [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.05]]
+[[plants]]
+name = "pose"
+nodes = [2]
+F = [[1.0, 0.0], [0.0, 0.9]]
+Q = [[0.02, 0.0], [0.0, 0.02]]
+period = 1.0
+mean = [3.0, 4.0]
+cov = [[0.2, 0.0], [0.0, 0.2]]
+input = { kind = "constant", value = [0.3], G = [[1.0], [0.0]] }
+[[sensors]]
+kind = "relative-range-bearing"
+path = "sights.csv"
+heading = 2
+R = [[0.04, 0.0], [0.0, 0.01]]
+[network]
+graph = { kind = "edges", edges = [[1, 2]] }
+activation = { kind = "broadcast" }
+[filter]
+kind = "central"
+"""
+
+
+def arc(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unicycle over a second with v = .5 and w = .2, and its Jacobian, by the textbook."""
+    v, w, h = 0.5, 0.2, x[2]
+    dx = v / w * (math.sin(h + w) - math.sin(h))
+    dy = v / w * (math.cos(h) - math.cos(h + w))
+    return x + np.array([dx, dy, w]), np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_blocks_need_not_be_linear(tmp_path: Path, engine: str) -> None:
+    (tmp_path / "sights.csv").write_text("t,node,to,y0,y1\n1,1,2,4.9,0.5\n2,1,2,4.8,0.4\n")
+    run = netkf.simulate(load(UNICYCLES, tmp_path), engine=engine)
+    xhat = np.array([0.0, 0.0, 0.3, 3.0, 4.0])
+    P, Q = np.diag([0.1, 0.1, 0.05, 0.2, 0.2]), np.diag([0.01, 0.01, 0.004, 0.02, 0.02])
+    for slot, y in enumerate([(4.9, 0.5), (4.8, 0.4), None], 1):
+        moved, J = arc(xhat[:3])
+        F = np.zeros((5, 5))
+        F[:3, :3], F[3, 3], F[4, 4] = J, 1.0, 0.9
+        xhat = np.array([*moved, xhat[3] + 0.3, 0.9 * xhat[4]])
+        P = F @ P @ F.T + Q
+        if y is not None:
+            dx, dy = xhat[3] - xhat[0], xhat[4] - xhat[1]
+            r = math.hypot(dx, dy)
+            H = np.array(
+                [
+                    [-dx / r, -dy / r, 0.0, dx / r, dy / r],
+                    [dy / r**2, -dx / r**2, -1.0, -dy / r**2, dx / r**2],
+                ]
+            )
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag([0.04, 0.01]))
+            xhat = xhat + K @ (np.array(y) - [r, math.atan2(dy, dx) - xhat[2]])
+            P = P - K @ H @ P
+        np.testing.assert_allclose(run.xhat[slot, 0], xhat, atol=1e-11)
+        np.testing.assert_allclose(run.P[slot, 0], P, atol=1e-11)
+
+
+def test_nodes_move_their_own_blocks_by_their_own_dynamics(tmp_path: Path) -> None:
+    (tmp_path / "sights.csv").write_text("t,node,to,y0,y1\n1,1,2,4.9,0.5\n")
+    own = {"filter": {"kind": "block-intersection", "estimates": "own"}}
+    scenario = load(UNICYCLES, tmp_path, own)
+    run = netkf.simulate(scenario)
+    xhat, P = np.array([0.0, 0.0, 0.3]), np.diag([0.1, 0.1, 0.05])
+    for slot in range(1, 4):
+        xhat, J = arc(xhat)
+        P = J @ P @ J.T + np.diag([0.01, 0.01, 0.004])
+        np.testing.assert_allclose(run.xhat[slot, 0], xhat, atol=1e-12)
+        np.testing.assert_allclose(run.P[slot, 0], P, atol=1e-12)
+    # Node 2 has two states; what node 1 saw of it was used once.
+    assert np.isnan(run.xhat[:, 1, 2]).all()
+    assert np.trace(run.P[1, 1, :2, :2]) < 0.2 + 0.162 + 0.04
+    drawn = load(UNICYCLES.replace('path = "sights.csv"', "to = [[1, 2]]"), tmp_path, own)
+    assert len(netkf.consistency(drawn, runs=10, workers=1).rows) == 2
+    with pytest.raises(netkf.ScenarioError, match=r"plants\[0\].coupling: must be left out"):
+        load(UNICYCLES, tmp_path, {"plants.0.coupling": [{"from": [2], "A": [[1.0]]}]})
+    with pytest.raises(netkf.ScenarioError, match=r"plants\[0\].input: must have 2 components"):
+        load(UNICYCLES, tmp_path, {"plants.0.input": {"kind": "constant", "value": [1.0]}})

@@ -338,10 +338,11 @@ def test_directories_are_never_overwritten(tmp_path, monkeypatch):
         create_output_directory(first, "x")
 
 
-NONLINEAR = scenario_files()[0].parent / "nonlinear" / "range_tracking.toml"
+OTHERS = [SCENARIOS / "nonlinear" / "range_tracking.toml"]
+OTHERS += [SCENARIOS / "blocks" / "cooperative_localisation.toml"]
 
 
-@pytest.mark.parametrize("file", [*scenario_files(), NONLINEAR], ids=lambda f: f.stem)
+@pytest.mark.parametrize("file", [*scenario_files(), *OTHERS], ids=lambda f: f.stem)
 def test_every_scenario_ends_in_its_expected_summary(file, tmp_path, capsys):
     """The file beside the scenario; numbers to 6 digits, counts exactly."""
     options = ["--out", str(tmp_path / "out"), "--no-plot"]

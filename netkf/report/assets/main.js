@@ -115,7 +115,7 @@ function nodeTable(run, r) {
   const rows = state.nodes.map((s) => [s.node,
     ...parts.flatMap((c) => [Format.number(s.xhat[c]), Format.number(run.scale.interval * Math.sqrt(State.variance(s.P, n, c, c)))]),
     Format.number(s.trace), Format.number(s.error), Format.number(s.nees), Format.number(s.age)]);
-  const truth = state.x ? "; truth " + parts.map((c) => "x" + c + " = " + Format.number(state.x[c])).join(", ") : "; no truth is known";
+  const truth = state.x ? "; truth " + parts.map((c) => "x" + c + " = " + Format.number(state.x[c])).join(", ") : "; no truth that all share is known";
   const name = app.runs.length > 1 ? "AB"[r] + ": nodes" : "Nodes";
   return Format.table(name + " at the sample of " + Format.time(state.sample ?? NaN) + " s" + truth, header, rows);
 }

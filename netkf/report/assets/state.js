@@ -76,7 +76,7 @@ const State = (() => {
   }
 
   function truthAt(run, k) {
-    return run.truth && k >= 0 ? Array.from(run.samples.x.subarray(k * run.n, k * run.n + run.n)) : null;
+    return run.samples.x && k >= 0 ? Array.from(run.samples.x.subarray(k * run.n, k * run.n + run.n)) : null;
   }
 
   // All of it as plain values: what tests compare with the trace.
