@@ -535,17 +535,25 @@ class RangeGraph(Graph):
     """Links between all pairs of nodes, each of which is up while its ends are at most ``radius``
     apart: over a link that is down nothing is sent.
 
-    nodes   N names the nodes 0 .. N - 1; a list names all nodes
+    nodes   N names the nodes 0 .. N - 1, a list names all nodes; by default they are those of which
+            a scenario says where they are
     radius  in the unit of positions
     """
 
     may_name_nodes: ClassVar[bool] = True
 
-    nodes: int | tuple[Any, ...] = field(either(_count, list_of(_node, "node ids"), _is_list))
+    nodes: int | tuple[Any, ...] | None = field(
+        either(_count, list_of(_node, "node ids"), _is_list), default=None
+    )
     radius: float = field(positive)
 
     def build(self, seed: int) -> Topology:
-        """Return the topology that links all pairs; ``seed`` is not used."""
+        """Return the topology that links all pairs; ``seed`` is not used. Raises ScenarioError
+        without nodes.
+        """
+        if not self.nodes:
+            remedy = "add nodes = N, or network.positions"
+            raise ScenarioError("nodes", "is missing, and nothing is placed", None, remedy)
         labels = range(self.nodes) if isinstance(self.nodes, int) else self.nodes
         ids = assign_ids(labels)
         _check_size(len(ids), len(ids) * (len(ids) - 1) // 2)

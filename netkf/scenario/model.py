@@ -41,7 +41,7 @@ from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graph_files import graph_rule
-from netkf.network.graphs import Graph, Link, Topology
+from netkf.network.graphs import Graph, Link, RangeGraph, Topology
 from netkf.network.matchings import SlotActivation
 from netkf.network.positions import Positions, PositionTable
 from netkf.plants.blocks import Block, Layout, stack
@@ -51,7 +51,7 @@ from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.block_sensors import estimated_blocks, require_no_blocks, stacked_sensors
 from netkf.scenario.names import bind_names
-from netkf.scenario.positions import positions_of, table_of_positions
+from netkf.scenario.positions import placed_nodes, positions_of, table_of_positions
 from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
 
@@ -332,8 +332,11 @@ class ScenarioModel(Component):
     @cached_property
     def topology(self) -> Topology:
         """The nodes and links; raises ScenarioError if the graph cannot be built."""
+        graph = self.network.graph
+        if isinstance(graph, RangeGraph) and graph.nodes is None:
+            graph = dataclasses.replace(graph, nodes=placed_nodes(self) or None)
         with errors_under("network.graph"):
-            return self.network.graph.build(self.seed)
+            return graph.build(self.seed)
 
     @cached_property
     def nodes(self) -> tuple[int, ...]:

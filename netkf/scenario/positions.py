@@ -8,13 +8,34 @@ from typing import Any
 import numpy as np
 
 from netkf.core.clock import generate_ticks
+from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock
+from netkf.network.graphs import NamedNode
 from netkf.network.positions import Positions, PositionTable, read_positions
 from netkf.rng.streams import Streams
 
 PLACE = "add position = [...] to the [[plants]] of these nodes, or network.positions"
+
+
+def placed_nodes(scenario: Any) -> list[int | str]:
+    """Return the nodes, by id or name, of which plants or ``network.positions`` say where they are,
+    before the graph is known.
+    """
+    listed = [
+        node
+        for block in scenario.plants
+        for node in (block.nodes or () if block.position is not None else ())
+    ]
+    source = scenario.network.positions
+    if source is not None:
+        with errors_under("network.positions"):
+            ids = read_columns(source, ("node",)).integers("node")
+        # Numbers below 0 stand for names.
+        names = {code: name for name, code in source.unknown.items()}
+        listed += [names.get(node, node) for node in ids]
+    return list(dict.fromkeys(str(n) if isinstance(n, NamedNode) else n for n in listed))
 
 
 def table_of_positions(scenario: Any) -> PositionTable | None:

@@ -338,6 +338,26 @@ def test_names_units_and_origin(tmp_path):
     assert netkf.simulate(again).fingerprint == run.fingerprint
 
 
+def test_nodes_of_a_range_graph_are_those_that_are_placed(tmp_path):
+    """Of a table, with names too, of plants, and of both."""
+    graph = {"kind": "range", "radius": 5.5}
+    given = scenario(tmp_path, graph=graph | {"nodes": 4}, positions=MOVING)
+    placed = scenario(tmp_path, graph=graph, positions=MOVING)
+    assert netkf.simulate(placed).fingerprint == netkf.simulate(given).fingerprint
+    text = MOVING.replace(",3,1,1", ",x,1,1").replace("0,3,", "0,x,").replace("0,0,0", "0,base,0")
+    sensors = [SAMPLED | PERIODIC | {"nodes": ["x", "base"]}]
+    by_name = scenario(tmp_path, graph=graph, positions=text, sensors=sensors)
+    assert sorted(map(str, by_name.nodes)) == ["1", "2", "base", "x"]
+    again = by_name.replace({"seed": 6})
+    assert dict(again.topology.names) == dict(by_name.topology.names)
+    mixed = scenario(
+        tmp_path, graph=graph, positions="node,x,y\n7,1,0\n", **robots("links", (0, 3))
+    )
+    assert mixed.nodes == (0, 3, 7)
+    with pytest.raises(NetkfError, match=r"network.graph.nodes: is missing"):
+        scenario(tmp_path, graph=graph)
+
+
 def test_rows_are_counted(tmp_path):
     moving = scenario(tmp_path, positions=MOVING)
     use = record_usage(moving, None)["network.positions"]
