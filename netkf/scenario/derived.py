@@ -587,7 +587,8 @@ class DerivedScenario(ScenarioModel):
         frame is an interval in which both are taken relative to an origin near x (plants.truth).
         This needs a plant whose state and readings are all drawn, linear sensors, filters that
         believe the true A (in slots F) and commute with a shift of the state, and growth so fast
-        that a second frame begins before the horizon.
+        that a second frame begins before the horizon, or an input along whose response the origin
+        moves in any case.
         """
         # Nonlinear readings depend on the absolute state.
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):
@@ -605,7 +606,7 @@ class DerivedScenario(ScenarioModel):
         else:
             frame = frame_period(self.diffusion.A) or math.inf
             model_is_true = np.array_equal(self.belief[0], self.diffusion.A)
-        return model_is_true and frame < self.horizon
+        return model_is_true and (frame < self.horizon or self.input_responses is not None)
 
     @property
     def delivers_all(self) -> bool:

@@ -144,10 +144,21 @@ def test_both_engines_make_the_same_run_of_a_driven_plant(unstable, model, incre
     changes = {"plant.input": {"kind": "recorded", "G": [[0.5], [1.0]], "path": "u.csv"}}
     object.__setattr__(driven, "_folder", tmp_path)
     run = assert_agree(driven.replace(changes | ({"sensors": sensors} if increments else {})))
-    assert run.exact_errors == (unstable and model is None)
+    assert run.exact_errors == (model is None)
     if model is None:
         free = netkf.simulate(run.scenario.undriven, engine="compiled")
         assert np.array_equal(run.error, free.error)
+
+
+@pytest.mark.parametrize("time", ["slots", "clocks"])
+def test_errors_keep_their_digits_however_large_a_known_input_is(time):
+    u = {"kind": "constant", "G": [[1.0, 0.0], [0.0, 1.0]], "value": [1e13, -1e13]}
+    driven = fitting({"slots": "kcf", "clocks": "hybrid"}[time], time, u=u)
+    run, free = (netkf.simulate(one) for one in (driven, driven.undriven))
+    assert np.abs(run.x).max() > 1e13
+    assert np.array_equal(run.nees, free.nees)
+    assert run.rounding_from == np.inf
+    assert fitting("kcf", "slots", u=u, model={"input": False}).exact_errors is False
 
 
 def integrated(A, G, u, m, start):
