@@ -26,8 +26,8 @@ _numbers = itertools.count(1)
 class VectorFunction:
     """A function with an ``address``: where ``is_kernel`` a kernel ``function(x, u, t, out)`` that
     writes its result into ``out``, or ``function(x, u, t, period, out)`` if it ``takes_period``,
-    else a function in Python, ``function(x, u, t)``, that returns it. ``shapes`` are those of x, u
-    and out. It must be kept as long as kernels may call it.
+    else a function in Python of the same arguments but ``out``, that returns it. ``shapes`` are
+    those of x, u and out. It must be kept as long as kernels may call it.
     """
 
     def __init__(
@@ -79,20 +79,21 @@ class VectorFunction:
         if error is not None:
             raise error
 
-    def _call_with_addresses(self, x: int, u: int, t: float, _period: float, out: int) -> None:
+    def _call_with_addresses(self, x: int, u: int, t: float, period: float, out: int) -> None:
         arrays = [self._array(a, shape) for a, shape in zip((x, u, out), self._shapes, strict=True)]
-        self._write(arrays[0].copy(), arrays[1].copy(), t, arrays[2])
+        self._write(arrays[0].copy(), arrays[1].copy(), t, period, arrays[2])
 
     def _call_with_arrays(self, x: Any, u: Any, t: float, period: float, out: Any) -> None:
         x, u, out = (a.reshape(shape) for a, shape in zip((x, u, out), self._shapes, strict=True))
         if self._is_kernel:
             self._function(x, u, t, *([period] if self._takes_period else []), out)
         else:
-            self._write(x.copy(), u.copy(), t, out)
+            self._write(x.copy(), u.copy(), t, period, out)
 
-    def _write(self, x: FloatArray, u: FloatArray, t: float, out: Any) -> None:
+    def _write(self, x: FloatArray, u: FloatArray, t: float, period: float, out: Any) -> None:
         try:
-            value = np.asarray(self._function(x, u, float(t)), dtype=np.float64)
+            others = [float(period)] if self._takes_period else []
+            value = np.asarray(self._function(x, u, float(t), *others), dtype=np.float64)
             if value.shape != out.shape:
                 raise ValueError(f"returned shape {value.shape} instead of {out.shape}")
             out[...] = value

@@ -30,7 +30,9 @@ from netkf.core.fields import (
 from netkf.core.instants import TimeGrid
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.dynamics import BlockPart, StackedDynamics
 from netkf.plants.inputs import Exogenous, Input
 from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.maps import NonlinearPlant
@@ -219,8 +221,10 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     plants = [block.plant for block in copies]
     slotted = isinstance(plants[0], SlotPlant)
     for k, block in enumerate(blocks):
-        if not isinstance(block.plant, LinearPlant | NonlinearPlant | Diffusion):
-            rule = "must be linear, a map of slots, or a diffusion: other plants cannot be blocks"
+        if not isinstance(
+            block.plant, LinearPlant | NonlinearPlant | Diffusion | NonlinearDiffusion
+        ):
+            rule = "must be linear, nonlinear or a diffusion: other plants cannot be blocks"
             raise ScenarioError(f"[{k}].kind", rule, block.name, "give F, Q, period, or A, B")
         if isinstance(block.plant, SlotPlant) != slotted:
             rule = "must be in slots as the others are, or in continuous time"
@@ -230,7 +234,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
             raise ScenarioError(f"[{k}].kind", rule, None, "leave kind out")
         _check_shapes(k, block)
     if not all(plant.linear for plant in plants):
-        return _stack_maps(blocks, layout)
+        return _stack_nonlinear(blocks)
     mean = np.concatenate([plant.start_mean for plant in plants])
     cov = block_diagonal([plant.start_cov for plant in plants])
     parts: dict[str, Any] = {
@@ -243,76 +247,41 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     return Diffusion(sensing_period=_one(blocks, "sensing_period"), **parts)
 
 
-class BlockMaps:
-    """The map of a slot of some blocks together, for ``plants.dynamics``: that of each plant on its
-    own entries of the state, first of ``entries``, and of the input, second.
-    """
-
-    def __init__(self, plants: Sequence[Any], entries: Sequence[tuple[slice, slice]]) -> None:
-        self._parts = list(zip(plants, entries, strict=True))
-
-    def of_places(self, chosen: Sequence[int]) -> BlockMaps:
-        """Return the map of some of the blocks, by their numbers, with the input of all."""
-        plants, entries, first = [], [], 0
-        for k in chosen:
-            plant, (_, u) = self._parts[k]
-            plants.append(plant)
-            entries.append((slice(first, first + plant.n), u))
-            first += plant.n
-        return BlockMaps(plants, entries)
-
-    def f(self, x: FloatArray, u: FloatArray, t: float) -> FloatArray:
-        """Return the state (n,) one slot after ``x`` (n,), with the input ``u`` (m,)."""
-        parts = []
-        for plant, (own, driven) in self._parts:
-            if plant.linear:
-                moved = plant.F @ x[own]
-                parts.append(moved if plant.input is None else moved + plant.input.G @ u[driven])
-            else:
-                f = plant.functions[0]
-                parts.append(f(x[own].copy(), u[driven].copy(), t, plant.period))
-        return np.concatenate(parts)
-
-    def jacobian(self, x: FloatArray, u: FloatArray, t: float) -> FloatArray:
-        """Return the derivatives (n, n) of ``f`` with respect to x."""
-        return block_diagonal(
-            [
-                plant.F
-                if plant.linear
-                else plant.functions[1](x[own].copy(), u[driven].copy(), t, plant.period)
-                for plant, (own, driven) in self._parts
-            ]
-        )
-
-
-def _stack_maps(blocks: Sequence[Block], layout: Layout) -> NonlinearPlant:
-    """Return the plant of all blocks, of which some are not linear."""
-    plants: list[Any] = [block.plant for block in blocks for _ in block.nodes or (None,)]
+def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
+    slotted = isinstance(blocks[0].plant, SlotPlant)
     for k, block in enumerate(blocks):
         plant: Any = block.plant
-        if block.coupling:
-            rule = "must be left out where blocks are not linear"
-            raise ScenarioError(f"[{k}].coupling", rule, None, "write one f for what is coupled")
-        if plant.linear and plant.schedule:
-            rule = "must be left out where blocks are not linear"
-            raise ScenarioError(f"[{k}].schedule", rule, None, "leave it out")
-        if not plant.linear:
+        for key, given in (("coupling", block.coupling), ("schedule", plant.changes)):
+            if len(given):
+                rule = "must be left out where blocks are not linear"
+                raise ScenarioError(f"[{k}].{key}", rule, None, "write one f for all of it")
+        if plant.linear:
+            _check_gain(k, plant.input, plant.n)
+        else:
             with errors_under(f"[{k}]"):
                 plant.check_dynamics()
-    entries, m = [], 0
-    for place, plant in zip(layout.places, plants, strict=True):
-        size = 0 if plant.input is None else plant.input.m
-        entries.append((place.entries, slice(m, m + size)))
-        m += size
-    inputs = tuple(plant.input for plant in plants if plant.input is not None)
-    return NonlinearPlant(
-        f=BlockMaps(plants, entries),
-        Q=block_diagonal([plant.Q for plant in plants]),
-        period=_one(blocks, "period"),
-        mean=np.concatenate([plant.start_mean for plant in plants]),
-        cov=block_diagonal([plant.start_cov for plant in plants]),
-        input=StackedInput(inputs=inputs) if inputs else None,
-    )
+    plants: list[Any] = [block.plant for block in blocks for _ in block.nodes or (None,)]
+    parts = []
+    for plant in plants:
+        u = plant.input
+        m, name = 0 if u is None else u.m, "F" if slotted else "A"
+        if plant.linear:
+            G = None if u is None else u.G
+            parts.append(BlockPart(None, plant.n, m, getattr(plant, name), G))
+        else:
+            parts.append(BlockPart(plant.f, plant.n, m))
+    inputs = [plant.input for plant in plants if plant.input is not None]
+    shared: dict[str, Any] = {
+        "f": StackedDynamics(tuple(parts)),
+        "mean": np.concatenate([plant.start_mean for plant in plants]),
+        "cov": block_diagonal([plant.start_cov for plant in plants]),
+        "input": StackedInput(inputs=tuple(inputs)) if inputs else None,
+    }
+    noise = block_diagonal([plant.Q if slotted else plant.B for plant in plants])
+    if slotted:
+        return NonlinearPlant(Q=noise, period=_one(blocks, "period"), **shared)
+    curved = [block for block in blocks if not block.plant.linear]
+    return NonlinearDiffusion(B=noise, step=_one(curved, "step"), **shared)
 
 
 def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]:
@@ -381,13 +350,17 @@ def _stacked_input(blocks: Sequence[Block], layout: Layout) -> StackedInput | No
             place, one = next(places), block.plant.input
             if one is None:
                 continue
-            if one.G is None or one.G.shape != (place.n, one.m):
-                rule = f"must be {place.n} x {one.m}"
-                raise ScenarioError(f"[{k}].input.G", rule, one.G, "correct the shape")
+            _check_gain(k, one, place.n)
             inputs.append(one)
             parts.append(np.zeros((layout.n, one.m)))
             parts[-1][place.entries] = one.G
     return StackedInput(inputs=tuple(inputs), G=np.concatenate(parts, axis=1)) if inputs else None
+
+
+def _check_gain(k: int, u: Input | None, n: int) -> None:
+    if u is not None and (u.G is None or u.G.shape != (n, u.m)):
+        rule = f"must be {n} x {u.m}"
+        raise ScenarioError(f"[{k}].input.G", rule, u.G, "correct the shape")
 
 
 def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:

@@ -19,7 +19,7 @@ from netkf.core.fields import field, matrix, seconds
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
 from netkf.linalg.vector_functions import VectorFunction
-from netkf.plants.dynamics import dynamics, functions_of
+from netkf.plants.dynamics import StackedDynamics, dynamics, functions_of
 from netkf.plants.inputs import SineInput
 from netkf.plants.linear import Blocks
 from netkf.plants.maps import check_dynamics
@@ -70,22 +70,33 @@ class NonlinearDiffusion(Plant):
         f, jacobian = functions_of(self.f, self.n, self.m, in_slots=False)
         return f, jacobian
 
+    def functions_of(self, entries: np.ndarray) -> tuple[Any, np.ndarray]:
+        """Return f and its Jacobian of the blocks whose states are ``entries`` (n',), and the
+        numbers of their inputs (m',).
+        """
+        parts, inputs = self.f.chosen(entries)
+        stacked = StackedDynamics(parts)
+        return functions_of(stacked, len(entries), len(inputs), in_slots=False), inputs
+
     def check_dynamics(self) -> None:
         """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
         check_dynamics(self, self.functions)
 
     @cached_property
     def tables_of_input(self) -> InputTables:
-        """The input: times (J,) of its jumps and values (J, m) from each on, and of a sine its
-        amplitudes, rad/s and phases (3, m).
+        """The input: times (J,) of its jumps and values (J, m) from each on, and amplitudes, rad/s
+        and phases (3, m) of the components that are sines, nan of others.
         """
-        u, nothing = self.input, np.zeros((0, 0))
-        if u is None:
-            return np.zeros(0), nothing, nothing
-        if isinstance(u, SineInput):
-            return np.zeros(0), np.zeros((0, u.m)), u.components
-        times = u.exogenous.times
-        return times, u.values(times), nothing
+        if self.input is None:
+            return np.zeros(0), np.zeros((0, 0)), np.zeros((3, 0))
+        inputs = getattr(self.input, "inputs", (self.input,))
+        steps = [u for u in inputs if not isinstance(u, SineInput)]
+        times = np.unique(np.concatenate([np.zeros(0), *(u.exogenous.times for u in steps)]))
+        values = np.concatenate([u.values(times) for u in inputs], axis=1)
+        sines = [
+            u.components if isinstance(u, SineInput) else np.full((3, u.m), np.nan) for u in inputs
+        ]
+        return times, values, np.concatenate(sines, axis=1)
 
     def path(
         self,

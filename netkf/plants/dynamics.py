@@ -13,9 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from netkf.core.contracts import place_of_error
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component, Rule
+from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.linalg.vector_functions import VectorFunction
 from netkf.plants import motion
 
@@ -77,10 +80,65 @@ class CustomDynamics(Component):
         return repr(self.name)
 
 
-def _convert(value: Any) -> str | CustomDynamics:
-    if isinstance(value, CustomDynamics) or value in tuple(MOTIONS):
-        dynamics: str | CustomDynamics = value
-        return dynamics
+class BlockPart(NamedTuple):
+    """A block of n states with m inputs: its f, or the matrices F or A (n, n) and G (n, m) of a
+    linear one.
+    """
+
+    f: Any
+    n: int
+    m: int
+    matrix: FloatArray | None = None
+    G: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StackedDynamics(Component):
+    """The dynamics of blocks side by side, which do not drive each other."""
+
+    parts: tuple[BlockPart, ...]
+
+    def chosen(self, entries: np.ndarray) -> tuple[tuple[BlockPart, ...], np.ndarray]:
+        """Return the parts of whole blocks whose states are ``entries`` (n',), in their order, and
+        the numbers (m',) of their inputs.
+        """
+        ends = np.cumsum([part.n for part in self.parts])
+        lasts = np.cumsum([part.m for part in self.parts])
+        order = dict.fromkeys(np.searchsorted(ends, entries, side="right").tolist())
+        inputs = [np.arange(lasts[k] - self.parts[k].m, lasts[k]) for k in order]
+        return tuple(self.parts[k] for k in order), np.concatenate([np.zeros(0, int), *inputs])
+
+
+class _Linear:
+    """A linear block as if it were a user's."""
+
+    def __init__(self, matrix: FloatArray, G: FloatArray | None) -> None:
+        self._matrix, self._G = matrix, G
+
+    def f(self, x: FloatArray, u: FloatArray, _: float) -> FloatArray:
+        return self._matrix @ x if self._G is None else self._matrix @ x + self._G @ u
+
+    def jacobian(self, _x: FloatArray, _u: FloatArray, _t: float) -> FloatArray:
+        return self._matrix
+
+
+class _Stacked:
+    """The values of the functions of blocks side by side, or their Jacobians as one."""
+
+    def __init__(self, functions: tuple[VectorFunction, ...], parts: Any, matrices: bool) -> None:
+        self._functions, self._parts, self._matrices = functions, parts, matrices
+
+    def __call__(self, x: FloatArray, u: FloatArray, t: float, period: float) -> FloatArray:
+        values, i, j = [], 0, 0
+        for function, part in zip(self._functions, self._parts, strict=True):
+            values.append(function(x[i : i + part.n], u[j : j + part.m], t, period))
+            i, j = i + part.n, j + part.m
+        return block_diagonal(values) if self._matrices else np.concatenate(values)
+
+
+def _convert(value: Any) -> Any:
+    if isinstance(value, CustomDynamics | StackedDynamics) or value in tuple(MOTIONS):
+        return value
     if value is None or isinstance(value, (str, bytes, int, float, list, tuple, dict)):
         raise TypeError
     cls = value if isinstance(value, type) else type(value)
@@ -108,11 +166,28 @@ dynamics = Rule(
 )
 
 
-def functions_of(f: str | CustomDynamics, n: int, m: int, in_slots: bool) -> Any:
+def functions_of(f: Any, n: int, m: int, in_slots: bool) -> Any:
     """Return f and its Jacobian for n states and m components of the input, as two functions that
     kernels can call: in slots the map of one, else the rate of change.
     """
     shapes = [((n,), (m,), out) for out in ((n,), (n, n))]
+    if isinstance(f, StackedDynamics):
+        pairs = [
+            functions_of(
+                part.f if part.matrix is None
+                else CustomDynamics("", _Linear(part.matrix, part.G)),
+                part.n, part.m, in_slots,
+            )
+            for part in f.parts
+        ]  # fmt: skip
+        return tuple(
+            VectorFunction(
+                _Stacked(functions, f.parts, matrices), shape, is_kernel=False, takes_period=True
+            )
+            for functions, shape, matrices in zip(
+                zip(*pairs, strict=True), shapes, (False, True), strict=True
+            )
+        )
     if isinstance(f, str):
         pair: Pair = MOTIONS[f].flow if in_slots else MOTIONS[f].rate
         is_kernel = takes_period = True

@@ -14,7 +14,7 @@ from netkf.core.fields import covariance, field, seconds
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
 from netkf.linalg.vector_functions import VectorFunction
-from netkf.plants.dynamics import MOTIONS, dynamics, functions_of
+from netkf.plants.dynamics import MOTIONS, StackedDynamics, dynamics, functions_of
 from netkf.plants.linear import BLOCK, Blocks, SlotPlant
 
 
@@ -60,6 +60,14 @@ class NonlinearPlant(SlotPlant):
             return np.zeros((slots, 0))
         return np.array(self.input.values(self.time_grid.snap(self.period * np.arange(slots))))
 
+    def functions_of(self, entries: np.ndarray) -> tuple[Any, np.ndarray]:
+        """Return f and its Jacobian of the blocks whose states are ``entries`` (n',), and the
+        numbers of their inputs (m',).
+        """
+        parts, inputs = self.f.chosen(entries)
+        stacked = StackedDynamics(parts)
+        return functions_of(stacked, len(entries), len(inputs), in_slots=True), inputs
+
     def check_dynamics(self) -> None:
         """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
         check_dynamics(self, self.functions)
@@ -75,6 +83,9 @@ class NonlinearPlant(SlotPlant):
 def check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction]) -> None:
     """Raise ScenarioError if f does not fit the state or the input of a plant, or fails."""
     n, m = plant.n, plant.m
+    # Blocks are checked one by one.
+    if isinstance(plant.f, StackedDynamics):
+        return
     if plant.input is not None and plant.input.G is not None:
         remedy = "leave it out: u is what f takes"
         raise ScenarioError("input.G", "means nothing with a nonlinear plant", None, remedy)

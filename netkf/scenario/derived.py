@@ -39,7 +39,6 @@ from netkf.plants.changes import dividing_period
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.driven import InputResponses, MovedReadings, driven
-from netkf.plants.dynamics import CustomDynamics, functions_of
 from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
@@ -306,19 +305,20 @@ class DerivedScenario(ScenarioModel):
         if not isinstance(plant, NonlinearPlant):
             F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
             return SlotModel(F, Q, H, R, plant.period)
-        (f, jacobian), (F, Q) = plant.functions, self.believed_pieces[0]
-        u = self.believed_inputs
-        if self.views is not None and len(Q[view]) < plant.n:
-            firsts = [place.first for place in self.layout.places]
-            chosen = [k for k, first in enumerate(firsts) if first in view]
-            chosen.sort(key=lambda k: int(np.flatnonzero(view == firsts[k])[0]))
-            maps = CustomDynamics("blocks", plant.f.part.of_places(chosen))
-            f, jacobian = functions_of(maps, len(view), u.shape[1], in_slots=True)
-        F, Q = (np.ascontiguousarray(M[view][:, view]) for M in (F, Q))
+        (f, jacobian), inputs, F, Q = self._curved(plant, view)
+        u = self.believed_inputs[:, inputs]
         return MapModel(
-            F, Q, H, R, plant.period,
-            f=f, jacobian=jacobian, u=u, linearise=self.filter.linearise,
-        )  # fmt: skip
+            F, Q, H, R, plant.period, f=f, jacobian=jacobian, u=u, linearise=self.filter.linearise
+        )
+
+    def _curved(self, plant: Any, view: Any) -> tuple[Any, ...]:
+        """Return f and its Jacobian of the states of a ``view``, the numbers of their inputs, and
+        nan and Q of these states.
+        """
+        F, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])
+        if isinstance(view, slice):
+            return plant.functions, np.arange(plant.m), F, Q
+        return (*plant.functions_of(view), F, Q)
 
     @cached_property
     def believed_inputs(self) -> FloatArray:
@@ -748,14 +748,13 @@ class DerivedScenario(ScenarioModel):
     def _flow_model(self, H: FloatArray, R: FloatArray, view: Any = slice(None)) -> FlowModel:
         plant = self.plant
         if isinstance(plant, NonlinearDiffusion):
-            f, jacobian = plant.functions
+            (f, jacobian), inputs, A, Q = self._curved(plant, view)
             times, values, sine = plant.tables_of_input
             known = 1.0 if self.filter.model.input else 0.0
-            amplitudes = np.array([known, 1.0, 1.0])[: len(sine), None]
+            amplitudes = np.array([[known], [1.0], [1.0]])
             return RateModel(
-                *self.believed_pieces[0], H, R, self.horizon, self.horizon, f=f,
-                jacobian=jacobian, step=plant.step,
-                tables_of_input=(times, known * values, sine * amplitudes),
+                A, Q, H, R, self.horizon, self.horizon, f=f, jacobian=jacobian, step=plant.step,
+                tables_of_input=(times, known * values[:, inputs], sine[:, inputs] * amplitudes),
                 linearise=self.filter.linearise,
             )  # fmt: skip
         A, Q = (np.ascontiguousarray(M[view][:, view]) for M in self.believed_pieces[0])

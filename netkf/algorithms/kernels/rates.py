@@ -41,7 +41,7 @@ class RateTables(Struct):
     step : the longest step of the integration in seconds
     distance, weight, center : ``maps.Spread``
     times, values : (J,) and (J, m), the input is ``values[j]`` from ``times[j]`` on, 0 before
-    sine : (3, m), amplitudes, rad/s and radians of an input that is a sine; (0, 0) of others
+    sine : (3, m), amplitudes, rad/s and radians of the components that are sines, nan of others
     Q : (n, n), the covariance of w over a second
     u, slope, J, state, stage, rates, points, work, mean, root : scratch, (m,), (n,), (n, n),
         (n + 2 n n,) twice, (4, n + 2 n n), (2 n + 1, n), (n, 3 n + 1), (1, n, 1) and (1, n, n, 1)
@@ -78,17 +78,15 @@ class RateRun(Struct):
 @kernel
 def set_input(model: RateTables, time: float, middle: float) -> None:
     """Write the input at ``time`` into ``model.u``; it does not jump from there to ``middle``."""
-    if model.sine.shape[0] > 0:
-        for k in range(len(model.u)):
-            angle = model.sine[1, k] * time + model.sine[2, k]
-            model.u[k] = model.sine[0, k] * math.sin(angle)
-        return
     last = -1
     for j in range(len(model.times)):
         if model.times[j] <= middle:
             last = j
     for k in range(len(model.u)):
         model.u[k] = model.values[last, k] if last >= 0 else 0.0
+        if not math.isnan(model.sine[0, k]):
+            angle = model.sine[1, k] * time + model.sine[2, k]
+            model.u[k] = model.sine[0, k] * math.sin(angle)
 
 
 @kernel

@@ -1,0 +1,220 @@
+"""Blocks of the state that are not linear: the filter of all blocks is a plain recursion."""
+
+import math
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.scenario.reading import from_table
+
+R_SEEN = np.diag([0.04, 0.01])
+Q_POSE, Q_TARGET, F_TARGET = np.diag([1e-3, 1e-3, 4e-4]), 0.02 * np.eye(2), 0.98 * np.eye(2)
+STARTS = {1: [0.0, 0.0, 0.3], 2: [3.0, 4.0, -1.0]}
+U = {1: np.array([1.0, 0.4]), 2: np.array([0.7, -0.3])}
+G = np.array([[0.1], [0.05]])
+
+
+def arc(x, u, T=0.5):
+    v, w = u
+    dx = v / w * (math.sin(x[2] + w * T) - math.sin(x[2]))
+    dy = v / w * (math.cos(x[2]) - math.cos(x[2] + w * T))
+    J = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    return x + np.array([dx, dy, w * T]), J
+
+
+def sight(x):
+    """What node 1 sees of node 2, from its heading, and the derivatives by the poses of both."""
+    dx, dy = x[3] - x[0], x[4] - x[1]
+    r2 = dx * dx + dy * dy
+    r = math.sqrt(r2)
+    H = np.zeros((2, 8))
+    H[0, :6] = [-dx / r, -dy / r, 0.0, dx / r, dy / r, 0.0]
+    H[1, :6] = [dy / r2, -dx / r2, -1.0, -dy / r2, dx / r2, 0.0]
+    return np.array([r, math.atan2(dy, dx) - x[2]]), H
+
+
+def poses(**plant):
+    return [
+        {
+            "name": "pose",
+            "nodes": [node],
+            "kind": "nonlinear",
+            "f": "unicycle",
+            "mean": STARTS[node],
+            "cov": np.diag([0.1, 0.1, 0.02]).tolist(),
+            "input": {"kind": "constant", "value": U[node].tolist()},
+            **plant,
+        }
+        for node in (1, 2)
+    ]
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    sights = ["t,node,to,y0,y1", "0.5,1,2,5.1,0.6", "1.5,1,2,4.4,0.45", "2,1,2,4.2,0.3"]
+    (tmp_path / "sights.csv").write_text("\n".join(sights) + "\n")
+    (tmp_path / "target.csv").write_text("t,node,y0,y1\n1,2,0.4,0.1\n2,2,0.5,-0.2\n")
+    target = {
+        "name": "target",
+        "F": F_TARGET.tolist(),
+        "Q": Q_TARGET.tolist(),
+        "period": 0.5,
+        "cov": np.eye(2).tolist(),
+        "input": {"kind": "sine", "amplitude": 1.0, "frequency": 0.2, "G": G.tolist()},
+    }
+    table = {
+        "format": 1,
+        "name": "team",
+        "horizon": 2.5,
+        "probe": 0.5,
+        "plants": [*poses(period=0.5, Q=Q_POSE.tolist()), target],
+        "sensors": [
+            {
+                "kind": "relative-range-bearing",
+                "of": "pose",
+                "path": "sights.csv",
+                "heading": 2,
+                "R": R_SEEN.tolist(),
+            },
+            {
+                "kind": "recorded",
+                "of": "target",
+                "path": "target.csv",
+                "H": np.eye(2).tolist(),
+                "R": [[0.1, 0.0], [0.0, 0.1]],
+            },
+        ],
+        "network": {
+            "graph": {"kind": "edges", "edges": [[1, 2]]},
+            "activation": {"kind": "broadcast"},
+        },
+        "filter": {"kind": "central"},
+    }
+    return from_table(table, tmp_path)
+
+
+def update(x, P, v, H, R):
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return x + K @ v, P - K @ H @ P
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_the_central_filter_is_a_plain_ekf_of_all_blocks(scenario, engine):
+    run = netkf.simulate(scenario, engine=engine)
+    x = np.array([*STARTS[1], *STARTS[2], 0.0, 0.0])
+    P = np.diag([0.1, 0.1, 0.02] * 2 + [1.0, 1.0])
+    Q = np.zeros((8, 8))
+    Q[:3, :3] = Q[3:6, 3:6] = Q_POSE
+    Q[6:, 6:] = Q_TARGET
+    seen = {1: (5.1, 0.6), 3: (4.4, 0.45), 4: (4.2, 0.3)}
+    told = {2: (0.4, 0.1), 4: (0.5, -0.2)}
+    for k in range(1, 6):
+        J = np.zeros((8, 8))
+        x[:3], J[:3, :3] = arc(x[:3], U[1])
+        x[3:6], J[3:6, 3:6] = arc(x[3:6], U[2])
+        x[6:] = F_TARGET @ x[6:] + G[:, 0] * math.sin(2.0 * math.pi * 0.2 * 0.5 * (k - 1))
+        J[6:, 6:] = F_TARGET
+        P = J @ P @ J.T + Q
+        expected, H = sight(x)
+        rows, R = np.zeros((0, 8)), np.zeros((0, 0))
+        v = np.zeros(0)
+        if k in seen:
+            v, rows, R = np.array(seen[k]) - expected, H, R_SEEN
+        if k in told:
+            H = np.zeros((2, 8))
+            H[:, 6:] = np.eye(2)
+            v = np.concatenate([v, np.array(told[k]) - x[6:]])
+            rows = np.concatenate([rows, H])
+            R = np.block(
+                [
+                    [R, np.zeros((len(R), 2))],
+                    [np.zeros((2, len(R))), 0.1 * np.eye(2)],
+                ]
+            )
+        if len(v):
+            x, P = update(x, P, v, rows, R)
+        np.testing.assert_allclose(run.xhat[k, 0], x, atol=1e-10)
+        np.testing.assert_allclose(run.P[k, 0], P, atol=1e-10)
+
+
+def test_nodes_that_estimate_their_own_block_have_its_filter(scenario):
+    """Without the readings of the other, an own block is a filter of its own."""
+    changes = {
+        "filter": {"kind": "local", "estimates": "own"},
+        "sensors": [
+            {
+                "kind": "range",
+                "of": "pose",
+                "nodes": [1, 2],
+                "positions": [[-1.0, 2.0], [1.0, 0.0]],
+                "R": [[0.04]],
+            }
+        ],
+    }
+    run = netkf.simulate(scenario.replace(changes), seed=4)
+    alone = scenario.replace(changes).replace({"filter": {"kind": "central"}})
+    whole = netkf.simulate(alone, seed=4)
+    np.testing.assert_array_equal(run.x, whole.x)
+    for node, entries in ((1, slice(0, 3)), (2, slice(3, 6))):
+        own = run.block("pose", node)
+        np.testing.assert_allclose(own.xhat, whole.xhat[:, 0, entries], atol=1e-12)
+        np.testing.assert_allclose(own.P, whole.P[:, 0, entries, entries], atol=1e-12)
+
+
+def test_split_covariance_intersection_of_poses(scenario):
+    sensors = [
+        {
+            "kind": "range-bearing",
+            "of": "pose",
+            "nodes": [1],
+            "positions": [[-1.0, 2.0]],
+            "R": R_SEEN.tolist(),
+        },
+        {"kind": "relative-range-bearing", "of": "pose", "heading": 2, "R": R_SEEN.tolist()},
+    ]
+    filtering = {"kind": "block-intersection", "estimates": "own"}
+    run = netkf.simulate(scenario.replace({"sensors": sensors, "filter": filtering}))
+    assert run.status == "complete"
+    first, last = (run.block("pose", 2).P[k, :2, :2].trace() for k in (0, -1))
+    assert last < 0.7 * first
+
+
+def test_blocks_in_continuous_time_are_integrated_side_by_side(scenario):
+    """Two unicycles are two scenarios of one, with steps and jumps of both inputs."""
+    plants = poses(step=0.02, B=(0.1 * np.eye(3)).tolist())
+    plants[1]["input"] = {"kind": "sine", "amplitude": [0.8, 0.5], "frequency": 0.3, "phase": 0.5}
+    changes = {
+        "plants": plants,
+        "sensors": [],
+        "network": {"graph": {"kind": "edges", "edges": [[1, 2]]}},
+        "filter": {"kind": "central"},
+        "probe": 0.4,
+    }
+    both = netkf.simulate(scenario.replace(changes))
+    for k, entries in ((0, slice(0, 3)), (1, slice(3, 6))):
+        one = netkf.simulate(scenario.replace(changes | {"plants": [plants[k]]}))
+        np.testing.assert_allclose(both.xhat[:, 0, entries], one.xhat[:, 0], atol=1e-10)
+        np.testing.assert_allclose(both.P[:, 0, entries, entries], one.P[:, 0], atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        (
+            "coupling",
+            [{"from": "target", "A": [[0.0] * 2] * 3}],
+            "plants[0].coupling: must be left",
+        ),
+        ("input", {"kind": "constant", "value": 1.0}, "plants[0].input: must have 2 components"),
+        ("period", 0.25, "plants[0].period: must be the same in all entries"),
+        ("f", "bicycle", "plants[0].f: must be one of"),
+    ],
+)
+def test_mistakes_in_blocks_are_refused_in_one_line(scenario, key, value, words):
+    plants = poses(period=0.5, Q=Q_POSE.tolist())
+    plants[0][key] = value
+    target = {"name": "target", "F": [[1.0]], "Q": [[1.0]], "period": 0.5}
+    with pytest.raises(netkf.ScenarioError) as caught:
+        scenario.replace({"plants": [*plants, target]})
+    assert words in str(caught.value)
