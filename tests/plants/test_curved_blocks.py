@@ -204,7 +204,7 @@ def test_blocks_in_continuous_time_are_integrated_side_by_side(scenario):
         (
             "coupling",
             [{"from": "target", "A": [[0.0] * 2] * 3}],
-            "plants[0].coupling: must be left",
+            "plants[0].coupling: must be",
         ),
         ("input", {"kind": "constant", "value": 1.0}, "plants[0].input: must have 2 components"),
         ("period", 0.25, "plants[0].period: must be the same in all entries"),
