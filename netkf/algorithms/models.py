@@ -22,15 +22,13 @@ from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.maps import MapTables, move_estimate, spread_of
 from netkf.algorithms.kernels.rates import RateTables, move_by_rate, scratch_of_rates
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
-from netkf.algorithms.kernels.run import usable
+from netkf.algorithms.kernels.run import CLOSE, usable
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.linalg.arrays import FloatArray, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, aligned
 from netkf.linalg.vector_functions import VectorFunction
 
-CLOSE = 1e-12
-"""Share of a time by which sums of gaps may miss it."""
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
 

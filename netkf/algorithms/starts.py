@@ -46,10 +46,10 @@ def information_notes(scenario: Any) -> tuple[str, ...]:
 
 def _information_condition(scenario: Any) -> float:
     """Return the largest condition of ``I + S' G S`` over the nodes of a scenario in slots."""
-    if not scenario.slotted:
+    if not scenario.slotted or not scenario.plant.linear:
         return 1.0
+    F, Q = scenario.believed_pieces[0]
     try:
-        F, Q = scenario.linear_plant and scenario.believed_pieces[0]
         pairs = [
             scenario.observation_matrices(node, believed=True) for node in scenario.sensing_nodes
         ]

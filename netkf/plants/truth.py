@@ -166,7 +166,7 @@ class ChangingTruth(SampledTruth):
         edges = [0.0, *changes.tolist(), math.inf]
         for tree, begin, end in zip(trees, edges[:-1], edges[1:], strict=True):
             inside = (self._times >= begin) & (self._times < end)
-            last = [end] if end < self._times[-1] or end == self._times[-1] else []
+            last = [end] if end <= self._times[-1] else []
             moments = grid.snap(np.concatenate([self._times[inside], last]) - begin)
             if not len(moments):
                 break

@@ -329,12 +329,10 @@ CLOCK_FILTERS = {
     "covariance-intersection": {"epsilon": 0.3},
     "diffusion": {},
     "kcf": {},
-    "icf": {},
     "intermittent": {},
-    "event-triggered": {"trigger": "consensus"},
     "track-fusion": {"rule": "ici"},
 }
-SAMPLES_ONLY = ("kcf", "icf", "intermittent", "event-triggered")
+SAMPLES_ONLY = ("kcf", "intermittent")
 INCREMENTS = {"sampling": "continuous"}
 DELAYS = {"none": {"kind": "none"}, "random": {"kind": "exponential", "mean": 0.4}}
 CASES = [

@@ -27,10 +27,15 @@ PLANTS = {
 TIMES = np.array([0.0, 0.3, 1.0, 7.5, 40.0])
 
 
+def flow_response(A, u):
+    """The response of a plant that does not change."""
+    return FlowResponse([(A, u.G)], np.zeros(0), u)
+
+
 @pytest.mark.parametrize("name", PLANTS)
 def test_constant_inputs_give_the_closed_form(name):
     A, G, value = np.array(PLANTS[name]), np.array([[1.0, 0.2], [-0.5, 2.0]]), [3.0, -1.0]
-    m = FlowResponse(A, ConstantInput(G=G, value=value)).states(TIMES)
+    m = flow_response(A, ConstantInput(G=G, value=value)).states(TIMES)
     drive = G @ value
     if name == "integrators":
         t = TIMES
@@ -45,7 +50,7 @@ def test_a_sine_at_the_frequency_of_the_plant_grows_as_time_does():
     # x'' = -w^2 x + sin(w t): x = (sin(w t) - w t cos(w t)) / (2 w^2)
     w = 2.0 * np.pi * 0.7
     A, t = np.array([[0.0, 1.0], [-(w**2), 0.0]]), np.linspace(0.0, 1000.0, 57)
-    m = FlowResponse(A, SineInput(G=[[0.0], [1.0]], amplitude=1.0, frequency=0.7)).states(t)
+    m = flow_response(A, SineInput(G=[[0.0], [1.0]], amplitude=1.0, frequency=0.7)).states(t)
     expected = (np.sin(w * t) - w * t * np.cos(w * t)) / (2.0 * w**2)
     np.testing.assert_allclose(m[:, 0], expected, atol=1e-9 * np.abs(expected).max())
 
@@ -82,10 +87,10 @@ def test_a_recorded_input_is_integrated_row_by_row(tmp_path):
             E = scipy.linalg.expm(np.block([[A, drive[:, None]], [np.zeros((1, 3))]]) * (cut - t))
             m, t = E[:2, :2] @ m + E[:2, 2], cut
         expected.append(m)
-    response = FlowResponse(A, u)
+    response = flow_response(A, u)
     np.testing.assert_allclose(response.states(times[::-1]), expected[::-1], rtol=1e-10)
     # However many are asked for, and in whatever order.
-    assert np.array_equal(response.states(times[1:2]), FlowResponse(A, u).states(times[:2])[1:])
+    assert np.array_equal(response.states(times[1:2]), flow_response(A, u).states(times[:2])[1:])
 
 
 def test_responses_over_pieces_are_states_and_moments(tmp_path):
@@ -93,8 +98,8 @@ def test_responses_over_pieces_are_states_and_moments(tmp_path):
     step = recorded(tmp_path, "t,u0\n0.35,2\n0.8,-3\n0.85,1\n")
     sine = SineInput(G=[[1.0], [2.0]], amplitude=2.0, frequency=1.3, phase=0.5)
     start, end = np.array([0.0, 0.25, 0.5]), np.array([0.25, 0.5, 1.0])
-    true = FlowResponse(A, step)
-    for response in (true, FlowResponse(A, sine), Difference(true, FlowResponse(1.1 * A, step))):
+    true = flow_response(A, step)
+    for response in (true, flow_response(A, sine), Difference(true, flow_response(1.1 * A, step))):
         m, pieces = response.over_pieces(start, end, grid)
         np.testing.assert_allclose(m, response.states(start), atol=1e-14)
         np.testing.assert_allclose(pieces[:, 0], response.states(end), atol=1e-14)
@@ -117,7 +122,7 @@ def test_in_slots_the_value_at_the_beginning_counts(tmp_path):
         expected.append(m)
         m = F @ m + G[:, 0] * value
         assert k < 5 or value == 9.0
-    response = SlotResponse(F, plant)
+    response = SlotResponse([(F, plant.input.G)], (), plant)
     assert response.states(np.array([2]))[0].tolist() == expected[2].tolist()
     np.testing.assert_allclose(response.states(np.arange(401)), expected[:401], rtol=1e-12)
 

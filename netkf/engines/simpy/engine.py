@@ -118,7 +118,7 @@ class _Simulation:
         return [
             self._sampling(truth, nodes, sums),
             self._moving_origin(truth, nodes),
-            self._changing(nodes),
+            *([self._changing(nodes)] if len(scenario.followed_changes) else []),
             *sensor_processes(*shared, truth, nodes),
             *clock_processes(*shared, self._transmitter, nodes),
         ]
