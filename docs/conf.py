@@ -78,6 +78,7 @@ def named_settings(
 TABLES = {
     "plant": "[plant]",
     "continuous plant": "[plant]",
+    "input": "[plant.input]",
     "sensor": "[[sensors]]",
     "sampling": "sensors.sampling",
     "graph": "network.graph",
