@@ -147,11 +147,13 @@ def _check_plant(scenario: DerivedScenario) -> None:
 
 
 def _check_input(u: Input, n: int) -> None:
+    # On the grid of the scenario two rows of its table may be one instant.
+    with errors_under("plant.input"):
+        m = u.m
     if u.G is None:
-        remedy = f"add G = ..., {n} rows of {u.m}"
-        raise ScenarioError("plant.input.G", "is missing", None, remedy)
-    parts = "components" if u.m > 1 else "component"
-    require_shape("plant.input.G", u.G, (n, u.m), f"n = {n}, and u has {u.m} {parts}")
+        raise ScenarioError("plant.input.G", "is missing", None, f"add G = ..., {n} rows of {m}")
+    parts = "components" if m > 1 else "component"
+    require_shape("plant.input.G", u.G, (n, m), f"n = {n}, and u has {m} {parts}")
 
 
 def _check_sensors(scenario: DerivedScenario) -> None:
