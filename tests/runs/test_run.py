@@ -339,7 +339,7 @@ def test_directories_are_never_overwritten(tmp_path, monkeypatch):
 
 
 OTHERS = [SCENARIOS / "nonlinear" / "range_tracking.toml"]
-OTHERS += [SCENARIOS / "blocks" / "cooperative_localisation.toml"]
+OTHERS += sorted((SCENARIOS / "blocks").glob("*.toml"))
 
 
 @pytest.mark.parametrize("file", [*scenario_files(), *OTHERS], ids=lambda f: f.stem)
