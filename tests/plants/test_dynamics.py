@@ -188,16 +188,13 @@ def test_unicycle_with_ranges_and_bearings_is_a_plain_ekf(pair, engine):
         np.testing.assert_allclose(central.P[k, 0], P, atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["gossip", "diffusion", "hcmci", "intermittent"])
+@pytest.mark.parametrize("kind", ["hcmci", "intermittent"])
 def test_networks_of_filters_are_the_same_in_both_engines(pair, kind):
     scenario, _ = pair
-    activation = {"kind": "matching", "protocol": "one-edge"} if kind == "gossip" else None
     changes = {
         "filter": {"kind": kind} | ({"steps": 2} if kind == "hcmci" else {}),
         "network.channel": {"loss": {"kind": "bernoulli", "delivery": 0.6}},
     }
-    if activation:
-        changes["network.activation"] = activation
     scenario = scenario.replace(changes)
     for method in ("ekf", "ckf"):
         one, other = (
