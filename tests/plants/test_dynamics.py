@@ -542,3 +542,32 @@ def test_check_plant_holds_f_to_its_word():
         netkf.testing.check_plant(
             netkf.parts.NonlinearDiffusion(f=WrongSlope, B=np.eye(2), step=0.1)
         )
+
+
+class Strength(netkf.parts.NonlinearSensor):
+    """The logarithm of the distance from the node, and a direction that is an angle."""
+
+    def h(self, x, node):
+        d = x[:2] - ANCHORS[node]
+        return np.array([math.log1p(d @ d), math.atan2(d[1], d[0])])
+
+    def jacobian(self, x, node):
+        d = x[:2] - ANCHORS[node]
+        r2 = d @ d
+        J = np.zeros((2, 3))
+        J[0, :2], J[1, :2] = 2.0 * d / (1.0 + r2), np.array([-d[1], d[0]]) / r2
+        return J
+
+    def difference(self, y, expected):
+        return wrapped(y - expected)
+
+
+@pytest.mark.parametrize("method", ["ekf", "ukf"])
+def test_a_users_sensor_is_read_alike_by_both_engines(pair, method):
+    scenario, _ = pair
+    sensor = Strength(nodes=(0, 1), R=R_SEEN)
+    changes = {"sensors": [sensor], "filter": {"kind": "central", "linearise": method}}
+    runs = [netkf.simulate(scenario.replace(changes), engine=engine) for engine in ENGINES]
+    for name in ("x", "xhat", "P"):
+        np.testing.assert_allclose(getattr(runs[0], name), getattr(runs[1], name), atol=1e-10)
+    assert np.abs(runs[0].error[10:]).max() < 1.0
