@@ -259,7 +259,7 @@ def test_sigma_points_are_those_of_the_papers(pair, method, engine):
         np.testing.assert_allclose(run.P[k, 0], P, atol=1e-10)
 
 
-MODULE = '''
+MODULE = """
 import math
 import numpy as np
 from netkf.kernels import kernel
@@ -268,10 +268,8 @@ F = np.array([[1.0, 0.1], [-0.02, 0.97]])
 
 
 class Linear:
-    """Sums in the order of the index, as netkf adds them."""
-
     def f(self, x, u, t):
-        return np.array([row[0] * x[0] + row[1] * x[1] for row in F])
+        return F @ x
 
     def jacobian(self, x, u, t):
         return F
@@ -316,7 +314,7 @@ class Flat(Swing):
 class Half:
     def f(self, x, u, t):
         return x
-'''
+"""
 
 
 @pytest.fixture
