@@ -212,6 +212,7 @@ def _short_times(scenario: Any) -> Iterator[tuple[str, float]]:
             rates = [rate for rate in (clock.rate, *(e[-1] for e in clock.rates)) if rate]
             yield "the mean gap of a clock,", 1.0 / max(rates, default=1e-15)
     if isinstance(scenario.plant, Diffusion):
-        fastest = float(np.abs(eigenvalues(scenario.plant.A)).max())
+        pieces = scenario.plant.pieces
+        fastest = max(float(np.abs(eigenvalues(piece.A)).max()) for piece in pieces)
         if fastest > 0.0:
             yield "the shortest time constant of the plant,", 1.0 / fastest
