@@ -24,7 +24,8 @@ NODE_FILTERS = ("diffusion", "kcf", "push-sum")
 def draw_any(number: int, folder: Path) -> Scenario:
     """Return the healthy scenario of a number; tables that netkf refuses are drawn again."""
     random = np.random.default_rng([number, 13])
-    names = list(built_in_filters())
+    # Of blocks of the state nothing is promised that could be checked.
+    names = [name for name in built_in_filters() if name != "block-intersection"]
     for _ in range(10 * ATTEMPTS):
         table = _draw_table(random, names[number % len(names)], folder)
         try:
