@@ -334,7 +334,7 @@ class ScenarioModel(Component):
         """The nodes and links; raises ScenarioError if the graph cannot be built."""
         graph = self.network.graph
         if isinstance(graph, RangeGraph) and graph.nodes is None:
-            graph = dataclasses.replace(graph, nodes=placed_nodes(self) or None)
+            graph = dataclasses.replace(graph, nodes=tuple(placed_nodes(self)) or None)
         with errors_under("network.graph"):
             return graph.build(self.seed)
 
