@@ -287,14 +287,14 @@ class Tied(RegressorSensor):
 
 @cache
 def moving(mean, cls):
-    """The plant with the changes of a class."""
-    return LinearPlant(**{**LINEAR, "mean": mean, **cls.changes})
+    """The plant with the altered of a class."""
+    return LinearPlant(**{**LINEAR, "mean": mean, **cls.altered})
 
 
 class Other(LinearPlant):
-    """Moves as the plant with ``changes``."""
+    """Moves as the plant with ``altered``."""
 
-    changes: ClassVar = {}
+    altered: ClassVar = {}
 
     def truth(self, random, frames=False):
         return moving(tuple(self.mean), type(self)).truth(random, frames)
@@ -302,14 +302,14 @@ class Other(LinearPlant):
 
 @says(PLANTS, "WrongF.truth: a start that is moved must move the path by powers of F", **LINEAR)
 class WrongF(Other):
-    changes: ClassVar = {"F": 1.02 * np.array(LINEAR["F"])}
+    altered: ClassVar = {"F": 1.02 * np.array(LINEAR["F"])}
 
 
 @says(PLANTS, "FixedF.truth: the noise x[k+1] - F x[k]", **LINEAR)
 class FixedF(Other):
     """As WrongF, of a class whose mean cannot be moved."""
 
-    changes: ClassVar = {"F": 1.02 * np.array(LINEAR["F"])}
+    altered: ClassVar = {"F": 1.02 * np.array(LINEAR["F"])}
 
     @property
     def start_mean(self):
@@ -318,12 +318,12 @@ class FixedF(Other):
 
 @says(PLANTS, "WrongQ.truth: the noise x[k+1] - F x[k] must have the covariance that Q", **LINEAR)
 class WrongQ(Other):
-    changes: ClassVar = {"Q": 1.2 * np.array(LINEAR["Q"])}
+    altered: ClassVar = {"Q": 1.2 * np.array(LINEAR["Q"])}
 
 
 @says(PLANTS, "LostCorrelation.truth: the noise x[k+1] - F x[k] must have the cov", **LINEAR)
 class LostCorrelation(Other):
-    changes: ClassVar = {"Q": np.diag([1.0, 0.4])}
+    altered: ClassVar = {"Q": np.diag([1.0, 0.4])}
 
 
 @says(PLANTS, "WrongStart.truth: x(0) less its mean must have the mean 0", **LINEAR)
@@ -334,12 +334,12 @@ class WrongStart(LinearPlant):
 
 @says(PLANTS, "WideStart.truth: x(0) less its mean must have the covariance that cov", **LINEAR)
 class WideStart(Other):
-    changes: ClassVar = {"cov": 1.2 * np.array(LINEAR["cov"])}
+    altered: ClassVar = {"cov": 1.2 * np.array(LINEAR["cov"])}
 
 
 @says(PLANTS, "ZeroStart.truth: x(0) less its mean must have the covariance that cov", **LINEAR)
 class ZeroStart(Other):
-    changes: ClassVar = {"cov": np.zeros((2, 2))}
+    altered: ClassVar = {"cov": np.zeros((2, 2))}
 
 
 class Retold:
@@ -431,12 +431,12 @@ class Signed(LinearPlant):
 
 
 class OtherFlow(Diffusion):
-    changes: ClassVar = {}
+    altered: ClassVar = {}
 
     @property
     def other(self):
         mine = {name: getattr(self, name) for name in ("A", "B", "mean", "cov", "sensing_period")}
-        return Diffusion(**{**mine, **self.changes})
+        return Diffusion(**{**mine, **self.altered})
 
     def paths(self, *arguments, **named):
         return self.other.paths(*arguments, **named)
@@ -447,17 +447,17 @@ class OtherFlow(Diffusion):
 
 @says(PLANTS, "WrongA.sampled_truth: a start that is moved must move the path", **FLOW)
 class WrongA(OtherFlow):
-    changes: ClassVar = {"A": 1.02 * np.array(FLOW["A"])}
+    altered: ClassVar = {"A": 1.02 * np.array(FLOW["A"])}
 
 
 @says(PLANTS, "WrongB.sampled_truth: the noise x(t + g) - e^(A g) x(t) over", **FLOW)
 class WrongB(OtherFlow):
-    changes: ClassVar = {"B": np.sqrt(1.2) * np.array(FLOW["B"])}
+    altered: ClassVar = {"B": np.sqrt(1.2) * np.array(FLOW["B"])}
 
 
 @says(PLANTS, "GridOnly.paths: the noise of x and its two moments", **FLOW)
 class GridOnly(OtherFlow):
-    changes: ClassVar = {"B": np.sqrt(1.2) * np.array(FLOW["B"])}
+    altered: ClassVar = {"B": np.sqrt(1.2) * np.array(FLOW["B"])}
 
     def sampled_truth(self, *arguments, **named):
         return Diffusion.sampled_truth(self, *arguments, **named)
@@ -465,7 +465,7 @@ class GridOnly(OtherFlow):
 
 @says(PLANTS, "Alone.path: must make the same path from equal streams", **FLOW)
 class Alone(OtherFlow):
-    changes: ClassVar = {"B": 1.01 * np.array(FLOW["B"])}
+    altered: ClassVar = {"B": 1.01 * np.array(FLOW["B"])}
 
     def paths(self, *arguments, **named):
         return Diffusion.paths(self, *arguments, **named)
