@@ -196,7 +196,9 @@ class BlockIntersection(Filter):
 
         def weighted(w: float, v: float) -> tuple[FloatArray, FloatArray, FloatArray]:
             P, C = state.dependent / w + own, seen.dependent / v + noise
-            K = np.linalg.solve(seen.H @ P @ seen.H.T + C, seen.H @ P).T
+            S = seen.H @ P @ seen.H.T + C
+            # Singular where both know something for certain.
+            K = P @ seen.H.T @ np.linalg.pinv(S, hermitian=True)
             return P, C, np.asarray(K)
 
         def trace_after(w: float) -> float:

@@ -96,7 +96,7 @@ class Component:
     Components are equal if they have the same class and equal fields.
     """
 
-    written_keys: ClassVar[Mapping[str, str]] = {}
+    _written_keys: ClassVar[Mapping[str, str]] = {}
     """Keys in files of fields whose names differ, since Python reserves these words."""
     _called_if: ClassVar[Mapping[str, str]] = {}
     """Methods of a contract that are called only where another member is True."""

@@ -21,7 +21,7 @@ FROM = "from"
 class Change(Component):
     """From ``start`` on (seconds, ``from`` in files) its matrices hold; all others stay."""
 
-    written_keys: ClassVar[Mapping[str, str]] = {"start": FROM}
+    _written_keys: ClassVar[Mapping[str, str]] = {"start": FROM}
 
     start: float = field(seconds)
 

@@ -159,6 +159,13 @@ def takes_samples(sensor: Sensor) -> bool:
     )
 
 
+_plant = dataclasses.replace(
+    instance_of(Plant),
+    convert=lambda value: None if value is None else instance_of(Plant).convert(value),
+)
+"""A plant, or None where there are ``plants``."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ScenarioModel(Component):
     """The fields of a scenario, and properties that need no numerical computation.
@@ -173,7 +180,7 @@ class ScenarioModel(Component):
 
     name: str = field(text)
     horizon: float = field(seconds)
-    plant: Plant = field(instance_of(Plant), default=None)
+    plant: Plant = field(_plant)
     sensors: tuple[Any, ...] = field(list_of(instance_of(Sensor), "sensors", min_length=0))
     network: Network = field(instance_of(Network))
     filter: Filtering = field(instance_of(Filtering))

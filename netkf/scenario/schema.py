@@ -94,7 +94,7 @@ def scenario_schema() -> Schema:
     file_format = {"const": FORMAT, "description": "The file format."}
     file_schema = _table_schema(scenario_keys, constants={"format": file_format})
     # A scenario without sensors may leave out the list.
-    required = [name for name in file_schema["required"] if name != "sensors"]
+    required = [name for name in file_schema["required"] if name not in ("plant", "sensors")]
     file_schema["oneOf"] = [{"required": ["plant"]}, {"required": ["plants"]}]
     file_schema["required"] = ["format", *required]
     definitions = {name: _family_schema(name, families) for name, families in FAMILIES.items()}

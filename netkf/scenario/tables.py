@@ -153,7 +153,7 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     values = _build_inner(values, builders)
     plant = values.get("plant")
     if "plants" in values:
-        plant = values["plants"][0].plant
+        plant, values["plant"] = values["plants"][0].plant, None
     time = "slot " if isinstance(plant, SLOTTED) else ""
     if plant is NOT_IMPORTED:
         time = "unknown"

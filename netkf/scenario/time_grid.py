@@ -102,7 +102,7 @@ def _times_of(key: str, part: Any) -> Iterator[TimeConstant]:
             for k, item in enumerate(value):
                 yield from _times_of(f"{key}.{field.name}[{k}]", item)
         elif isinstance(value, float) and rule is not None and rule.of_time:
-            yield _constant(f"{key}.{part.written_keys.get(field.name, field.name)}", value)
+            yield _constant(f"{key}.{part._written_keys.get(field.name, field.name)}", value)
     gaps = getattr(part, "gaps", None)
     if isinstance(gaps, Lattice):
         yield _constant(key, gaps.period)

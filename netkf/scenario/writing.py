@@ -159,7 +159,7 @@ def _field_values(part: Component, style: _Style) -> dict[str, Any]:
             value = map_nodes(value, lambda node: style.names.get(node, node))
         if value is None or (is_default and not with_defaults):
             continue
-        table[part.written_keys.get(field.name, field.name)] = _toml_value(value, style)
+        table[part._written_keys.get(field.name, field.name)] = _toml_value(value, style)
         if isinstance(value, LinkClock) and not isinstance(part, Network):
             # Keys of clocks of links, which another clock must not have.
             for key in ("at", "rates") if isinstance(part, Sensor) else ("at",):

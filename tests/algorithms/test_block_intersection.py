@@ -180,7 +180,7 @@ def test_no_block_filter_is_below_the_stacked_kalman_filter(
 
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
 def test_only_the_naive_update_is_overconfident(tmp_path: Path, estimates: str) -> None:
-    runs, level = 60, 1e-4
+    runs, level = 40, 1e-4
     for rule in RULES:
         # Little noise of the plant: the same errors go round for long.
         changes = {"filter__rule": rule, "filter__estimates": estimates}

@@ -244,7 +244,7 @@ def test_nothing_is_read_from_or_written_to_the_current_folder(tmp_path, monkeyp
 def test_settings_of_the_current_folder_are_not_read(tmp_path):
     (tmp_path / ".numba_config.yaml").write_text("cache_dir: here\ndisable_jit: 1\n")
     code = (
-        "from netkf.linalg.compiling import _numba; config = _numba().config; "
+        "from netkf.linalg.compiling import require_numba; config = require_numba().config; "
         "config.reload_config(); print([config.CACHE_DIR, config.DISABLE_JIT])"
     )
     environment = {name: text for name, text in os.environ.items() if "NUMBA" not in name}

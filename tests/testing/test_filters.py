@@ -45,6 +45,7 @@ SOUND = {
         parts.BeliefPropagation(memory="all"),
     ],
     "consensus-innovations": [parts.ConsensusInnovations()],
+    "block-intersection": [parts.BlockIntersection(), parts.BlockIntersection(rule="ci")],
     "kcf": [parts.Kcf(epsilon=0.2)],
     "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [
