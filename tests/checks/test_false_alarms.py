@@ -277,7 +277,9 @@ def test_scenarios_drawn_at_random_are_not_accused(scenario_number, tmp_path):
     assert not accusations(draw_scenario(scenario_number, tmp_path), 12, 0, levels=(0.01,))
 
 
-@pytest.mark.parametrize("number", [16, 20, 43, 155, 202, 260])
+@pytest.mark.parametrize(
+    "number", [16, 43, 155, *(pytest.param(k, marks=pytest.mark.slow) for k in (20, 202, 260))]
+)
 def test_scenarios_of_all_kinds_are_not_accused(number, tmp_path):
     """One node that nobody hears, H that varies, rare messages: each was accused once. More are
     drawn by ``python -m tests.checks.calibration --any``.

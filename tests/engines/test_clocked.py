@@ -31,7 +31,10 @@ def test_drawn_scenarios_agree(first, tmp_path):
     agree(range(first, first + TOGETHER), tmp_path)
 
 
-@pytest.mark.parametrize("first", range(0, FEW + 2 * TOGETHER, TOGETHER))
+LATER = range(TOGETHER, FEW + 2 * TOGETHER, TOGETHER)
+
+
+@pytest.mark.parametrize("first", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in LATER)])
 def test_filters_of_the_literature_agree(first, tmp_path):
     """Fusion with the best weight, constant gains, consensus on predictions, beliefs."""
     for scenario, run in agree(
