@@ -177,6 +177,7 @@ def make_of(name):
     return slots(kind, filter=filtering)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SLOT_FILTERS)
 def test_both_engines_agree_in_slots(name):
     s = make_of(name)
