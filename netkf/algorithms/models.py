@@ -29,6 +29,9 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, aligned
 from netkf.linalg.vector_functions import VectorFunction
 
+DIFFERENCE = 1e-5
+"""Steps of differences, as shares of states above 1: errors of rounding and of curvature are alike.
+"""
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
 
@@ -430,6 +433,16 @@ class RateModel(FlowModel):
         if age <= 0.0:
             return xhat, root
         return self._move(xhat, root, age)
+
+    def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
+        """Return the derivative (n, n) of the predicted estimate at ``xhat`` (n,), by central
+        differences.
+        """
+        still, columns = np.zeros((len(xhat),) * 2), []
+        for e in np.diag(DIFFERENCE * np.maximum(1.0, np.abs(xhat))):
+            after, before = (self.predict(xhat + d, still, gap)[0] for d in (e, -e))
+            columns.append((after - before) / (2.0 * e.sum()))
+        return np.stack(columns, axis=1)
 
 
 def linear_transition(model: Any, n: int, gap: float) -> FloatArray:

@@ -218,3 +218,23 @@ def test_mistakes_in_blocks_are_refused_in_one_line(scenario, key, value, words)
     with pytest.raises(netkf.ScenarioError) as caught:
         scenario.replace({"plants": [*plants, target]})
     assert words in str(caught.value)
+
+
+def test_the_derivative_of_a_prediction_is_taken_at_the_estimate(tmp_path):
+    made = {
+        "format": 1, "name": "arc", "horizon": 3.0, "probe": 1.0, "sensors": [],
+        "plant": {
+            "kind": "nonlinear", "f": "unicycle", "step": 0.01, "B": np.eye(3).tolist(),
+            "input": {"kind": "constant", "value": [2.0, 0.5]},
+        },
+        "network": {"graph": {"kind": "path", "nodes": 2}},
+        "filter": {"kind": "local"},
+    }  # fmt: skip
+    model = from_table(made, tmp_path).model_of(0)
+    model.move_to(1.5)
+    h, T, v, w = 0.7, 1.5, 2.0, 0.5
+    along = v / w * (np.sin(h + w * T) - np.sin(h))
+    aside = v / w * (np.cos(h) - np.cos(h + w * T))
+    expected = [[1.0, 0.0, -aside], [0.0, 1.0, along], [0.0, 0.0, 1.0]]
+    found = model.transition(np.array([30.0, -4.0, h]), T)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
