@@ -212,13 +212,17 @@ class StackedInput(Input):
         return np.concatenate([one.values(times) for one in self.inputs], axis=1)
 
 
+def _copies(blocks: Sequence[Block]) -> list[tuple[int, Block]]:
+    """Return the entry of each place of a layout, and its number."""
+    return [(k, block) for k, block in enumerate(blocks) for _ in block.nodes or (None,)]
+
+
 def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
     """Return the plant whose state is that of all ``blocks``, at the places of their ``layout``.
 
     Raises ScenarioError if blocks belong to different models of time, or a coupling does not fit.
     """
-    copies = [block for block in blocks for _ in block.nodes or (None,)]
-    plants = [block.plant for block in copies]
+    plants: list[Any] = [block.plant for _, block in _copies(blocks)]
     slotted = isinstance(plants[0], SlotPlant)
     for k, block in enumerate(blocks):
         if not isinstance(
@@ -260,7 +264,7 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
         else:
             with errors_under(f"[{k}]"):
                 plant.check_dynamics()
-    plants: list[Any] = [block.plant for block in blocks for _ in block.nodes or (None,)]
+    plants: list[Any] = [block.plant for _, block in _copies(blocks)]
     parts = []
     for plant in plants:
         u = plant.input
@@ -286,7 +290,7 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
 
 def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]:
     """Return F and Q, or A and B, of all blocks together."""
-    plants: list[Any] = [block.plant for block in blocks for _ in block.nodes or (None,)]
+    plants: list[Any] = [block.plant for _, block in _copies(blocks)]
     names = ("F", "Q") if isinstance(plants[0], LinearPlant) else ("A", "B")
     M, noise = (
         block_diagonal([np.asarray(getattr(plant, name)) for plant in plants]) for name in names
@@ -344,16 +348,15 @@ def _one(blocks: Sequence[Block], key: str) -> Any:
 
 def _stacked_input(blocks: Sequence[Block], layout: Layout) -> StackedInput | None:
     """Return what drives all blocks; None if nothing does."""
-    inputs, parts, places = list[Input](), list[FloatArray](), iter(layout.places)
-    for k, block in enumerate(blocks):
-        for _ in block.nodes or (None,):
-            place, one = next(places), block.plant.input
-            if one is None:
-                continue
-            _check_gain(k, one, place.n)
-            inputs.append(one)
-            parts.append(np.zeros((layout.n, one.m)))
-            parts[-1][place.entries] = one.G
+    inputs, parts = list[Input](), list[FloatArray]()
+    for place, (k, block) in zip(layout.places, _copies(blocks), strict=True):
+        one = block.plant.input
+        if one is None:
+            continue
+        _check_gain(k, one, place.n)
+        inputs.append(one)
+        parts.append(np.zeros((layout.n, one.m)))
+        parts[-1][place.entries] = one.G
     return StackedInput(inputs=tuple(inputs), G=np.concatenate(parts, axis=1)) if inputs else None
 
 
@@ -364,19 +367,14 @@ def _check_gain(k: int, u: Input | None, n: int) -> None:
 
 
 def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:
-    places = iter(layout.places)
-    for k, block in enumerate(blocks):
-        for _ in block.nodes or (None,):
-            place = next(places)
-            for c, coupling in enumerate(block.coupling):
-                key = f"[{k}].coupling[{c}]"
-                for origin in _origins(f"{key}.from", coupling, place, layout):
-                    if coupling.A.shape != (place.n, origin.n):
-                        rule = (
-                            f"must be {place.n} x {origin.n}, from the block of {origin.n} states"
-                        )
-                        raise ScenarioError(f"{key}.A", rule, coupling.A, "correct the shape")
-                    M[place.entries, origin.entries] += coupling.A
+    for place, (k, block) in zip(layout.places, _copies(blocks), strict=True):
+        for c, coupling in enumerate(block.coupling):
+            key = f"[{k}].coupling[{c}]"
+            for origin in _origins(f"{key}.from", coupling, place, layout):
+                if coupling.A.shape != (place.n, origin.n):
+                    rule = f"must be {place.n} x {origin.n}, from the block of {origin.n} states"
+                    raise ScenarioError(f"{key}.A", rule, coupling.A, "correct the shape")
+                M[place.entries, origin.entries] += coupling.A
 
 
 def _origins(key: str, coupling: Coupling, place: Place, layout: Layout) -> list[Place]:

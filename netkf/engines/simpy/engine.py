@@ -234,16 +234,16 @@ class _Simulation:
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]
-        views = scenario.views
-        if views is not None:
-            self._record_views(time, x, local, nodes, estimates)
-            return
-        local_estimates, P, has_no_P = stack_estimates(estimates)
         # The trace has absolute states. Adding the origin loses digits, so the error is computed
         # from local ones.
-        xhat = local_estimates
+        origin = np.zeros(len(x))
         if x is not local:
-            xhat = local_estimates + scenario.origins(np.array([when]), local[None], x[None])
+            origin = scenario.origins(np.array([when]), local[None], x[None])[0]
+        if scenario.views is not None:
+            self._record_views(time, (x, local, origin), nodes, estimates)
+            return
+        local_estimates, P, has_no_P = stack_estimates(estimates)
+        xhat = local_estimates if x is local else local_estimates + origin
         error = local - local_estimates
         recorder.sample(time, x, xhat, P, error)
         # Sums are taken at samples only: summing over all nodes at every event would be quadratic.
@@ -255,13 +255,14 @@ class _Simulation:
     def _record_views(
         self,
         time: float,
-        x: FloatArray,
-        local: FloatArray,
+        states: tuple[FloatArray, FloatArray, FloatArray],
         nodes: dict[int, Any],
         estimates: list[tuple[FloatArray, FloatArray | None]],
     ) -> None:
-        """Record a sample of nodes that estimate different parts of the state, nan beyond them."""
-        scenario, diverged = self._scenario, list[int]()
+        """Record a sample of nodes that estimate different parts of the state, nan beyond them, at
+        the absolute and local ``states``, with the origin of the latter.
+        """
+        scenario, diverged, (x, local, origin) = self._scenario, list[int](), states
         N, width = len(scenario.nodes), scenario.width
         xhat, error = (np.full((N, width), np.nan) for _ in range(2))
         P = np.full((N, width, width), np.nan)
@@ -271,7 +272,7 @@ class _Simulation:
             chosen = view if nodes[node].view is None else slice(None)
             n, own = len(view), mean[chosen]
             error[k, :n] = local[view] - own
-            xhat[k, :n] = own + (x - local)[view]
+            xhat[k, :n] = own + origin[view]
             if cov is not None:
                 P[k, :n, :n] = cov[chosen][:, chosen]
             known = error[k, :n] if scenario.plant.truth_known else None

@@ -88,8 +88,8 @@ class View:
             outside = np.ones(self._n, dtype=bool)
             outside[self.entries] = False
             owners = np.repeat(np.arange(len(self._places)), [place.n for place in self._places])
-            firsts = [owners[outside & (row != 0.0)][:1].tolist() if row.any() else [] for row in H]
-            keys = np.array([first[0] if first else -1 for first in firsts], dtype=np.int64)
+            others = [owners[outside & (row != 0.0)].tolist() for row in H]
+            keys = np.array([own[0] if own else -1 for own in others], dtype=np.int64)
             for key in np.unique(keys):
                 rows = np.flatnonzero(keys == key)
                 yield rows, H[rows]
