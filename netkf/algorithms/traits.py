@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from netkf.algorithms.translation import Common, read_vector
 from netkf.linalg.arrays import FloatArray
 
 
@@ -32,8 +33,13 @@ class Needs:
                           sensor must be heard by another one
     network : its nodes are given ``NodeInfo.network``
     one_way : in slots links may go one way, and the graph need not be connected
-    blocks : its nodes may estimate different blocks of ``[[plants]]``, and it knows what to do with
-             readings of a block that a node does not estimate (``Reading.pairs``)
+    blocks : its nodes may estimate different blocks of ``[[plants]]``: its messages say of which
+             they speak, and it knows what to do with readings of a block that a node does not
+             estimate (``Reading.pairs``)
+    translate : without ``blocks``, how a node reads a message of one that estimates other blocks,
+                ``translate(payload, own, common)``: ``own`` is the payload that the node itself
+                would send, ``common`` says which states both estimate (``translation.Common``). By
+                default payloads are one vector of the state
     check : ``check(scenario)`` raises ScenarioError where settings of the filter do not fit a
             ``netkf.Scenario``
     notes : ``notes(scenario)`` returns notes on the filter for the user, one line each
@@ -53,6 +59,7 @@ class Needs:
     network: bool = False
     one_way: bool = False
     blocks: bool = False
+    translate: Callable[[Any, Any, Common], Any] = read_vector
     check: Callable[[Any], None] | None = None
     notes: Callable[[Any], tuple[str, ...]] | None = None
 

@@ -283,6 +283,21 @@ class DerivedScenario(ScenarioModel):
         """Return the entries (n',) of the state that node number ``k`` estimates, or a slice."""
         return slice(None) if self.views is None else self.views[k]
 
+    @cached_property
+    def common_entries(self) -> dict[Link, tuple[np.ndarray, np.ndarray]]:
+        """Of links whose ends, (sender, receiver), estimate different states: the entries (k,) of
+        those that both estimate, in the state of the sender and in that of the receiver. Empty for
+        filters whose messages say of which blocks they speak.
+        """
+        if self.views is None or self.node_filter.needs.blocks or self.node_filter.timing.pooled:
+            return {}
+        views = dict(zip(self.nodes, self.views, strict=True))
+        return {
+            (i, j): np.intersect1d(views[i], views[j], return_indices=True)[1:]
+            for i, j in self.topology.directions
+            if not np.array_equal(views[i], views[j])
+        }
+
     def _own_sensors(
         self, k: int, placed: tuple[PlacedSensor, ...]
     ) -> tuple[FloatArray, FloatArray]:

@@ -11,6 +11,8 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import breadth_first_order
 
+from netkf.algorithms.filter import Exchange, may_be_silent
+from netkf.algorithms.translation import read_vector
 from netkf.core.errors import ScenarioError
 from netkf.linalg.arrays import is_definite
 from netkf.linalg.spectra import hidden_mode, outputs_of
@@ -74,9 +76,10 @@ def _check_blocks(scenario: DerivedScenario) -> None:
     if scenario.node_filter.timing.pooled:
         return
     knows_blocks = scenario.node_filter.needs.blocks
-    if talks and not knows_blocks and len(set(scenario.estimated)) > 1:
+    unread = talks and not knows_blocks and len(set(scenario.estimated)) > 1
+    if unread and not _translates(scenario):
         rule = f"must be the same blocks for all nodes for the {name}, whose messages say no blocks"
-        remedy = 'write "all", or kind = "block-intersection"'
+        remedy = 'write "all", kind = "block-intersection", or Needs(translate=...) in a class'
         raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
     for k, node in enumerate(scenario.nodes):
         view = scenario.view(k)
@@ -100,6 +103,26 @@ def _check_blocks(scenario: DerivedScenario) -> None:
             if not (scenario.slotted or takes_samples(sensor)):
                 rule = "is missing: increments of two blocks need both estimates"
                 raise ScenarioError(f"{key}.sampling", rule, None, f"add {SAMPLING}")
+
+
+def _translates(scenario: DerivedScenario) -> bool:
+    """Return True if messages between nodes that estimate different blocks can be read."""
+    algorithm, node = scenario.node_filter, scenario.nodes[0]
+    timing, needs = algorithm.timing, algorithm.needs
+    if may_be_silent(algorithm) or timing.randomised or needs.network:
+        return False
+    if needs.translate is not read_vector:
+        return True
+    info, model = scenario.node_infos[0], scenario.model_of(0)
+    start, kernels = scenario.initial_estimate(node), algorithm.kernels
+    if kernels is None:
+        state = algorithm.init(model, *start, info)
+        payload = algorithm.emit(state, Exchange(0.0, 0, 0, 0, tuple(info.senders)))[1]
+        return isinstance(payload, np.ndarray) and payload.shape == start[0].shape
+    kernels = kernels.of(not scenario.slotted)
+    shapes = kernels.record(algorithm, [info], [model]).payload.values()
+    says_more = kernels.sends_readings or kernels.addressed
+    return not says_more and list(shapes) == [start[0].shape]
 
 
 def _check_increments(scenario: DerivedScenario) -> None:

@@ -303,6 +303,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     """Return the arguments of Node for ``node`` (id, -1: pooled) with index ``entity``."""
     views = scenario.views
     view = None if node < 0 or views is None else views[entity]
+    common = {i: entries for (i, j), entries in scenario.common_entries.items() if j == node}
     # -1: the pooled filter, which is not a node of the graph.
     model = scenario.model_of(entity)
     if scenario.tells_models:
@@ -318,7 +319,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         scenario.initial_estimate(scenario.nodes[entity]),
         scenario.node_infos[entity],
         spread_of(scenario.filter.linearise, scenario.plant.n if view is None else len(view)),
-        None if view is None else View(view, scenario.layout.places),
+        None if view is None else View(view, scenario.layout.places, common),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from netkf.algorithms.filter import (
 from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
 from netkf.algorithms.models import ChangingFlowModel, MapModel, RateModel, first_root
+from netkf.algorithms.translation import Common, state_before
 from netkf.core.places import Place
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.driven import DrivenModel
@@ -57,9 +59,16 @@ class Envelope(NamedTuple):
 class View:
     """The part of the state that a node estimates: its ``entries`` (n',) in that of the plant."""
 
-    def __init__(self, entries: np.ndarray, places: Sequence[Place]) -> None:
-        """``places`` are all blocks of the state."""
-        self.entries, self._places = entries, places
+    def __init__(
+        self,
+        entries: np.ndarray,
+        places: Sequence[Place],
+        common: dict[int, tuple[np.ndarray, np.ndarray]],
+    ) -> None:
+        """``places`` are all blocks of the state; ``common`` are the entries of what senders and
+        the node both estimate, by sender, where messages do not say it.
+        """
+        self.entries, self._places, self.common = entries, places, common
         self._n = sum(place.n for place in places)
 
     def readings(
@@ -209,13 +218,27 @@ class Node:
         else:
             envelopes.append(envelope)
 
-    def take_messages(self) -> tuple[list[Envelope], list[Message]]:
-        """Empty the inbox; return its envelopes by sender, and the messages that filters take."""
+    def take_messages(self, exchange: Exchange) -> tuple[list[Envelope], list[Message]]:
+        """Empty the inbox; return its envelopes by sender, and the messages that filters take in
+        this ``exchange``.
+        """
         # A floating-point sum must not depend on the order of arrival.
         envelopes = [envelope for peer in sorted(self.inbox) for envelope in self.inbox[peer]]
         self.inbox.clear()
-        messages = [Message(e.sender, e.weight, e.payload, e.age) for e in envelopes]
+        own = None
+        if self.view is not None and any(e.sender in self.view.common for e in envelopes):
+            # What it would say itself: a filter's verbs leave its state as it is.
+            own = self.algorithm.emit(self.state, exchange)[1]
+        messages = [Message(e.sender, e.weight, self._translated(e, own), e.age) for e in envelopes]
         return envelopes, messages
+
+    def _translated(self, envelope: Envelope, own: Any) -> Any:
+        common = None if self.view is None else self.view.common.get(envelope.sender)
+        if common is None:
+            return envelope.payload
+        before = partial(state_before, self.model, age=envelope.age)
+        translate = self.algorithm.needs.translate
+        return translate(envelope.payload, own, Common(*common, before))
 
     def linearise(self, samples: Sequence[Sample]) -> Sequence[Sample]:
         """Return samples in which matrices at the present estimate replace the functions that
@@ -367,8 +390,9 @@ class ClockedNode(Node):
     def _absorb(self, _: simpy.Event) -> None:
         time = self._timeline.now
         self.predict_to(time)
-        messages = self.take_messages()[1]
-        self.state = self.algorithm.absorb(self.state, messages, Exchange(time=time))
+        exchange = Exchange(time=time)
+        messages = self.take_messages(exchange)[1]
+        self.state = self.algorithm.absorb(self.state, messages, exchange)
         oldest = max(message.age for message in messages)
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))
 

@@ -233,10 +233,10 @@ class SlotNode(Node):
 
     def _close(self, stage: Stage, slot: int) -> None:
         append, now, phase = self._recorder.append, stage.time, stage.phase
-        envelopes, messages = self.take_messages()
+        exchange = Exchange(now, phase, stage.step, slot)
+        envelopes, messages = self.take_messages(exchange)
         # From now on a message of this exchange is late.
         self._open = -1
-        exchange = Exchange(now, phase, stage.step, slot)
         self.state = self.algorithm.absorb(self.state, messages, exchange)
         # A swap records each message; other filters absorb all of them in one event.
         if self._timing.pairwise:

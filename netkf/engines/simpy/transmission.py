@@ -55,6 +55,8 @@ class DirectedLink:
         # Probability in the table and weight do not change in a run.
         self.table_probability = scenario.table_probability(link)
         self.weight = scenario.weight(link[1], link[0])
+        common = scenario.common_entries.get(link)
+        self.has_nothing_to_tell = common is not None and not len(common[0])
         self.messages = 0
 
 
@@ -95,7 +97,7 @@ class Transmitter:
         """Send one message with its outcome: record it, and deliver it now, later or never. A
         payload of None is not sent. ``phase`` and ``exchange`` are -1 under clocks.
         """
-        if payload is None:
+        if payload is None or direction.has_nothing_to_tell:
             return
         now, (sender, receiver), number = self._timeline.now, direction.link, direction.messages
         direction.messages = number + 1

@@ -1,0 +1,144 @@
+"""Filters whose messages are one vector of the state, on nodes that estimate different blocks: the
+Kalman consensus filter of the documentation against its formula, block by block.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import netkf
+from netkf.scenario.reading import from_table
+from tests.conftest import ROOT
+
+PAGE = (ROOT / "docs" / "writing_filters.md").read_text()
+NODES, LINKS, EPSILON = (1, 2, 3, 4), ((1, 2), (2, 3), (3, 4)), 0.3
+RATES = {"pose": (0.9, 0.2), "target": (0.8, 0.1)}
+BLOCKS: dict[Any, dict[int, list[tuple[str, int]]]] = {
+    "own": {i: [("pose", i)] for i in NODES},
+    "own+neighbours": {
+        1: [("pose", 1), ("pose", 2)],
+        2: [("pose", 2), ("pose", 1), ("pose", 3)],
+        3: [("pose", 3), ("pose", 2), ("pose", 4)],
+        4: [("pose", 4), ("pose", 3)],
+    },
+    "shared": {i: [("target", 0)] for i in NODES},
+    "named": {i: [("pose", i), ("target", 0)] for i in NODES},
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    for name, text in re.findall(r"```python\n# (kcf\S*)\n(.*?)```", PAGE, re.S):
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    for name in ("kcf", "kcf_kernels"):
+        sys.modules.pop(name, None)
+
+
+def scenario(folder: Path, estimates: str, kind: str = "kcf:Kcf", **changes: Any) -> Any:
+    named = {"named": ["pose", "target"], "shared": ["target"]}
+    names = named.get(estimates, ["pose"])
+    for name in names:
+        rng = np.random.default_rng(len(name))
+        rows = [f"{t},{i},{y:.3f}" for i in NODES for t, y in enumerate(rng.normal(size=5), 1)]
+        (folder / f"{name}.csv").write_text("t,node,y0\n" + "\n".join(rows) + "\n")
+    plants = [
+        {"name": name, "F": [[F]], "Q": [[Q]], "period": 1.0, "cov": [[1.0]]}
+        | ({"nodes": list(NODES)} if name == "pose" else {})
+        for name, (F, Q) in RATES.items()
+    ]
+    sensor = {"kind": "recorded", "H": [[1.0]], "R": [[0.1]], "nodes": list(NODES)}
+    table = {
+        "format": 1,
+        "name": "own states",
+        "horizon": 5.0,
+        "probe": 1.0,
+        "plants": plants,
+        "sensors": [sensor | {"of": name, "path": f"{name}.csv"} for name in names],
+        "network": {
+            "graph": {"kind": "edges", "edges": [list(link) for link in LINKS]},
+            "activation": {"kind": "broadcast"},
+        },
+        "filter": {
+            "kind": kind,
+            "epsilon": EPSILON,
+            "estimates": names if estimates == "named" else estimates,
+        },
+    }
+    return from_table(table, folder).replace(changes)
+
+
+@pytest.mark.parametrize("kind", ["kcf:Kcf", "kcf_kernels:Kcf"])
+@pytest.mark.parametrize("estimates", BLOCKS)
+def test_the_consensus_filter_of_the_page_speaks_of_common_blocks(
+    folder: Path, estimates: str, kind: str
+) -> None:
+    run = netkf.simulate(scenario(folder, estimates, kind), engine="simpy")
+    blocks = BLOCKS[estimates]
+    tables = {p.stem: pd.read_csv(p) for p in folder.glob("*.csv")}
+    readings = {
+        (name, row.node, row.t): row.y0 for name, t in tables.items() for row in t.itertuples()
+    }
+    xhat = {(i, block): 0.0 for i in NODES for block in blocks[i]}
+    P = dict.fromkeys(xhat, 1.0)
+    for slot in range(1, 5):
+        prior = {}
+        for (i, block), x in xhat.items():
+            F, Q = RATES[block[0]]
+            prior[i, block] = F * x
+            variance = F * P[i, block] * F + Q
+            y = readings.get((block[0], i, slot)) if block[1] in (0, i) else None
+            K = 0.0 if y is None else variance / (variance + 0.1)
+            xhat[i, block] = F * x + K * ((y or 0.0) - F * x)
+            P[i, block] = (1.0 - K) * variance
+        for i, block in xhat:
+            heard = [j for link in LINKS if i in link for j in link if j != i]
+            told = [prior[j, block] - prior[i, block] for j in heard if block in blocks[j]]
+            xhat[i, block] += EPSILON * sum(told)
+        for k, i in enumerate(NODES):
+            n = len(blocks[i])
+            expected = [xhat[i, block] for block in blocks[i]]
+            np.testing.assert_allclose(run.xhat[slot, k, :n], expected, atol=1e-12)
+            expected = [P[i, block] for block in blocks[i]]
+            np.testing.assert_allclose(np.diag(run.P[slot, k])[:n], expected, atol=1e-12)
+    # Nodes that have no block in common tell each other nothing.
+    assert run.count("send") == (0 if estimates == "own" else 6 * 4)
+
+
+CLOCKED = {
+    "plants.0": {"name": "pose", "nodes": list(NODES), "A": [[-0.4]], "B": [[0.6]], "cov": [[1.0]]},
+    "plants.1": {"name": "target", "A": [[-0.1]], "B": [[0.3]], "cov": [[1.0]]},
+    "network.activation": {"kind": "periodic", "period": 0.7, "at": "nodes"},
+    "network.channel": {"delay": {"kind": "constant", "seconds": 0.4}},
+}
+
+
+def test_what_is_told_late_of_one_block_leaves_the_others(folder: Path) -> None:
+    """Of own poses nothing is told, so that they are as alone, also where messages take time."""
+    both, shared, alone = (
+        netkf.simulate(scenario(folder, estimates, **CLOCKED))
+        for estimates in ("named", "shared", "own")
+    )
+    assert both.count("deliver") == shared.count("deliver") > 20
+    assert alone.count("send") == 0
+    np.testing.assert_allclose(both.xhat[:, :, 0], alone.xhat[:, :, 0], atol=1e-12)
+    np.testing.assert_allclose(both.xhat[:, :, 1], shared.xhat[:, :, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["kcf", "hybrid", "diffusion-kalman", "one-bit"])
+def test_other_messages_are_refused_by_name(folder: Path, kind: str) -> None:
+    settings: dict[str, Any] = {"kind": kind, "estimates": "own"}
+    if kind == "hybrid":
+        settings["epsilon"] = 0.3
+    changes = {"filter": settings, **(CLOCKED if kind == "hybrid" else {})}
+    with pytest.raises(netkf.ScenarioError, match=r"filter.estimates: .*say no blocks.*translate"):
+        scenario(folder, "own", **changes)
