@@ -67,6 +67,26 @@ class Columns(dict[str, FloatArray]):
             remedy = "set [time] origin to where the run begins in the log"
             raise ScenarioError("path", f"{self.where(row)}: {rule}", float(self["t"][row]), remedy)
 
+    def of_node(self, node: int | None) -> Columns:
+        """Return the rows of ``node`` (id), or all of a table without a column node.
+
+        Raises ScenarioError if there are none, or for a table of several nodes where ``node`` is
+        None.
+        """
+        if "node" not in self:
+            return self
+        if node is None:
+            rule = f"{self.source.name} has a column node, which belongs to blocks of nodes"
+            remedy = "write [[plants]] with nodes, or remove the column"
+            raise ScenarioError("path", rule, None, remedy)
+        chosen = np.array(self.integers("node"), dtype=np.int64) == node
+        if not chosen.any():
+            rule = f"{self.source.name} has no row of node {node}"
+            raise ScenarioError("path", rule, None, "add some, or take it from nodes")
+        rows = Columns(self.source, self.lines[chosen], self.half_digits[chosen])
+        rows.update((name, column[chosen]) for name, column in self.items())
+        return rows
+
     def integers(self, name: str) -> list[int]:
         """Return the column ``name`` as K integers, ids or counts; raises ScenarioError, with the
         line, for a value that is not an integer from 0 to MAX_ID. Names of nodes are below 0 until

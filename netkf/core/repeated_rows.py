@@ -37,6 +37,12 @@ def count_rows(path: str, keys: Iterable[Key], is_used: Callable[[Key], bool]) -
     return RowUse(path, counts.total(), len(used), sum(used) - len(used))
 
 
+def add_uses(uses: Sequence[RowUse]) -> RowUse:
+    """Return the use of one file by several, each of whom has rows of its own."""
+    rows, used, merged = (sum(counts) for counts in zip(*(use[1:] for use in uses), strict=True))
+    return RowUse(uses[0].path, rows, used, merged)
+
+
 def first_rows(
     table: Columns,
     keys: Iterable[Key],

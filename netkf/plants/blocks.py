@@ -37,6 +37,8 @@ from netkf.plants.inputs import Exogenous, Input
 from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.plant import Plant
+from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
+from netkf.plants.states import StackedStates
 
 
 class Coupling(NamedTuple):
@@ -97,6 +99,11 @@ class Block(Component):
     position: tuple[int, ...] | None = field(
         list_of(integer(low=0), "numbers of entries"), default=None
     )
+
+    @cached_property
+    def copies(self) -> tuple[Any, ...]:
+        """The plant of each of ``nodes``, or the one that all share."""
+        return tuple(self.plant.owned_by(node) for node in self.nodes or (None,))
 
     def check_position(self) -> None:
         """Raise ScenarioError unless ``position`` names different entries of blocks of nodes."""
@@ -200,8 +207,10 @@ class StackedInput(Input):
         for part in parts:
             last = part.last(times)
             gaps = (times - part.times[last])[:, None, None]
-            moved = scipy.linalg.expm(gaps * part.S) @ part.z[last][:, :, None]
-            z.append(np.where(last[:, None] >= 0, moved[:, :, 0], 0.0))
+            moved = part.z[last]
+            if part.S.any():
+                moved = (scipy.linalg.expm(gaps * part.S) @ moved[:, :, None])[:, :, 0]
+            z.append(np.where(last[:, None] >= 0, moved, 0.0))
         S, C = (
             block_diagonal(matrices) for matrices in zip(*((p.S, p.C) for p in parts), strict=True)
         )
@@ -212,9 +221,13 @@ class StackedInput(Input):
         return np.concatenate([one.values(times) for one in self.inputs], axis=1)
 
 
-def _copies(blocks: Sequence[Block]) -> list[tuple[int, Block]]:
-    """Return the entry of each place of a layout, and its number."""
-    return [(k, block) for k, block in enumerate(blocks) for _ in block.nodes or (None,)]
+def _copies(blocks: Sequence[Block]) -> list[tuple[int, Any]]:
+    """Return the number of the entry of each place of a layout, and its plant."""
+    return [(k, plant) for k, block in enumerate(blocks) for plant in block.copies]
+
+
+def _plants(blocks: Sequence[Block]) -> list[Any]:
+    return [plant for _, plant in _copies(blocks)]
 
 
 def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
@@ -222,8 +235,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
 
     Raises ScenarioError if blocks belong to different models of time, or a coupling does not fit.
     """
-    plants: list[Any] = [block.plant for _, block in _copies(blocks)]
-    slotted = isinstance(plants[0], SlotPlant)
+    slotted = isinstance(blocks[0].plant, SlotPlant)
     for k, block in enumerate(blocks):
         if not isinstance(
             block.plant, LinearPlant | NonlinearPlant | Diffusion | NonlinearDiffusion
@@ -233,10 +245,17 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
         if isinstance(block.plant, SlotPlant) != slotted:
             rule = "must be in slots as the others are, or in continuous time"
             raise ScenarioError(f"[{k}]", rule, block.name, "give all F, Q, period, or all A, B")
-        if not block.plant.is_random:
-            rule = "must be drawn: recorded or unknown states cannot be blocks"
+        if not block.plant.truth_known:
+            rule = "must be drawn or recorded: unknown states cannot be blocks"
             raise ScenarioError(f"[{k}].kind", rule, None, "leave kind out")
+        if block.plant.is_random != blocks[0].plant.is_random:
+            rule = "must be recorded in all entries, or in none"
+            raise ScenarioError(f"[{k}].path", rule, None, "add the tables, or leave them out")
         _check_shapes(k, block)
+        with errors_under(f"[{k}]"):
+            for plant in block.copies:
+                plant.read()
+    plants = _plants(blocks)
     if not all(plant.linear for plant in plants):
         return _stack_nonlinear(blocks)
     mean = np.concatenate([plant.start_mean for plant in plants])
@@ -246,15 +265,19 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
         **{"mean": mean, "cov": cov, "input": _stacked_input(blocks, layout)},
         "schedule": _stacked_schedule(blocks, layout),
     }
+    if not plants[0].is_random:
+        parts["path"] = StackedStates([plant.record for plant in plants])
     if slotted:
-        return LinearPlant(period=_one(blocks, "period"), **parts)
-    return Diffusion(sensing_period=_one(blocks, "sensing_period"), **parts)
+        parts["period"] = _one(blocks, "period")
+        return LinearPlant(**parts) if plants[0].is_random else RecordedPlant(**parts)
+    parts["sensing_period"] = _one(blocks, "sensing_period")
+    return Diffusion(**parts) if plants[0].is_random else RecordedDiffusion(**parts)
 
 
 def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
     slotted = isinstance(blocks[0].plant, SlotPlant)
     for k, block in enumerate(blocks):
-        plant: Any = block.plant
+        plant = block.copies[0]
         for key, given in (("coupling", block.coupling), ("schedule", plant.changes)):
             if len(given):
                 rule = "must be left out where blocks are not linear"
@@ -264,8 +287,7 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
         else:
             with errors_under(f"[{k}]"):
                 plant.check_dynamics()
-    plants: list[Any] = [block.plant for _, block in _copies(blocks)]
-    parts = []
+    plants, parts = _plants(blocks), []
     for plant in plants:
         u = plant.input
         m, name = 0 if u is None else u.m, "F" if slotted else "A"
@@ -281,6 +303,8 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
         "cov": block_diagonal([plant.start_cov for plant in plants]),
         "input": StackedInput(inputs=tuple(inputs)) if inputs else None,
     }
+    if not plants[0].is_random:
+        shared["path"] = StackedStates([plant.record for plant in plants])
     noise = block_diagonal([plant.Q if slotted else plant.B for plant in plants])
     if slotted:
         return NonlinearPlant(Q=noise, period=_one(blocks, "period"), **shared)
@@ -290,7 +314,7 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
 
 def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]:
     """Return F and Q, or A and B, of all blocks together."""
-    plants: list[Any] = [block.plant for _, block in _copies(blocks)]
+    plants = _plants(blocks)
     names = ("F", "Q") if isinstance(plants[0], LinearPlant) else ("A", "B")
     M, noise = (
         block_diagonal([np.asarray(getattr(plant, name)) for plant in plants]) for name in names
@@ -349,8 +373,8 @@ def _one(blocks: Sequence[Block], key: str) -> Any:
 def _stacked_input(blocks: Sequence[Block], layout: Layout) -> StackedInput | None:
     """Return what drives all blocks; None if nothing does."""
     inputs, parts = list[Input](), list[FloatArray]()
-    for place, (k, block) in zip(layout.places, _copies(blocks), strict=True):
-        one = block.plant.input
+    for place, (k, plant) in zip(layout.places, _copies(blocks), strict=True):
+        one = plant.input
         if one is None:
             continue
         _check_gain(k, one, place.n)
@@ -367,8 +391,8 @@ def _check_gain(k: int, u: Input | None, n: int) -> None:
 
 
 def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:
-    for place, (k, block) in zip(layout.places, _copies(blocks), strict=True):
-        for c, coupling in enumerate(block.coupling):
+    for place, (k, _) in zip(layout.places, _copies(blocks), strict=True):
+        for c, coupling in enumerate(blocks[k].coupling):
             key = f"[{k}].coupling[{c}]"
             for origin in _origins(f"{key}.from", coupling, place, layout):
                 if coupling.A.shape != (place.n, origin.n):

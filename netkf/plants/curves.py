@@ -23,14 +23,14 @@ from netkf.plants.dynamics import StackedDynamics, dynamics, functions_of
 from netkf.plants.inputs import SineInput
 from netkf.plants.linear import Blocks
 from netkf.plants.maps import check_dynamics
-from netkf.plants.plant import Plant
 from netkf.plants.sensors import cut, step_noise
+from netkf.plants.states import RecordedStates
 
 InputTables = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class NonlinearDiffusion(Plant):
+class NonlinearDiffusion(RecordedStates):
     """``dx = f(x, u(t), t) dt + B dw``.
 
     f     "unicycle" (x, y, heading, with speed and turn rate as input), "coordinated-turn" (x, y,
@@ -40,7 +40,7 @@ class NonlinearDiffusion(Plant):
           path, and filters integrate mean and covariance in steps that are no longer, by one of
           order 4
 
-    Headings are not wrapped: they count whole turns.
+    Headings are not wrapped: they count whole turns. With a ``path`` the states are recorded.
     """
 
     linear: ClassVar[bool] = False
@@ -98,7 +98,7 @@ class NonlinearDiffusion(Plant):
         ]
         return times, values, np.concatenate(sines, axis=1)
 
-    def path(
+    def curve(
         self,
         random: np.random.Generator,
         sampled: tuple[FloatArray, np.random.Generator],
@@ -138,7 +138,7 @@ class NonlinearDiffusion(Plant):
 
 class CurvePath:
     """The states of one run at some times, from x(0) = ``start`` (n,) on; see
-    ``NonlinearDiffusion.path``.
+    ``NonlinearDiffusion.curve``.
     """
 
     frame_times = np.empty(0)

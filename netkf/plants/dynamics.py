@@ -4,7 +4,8 @@ A user's class has ``f(x, u, t)`` and ``jacobian(x, u, t)``, the derivatives of 
 (n, n): of a plant in slots the state (n,) one slot after ``x`` (n,), in continuous time its rate of
 change; ``u`` (m,) is the input and ``t`` the time in seconds. Instead of both it may have
 ``kernels``, a pair of kernels ``f(x, u, t, out)`` and ``jacobian(x, u, t, out)`` (netkf.kernels),
-which write their results into ``out``: then runs need no Python between two samples.
+which write their results into ``out``: then runs need no Python between two samples. An attribute
+``headings`` names the states that are angles, which recorded states may count from anywhere.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class Motion(NamedTuple):
 
     n, m : numbers of states and of components of the input
     states, inputs : what they are
+    headings : which states are angles
     flow, rate : the exact flow over a period, the rate of change, each with its Jacobian
     """
 
@@ -38,18 +40,19 @@ class Motion(NamedTuple):
     m: int
     states: str
     inputs: str
+    headings: tuple[int, ...]
     flow: Pair
     rate: Pair
 
 
 MOTIONS = {
     "unicycle": Motion(
-        3, 2, "x, y and heading", "speed and turn rate",
+        3, 2, "x, y and heading", "speed and turn rate", (2,),
         (motion.move_unicycle, motion.unicycle_jacobian),
         (motion.unicycle_rate, motion.unicycle_rate_jacobian),
     ),
     "coordinated-turn": Motion(
-        5, 0, "x, y, vx, vy and turn rate", "",
+        5, 0, "x, y, vx, vy and turn rate", "", (),
         (motion.move_turning, motion.turning_jacobian),
         (motion.turning_rate, motion.turning_rate_jacobian),
     ),
@@ -192,6 +195,13 @@ dynamics = Rule(
     "choose one of them",
     {"type": "string"},
 )
+
+
+def headings_of(f: Any) -> tuple[int, ...]:
+    """Return which states are headings: of a motion that netkf knows, or that a class names."""
+    if isinstance(f, str):
+        return MOTIONS[f].headings
+    return tuple(getattr(getattr(f, "part", None), "headings", ()))
 
 
 def functions_of(f: Any, n: int, m: int, in_slots: bool) -> Any:

@@ -6,11 +6,12 @@ nothing drives. Its response in a linear plant is therefore exact (``response``)
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -50,6 +51,10 @@ class Input(Component, OnGrid):
     G: FloatArray | None = field(matrix, default=None)
 
     grid_values: ClassVar[tuple[str, ...]] = ("exogenous",)
+
+    def owned_by(self, node: int) -> Self:
+        """Return the input of the block of ``node`` (id): the same for all, but from tables."""
+        return self
 
     @property
     @abstractmethod
@@ -162,30 +167,49 @@ class SineInput(Input):
 @dataclass(frozen=True, eq=False)
 class RecordedInput(Input):
     """u is read from a table ``t,u0,u1,...``: a row holds until the next, and u is 0 before the
-    first.
+    first. With a column ``node`` a row is that of the block of this node.
     """
 
     path: SourceFile = field(source_file)
 
+    node: ClassVar[int | None] = None
+    """The node (id) whose rows count."""
+
     def __post_init__(self) -> None:
         """Check the fields and read the table; raises ScenarioError for a mistake in either."""
         super().__post_init__()
-        _ = self.exogenous
+        if "node" not in self._columns:
+            _ = self.exogenous
+
+    def owned_by(self, node: int) -> Self:
+        """Return the input of the block of ``node`` (id)."""
+        owned = copy.copy(self)
+        for name in ("exogenous", "_table"):
+            owned.__dict__.pop(name, None)
+        object.__setattr__(owned, "node", node)
+        return owned
 
     @cached_property
-    def _table(self) -> tuple[Columns, FloatArray]:
-        """The columns of the table, and u (K, m) of its rows."""
+    def _columns(self) -> Columns:
+        """All columns of the table."""
         m = sum(number_of(name, "u") >= 0 for name in read_header(self.path))
         names = [f"u{k}" for k in range(max(m, 1))]
-        columns = read_columns(self.path, ("t", *names))
+        columns = read_columns(self.path, ("t", *names), ("node",))
         if not len(columns.lines):
             raise ScenarioError("path", f"{self.path.name} has no rows", None, "add some")
         columns.refuse_early(np.flatnonzero(columns["t"] < 0.0), "t must be at least 0")
+        return columns
+
+    @cached_property
+    def _table(self) -> tuple[Columns, FloatArray]:
+        """The columns of the rows that count, and u (K, m) of these."""
+        columns = self._columns.of_node(self.node)
+        names = [name for name in columns if number_of(name, "u") >= 0]
         return columns, np.stack([columns[name] for name in names], axis=1)
 
     @property
     def row_keys(self) -> list[float]:
-        """The instant of each row, in the order of the table."""
+        """The instant of each row that counts, in the order of the table."""
         return [float(t) for t in self.time_grid.snap(self._table[0]["t"])]
 
     @cached_property

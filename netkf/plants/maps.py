@@ -16,10 +16,11 @@ from netkf.linalg.portable import apply
 from netkf.linalg.vector_functions import VectorFunction
 from netkf.plants.dynamics import MOTIONS, StackedDynamics, dynamics, functions_of
 from netkf.plants.linear import BLOCK, Blocks, SlotPlant
+from netkf.plants.states import RecordedPath, RecordedStates
 
 
 @dataclass(frozen=True, eq=False)
-class NonlinearPlant(SlotPlant):
+class NonlinearPlant(RecordedStates, SlotPlant):
     """``x[k+1] = f(x[k], u[k], t_k) + w[k]``, cov(w) = Q; slot k is at time ``k * period`` seconds,
     u[k] is the ``input`` then.
 
@@ -29,7 +30,7 @@ class NonlinearPlant(SlotPlant):
     Q       (n, n)
     period  seconds
 
-    Headings are not wrapped: they count whole turns.
+    Headings are not wrapped: they count whole turns. With a ``path`` the states are recorded.
     """
 
     linear: ClassVar[bool] = False
@@ -72,10 +73,12 @@ class NonlinearPlant(SlotPlant):
         """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
         check_dynamics(self, self.functions)
 
-    def truth(self, random: np.random.Generator, frames: bool = False) -> MapPath:
-        """Return the true states of one run, drawn from ``random``; ``frames`` are for linear
-        plants only.
+    def truth(self, random: np.random.Generator, frames: bool = False) -> MapPath | RecordedPath:
+        """Return the true states of one run, drawn from ``random`` or recorded; ``frames`` are for
+        linear plants only.
         """
+        if self.record is not None:
+            return RecordedPath(self.record.slots(self.period), np.full(self.n, np.nan))
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         return MapPath(self, start, random)
 

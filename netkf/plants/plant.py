@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from netkf.core.errors import errors_under
 from netkf.core.fields import Component, covariance, field, instance_of, vector
 from netkf.core.instants import OnGrid, TimeGrid
 from netkf.linalg.arrays import FloatArray
@@ -34,6 +36,10 @@ class Plant(Component, OnGrid):
     """True if the state is known, so that errors can be computed."""
     linear: ClassVar[bool] = True
     """Whether the dynamics are linear in the state."""
+    record: ClassVar[Any] = None
+    """The states of its table, ``states.StateTable``; None if it has none."""
+    node: ClassVar[int | None] = None
+    """The node (id) whose rows count in tables with a column ``node``."""
 
     mean: FloatArray | None = field(vector, default=None)
     cov: FloatArray | None = field(covariance, default=None)
@@ -45,6 +51,23 @@ class Plant(Component, OnGrid):
         if plant is not self and plant.input is not None:
             object.__setattr__(plant, "input", plant.input.on_grid(grid))
         return plant
+
+    def owned_by(self, node: int | None) -> Self:
+        """Return the plant as the block of ``node`` (id), whose rows count in its tables."""
+        if node is None:
+            return self
+        plant = copy.copy(self)
+        plant.__dict__.pop("record", None)
+        object.__setattr__(plant, "node", node)
+        if plant.input is not None:
+            object.__setattr__(plant, "input", plant.input.owned_by(node))
+        return plant
+
+    def read(self) -> None:
+        """Raise ScenarioError for a mistake in its tables."""
+        if self.input is not None:
+            with errors_under("input"):
+                _ = self.input.exogenous
 
     @property
     @abstractmethod

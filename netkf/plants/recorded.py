@@ -1,14 +1,14 @@
 """Plants and sensors whose truth or readings come from tables, in both models of time.
 
-The checks of a scenario call the methods ``require_...``, which raise, before a run starts, if the
-table lacks a state that the run needs. Readings may be missing: a node whose table has no row for a
-slot has no reading in that slot.
+The checks of a scenario call methods ``require_...`` of states (``states``), which raise, before a
+run starts, if the table lacks one that the run needs. Readings may be missing: a node whose table
+has no row for a slot has no reading in that slot.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     SourceFile,
@@ -25,11 +24,9 @@ from netkf.core.fields import (
     list_of,
     matrix,
     node_id,
-    one_of,
     source_file,
     text,
 )
-from netkf.core.repeated_rows import first_rows
 from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -38,14 +35,12 @@ from netkf.plants.readings import (
     ReadingTable,
     RecordedReadings,
     RecordedSamples,
-    slot_number,
     take_from_record,
 )
 from netkf.plants.sensors import Sensor
-from netkf.plants.truth import TOLERANCE, RecordedTruth, demand_states
+from netkf.plants.states import RecordedPath, RecordedStates, state_file
+from netkf.plants.truth import RecordedTruth
 
-INTERPOLATIONS = ("linear", "hold")
-"""What recorded states are between the rows of their table."""
 NO_TIMES = np.empty(0)
 
 
@@ -65,7 +60,7 @@ class UnknownPlant(LinearPlant):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedPlant(LinearPlant):
+class RecordedPlant(RecordedStates, LinearPlant):
     """The state is read from a table ``t,x0,x1,...``, one row a slot, t in seconds; ``F``, ``Q``,
     ``mean`` and ``cov`` are the filters' model of it.
 
@@ -73,89 +68,11 @@ class RecordedPlant(LinearPlant):
     two rows "linear", or the earlier one ("hold").
     """
 
-    is_random: ClassVar[bool] = False
-
-    path: SourceFile = field(source_file)
-    interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _ = self.table  # a mistake in the file is found on construction
-
-    @cached_property
-    def table(self) -> SlotStates:
-        """The states (n,) by slot number; raises ScenarioError for a mistake in the file."""
-        if self.interpolate is not None:
-            truth = _recorded_truth(*self._states, self.n, self.interpolate)
-            return InterpolatedStates(truth, self.period)
-        columns, states = self._states
-        rule = "there may be one row a slot, or equal ones"
-        first = first_rows(columns, self._slots, states.tolist(), rule)
-        return {slot: states[row] for slot, row in first.items() if slot >= 0}
-
-    @cached_property
-    def _states(self) -> tuple[Columns, FloatArray]:
-        return _read_states(self.path, self.n)
-
-    @cached_property
-    def _slots(self) -> list[int]:
-        """The slot number of each row, in the order of the table; rows of one slot are equal."""
-        columns = self._states[0]
-        columns.refuse_early(np.flatnonzero(columns["t"] < 0.0), "t must be at least 0")
-        return [slot_number(columns, row, self.period) for row in range(len(columns.lines))]
-
-    @property
-    def row_times(self) -> FloatArray:
-        """The times (K,) of all rows in seconds, in the order of the table."""
-        return self._states[0]["t"]
-
-    @property
-    def row_keys(self) -> list[int]:
-        """The subject of each row, in the order of the table: its slot or, with ``interpolate``,
-        its place among the times of the table.
-        """
-        return self._slots if self.interpolate is None else _time_keys(self.row_times)
-
-    def used_keys(self, slots: Iterable[int]) -> set[int]:
-        """Return the ``row_keys`` of the rows that say the states of these ``slots``."""
-        if not isinstance(self.table, InterpolatedStates):
-            return set(slots)
-        return {key for slot in slots for key in self.table.rows_at(slot)}
-
-    def require_slots(self, slots: Iterable[int]) -> None:
-        """Raise ScenarioError if the table has no state for one of the ``slots`` (numbers)."""
-        missing = next((slot for slot in slots if slot not in self.table), None)
-        if missing is not None:
-            time = f"slot {missing}, t = {missing * self.period:g}"
-            remedy = "add the row or shorten the horizon"
-            if self.interpolate is None:
-                remedy = 'add the row, or write interpolate = "linear" or "hold"'
-            rule = f"{self.path.name} has no state for {time}"
-            raise ScenarioError("path", rule, None, remedy)
+    path: SourceFile = field(state_file)
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """Return the states of the table, nan in slots without one; ``random`` is not used."""
-        return RecordedPath(self.table, np.full(self.n, math.nan))
-
-
-class InterpolatedStates:
-    """The states of slots of ``period`` seconds in the ``truth`` of a table with rows at any
-    times.
-    """
-
-    def __init__(self, truth: RecordedTruth, period: float) -> None:
-        self._truth, self._period = truth, period
-
-    def rows_at(self, slot: int) -> tuple[int, ...]:
-        """Return the indices of the times of the table that say the state of a slot."""
-        return self._truth.rows_at(slot * self._period)
-
-    def __contains__(self, slot: int) -> bool:
-        return bool(self.rows_at(slot))
-
-    def get(self, slot: int, otherwise: FloatArray) -> FloatArray:
-        """Return the state (n,) of a slot, ``otherwise`` (n,) if it is unknown."""
-        return self._truth.local(slot * self._period) if slot in self else otherwise
+        return RecordedPath(self.record.slots(self.period), np.full(self.n, math.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,102 +89,15 @@ class UnknownDiffusion(Diffusion):
         """The true state of a run as engines read it: nan at all times."""
         return RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n)
 
-    def require_times(self, times: FloatArray, what: str) -> None:
-        """Accept any ``times`` (K,) and any use ``what``: no state is known, so none is missing."""
-
 
 @dataclass(frozen=True, eq=False)
-class RecordedDiffusion(Diffusion):
+class RecordedDiffusion(RecordedStates, Diffusion):
     """The state is read from a table ``t,x0,x1,...``, t in seconds, and exists at its rows only, or
     with ``interpolate`` between them too: "linear", or the last one ("hold"); ``A``, ``B``,
     ``mean`` and ``cov`` are the filters' model of it.
     """
 
-    is_random: ClassVar[bool] = False
-
-    path: SourceFile = field(source_file)  # type: ignore[assignment]
-    interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _ = self.recorded_truth  # a mistake in the file is found on construction
-
-    @cached_property
-    def recorded_truth(self) -> RecordedTruth:
-        """The true state as engines read it; raises ScenarioError for two states at one time."""
-        return _recorded_truth(*self._states, self.n, self.interpolate)
-
-    @cached_property
-    def _states(self) -> tuple[Columns, FloatArray]:
-        return _read_states(self.path, self.n)
-
-    @property
-    def row_times(self) -> FloatArray:
-        """The times (K,) of all rows in seconds, in the order of the table."""
-        return self._states[0]["t"]
-
-    @property
-    def row_keys(self) -> list[int]:
-        """The place of each row's time among all times of the table, in the order of the table."""
-        return _time_keys(self.row_times)
-
-    def used_keys(self, times: FloatArray) -> set[int]:
-        """Return the ``row_keys`` of the rows that say the states at ``times`` (K,) in seconds."""
-        return {key for time in times.tolist() for key in self.recorded_truth.rows_at(time)}
-
-    def require_times(self, times: FloatArray, what: str) -> None:
-        """Raise ScenarioError if a state is missing at ``times`` (K,), for the use ``what``."""
-        demand_states(self.path, self.recorded_truth, times, what)
-
-
-def _time_keys(times: FloatArray) -> list[int]:
-    """Return the index of each time among all that differ by more than TOLERANCE."""
-    order = np.argsort(times, kind="stable")
-    keys = np.zeros(len(order), dtype=np.int64)
-    keys[order[1:]] = np.cumsum(np.diff(times[order]) > TOLERANCE)
-    return [int(key) for key in keys]
-
-
-def _recorded_truth(
-    columns: Columns, states: FloatArray, n: int, interpolate: str | None
-) -> RecordedTruth:
-    """Return the truth of a table with ``states`` (K, n) at the times "t" of its ``columns``."""
-    rule = "there may be one row a time, or equal ones"
-    first = first_rows(columns, _time_keys(columns["t"]), states.tolist(), rule)
-    rows = [first[key] for key in range(len(first))]
-    return RecordedTruth(columns["t"][rows], states[rows], n, interpolate)
-
-
-def _read_states(source: SourceFile, n: int) -> tuple[Columns, FloatArray]:
-    """Return the columns of a table ``t,x0,x1,...``, and the states (K, n) of its rows."""
-    names = [f"x{k}" for k in range(n)]
-    table = read_columns(source, ("t", *names))
-    return table, np.stack([table[name] for name in names], axis=1)
-
-
-SlotStates = dict[int, FloatArray] | InterpolatedStates
-"""Recorded states by slot."""
-
-
-class RecordedPath:
-    """The truth of a run from a table: states (n,) by slot number, ``otherwise`` (n,) in slots that
-    it lacks.
-    """
-
-    frame_slots: int | None = None
-
-    def __init__(self, states: SlotStates, otherwise: FloatArray) -> None:
-        self._states, self._otherwise = states, otherwise
-
-    def state(self, slot: int) -> FloatArray:
-        """Return the state (n,) in slot number ``slot``."""
-        return self._states.get(slot, self._otherwise)
-
-    local = absolute = state
-
-    def rebase(self, slot: int) -> FloatArray:
-        """Raise IndexError: a recorded path has no frames, so that none begins at ``slot``."""
-        raise IndexError(slot)
+    path: SourceFile = field(state_file)  # type: ignore[assignment]
 
 
 @dataclass(frozen=True, eq=False)

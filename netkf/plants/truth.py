@@ -187,7 +187,7 @@ class RecordedTruth:
         self, times: FloatArray, states: FloatArray, n: int, interpolate: str | None = None
     ) -> None:
         self.times, self._states, self._interpolate = times, states, interpolate
-        self._missing = np.full(n, math.nan)
+        self.n, self._missing = n, np.full(n, math.nan)
 
     def rows_at(self, time: float) -> tuple[int, ...]:
         """Return the indices of the rows that say the state at ``time`` (seconds): one, or the two

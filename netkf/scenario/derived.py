@@ -470,8 +470,11 @@ class DerivedScenario(ScenarioModel):
         if isinstance(self.plant, NonlinearDiffusion):
             if sampled is None:
                 sampled = all_sample_times(sample_times(self, streams))
+            if not self.plant.is_random:
+                require_states(self, sample_times(self, streams))
+                return self.plant.recorded_truth
             random, *inside = map(streams.generator, ("plant", "samples", "probe"))
-            return self.plant.path(random, (sampled, inside[0]), (self.times, inside[1]))
+            return self.plant.curve(random, (sampled, inside[0]), (self.times, inside[1]))
         plant, horizon = self.diffusion, self.horizon
         recorded, on_grid = not plant.is_random, uses_grid(self)
         if sampled is None or recorded:
@@ -484,7 +487,7 @@ class DerivedScenario(ScenarioModel):
         random, probes = streams.generator("plant"), self.times
         times, responses = np.union1d(sampled, probes), self.input_responses
         truth: Any
-        if isinstance(plant, (RecordedDiffusion, UnknownDiffusion)):
+        if isinstance(plant, RecordedDiffusion | UnknownDiffusion):
             truth = plant.recorded_truth
         elif not on_grid:
             truth = plant.sampled_truth(random, times, horizon, frames)
@@ -765,6 +768,11 @@ class DerivedScenario(ScenarioModel):
         if isinstance(plant, NonlinearDiffusion):
             (f, jacobian), inputs, A, Q = self._curved(plant, view)
             times, values, sine = plant.tables_of_input
+            if not isinstance(view, slice) and len(times):
+                # Predictions begin anew where inputs of its own blocks change.
+                changes = (np.diff(values[:, inputs], axis=0) != 0.0).any(axis=1)
+                jumps = np.append(True, changes)
+                times, values = times[jumps], values[jumps]
             known = 1.0 if self.filter.model.input else 0.0
             amplitudes = np.array([[known], [1.0], [1.0]])
             return RateModel(

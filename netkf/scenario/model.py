@@ -224,6 +224,8 @@ class ScenarioModel(Component):
         if not self.plants:
             if self.plant is None:
                 raise ScenarioError("plant", "is missing", None, "add [plant] or [[plants]]")
+            with errors_under("plant"):
+                self.plant.read()
             with errors_under("sensors"):
                 require_no_blocks(self.sensors)
         else:
@@ -240,6 +242,14 @@ class ScenarioModel(Component):
             object.__setattr__(self, "sensors", stacked)
         object.__setattr__(self, "declared_sensors", declared)
         object.__setattr__(self, "sensor_entries", entries)
+
+    @property
+    def all_plants(self) -> list[tuple[str, Any]]:
+        """The plant, or that of each block, each with its key path."""
+        if not self.plants:
+            return [("plant", self.plant)]
+        entries = enumerate(self.plants)
+        return [(f"plants[{k}]", plant) for k, block in entries for plant in block.copies]
 
     @cached_property
     def layout(self) -> Layout:

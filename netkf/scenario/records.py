@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from typing import Any
+
 import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under
-from netkf.core.repeated_rows import RowUse, count_rows
+from netkf.core.repeated_rows import RowUse, add_uses, count_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.contacts import Contacts
 from netkf.network.matchings import RecordedSlots
 from netkf.plants.inputs import RecordedInput
-from netkf.plants.plant import Plant
-from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.derived import DerivedScenario
@@ -31,10 +32,12 @@ def check_records(scenario: DerivedScenario) -> None:
                 None,
                 'write kind = "recorded" and path = "readings.csv"',
             )
-    plant = scenario.plant
-    if isinstance(plant, RecordedPlant):
-        with errors_under("plant"):
-            plant.require_slots(sorted(_state_slots(scenario)))
+    if scenario.slotted:
+        slots, period = sorted(_state_slots(scenario)), scenario.slot_plant.period
+        for key, plant in scenario.all_plants:
+            if plant.record is not None:
+                with errors_under(key):
+                    plant.record.require_slots(slots, period)
     if scenario.slotted and scenario.filter.algorithm.timing.talks:
         _check_exchanges(scenario)
 
@@ -104,28 +107,14 @@ def exchange_slots(scenario: DerivedScenario) -> range:
     return range(scenario.node_filter.timing.first_exchange, sensed_slots(scenario).stop)
 
 
-def count_state_rows(scenario: DerivedScenario) -> RowUse | None:
-    """Return the use of the rows of recorded states; None if states are not recorded."""
-    plant = scenario.plant
-    if isinstance(plant, RecordedDiffusion):
-        used = plant.used_keys(_state_times(scenario))
-    elif isinstance(plant, RecordedPlant):
-        used = plant.used_keys(_state_slots(scenario))
-    else:
-        return None
-    return count_rows(plant.path.name, plant.row_keys, used.__contains__)
-
-
-def recorded_inputs(scenario: DerivedScenario) -> dict[str, RecordedInput]:
-    """Return the recorded inputs of the plant, or of its blocks, by key path."""
-    plants: list[tuple[str, Plant]] = [("plant", scenario.plant)]
-    if scenario.plants:
-        plants = [(f"plants[{k}]", block.plant) for k, block in enumerate(scenario.plants)]
-    return {
-        f"{key}.input": plant.input.on_grid(scenario.time_grid)
-        for key, plant in plants
-        if isinstance(plant.input, RecordedInput)
-    }
+def count_state_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
+    """Return the use of the rows of recorded states by key path."""
+    if scenario.plant.record is None:
+        return {}
+    needed: Any = _state_slots(scenario) if scenario.slotted else _state_times(scenario).tolist()
+    return _sum_by_key(
+        (key, plant.record.use(needed, _period(scenario))) for key, plant in scenario.all_plants
+    )
 
 
 def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
@@ -135,10 +124,38 @@ def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
         # In slots u counts at their beginnings only.
         period = scenario.slot_plant.period
         starts = scenario.time_grid.before(horizon, period * np.arange(int(horizon / period) + 2))
-    return {
-        key: count_rows(u.path.name, u.row_keys, u.used_keys(horizon, starts).__contains__)
-        for key, u in recorded_inputs(scenario).items()
-    }
+    return _sum_by_key(
+        (key, count_rows(u.path.name, u.row_keys, u.used_keys(horizon, starts).__contains__))
+        for key, u in _recorded_inputs(scenario)
+    )
+
+
+def count_plant_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
+    """Return the use of the rows of recorded states and inputs if all are used, by key path."""
+    tables = [
+        (key, plant.record.columns.source.name, plant.record.row_keys(_period(scenario)))
+        for key, plant in scenario.all_plants
+        if plant.record is not None
+    ]
+    tables += [(key, u.path.name, u.row_keys) for key, u in _recorded_inputs(scenario)]
+    return _sum_by_key((key, count_rows(path, keys, lambda _: True)) for key, path, keys in tables)
+
+
+def _recorded_inputs(scenario: Any) -> Iterator[tuple[str, RecordedInput]]:
+    for key, plant in scenario.all_plants:
+        if isinstance(plant.input, RecordedInput):
+            yield f"{key}.input", plant.input.on_grid(scenario.time_grid)
+
+
+def _period(scenario: DerivedScenario) -> float | None:
+    return scenario.slot_plant.period if scenario.slotted else None
+
+
+def _sum_by_key(uses: Iterable[tuple[str, RowUse]]) -> dict[str, RowUse]:
+    by_key: dict[str, list[RowUse]] = {}
+    for key, use in uses:
+        by_key.setdefault(key, []).append(use)
+    return {key: add_uses(parts) for key, parts in by_key.items()}
 
 
 def _state_times(scenario: DerivedScenario) -> FloatArray:

@@ -14,7 +14,6 @@ import numpy as np
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
-from netkf.plants.recorded import RecordedDiffusion
 from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
@@ -98,26 +97,25 @@ def uses_grid(scenario: ScenarioModel) -> bool:
 
 
 def require_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray]) -> None:
-    """Raise ScenarioError if a recorded diffusion lacks the state at a time that a run needs.
+    """Raise ScenarioError if recorded states lack that at a time that a run needs.
 
     These are the probe times, and the sample times of sensors whose readings are drawn. ``times``
     are the sample times (K,) in seconds by (node, ordinal).
     """
-    plant = scenario.plant
-    if not isinstance(plant, RecordedDiffusion):
-        return
-    with errors_under("plant"):
-        plant.require_times(scenario.times, "the probe")
-        for node, placed_sensor in _iterate_sampled_sensors(scenario):
-            if scenario.sensors[placed_sensor.entry].is_random:
-                plant.require_times(times[node, placed_sensor.ordinal], f"a sample of node {node}")
+    for key, plant in scenario.all_plants if scenario.plant.record is not None else ():
+        with errors_under(key):
+            plant.record.require_times(scenario.times, "the probe")
+            for node, placed_sensor in _iterate_sampled_sensors(scenario):
+                if scenario.sensors[placed_sensor.entry].is_random:
+                    needed, use = times[node, placed_sensor.ordinal], f"a sample of node {node}"
+                    plant.record.require_times(needed, use)
 
 
 def check_sampling(scenario: ScenarioModel) -> None:
     """Raise ScenarioError if the sampling of a sensor does not fit the plant or the graph.
 
-    Sensors of a recorded or unknown diffusion must take samples, and a recorded diffusion must have
-    the states that replica 0 needs.
+    Sensors of a recorded or unknown diffusion must take samples, and recorded states must have
+    those that replica 0 needs.
     """
     for k, sensor in enumerate(scenario.sensors):
         key = f"sensors[{k}]"
@@ -140,7 +138,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
                 None,
                 'write sampling = { kind = "periodic", period = ... }',
             )
-    if not scenario.slotted and isinstance(scenario.plant, RecordedDiffusion):
+    if not scenario.slotted and scenario.plant.record is not None:
         require_states(scenario, sample_times(scenario, Streams(scenario.seed)))
 
 

@@ -29,7 +29,6 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import RecordedClock
 from netkf.network.contacts import Contacts
 from netkf.plants.inputs import RecordedInput
-from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sampling import RecordedSampling
 
 LATE = 100.0  # seconds; records that begin earlier need no note
@@ -151,8 +150,8 @@ def _recorded_times(scenario: Any) -> Iterator[FloatArray]:
     positions = scenario.position_table
     if positions is not None and positions.timed:
         yield np.array([t for _, t in positions.row_keys])
-    plant = scenario.plant
-    if isinstance(plant, RecordedDiffusion | RecordedPlant):
-        yield plant.row_times
-    if isinstance(plant.input, RecordedInput):
-        yield np.array(plant.input.row_keys)
+    for _, plant in scenario.all_plants:
+        if plant.record is not None:
+            yield plant.record.columns["t"]
+        if isinstance(plant.input, RecordedInput):
+            yield np.array(plant.input.row_keys)

@@ -21,6 +21,7 @@ from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
 from netkf.plants.blocks import Block
+from netkf.plants.states import state_file
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin, find_class
 from netkf.scenario.model import Belief, Filtering, Network
@@ -195,7 +196,7 @@ def _build_object(
     rules = {name: fields[name].metadata.get("rule") for name in values}
     values = dict(values)
     for name, value in values.items():
-        if rules[name] is source_file and isinstance(value, str):
+        if rules[name] in (source_file, state_file) and isinstance(value, str):
             values[name] = SourceFile(value, origin.folder, origin.stamps)
         elif isinstance(value, SourceFile):
             # It may have been read with names of nodes of another graph.
@@ -256,6 +257,10 @@ def _build_plant(origin: Origin, value: Any) -> Any:
         "input": partial(_build_part, "input", origin),
     }
     table = _build_inner(_as_dict(value), builders)
+    if table.get("kind") == "recorded" and "f" in table:
+        table["kind"] = "nonlinear"
+        if "path" not in table:
+            raise ScenarioError("path", "is missing", None, "add path = ...")
     # Some kinds exist for both models of time; the keys tell which one is meant.
     in_both_times = table.get("kind") in ("nonlinear", "recorded", "unknown")
     continuous = in_both_times and not {"A", "B", "step"}.isdisjoint(table)

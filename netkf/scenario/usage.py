@@ -13,14 +13,13 @@ from netkf.network.graphs import Link
 from netkf.network.matchings import RecordedSlots
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.plants.readings import ReadingTable
-from netkf.plants.recorded import RecordedDiffusion, RecordedPlant
 from netkf.plants.sampling import RecordedSampling
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.records import (
     count_input_rows,
+    count_plant_rows,
     count_state_rows,
     exchange_slots,
-    recorded_inputs,
     sensed_slots,
 )
 
@@ -69,10 +68,8 @@ def record_usage(scenario: DerivedScenario, sent: Mapping[Link, int] | None) -> 
             more = {"beyond": beyond, "after": component.after}
             uses[f"network.channel.{key}"] = _make_use(rows) | more
     uses |= {key: _make_use(use) for key, use in _find_sensor_uses(scenario).items()}
-    state_rows = count_state_rows(scenario)
-    if state_rows is not None:
-        uses["plant"] = _make_use(state_rows)
-    return uses | {key: _make_use(use) for key, use in count_input_rows(scenario).items()}
+    plant_uses = count_state_rows(scenario) | count_input_rows(scenario)
+    return uses | {key: _make_use(use) for key, use in plant_uses.items()}
 
 
 def usage_notes(usage: Mapping[str, Use]) -> tuple[str, ...]:
@@ -99,8 +96,8 @@ def unused_notes(scenario: DerivedScenario, without_states: bool = False) -> tup
     out, whose use differs from run to run, and on demand that of recorded states.
     """
     usage = record_usage(scenario, sent=None)
-    if without_states:
-        usage.pop("plant", None)
+    for key in count_state_rows(scenario) if without_states else ():
+        del usage[key]
     return usage_notes(usage)
 
 
@@ -126,18 +123,15 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
         if isinstance(clock, RecordedSampling):
             key = f"sensors[{k}].sampling"
             tables[key] = "node and time", clock.path.name, clock.row_times
-    if isinstance(scenario.plant, RecordedDiffusion | RecordedPlant):
-        tables["plant"] = "time", scenario.plant.path.name, scenario.plant.row_keys
     positions = scenario.position_table
     if positions is not None:
         what = "node and time" if positions.timed else "node"
         tables["network.positions"] = what, positions.path, positions.row_keys
-    for key, u in recorded_inputs(scenario).items():
-        tables[key] = "time", u.path.name, u.row_keys
     uses = [
         (f"network.graph{key}", "node" if key else "link", use)
         for key, use in scenario.topology.tables.items()
     ]
+    uses += [(key, "time", use) for key, use in count_plant_rows(scenario).items()]
     for key, (what, path, keys) in tables.items():
         uses.append((key, what, count_rows(path, keys, lambda _: True)))
     # A table that several sensors name is told once.

@@ -131,12 +131,12 @@ def _check_maps(part: NonlinearPlant, copy: Any, name: str, seed: int) -> None:
 
 
 def _check_curve(part: NonlinearDiffusion, copy: Any, name: str, seed: int) -> None:
-    where, times = f"{name}.path", part.step * np.array([0.4, 1.0, 1.7, 5.2])
+    where, times = f"{name}.curve", part.step * np.array([0.4, 1.0, 1.7, 5.2])
     probes = part.step * np.array([0.2, 1.5, 3.0, 5.0])
 
     def draw(plant: Any, probes: FloatArray) -> FloatArray:
         random = [_make_generator(seed, 0, name) for name in ("plant", "samples", "probe")]
-        path = plant.path(random[0], (times, random[1]), (probes, random[2]))
+        path = plant.curve(random[0], (times, random[1]), (probes, random[2]))
         return np.array([path.absolute(time) for time in times.tolist()])
 
     with guard_user_code(where):

@@ -237,7 +237,7 @@ def test_states_do_not_depend_on_what_else_is_asked_for():
 
     def states(sampled, probes):
         streams = Streams(3, 0)
-        path = plant.path(
+        path = plant.curve(
             streams.generator("plant"),
             (sampled, streams.generator("samples")),
             (probes, streams.generator("probe")),
@@ -270,7 +270,7 @@ def test_noise_inside_steps_has_its_law(folder):
     for run in range(len(drawn)):
         streams = Streams(9, run)
         plain, *inside = (streams.generator(name) for name in ("plant", "samples", "probe"))
-        path = plant.path(plain, (sampled, inside[0]), (probes, inside[1]))
+        path = plant.curve(plain, (sampled, inside[0]), (probes, inside[1]))
         drawn[run] = [path.absolute(t)[0] for t in times.tolist()]
     increments = np.diff(drawn, axis=1, prepend=0.0) / np.sqrt(4.0 * np.diff(times, prepend=0.0))
     covariance = increments.T @ increments / len(drawn)

@@ -76,12 +76,22 @@ class RateRun(Struct):
 
 
 @kernel
+def last_jump(times: FloatArray, time: float) -> int:
+    """Return the index of the last of increasing ``times`` (J,) not after ``time``, -1 without."""
+    low, high = 0, len(times)
+    while low < high:
+        middle = (low + high) // 2
+        if times[middle] <= time:
+            low = middle + 1
+        else:
+            high = middle
+    return low - 1
+
+
+@kernel
 def set_input(model: RateTables, time: float, middle: float) -> None:
     """Write the input at ``time`` into ``model.u``; it does not jump from there to ``middle``."""
-    last = -1
-    for j in range(len(model.times)):
-        if model.times[j] <= middle:
-            last = j
+    last = last_jump(model.times, middle)
     for k in range(len(model.u)):
         model.u[k] = model.values[last, k] if last >= 0 else 0.0
         if not math.isnan(model.sine[0, k]):
@@ -138,10 +148,9 @@ def move_by_rate(
     """
     time, n = end - gap, x.shape[1]
     while time < end:
-        stop = end
-        for j in range(len(model.times)):
-            if time < model.times[j] < stop:
-                stop = model.times[j]
+        stop, later = end, last_jump(model.times, time) + 1
+        if later < len(model.times) and model.times[later] < stop:
+            stop = model.times[later]
         # Steps of equal length up to a jump of the input.
         count = max(1, math.ceil((stop - time) / model.step - 1e-9))
         length = (stop - time) / count

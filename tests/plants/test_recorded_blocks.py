@@ -1,0 +1,176 @@
+"""Inputs and true states of blocks from tables whose column ``node`` says whose row it is."""
+
+import math
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.core.errors import ScenarioError
+from netkf.scenario.reading import from_table
+from netkf.scenario.usage import record_usage
+
+START = {1: [0.0, 0.0, 3.0], 2: [3.0, 4.0, -1.0]}
+ODOMETRY = """t,node,u0,u1
+0,1,1.0,0.4
+0,2,0.5,-0.2
+1,2,0.8,0.3
+2,1,0.6,-0.1
+2,3,9.0,9.0
+"""
+# Headings as a tracker gives them, in (-pi, pi]; that of robot 1 passes pi.
+TRUTH = """t,node,x0,x1,x2
+0,1,0.0,0.0,3.0
+0,2,3.0,4.0,-1.0
+2,2,3.5,3.0,-1.5
+1,1,-1.0,0.2,-3.1
+2,1,-2.0,0.1,-2.9
+"""
+
+
+def team(folder, time=None, **plant):
+    """Two unicycles, of which the first sees a landmark and the second."""
+    time = time or {"period": 0.5, "Q": np.diag([1e-3, 1e-3, 4e-4]).tolist()}
+    block = {
+        "name": "pose",
+        "f": "unicycle",
+        "cov": np.diag([0.1, 0.1, 0.02]).tolist(),
+        **time,
+        **plant,
+    }
+    sampling = {} if "period" in time else {"sampling": {"kind": "periodic", "period": 0.5}}
+    sensor = {"of": "pose", "heading": 2, "R": [[0.01, 0.0], [0.0, 0.01]], **sampling}
+    clocked = {"kind": "periodic", "period": 1.0, "at": "nodes"}
+    (folder / "odometry.csv").write_text(ODOMETRY)
+    (folder / "truth.csv").write_text(TRUTH)
+    return {
+        "format": 1,
+        "name": "team",
+        "horizon": 2.0,
+        "probe": 0.5,
+        "plants": [{**block, "nodes": [k], "mean": START[k]} for k in START],
+        "sensors": [
+            {"kind": "range-bearing", "nodes": [1], "positions": [[2.0, 2.0]], **sensor},
+            {"kind": "relative-range-bearing", "to": [[1, 2]], **sensor},
+        ],
+        "network": {
+            "graph": {"kind": "edges", "edges": [[1, 2]]},
+            "activation": clocked if sampling else {"kind": "broadcast"},
+        },
+        "filter": {"kind": "central"},
+    }
+
+
+RECORDED = {"kind": "recorded", "path": "odometry.csv"}
+FLOW = {"B": np.diag([0.1, 0.1, 0.05]).tolist(), "step": 0.1}
+
+
+@pytest.mark.parametrize(("time", "engine"), [(None, "simpy"), (None, "compiled"), (FLOW, "simpy")])
+def test_each_block_is_driven_by_the_rows_of_its_node(tmp_path, time, engine):
+    scenario = from_table(team(tmp_path, time, input=RECORDED), tmp_path)
+    one = netkf.simulate(scenario, engine=engine)
+    apart = team(tmp_path, time)
+    for node, block in enumerate(apart["plants"], 1):
+        rows = [line.split(",") for line in ODOMETRY.splitlines()[1:]]
+        lines = ["t,u0,u1", *(f"{t},{u},{w}" for t, i, u, w in rows if i == str(node))]
+        (tmp_path / f"{node}.csv").write_text("\n".join(lines) + "\n")
+        block["input"] = {"kind": "recorded", "path": f"{node}.csv"}
+    other = netkf.simulate(from_table(apart, tmp_path), engine=engine)
+    np.testing.assert_array_equal(one.xhat, other.xhat)
+    np.testing.assert_array_equal(one.x, other.x)
+    # Of an entry the rows of its own nodes are counted: 2 hold before the horizon.
+    assert scenario.plant.input.inputs[1].at(1.5).tolist() == [0.8, 0.3]
+
+
+def test_a_plant_of_several_nodes_takes_rows_by_node_and_own_estimates_follow(tmp_path):
+    table = team(tmp_path, FLOW, input=RECORDED)
+    table["filter"] = {"kind": "block-intersection", "estimates": "own"}
+    table["sensors"] = [table["sensors"][0] | {"nodes": [1, 2], "positions": [[2, 2], [2, 2]]}]
+    apart = netkf.simulate(from_table(table, tmp_path), engine="simpy")
+    table["plants"] = [table["plants"][0] | {"nodes": [1, 2], "mean": [1.0, 2.0, 0.5]}]
+    run = netkf.simulate(from_table(table, tmp_path), engine="simpy")
+    moved = run.block("pose", 2).xhat[1] - run.block("pose", 2).xhat[0]
+    other = run.block("pose", 1).xhat[1] - run.block("pose", 1).xhat[0]
+    assert abs(moved - other).max() > 0.05
+    # A view steps where its own input jumps: without readings its mean is the arc.
+    alone = {**table, "sensors": [table["sensors"][0] | {"nodes": [1], "positions": [[9, 9]]}]}
+    xhat = netkf.simulate(from_table(alone, tmp_path), engine="simpy").block("pose", 2).xhat
+    h, x = 0.5, np.array([1.0, 2.0])
+    for v, w in ((0.5, -0.2), (0.8, 0.3)):
+        turn = [math.sin(h + w) - math.sin(h), math.cos(h) - math.cos(h + w)]
+        x, h = x + v / w * np.array(turn), h + w
+    np.testing.assert_allclose(xhat[-1], [*x, h], atol=1e-6)
+    assert apart.xhat.shape == (5, 2, 3)
+
+
+@pytest.mark.parametrize(("time", "engine"), [(None, "simpy"), (None, "compiled"), (FLOW, "simpy")])
+def test_recorded_states_of_blocks_count_whole_turns(tmp_path, time, engine):
+    truth = {"kind": "recorded", "path": "truth.csv", "interpolate": "linear"}
+    scenario = from_table(team(tmp_path, time, input=RECORDED, **truth), tmp_path)
+    run = netkf.simulate(scenario, engine=engine)
+    first = [
+        [0.0, 0.0, 3.0],
+        [-0.5, 0.1, (3.0 + 2.0 * math.pi - 3.1) / 2.0],
+        [-1.0, 0.2, 2.0 * math.pi - 3.1],
+        [-1.5, 0.15, 2.0 * math.pi - 3.0],
+        [-2.0, 0.1, 2.0 * math.pi - 2.9],
+    ]
+    second = np.linspace([3.0, 4.0, -1.0], [3.5, 3.0, -1.5], 5)
+    np.testing.assert_allclose(run.x, np.hstack([first, second]), rtol=0, atol=1e-12)
+    # The readings are of the recorded states, and the filter keeps close to them.
+    assert abs(run.x[-1] - run.xhat[-1, 0])[:3].max() < 0.5
+    assert scenario.notes == ()
+    uses = record_usage(scenario, sent=None)
+    assert {key: use["unused"] for key, use in uses.items()} == {
+        "plants[0]": 0, "plants[1]": 0, "plants[0].input": 1, "plants[1].input": 0,
+    }  # fmt: skip
+
+
+def test_recorded_linear_blocks_are_one_recorded_plant(tmp_path):
+    (tmp_path / "walk.csv").write_text("t,node,x0\n0,1,1\n0,2,5\n1,1,2\n1,2,6\n2,1,3\n2,2,8\n")
+    walk = {"kind": "recorded", "path": "walk.csv", "name": "walk", "nodes": [1, 2]}
+    for keys in ({"F": [[1.0]], "Q": [[1.0]], "period": 1.0}, {"A": [[0.0]], "B": [[1.0]]}):
+        sampling = {} if "F" in keys else {"sampling": {"kind": "periodic", "period": 1.0}}
+        table = {
+            **team(tmp_path),
+            "plants": [{**walk, **keys, "cov": [[1.0]]}],
+            "sensors": [{"of": "walk", "nodes": [1], "H": [[1.0]], "R": [[0.1]], **sampling}],
+            "probe": 1.0,
+        }
+        if sampling:
+            table["network"] = team(tmp_path, FLOW)["network"]
+        for engine in ("simpy", "compiled"):
+            run = netkf.simulate(from_table(table, tmp_path), engine=engine)
+            assert run.x.tolist() == [[1.0, 5.0], [2.0, 6.0], [3.0, 8.0]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"plants.1.nodes": [4]}, r"plants\[1\].input.path: odometry.csv has no row of node 4"),
+        ({"plants.1.path": "truth.csv"}, r"plants\[1\].path: must be recorded in all entries"),
+        ({"plants.1.interpolate": "hold"}, r"plants\[1\].interpolate: means nothing without path"),
+        (
+            {"plants": [{"name": "all", "A": [[0.0]], "B": [[1.0]], "input": RECORDED}]},
+            r"plants\[0\].input.path: odometry.csv has a column node",
+        ),
+    ],
+)
+def test_tables_by_node_are_refused_where_they_do_not_fit(tmp_path, change, message):
+    table = team(tmp_path, FLOW, input=RECORDED)
+    table["network"]["graph"]["edges"] = [[1, 2], [2, 4]]
+    scenario = from_table(table, tmp_path)
+    with pytest.raises(ScenarioError, match=message):
+        scenario.replace(change)
+
+
+def test_a_plant_of_all_has_no_rows_by_node(tmp_path):
+    (tmp_path / "truth.csv").write_text(TRUTH)
+    plant = {"kind": "recorded", "f": "unicycle", "path": "truth.csv", **FLOW, "input": RECORDED}
+    table = {**team(tmp_path, FLOW), "plant": plant, "sensors": []}
+    del table["plants"]
+    with pytest.raises(ScenarioError, match=r"plant.input.path: odometry.csv has a column node"):
+        from_table(table, tmp_path)
+    plant["input"] = {"kind": "constant", "value": [1.0, 0.1]}
+    with pytest.raises(ScenarioError, match=r"plant.path: truth.csv has a column node"):
+        from_table(table, tmp_path)
