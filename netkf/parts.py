@@ -35,6 +35,7 @@ from netkf.algorithms.information_consensus import Hcmci, Icf
 from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.kalman_consensus import Kcf
 from netkf.algorithms.one_bit import OneBit
+from netkf.algorithms.partition import Partition
 from netkf.algorithms.push_sum import PushSum
 from netkf.algorithms.stochastic_trigger import StochasticTrigger
 from netkf.algorithms.track_fusion import BarShalomCampo, InverseIntersection, OptimisedIntersection
@@ -215,6 +216,7 @@ __all__ = [
     "OneBit",
     "OptimisedIntersection",
     "PairReading",
+    "Partition",
     "PathGraph",
     "PerLink",
     "Periodic",

@@ -90,6 +90,7 @@ class NodeInfo(NamedTuple):
     network : the whole network, if ``Needs.network`` of the filter says so
     rows : the most rows that a reading of any node has
     blocks : its blocks of ``[[plants]]`` at their places in its own state (plants.blocks.Place)
+    whole : all blocks at their places in the whole state, if ``Needs.coupled`` says so
     alone : no other node estimates one of these
     sampled : H (p, n) and R (p, p) of its sensors that take samples (in slots: of all) together, as
               the node believes them, where they are fixed; p = 0 without such sensors
@@ -109,6 +110,7 @@ class NodeInfo(NamedTuple):
     sampled: tuple[FloatArray, FloatArray] = (np.zeros((0, 0)), np.zeros((0, 0)))
     blocks: tuple[Any, ...] = ()
     alone: bool = True
+    whole: tuple[Any, ...] = ()
 
 
 class Exchange(NamedTuple):

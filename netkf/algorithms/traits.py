@@ -36,6 +36,9 @@ class Needs:
     blocks : its nodes may estimate different blocks of ``[[plants]]``: its messages say of which
              they speak, and it knows what to do with readings of a block that a node does not
              estimate (``Reading.pairs``)
+    coupled : it knows the plant of all blocks, so that those that a node does not estimate may
+              drive the others: ``init`` gets the model, mean and cov of the whole state, and
+              ``NodeInfo.whole``
     translate : without ``blocks``, how a node reads a message of one that estimates other blocks,
                 ``translate(payload, own, common)``: ``own`` is the payload that the node itself
                 would send, ``common`` says which states both estimate (``translation.Common``). By
@@ -59,6 +62,7 @@ class Needs:
     network: bool = False
     one_way: bool = False
     blocks: bool = False
+    coupled: bool = False
     translate: Callable[[Any, Any, Common], Any] = read_vector
     check: Callable[[Any], None] | None = None
     notes: Callable[[Any], tuple[str, ...]] | None = None

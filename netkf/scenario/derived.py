@@ -173,7 +173,7 @@ class DerivedScenario(ScenarioModel):
         first = (self._pooled_model,) if pooled else self._node_models
         pieces: list[tuple[Any, ...]] = [first]
         for matrices in self.believed_pieces[1:]:
-            if self.views is not None and not pooled:
+            if self.model_views is not None and not pooled:
                 pieces.append(
                     tuple(
                         dataclasses.replace(
@@ -183,7 +183,7 @@ class DerivedScenario(ScenarioModel):
                                 for name, M in zip(names, matrices, strict=True)
                             },
                         )
-                        for model, view in zip(first, self.views, strict=True)
+                        for model, view in zip(first, self.model_views, strict=True)
                     )
                 )
                 continue
@@ -241,11 +241,11 @@ class DerivedScenario(ScenarioModel):
     @cached_property
     def _node_models(self) -> tuple[Any, ...]:
         """The first believed models of all nodes."""
-        if self.views is not None:
+        if self.model_views is not None:
             placed = self.placed_sensors if self.slotted else self.increment_sensors
             make = self._slot_model if self.slotted else self._flow_model
             return tuple(
-                make(*self._own_sensors(k, placed.get(node, ())), self.views[k])
+                make(*self._own_sensors(k, placed.get(node, ())), self.model_views[k])
                 for k, node in enumerate(self.nodes)
             )
         if self.slotted:
@@ -278,6 +278,11 @@ class DerivedScenario(ScenarioModel):
         """The first believed model of a central filter."""
         stacked = self._stack_sensors(self._pooled_sensors, believed=True)
         return self._slot_model(*stacked) if self.slotted else self._flow_model(*stacked)
+
+    @property
+    def model_views(self) -> tuple[np.ndarray, ...] | None:
+        """The entries (n',) of the state of which each node has a model; None for all of it."""
+        return None if self.node_filter.needs.coupled else self.views
 
     def view(self, k: int) -> Any:
         """Return the entries (n',) of the state that node number ``k`` estimates, or a slice."""
@@ -365,12 +370,13 @@ class DerivedScenario(ScenarioModel):
         most_rows = max([1, *rows])
         sampled = self.placed_sensors if self.slotted else self.sampled_sensors
         counts = Counter(itertools.chain.from_iterable(self.estimated)) if self.plants else None
+        whole = self.layout.places if self.node_filter.needs.coupled else ()
         return tuple(
             NodeInfo(
                 node, degrees[node], receiver_counts[node], len(self.nodes), own_weights[node],
                 total_information, max_delay, k, tuple(sorted(senders[node])), network, most_rows,
                 self._own_sensors(k, sampled.get(node, ())), self._own_places(k),
-                self._is_alone(k, counts),
+                self._is_alone(k, counts), whole,
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip
@@ -798,9 +804,9 @@ class DerivedScenario(ScenarioModel):
             cov = self.plant.start_cov
         xhat = mean[index] if isinstance(mean, tuple) else mean
         P = cov[index] if isinstance(cov, tuple) else cov
-        if self.views is None or self.node_filter.timing.pooled:
+        if self.model_views is None or self.node_filter.timing.pooled:
             return xhat, P
-        view = self.views[index]
+        view = self.model_views[index]
         return xhat[view], P[np.ix_(view, view)]
 
     def weight(self, receiver: int, sender: int) -> float:

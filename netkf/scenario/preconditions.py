@@ -7,6 +7,8 @@ here is the only place that checks them, in slots and in continuous time.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import breadth_first_order
@@ -85,10 +87,11 @@ def _check_blocks(scenario: DerivedScenario) -> None:
         view = scenario.view(k)
         others = np.setdiff1d(np.arange(scenario.plant.n), view)
         # Blocks of a plant that is not linear drive nobody.
-        pieces = scenario.believed_pieces if scenario.plant.linear else ()
+        closed = scenario.node_filter.needs.coupled or not scenario.plant.linear
+        pieces = () if closed else scenario.believed_pieces
         if any(M[np.ix_(view, others)].any() for M, _ in pieces):
             rule = f"must contain all that drives the blocks of node {node}"
-            remedy = 'estimate the coupled blocks too, as "all" does'
+            remedy = 'write kind = "partition", or estimate the coupled blocks too, as "all" does'
             raise ScenarioError("filter.estimates", rule, scenario.filter.estimates, remedy)
         for placed in scenario.placed_sensors.get(node, ()):
             support = scenario.support(placed)
@@ -100,9 +103,21 @@ def _check_blocks(scenario: DerivedScenario) -> None:
                 remedy = 'write filter.estimates = "own+neighbours" or "all"'
                 raise ScenarioError(key, rule, scenario.filter.estimates, remedy)
             sensor = scenario.sensors[placed.entry]
+            _check_rows(scenario, k, key, sensor)
             if not (scenario.slotted or takes_samples(sensor)):
                 rule = "is missing: increments of two blocks need both estimates"
                 raise ScenarioError(f"{key}.sampling", rule, None, f"add {SAMPLING}")
+
+
+def _check_rows(scenario: DerivedScenario, k: int, key: str, sensor: Any) -> None:
+    """Check that no row of a linear sensor of node number ``k`` reads several unknown blocks."""
+    H = getattr(sensor, "H", None)
+    unknown = [place for place in scenario.layout.places if place not in scenario.estimated[k]]
+    for row in () if H is None or H.shape[1] != scenario.plant.n else H:
+        read = [f"{place.name} of {place.node}" for place in unknown if row[place.entries].any()]
+        if len(read) > 1:
+            rule = f"must read one block at most that node {scenario.nodes[k]} does not estimate"
+            raise ScenarioError(f"{key}.H", rule, read, "split it, or estimate more blocks")
 
 
 def _translates(scenario: DerivedScenario) -> bool:

@@ -46,6 +46,7 @@ SOUND = {
     ],
     "consensus-innovations": [parts.ConsensusInnovations()],
     "block-intersection": [parts.BlockIntersection(), parts.BlockIntersection(rule="ci")],
+    "partition": [parts.Partition()],
     "kcf": [parts.Kcf(epsilon=0.2)],
     "diffusion-kalman": [parts.DiffusionKalman()],
     "push-sum": [

@@ -307,7 +307,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
     # -1: the pooled filter, which is not a node of the graph.
     model = scenario.model_of(entity)
     if scenario.tells_models:
-        model = DrivenModel(scenario, model, view)
+        model = DrivenModel(scenario, model, None if scenario.model_views is None else view)
     if isinstance(model, MapModel | RateModel):
         # It follows the time of one run.
         model = dataclasses.replace(model)

@@ -189,6 +189,7 @@ class Node:
         """
         self._points, self.view = points, view
         self.node, self.entity, self.info, self.model = node, entity, info, model
+        self.width = len(model.information) if view is None else len(view.entries)
         self.moving_model = model.undriven if isinstance(model, DrivenModel) else model
         """The model in which matrices may change."""
         self.algorithm, self._timing = algorithm, algorithm.timing
@@ -356,7 +357,7 @@ class ClockedNode(Node):
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
         known = self.linearise([sample[1:] for sample in samples])
-        nothing = np.empty(0), np.empty((0, len(self.model.information)))
+        nothing = np.empty(0), np.empty((0, self.width))
         y, H = (
             np.concatenate([nothing[part], *(sample[part] for sample in known)])
             for part in range(2)

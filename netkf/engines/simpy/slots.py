@@ -199,7 +199,7 @@ class SlotNode(Node):
         samples = self.linearise(self._samples)
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, *_ in samples)])
-        H = np.concatenate([self.model.H[:0], *(H for _, H, _ in samples)])
+        H = np.concatenate([np.empty((0, self.width)), *(H for _, H, _ in samples)])
         R = block_diagonal([R for *_, R in samples])
         present = np.concatenate(
             [np.empty(0, dtype=bool), *(_finite_rows(y, H) for y, H, _ in samples)]

@@ -1,0 +1,292 @@
+"""A filter of coupled blocks: each node estimates its own, and takes what its neighbours tell of
+theirs for inputs with a covariance.
+
+A block moves by ``x_a' = A_aa x_a + sum_b A_ab x_b + w_a``. Its owner knows estimates of all x_b,
+and bounds P_b of the covariances of their errors, but not how these errors correlate. For any
+weights that sum to one
+
+    P_a' = sum_b (1 / weight_b) A_ab P_b A_ab' + Q_a
+
+is a bound again, with b = a among them. The weights here are those with the least trace, in
+proportion to the root of the trace of ``A_ab P_b A_ab'``: without coupling it is the prediction of
+a Kalman filter.
+
+Farina, Ferrari-Trecate and Scattolini, "Moving-horizon partition-based state estimation of
+large-scale systems", Automatica 46(5), 2010, whose bounds have equal weights; Khan and Moura,
+"Distributing the Kalman filter for large-scale systems", IEEE Trans. Signal Processing 56(10),
+2008.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
+from netkf.algorithms.registry import built_in
+from netkf.algorithms.traits import Analysis, Needs, Timing
+from netkf.core.places import Place
+from netkf.linalg.arrays import FloatArray, symmetric
+
+MARGIN = 1e-6
+"""Weights of covariance intersection are at least this."""
+
+
+class Start(NamedTuple):
+    """What all nodes know before the first reading, predicted to the present: mean (n,) and
+    covariance ``cov`` (n, n) of the whole state.
+    """
+
+    mean: FloatArray
+    cov: FloatArray
+
+
+class Gap(NamedTuple):
+    """The time since a node last used something: the transition Phi (n, n), and Q (n, n)."""
+
+    Phi: FloatArray
+    Q: FloatArray
+
+
+class PartitionState(NamedTuple):
+    """What a node knows of the whole state, of n components.
+
+    x : (n,) its estimate now
+    bounds : (n, n) of its ``groups``, when it last used something: covariances of their errors are
+             no larger. 0 between groups, where nothing is known
+    gap : the time since then
+    start : see Start
+    groups : entries of what the node estimates, and then of each other block
+    model : that of the whole state
+    places : all blocks; ``blocks``: the names and owners of those that it estimates
+    """
+
+    x: FloatArray
+    bounds: FloatArray
+    gap: Gap
+    start: Start
+    groups: tuple[np.ndarray, ...]
+    model: Any
+    places: dict[tuple[str, int | None], np.ndarray]
+    blocks: tuple[tuple[str, int | None], ...]
+
+
+class Told(NamedTuple):
+    """What a node sends: its estimate (n',) of its ``blocks``, with the bound P (n', n')."""
+
+    xhat: FloatArray
+    P: FloatArray
+    blocks: tuple[tuple[str, int | None], ...]
+
+
+def _notes(scenario: Any) -> tuple[str, ...]:
+    if scenario.slotted or scenario.network.channel.delay.longest == 0.0:
+        return ()
+    return ("the partition filter uses no message that took time: those with a delay are late",)
+
+
+@built_in("partition")
+@dataclass(frozen=True, eq=False)
+class Partition(Filter):
+    """Each node estimates blocks of its own that others drive, see the module.
+
+    Of a block that it does not estimate a node has what a neighbour told last, predicted by the
+    plant, which all nodes know with its inputs and changes; while messages are lost the bound
+    grows. Before it has heard of a block, and wherever the bound has become worse than that, it
+    has what was known at the start, predicted. What two nodes both estimate, and a reading of one
+    block of the node and one of another, is used by covariance intersection. P is never below the
+    covariance of the error. Under clocks a message that took time is late.
+    """
+
+    timing = Timing(max_age=0.0)
+    needs = Needs(
+        one_way=True,
+        samples=True,
+        blocks=True,
+        coupled=True,
+        linear_plant=True,
+        notes=_notes,
+    )
+    analysis = Analysis(P_by_design=("larger", "larger"))
+
+    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PartitionState:
+        """Return the state at time 0; mean and cov are of the whole state."""
+        n = len(mean)
+        places = {
+            (place.name, place.node): np.arange(n)[place.entries]
+            for place in node.whole or (Place("plant", None, 0, n),)
+        }
+        blocks = tuple((place.name, place.node) for place in node.blocks) or tuple(places)
+        own = np.concatenate([places[block] for block in blocks])
+        groups = (own, *(entries for key, entries in places.items() if key not in blocks))
+        P = np.array(cov, dtype=np.float64)
+        bounds = np.zeros((n, n))
+        for group in groups:
+            bounds[np.ix_(group, group)] = P[np.ix_(group, group)]
+        gap, start = Gap(np.eye(n), np.zeros((n, n))), Start(np.array(mean), P)
+        return PartitionState(
+            np.array(mean), bounds, gap, start, groups, model, places, tuple(blocks)
+        )
+
+    def predict(self, state: PartitionState, gap: float) -> PartitionState:
+        """Return the state ``gap`` seconds later. Bounds follow from those at the last use in one
+        step, so that they do not depend on how often somebody looks.
+        """
+        n = len(state.x)
+        Phi = state.model.transition(np.zeros(n), gap)
+        moved, root = state.model.predict(np.zeros(n), np.zeros((n, n)), gap)
+        Q = root @ root.T
+        (before, noise), start = state.gap, state.start
+        return state._replace(
+            x=Phi @ state.x + moved,
+            gap=Gap(Phi @ before, symmetric(Phi @ noise @ Phi.T + Q)),
+            start=Start(Phi @ start.mean + moved, symmetric(Phi @ start.cov @ Phi.T + Q)),
+        )
+
+    def _part(self, state: PartitionState, group: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate (k,) and bound (k, k) of a group now."""
+        (Phi, Q), (mean, cov), square = state.gap, state.start, np.ix_(group, group)
+        terms = [
+            M @ state.bounds[other[:, None], other] @ M.T
+            for other in state.groups
+            for M in [Phi[group[:, None], other]]
+        ]
+        P, known = symmetric(_bound_of_sum(terms) + Q[square]), cov[square]
+        return (state.x[group], P) if np.trace(P) <= np.trace(known) else (mean[group], known)
+
+    def _present(self, state: PartitionState) -> tuple[FloatArray, FloatArray]:
+        """Return estimate (n,) and bounds (n, n) of all groups now."""
+        x, bounds = np.zeros_like(state.x), np.zeros_like(state.bounds)
+        for group in state.groups:
+            x[group], bounds[np.ix_(group, group)] = self._part(state, group)
+        return x, bounds
+
+    def _used(self, state: PartitionState, x: FloatArray, bounds: FloatArray) -> PartitionState:
+        """Return the state that begins anew from an estimate (n,) and bounds (n, n)."""
+        n = len(x)
+        return state._replace(x=x, bounds=bounds, gap=Gap(np.eye(n), np.zeros((n, n))))
+
+    def update(self, state: PartitionState, reading: Reading) -> PartitionState:
+        """Return the state after readings of its own blocks, and of one of these and another."""
+        if not len(reading.y) and not reading.pairs:
+            return state
+        x, bounds = self._present(state)
+        own = state.groups[0]
+        square = np.ix_(own, own)
+        xhat, P = x[own], bounds[square]
+        if len(reading.y):
+            y, H, R = reading.y, reading.H, reading.R
+            xhat, P = _used_as_is(xhat, P, y, H, R)
+        for pair in reading.pairs:
+            xhat, P = self._with_pair(xhat, P, pair, (state, x, bounds))
+        x[own], bounds[square] = xhat, P
+        return self._used(state, x, bounds)
+
+    def _with_pair(
+        self,
+        xhat: FloatArray,
+        P: FloatArray,
+        pair: PairReading,
+        known: tuple[PartitionState, FloatArray, FloatArray],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return estimate and bound after a reading of another block, of which all is ``known``."""
+        (state, x, bounds), (name, owner) = known, pair.other
+        other = state.places[name, owner if owner >= 0 else None]
+        z, H, H_other = pair.H(xhat, x[other])
+        C = H_other @ bounds[np.ix_(other, other)] @ H_other.T
+        return _intersected(xhat, P, z - H_other @ x[other], H, (C, pair.R))
+
+    def emit(self, state: PartitionState, exchange: Exchange) -> tuple[PartitionState, Told]:
+        """Return the estimate of its own blocks as a message."""
+        return state, Told(*self.estimate(state), state.blocks)
+
+    def absorb(
+        self, state: PartitionState, messages: Sequence[Message], exchange: Exchange
+    ) -> PartitionState:
+        """Return the state after all messages of this instant, one after the other by sender."""
+        if not messages:
+            return state
+        x, bounds = self._present(state)
+        for message in messages:
+            told, theirs = message.payload, {}
+            for entry, index in enumerate(np.concatenate([state.places[b] for b in told.blocks])):
+                theirs[int(index)] = entry
+            for group in state.groups:
+                mine = [k for k, index in enumerate(group.tolist()) if index in theirs]
+                if not mine:
+                    continue
+                heard = [theirs[index] for index in group[mine].tolist()]
+                z, C, H = told.xhat[heard], told.P[np.ix_(heard, heard)], np.eye(len(group))[mine]
+                square = np.ix_(group, group)
+                x[group], bounds[square] = _intersected(
+                    x[group], bounds[square], z, H, (C, 0.0 * C)
+                )
+        return self._used(state, x, bounds)
+
+    def estimate(self, state: PartitionState) -> tuple[FloatArray, FloatArray]:
+        """Return xhat (n',) and P (n', n') of the blocks that the node estimates."""
+        return self._part(state, state.groups[0])
+
+    def shift(self, state: Any, offset: FloatArray) -> Any:
+        """Return a state, or a message, with ``offset`` (n,) added to estimates."""
+        if isinstance(state, Told):
+            return state._replace(xhat=state.xhat + offset)
+        start = state.start._replace(mean=state.start.mean + offset)
+        return state._replace(x=state.x + offset, start=start)
+
+
+def _bound_of_sum(terms: Sequence[FloatArray]) -> FloatArray:
+    """Return the bound (k, k) with the least trace of the covariance of a sum, of whose terms only
+    the covariances (k, k) are known.
+    """
+    parts = [(float(np.sqrt(np.trace(term))), term) for term in terms if term.any()]
+    total = sum(size for size, _ in parts)
+    return np.asarray(sum((total / size * term for size, term in parts), np.zeros_like(terms[0])))
+
+
+def _used_as_is(
+    x: FloatArray, P: FloatArray, z: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Kalman update of x (k,) and P (k, k) with ``z = H x + v``, cov(v) = R."""
+    # Singular where both are certain.
+    K = P @ H.T @ np.linalg.pinv(H @ P @ H.T + R, hermitian=True)
+    stays = np.eye(len(x)) - K @ H
+    return x + K @ (z - H @ x), symmetric(stays @ P @ stays.T + K @ R @ K.T)
+
+
+def _intersected(
+    x: FloatArray,
+    P: FloatArray,
+    z: FloatArray,
+    H: FloatArray,
+    covariances: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Return x (k,) and P (k, k) after ``z = H x + e + v``, by the weight with the least trace;
+    ``covariances`` (C, R) are those of e, which may correlate with the error of x, and of v, which
+    does not.
+    """
+    C, R = covariances
+
+    def fused(w: float) -> tuple[FloatArray, FloatArray]:
+        return _used_as_is(x, P / w, z, H, C / (1.0 - w) + R)
+
+    def trace(w: float) -> float:
+        return float(np.trace(fused(w)[1]))
+
+    if not C.any():
+        return _used_as_is(x, P, z, H, R)
+    choices = [(x, P)]
+    if len(z) == len(x) and not R.any():
+        # All is heard: what was known may be forgotten.
+        choices.append((H.T @ z, H.T @ C @ H))
+        differences = np.linalg.eigvalsh(P - choices[1][1])
+        if differences[0] >= 0.0 or differences[-1] <= 0.0:
+            return choices[int(differences[-1] > 0.0)]
+    bounds = (MARGIN, 1.0 - MARGIN)
+    found = minimize_scalar(trace, bounds=bounds, method="bounded", options={"xatol": 1e-9})
+    choices += [fused(w) for w in (found.x, *bounds)]
+    return min(choices, key=lambda choice: float(np.trace(choice[1])))

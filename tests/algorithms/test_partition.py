@@ -1,0 +1,322 @@
+"""The partition filter: coupled blocks, of which each node estimates its own.
+
+The truth is not ours: plain scalar recursions with the exact covariance of all errors beside them,
+the Kalman filter of all blocks, that of one block alone, and the errors of many runs.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+import netkf
+
+AREAS = """
+format = 1
+name = "areas"
+horizon = 12.0
+probe = 1.0
+seed = 5
+[[plants]]
+name = "area"
+nodes = [1]
+F = [[0.8, 0.1], [0.0, 0.7]]
+Q = [[0.1, 0.0], [0.0, 0.1]]
+period = 1.0
+cov = [[1.0, 0.0], [0.0, 2.0]]
+coupling = [{ from = [2], A = [[0.2], [0.1]] }]
+[[plants]]
+name = "area"
+nodes = [2]
+F = [[0.6]]
+Q = [[0.2]]
+period = 1.0
+cov = [[1.0]]
+coupling = [{ from = [1], A = [[0.2, 0.1]] }, { from = [3], A = [[-0.3]] }]
+[[plants]]
+name = "area"
+nodes = [3]
+F = [[0.9]]
+Q = [[0.3]]
+period = 1.0
+cov = [[1.5]]
+coupling = [{ from = [2], A = [[0.3]] }]
+[[sensors]]
+of = "area"
+nodes = [1]
+H = [[1.0, 0.0]]
+R = [[0.1]]
+[[sensors]]
+of = "area"
+nodes = [2, 3]
+H = [[1.0]]
+R = [[0.2]]
+[network]
+graph = { kind = "edges", edges = [[1, 2], [2, 3]] }
+activation = { kind = "broadcast" }
+channel = { loss = { kind = "bernoulli", delivery = 0.7 } }
+[filter]
+kind = "partition"
+estimates = "own"
+"""
+FLOWS = """
+[[sensors]]
+nodes = [2]
+H = [[0.0, 1.0, -1.0, 0.0]]
+R = [[0.05]]
+[network]"""
+F = np.array([[0.8, 0.1, 0.2, 0.0], [0.0, 0.7, 0.1, 0.0], [0.2, 0.1, 0.6, -0.3], [0, 0, 0.3, 0.9]])
+
+
+def clocked(text: str) -> str:
+    """The same areas in continuous time, with A = F - 1."""
+    for old, new in (
+        ("F = [[0.8, 0.1], [0.0, 0.7]]", "A = [[-0.2, 0.1], [0.0, -0.3]]"),
+        ("F = [[0.6]]", "A = [[-0.4]]"),
+        ("F = [[0.9]]", "A = [[-0.1]]"),
+        ("Q = [[0.1, 0.0], [0.0, 0.1]]", "B = [[0.3, 0.0], [0.0, 0.3]]"),
+        ("Q = [[0.2]]", "B = [[0.4]]"),
+        ("Q = [[0.3]]", "B = [[0.5]]"),
+        ("period = 1.0\n", ""),
+        ("R = [[0.1]]", 'R = [[0.1]]\nsampling = { kind = "periodic", period = 0.5 }'),
+        ("R = [[0.2]]", 'R = [[0.2]]\nsampling = { kind = "poisson", rate = 2.0 }'),
+        ("R = [[0.05]]", 'R = [[0.05]]\nsampling = { kind = "periodic", period = 0.7 }'),
+        ('"broadcast"', '"poisson", rate = 3.0, at = "nodes"'),
+    ):
+        text = text.replace(old, new)
+    return text
+
+
+def load(text: str, folder: Path, **changes: object) -> netkf.Scenario:
+    path = folder / "scenario.toml"
+    path.write_text(text)
+    return netkf.load(path, {key.replace("__", "."): value for key, value in changes.items()})
+
+
+def uncoupled(text: str) -> str:
+    return "\n".join(line for line in text.splitlines() if not line.startswith("coupling"))
+
+
+@pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
+def test_without_coupling_it_is_the_local_filter(tmp_path: Path, text: str) -> None:
+    text = uncoupled(text)
+    run = netkf.simulate(load(text, tmp_path))
+    local = netkf.simulate(load(text, tmp_path, filter={"kind": "local", "estimates": "own"}))
+    assert run.count("deliver") > 10
+    np.testing.assert_allclose(run.xhat, local.xhat, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run.P, local.P, rtol=1e-12)
+
+
+@pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours", "all"])
+@pytest.mark.parametrize("delivery", [1.0, 0.5])
+def test_it_is_never_below_the_stacked_kalman_filter(
+    tmp_path: Path, text: str, estimates: str, delivery: float
+) -> None:
+    changes = {"network__channel__loss__delivery": delivery, "filter__estimates": estimates}
+    text = text.replace("[network]", FLOWS.replace("R = [[0.05]]", _noise(text)), 1)
+    scenario = load(text, tmp_path, **changes)
+    run = netkf.simulate(scenario)
+    central = netkf.simulate(load(text, tmp_path, filter={"kind": "central"}), engine="simpy")
+    for k in range(3):
+        view = np.arange(4)[scenario.view(k)]
+        above = run.P[:, k][:, : len(view), : len(view)] - central.P[:, 0][:, view][:, :, view]
+        assert np.linalg.eigvalsh(above).min() > -1e-10
+
+
+def _noise(text: str) -> str:
+    sampling = '\nsampling = { kind = "periodic", period = 0.7 }' if "sampling" in text else ""
+    return "R = [[0.05]]" + sampling
+
+
+SCALARS = """
+format = 1
+name = "two areas"
+horizon = 9.0
+probe = 1.0
+[[plants]]
+name = "area"
+nodes = [1]
+F = [[0.8]]
+Q = [[0.1]]
+period = 1.0
+cov = [[1.0]]
+coupling = [{ from = [2], A = [[0.3]] }]
+[[plants]]
+name = "area"
+nodes = [2]
+F = [[0.9]]
+Q = [[0.2]]
+period = 1.0
+cov = [[0.5]]
+coupling = [{ from = [1], A = [[-0.2]] }]
+[[sensors]]
+kind = "recorded"
+path = "y.csv"
+of = "area"
+nodes = [1, 2]
+H = [[1.0]]
+R = [[0.1]]
+[network]
+graph = { kind = "edges", edges = [[1, 2]] }
+activation = { kind = "broadcast" }
+channel = { loss = { kind = "recorded", path = "lost.csv" } }
+[filter]
+kind = "partition"
+estimates = "own"
+"""
+
+
+def test_two_areas_follow_a_scalar_recursion(tmp_path: Path) -> None:
+    """With messages lost in both directions: what was told last is predicted with its bound. The
+    exact covariance of all four errors, of what both know of both, is never above the bounds.
+    """
+    rng, slots = np.random.default_rng(0), range(1, 9)
+    y = {(i, slot): round(float(rng.normal()), 3) for i in (1, 2) for slot in slots}
+    rows = [f"{slot},{i},{value}" for (i, slot), value in y.items()]
+    (tmp_path / "y.csv").write_text("t,node,y0\n" + "\n".join(rows) + "\n")
+    lost = {(1, 2): [1, 1, 0, 0, 1, 1, 1, 1], (2, 1): [1, 0, 1, 0, 0, 0, 1, 1]}
+    fates = [f"{i},{j},{m},{ok}" for (i, j), all_ok in lost.items() for m, ok in enumerate(all_ok)]
+    (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n" + "\n".join(fates))
+    run = netkf.simulate(load(SCALARS, tmp_path))
+    A, Q, R = np.array([[0.8, 0.3], [-0.2, 0.9]]), np.diag([0.1, 0.2]), 0.1
+    P0 = np.diag([1.0, 0.5])
+    # x[i] and s[i] are what node i knows of both areas. E is the exact covariance of the errors of
+    # node 1, of node 2, and of what was known at the start, of both areas each.
+    x, s, E = np.zeros((2, 2)), np.tile(np.diag(P0), (2, 1)), np.kron(np.ones((3, 3)), P0)
+    base, moves, noise, start = s.copy(), [np.eye(2)] * 2, [np.zeros((2, 2))] * 2, P0
+    for slot in slots:
+        big, start = np.kron(np.eye(3), A), A @ start @ A.T + Q
+        E = big @ E @ big.T + np.kron(np.ones((3, 3)), Q)
+        T = np.eye(6)
+        for i in range(2):
+            x[i] = A @ x[i]
+            moves[i], noise[i] = A @ moves[i], A @ noise[i] @ A.T + Q
+            s[i] = (np.abs(moves[i]) @ np.sqrt(base[i])) ** 2 + np.diag(noise[i])
+            for a in range(2):
+                if s[i, a] > start[a, a]:
+                    x[i, a], s[i, a], T[2 * i + a] = 0.0, start[a, a], np.eye(6)[4 + a]
+        E = T @ E @ T.T
+        for i in range(2):
+            # The own reading: every node has one in every slot, and begins anew with it.
+            own, K, T = 3 * i, s[i, i] / (s[i, i] + R), np.eye(6)
+            x[i, i] += K * (y[i + 1, slot] - x[i, i])
+            T[own, own], s[i, i] = 1.0 - K, (1.0 - K) * s[i, i]
+            E = T @ E @ T.T
+            E[own, own] += K**2 * R
+            base[i], moves[i], noise[i] = s[i], np.eye(2), np.zeros((2, 2))
+        told, T = [(x[i, i], s[i, i]) for i in range(2)], np.eye(6)
+        for i, j in ((0, 1), (1, 0)):
+            if lost[i + 1, j + 1][slot - 1]:
+                assert told[i][1] < s[j, i]
+                (x[j, i], s[j, i]), T[2 * j + i] = told[i], np.eye(6)[3 * i]
+        base, E = s.copy(), T @ E @ T.T
+        assert np.all(np.diag(E)[:4] <= s.reshape(4) * (1 + 1e-12))
+        np.testing.assert_allclose(run.xhat[slot, :, 0], np.diag(x), atol=1e-12)
+        np.testing.assert_allclose(run.P[slot, :, 0, 0], np.diag(s), rtol=1e-12)
+
+
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
+def test_errors_of_many_runs_are_within_the_bounds(tmp_path: Path, estimates: str) -> None:
+    runs, level = 30, 1e-4
+    text = AREAS.replace("[network]", FLOWS, 1)
+    scenario = load(text, tmp_path, filter__estimates=estimates, horizon=6.0)
+    ensemble = netkf.monte_carlo(scenario, runs, workers=1)
+    n = np.array([len(np.arange(4)[scenario.view(k)]) for k in range(3)])
+    upper = chi2.ppf(1.0 - level / 3, runs * n) / runs
+    assert (ensemble.mean_nees[-1] <= upper).all()
+    # It is not far from them either: a bound of twice the covariance has half the NEES.
+    assert (ensemble.mean_nees[-1] > 0.4 * n).all()
+
+
+def test_a_reading_across_a_border_is_used_by_covariance_intersection(tmp_path: Path) -> None:
+    text = AREAS.replace("[network]", FLOWS, 1)
+    horizon = {"horizon": 1.0}
+    with_flow = netkf.simulate(load(text, tmp_path, **horizon))
+    without = netkf.simulate(load(AREAS, tmp_path, **horizon))
+    np.testing.assert_array_equal(with_flow.P[1, [0, 2]], without.P[1, [0, 2]])
+    # Node 2 at slot 1: x2 of area 1 was never told, and is as at the start, predicted.
+    P, C = without.P[1, 1, 0, 0], (F @ np.diag([1.0, 2.0, 1.0, 1.5]) @ F.T)[1, 1] + 0.1
+
+    def variance(w: float) -> float:
+        return 1.0 / (w / P + 1.0 / (C / (1.0 - w) + 0.05))
+
+    best = minimize_scalar(variance, bounds=(1e-6, 1 - 1e-6), options={"xatol": 1e-9})
+    assert with_flow.P[1, 1, 0, 0] == pytest.approx(min(best.fun, P), rel=1e-9)
+
+
+def test_bounds_do_not_depend_on_probes(tmp_path: Path) -> None:
+    text = clocked(AREAS)
+    often = netkf.simulate(load(text, tmp_path, probe=0.25, horizon=4.0))
+    rarely = netkf.simulate(load(text, tmp_path, probe=2.0, horizon=4.0))
+    np.testing.assert_allclose(often.P[::8], rarely.P, rtol=1e-8)
+    np.testing.assert_allclose(often.xhat[::8], rarely.xhat, atol=1e-8)
+
+
+def test_a_silent_neighbour_is_predicted_by_the_exact_flow(tmp_path: Path) -> None:
+    """Nothing is heard and nothing read: P is that of the start, predicted by the plant."""
+    text = clocked(AREAS).replace("nodes = [2, 3]\nH", "nodes = [3]\nH")
+    changes = {"network__channel__loss__delivery": 0.0, "horizon": 4.0}
+    run = netkf.simulate(load(text, tmp_path, **changes))
+    A, B = F - np.eye(4), np.diag([0.3, 0.3, 0.4, 0.5])
+    for k, t in enumerate(run.times):
+        nested = np.block([[-A, B @ B.T], [np.zeros((4, 4)), A.T]]) * t
+        moved = scipy.linalg.expm(nested)
+        Phi = moved[4:, 4:].T
+        cov = Phi @ np.diag([1.0, 2.0, 1.0, 1.5]) @ Phi.T + Phi @ moved[:4, 4:]
+        # It knows the start of all blocks, and their correlation since then.
+        assert run.P[k, 1, 0, 0] == pytest.approx(cov[2, 2], rel=1e-9)
+
+
+@pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
+def test_known_inputs_of_all_blocks_shift_means_only(tmp_path: Path, text: str) -> None:
+    driven = text.replace(
+        "coupling = [{ from = [2], A = [[0.3]] }]",
+        "coupling = [{ from = [2], A = [[0.3]] }]\n"
+        'input = { kind = "sine", G = [[2.0]], amplitude = 1.0, frequency = 0.1 }',
+    )
+    assert driven != text
+    one, other = (netkf.simulate(load(each, tmp_path)) for each in (driven, text))
+    np.testing.assert_array_equal(one.P, other.P)
+    np.testing.assert_allclose(one.error, other.error, atol=1e-12)
+    assert one.fingerprint == other.fingerprint
+    assert np.abs(one.x - other.x)[:, 0].max() > 0.1  # two areas away
+
+
+@pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
+def test_it_follows_changes_of_the_plant(tmp_path: Path, text: str) -> None:
+    """At the change the coupled areas become other ones, which begin with what is known."""
+    key = "A" if "A = [[-0.4]]" in text else "F"
+    value = "-0.9" if key == "A" else "0.1"
+    line = f"schedule = [{{ from = 5.0, {key} = [[{value}]] }}]\ncoupling = [{{ from = [1]"
+    changing = text.replace("coupling = [{ from = [1]", line)
+    run, before = (netkf.simulate(load(each, tmp_path)) for each in (changing, text))
+    np.testing.assert_allclose(run.P[:6], before.P[:6], rtol=1e-12)
+    assert np.all(run.P[7:, 1, 0, 0] < before.P[7:, 1, 0, 0])
+    kalman = load(changing, tmp_path, filter={"kind": "central"})
+    central = netkf.simulate(kalman, engine="simpy")
+    assert np.all(run.P[:, 1, 0, 0] >= central.P[:, 0, 2, 2] * (1 - 1e-12))
+
+
+def test_messages_that_took_time_are_late_under_clocks(tmp_path: Path) -> None:
+    delay = {"network__channel__delay": {"kind": "constant", "seconds": 0.1}}
+    scenario = load(clocked(AREAS), tmp_path, **delay)
+    run = netkf.simulate(scenario)
+    assert run.count("late") > 10
+    assert run.count("deliver") == 0
+    assert any("took time" in note for note in scenario.notes)
+
+
+def test_rows_that_read_two_unknown_blocks_are_refused(tmp_path: Path) -> None:
+    text = AREAS.replace("[network]", FLOWS.replace("-1.0, 0.0", "-1.0, 1.0"), 1)
+    with pytest.raises(netkf.ScenarioError, match=r"sensors\[2\].H: must read one block at most"):
+        load(text, tmp_path)
+    with pytest.raises(netkf.ScenarioError, match=r"must contain all that drives.*partition"):
+        load(AREAS, tmp_path, filter={"kind": "block-intersection", "estimates": "own"})
+    assert math.isfinite(netkf.simulate(load(AREAS, tmp_path)).P[-1, 0, 0, 0])
