@@ -97,7 +97,8 @@ class BlockIntersection(Filter):
     @property
     def analysis(self) -> Analysis:
         """That P is no smaller than the covariance of the error, unless the rule is naive."""
-        return Analysis(P_by_design=("", "") if self.rule == NAIVE else ("larger", "larger"))
+        design = ("", "") if self.rule == NAIVE else ("larger", "larger")
+        return Analysis(P_by_design=design, affine=True)
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BlockState:
         """Return the state at time 0. Errors are independent then, but for ``rule`` "ci"."""

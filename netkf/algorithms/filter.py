@@ -351,14 +351,26 @@ def commutes(algorithm: Filter) -> bool:
     wrapped = algorithm.analysis.wrapped
     if wrapped is not None and not commutes(wrapped):
         return False
+    # A class that redefines a step without ``shift`` may no longer commute.
+    return _is_about_steps(algorithm, "shift")
+
+
+def _is_about_steps(algorithm: Filter, attribute: str) -> bool:
     order = type(algorithm).__mro__
 
     def owner(name: str) -> int:
         """Return the position in the method resolution order of the class that defines ``name``."""
         return next((k for k, cls in enumerate(order) if name in cls.__dict__), len(order))
 
-    # A class that redefines a step without ``shift`` may no longer commute.
-    return owner("shift") <= min(owner(name) for name in STEPS)
+    return owner(attribute) <= min(owner(name) for name in STEPS)
+
+
+def takes_columns(algorithm: Filter) -> bool:
+    """Return True if verbs in Python take estimates of several columns, ``Analysis.affine``, by the
+    class that defines the last of its STEPS.
+    """
+    affine = algorithm.analysis.affine and _is_about_steps(algorithm, "analysis")
+    return affine and commutes(algorithm)
 
 
 def compiled_kernels(algorithm: Filter, clocked: bool) -> Kernels | None:

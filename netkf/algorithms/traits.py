@@ -139,6 +139,8 @@ class Analysis:
     stopped : ``stopped(state)``, True once the node has permanently frozen its network estimate:
               what it computes of all nodes by exchanges, as number and information in push-sum
     wrapped : the filter that this one runs on its nodes, if it runs another, else None
+    affine : its verbs in Python are affine in estimates, readings and payloads once P is known, and
+             take them with several columns, (n, C) and (p, C), so that exact errors follow
     """
 
     paper: str = ""
@@ -150,6 +152,7 @@ class Analysis:
     conserved: Callable[[Any], Mapping[str, float | Sequence[float]]] = nothing_conserved
     stopped: Callable[[Any], bool] = never
     wrapped: Any = None
+    affine: bool = False
 
 
 CLOCKS = ("links", "directions", "nodes", "readings")

@@ -205,7 +205,7 @@ def _variance_floor(scenario: Scenario) -> float:
 
 def few_errors(scenario: Scenario) -> Assumption:
     """Return the assumption that all nodes have at most MAX_ERRORS errors together at one time."""
-    size = len(scenario.nodes) * scenario.plant.n
+    size = len(scenario.nodes) * scenario.width
     evidence = f"{size} errors of all nodes together, at most {MAX_ERRORS}"
     return Assumption("exact errors are within reach", "netkf", size <= MAX_ERRORS, evidence)
 
@@ -304,7 +304,7 @@ def check_error_covariance(samples: RunSamples, level: float) -> Finding:
     of the ``level``, and for all errors of all times (``runs.joint``).
     """
     runs, scenario = samples.runs, samples.scenario
-    n, max_runs = scenario.plant.n, max_replayed(scenario)
+    n, max_runs = scenario.width, max_replayed(scenario)
     Sigma, all_nodes = runs.Sigma[:max_runs], runs.whole[:max_runs]
     e = runs.e[:max_runs] - runs.mean[:max_runs]
     if np.isnan(e).all():
@@ -392,7 +392,7 @@ def check_expected_nees(samples: RunSamples, level: float) -> Finding:
     squares of standard normal numbers weighted by the eigenvalues of P^-1 Sigma, scaled to n; so is
     its sum over runs. The interval misses with at most the probability ``level``.
     """
-    runs, n = samples.runs, samples.scenario.plant.n
+    runs, n = samples.runs, samples.scenario.width
     max_runs = max_replayed(samples.scenario)
     P, Sigma = runs.replayed[:max_runs], runs.Sigma[:max_runs]
     # Points without exact covariances have no weight, and so are not tested.
@@ -441,7 +441,7 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
     runs is chi-square with R n degrees of freedom at every node and time, with at most the
     probability ``level`` of a miss.
     """
-    n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
+    n, nees = samples.scenario.width, samples.runs.nees.reshape(samples.count, -1)
     if np.isnan(samples.runs.e).all():
         return find_nothing(NEES_TOLERANCE)
     freedom = [n * len(nees)] * nees.shape[1]
@@ -462,7 +462,7 @@ def check_nees(samples: RunSamples, level: float) -> Finding:
 @error_test
 def check_nees_bound(samples: RunSamples, level: float) -> Finding:
     """Test that the mean of NEES / n is at most 1, by Student's interval: events depend on data."""
-    n, nees = samples.scenario.plant.n, samples.runs.nees.reshape(samples.count, -1)
+    n, nees = samples.scenario.width, samples.runs.nees.reshape(samples.count, -1)
     finite = np.flatnonzero(np.isfinite(nees).all(axis=0))
     if not len(finite):
         return find_nothing(NEES_TOLERANCE)

@@ -227,12 +227,13 @@ def fixed_readings(scenario: Scenario) -> Assumption:
 
 def exact_start(scenario: Scenario) -> Assumption:
     """Return the assumption, a row, that filters start with the mean and covariance of x(0)."""
-    plant = scenario.plant
+    start, filtering = scenario.plant, scenario.filter
     different = [
         node
-        for node in scenario.nodes
-        for mean, cov in [scenario.initial_estimate(node)]
-        if not (np.array_equal(mean, plant.start_mean) and np.array_equal(cov, plant.start_cov))
+        for k, node in enumerate(scenario.nodes)
+        for given, true in ((filtering.mean, start.start_mean), (filtering.cov, start.start_cov))
+        if given is not None
+        and not np.array_equal(given[k] if isinstance(given, tuple) else given, true)
     ]
     evidence = "mean and covariance are the plant's"
     if different:

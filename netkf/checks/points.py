@@ -42,8 +42,9 @@ def check_times(scenario: Scenario) -> list[float]:
 
 def errors_at_once(scenario: Scenario) -> int:
     """Return the number of scalar errors of all filters at one time."""
-    filters = 1 if scenario.filter.algorithm.timing.pooled else len(scenario.nodes)
-    return filters * scenario.plant.n
+    pooled = scenario.filter.algorithm.timing.pooled and scenario.views is None
+    filters = 1 if pooled else len(scenario.nodes)
+    return filters * scenario.width
 
 
 def probe_times(scenario: Scenario) -> list[float]:
@@ -72,7 +73,7 @@ def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
 
 def sampled_indices(scenario: Scenario) -> IntArray:
     """Return the indices (W,) of the nodes whose samples are kept: all, or evenly spaced ones."""
-    nodes, n = len(scenario.nodes), scenario.plant.n
+    nodes, n = len(scenario.nodes), scenario.width
     if nodes <= MAX_NODES:
         return np.arange(nodes)
     count = int(np.clip(MAX_ENTRIES // n**2, MIN_SAMPLED, MAX_SAMPLED))

@@ -64,8 +64,14 @@ class RunSamples:
 
     @property
     def first_covariances(self) -> FloatArray:
-        """P(0) (N', n, n) of all N' nodes of the network, in their order."""
-        return np.array([self.scenario.initial_estimate(node)[1] for node in self.scenario.nodes])
+        """P(0) (N', n, n) of all N' nodes of the network, in their order; 0 beyond their states."""
+        P = np.zeros((len(self.scenario.nodes), self.scenario.width, self.scenario.width))
+        for k, node in enumerate(self.scenario.nodes):
+            cov = self.scenario.initial_estimate(node)[1]
+            view = self.scenario.view(k) if len(cov) > self.scenario.width else slice(None)
+            own = cov[view][:, view]
+            P[k, : len(own), : len(own)] = own
+        return P
 
     @property
     def first_trace(self) -> float:

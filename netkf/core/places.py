@@ -16,6 +16,11 @@ class Place(NamedTuple):
     n: int
 
     @property
+    def label(self) -> str:
+        """Its name, and whose it is: pose@3."""
+        return self.name if self.node is None else f"{self.name}@{self.node}"
+
+    @property
     def entries(self) -> slice:
         """Its entries in the stacked state."""
         return slice(self.first, self.first + self.n)

@@ -275,6 +275,15 @@ class ScenarioModel(Component):
         whole = np.arange(self.plant.n)
         return None if all(np.array_equal(one, whole) for one in entries) else tuple(entries)
 
+    @cached_property
+    def is_estimated(self) -> np.ndarray:
+        """A mask (N, n) of the states that nodes estimate, of the n of that with most: the first of
+        each.
+        """
+        entries = np.arange(self.width)
+        views = self.views or [entries] * len(self.nodes)
+        return np.array([entries < len(view) for view in views])
+
     @property
     def width(self) -> int:
         """The largest number of states that a node estimates."""

@@ -11,15 +11,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.filter import takes_columns
 from netkf.algorithms.registry import built_in_class, overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
+from netkf.theory.common.block_columns import ClockBlocks, SlotBlocks
+from netkf.theory.common.blocks import (
+    SeenErrors,
+    have_one_view,
+    run_of_view,
+    scenario_of_all,
+    scenario_of_view,
+)
 from netkf.theory.common.clock_columns import ClockColumns
 from netkf.theory.common.columns import ErrorColumns, has_columns
 from netkf.theory.common.evidence import require_linear
-from netkf.theory.common.requirements import require_whole_state
 from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.folders import theory_of
 from netkf.trace.run import Run
@@ -28,7 +36,9 @@ from netkf.trace.run import Run
 class ErrorLaw(NamedTuple):
     """The Gaussian law of the errors of M estimators at T times given the events of a run.
 
-    ``mean`` (T M n,) and ``covariance`` (T M n, T M n) of all errors together, ``P`` (T, M, n, n).
+    ``mean`` (T M n,) and ``covariance`` (T M n, T M n) of all errors together, ``P`` (T, M, n, n),
+    where nodes that estimate blocks have n states, of which those beyond their own are 0, with the
+    variance 1 in P.
     """
 
     mean: FloatArray
@@ -39,7 +49,9 @@ class ErrorLaw(NamedTuple):
 def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> FloatArray:
     """Return the covariance (T, N, n, n) of x - xhat_i at ``run.times``, given the run's events.
 
-    With ``stacked``, (T, N n, N n): the errors of all nodes together. Paper H (10) says that each
+    With ``stacked``, (T, N n, N n): the errors of all nodes together. Where nodes estimate some
+    blocks of the state n is the number of states of the node with most, entries of others beyond
+    theirs are nan as in ``Run.P``, and left out of the stacked ones. Paper H (10) says that each
     block stays below P_i, which this shows without Monte Carlo. Regressors are those of the run;
     delays, losses and filter models that differ from the truth are included; recorded states and
     readings are treated as if they had the law that the scenario gives them. Raises TheoryError for
@@ -47,7 +59,12 @@ def error_covariance(scenario: Scenario, run: Run, stacked: bool = False) -> Flo
     subclass overrides one.
     """
     joint = _joint_moments(scenario, run, about_mean=True)
-    return joint if stacked else diagonal_blocks(joint, len(scenario.nodes))
+    if not stacked:
+        return _seen_blocks(scenario, joint)
+    if scenario.views is None:
+        return joint
+    known = scenario.is_estimated.ravel()
+    return joint[:, known][:, :, known]
 
 
 def error_squares(scenario: Scenario, run: Run) -> FloatArray:
@@ -55,7 +72,7 @@ def error_squares(scenario: Scenario, run: Run) -> FloatArray:
     :func:`error_covariance` and the square of the mean error, which is not 0 where filters start
     elsewhere than the plant. Raises the errors of that function.
     """
-    return diagonal_blocks(_joint_moments(scenario, run, about_mean=False), len(scenario.nodes))
+    return _seen_blocks(scenario, _joint_moments(scenario, run, about_mean=False))
 
 
 def error_law(scenario: Scenario, run: Run) -> ErrorLaw:
@@ -80,6 +97,13 @@ def diagonal_blocks(stacked: FloatArray, nodes: int) -> FloatArray:
     return np.ascontiguousarray(np.einsum("tiaib->tiab", blocks))
 
 
+def _seen_blocks(scenario: Scenario, joint: FloatArray) -> FloatArray:
+    """Return the blocks (T, N, n, n), nan beyond the states of a node, of joint (T, N n, N n)."""
+    known = scenario.is_estimated
+    blocks = diagonal_blocks(joint, len(scenario.nodes))
+    return np.where(known[:, :, None] & known[:, None, :], blocks, np.nan)
+
+
 def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray:
     """Return the joint covariance (T, N n, N n) of all errors, or their second moments."""
     errors = _errors_of(scenario, run)
@@ -93,7 +117,6 @@ def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray
 
 def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     """Return the errors at time 0 of all estimators (the filters of the nodes, or a pooled one)."""
-    require_whole_state(scenario)
     if not isinstance(run, Run):
         raise TheoryError(
             f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
@@ -105,6 +128,15 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         raise TheoryError("the true state says who hears whom: events tell of it")
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
+    if takes_columns(scenario.node_filter):
+        return (SlotBlocks if scenario.slotted else ClockBlocks)(scenario, run)
+    if not scenario.node_filter.timing.talks and scenario.views is not None:
+        return SeenErrors(_errors_of(scenario_of_all(scenario), run), scenario)
+    if have_one_view(scenario):
+        return _errors_of(scenario_of_view(scenario), run_of_view(scenario, run))
+    if scenario.views is not None:
+        name = type(scenario.node_filter).__name__
+        raise TheoryError(f"no exact error covariance for {name} of different blocks")
     if has_columns(scenario):
         return (SlotColumns if scenario.slotted else ClockColumns)(scenario, run)
     require_known_filter(scenario)

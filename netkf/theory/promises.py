@@ -31,8 +31,10 @@ from netkf.theory import (
     true_limit_covariance,
 )
 from netkf.theory.assumptions import assumption_rows
+from netkf.theory.block_promises import block_lines, block_promises
+from netkf.theory.common.blocks import have_one_view
 from netkf.theory.common.papers import paper_legend
-from netkf.theory.common.requirements import require_whole_state
+from netkf.theory.common.requirements import scenario_of_estimates
 from netkf.theory.folders import theory_of
 from netkf.theory.hybrid.coupled import concerns_hybrid_paper
 from netkf.theory.hybrid.steady import steady_by_node
@@ -57,7 +59,8 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
     Matrices have ``value`` and ``trace``, None with a ``reason`` if there is none. Of a plant that
     changes all but the bound at the horizon is about the last piece.
     """
-    require_whole_state(scenario)
+    if have_one_view(scenario):
+        scenario = scenario_of_estimates(scenario)
     promises: dict[str, Any] = {
         "scenario": scenario.name,
         "filter": name_of("filter", scenario.filter.algorithm),
@@ -72,6 +75,9 @@ def compute_promises(scenario: Scenario) -> dict[str, Any]:
             for assumption, source, holds, evidence in assumption_rows(scenario)
         ],
     }
+    if scenario.views is not None:
+        of_blocks: dict[str, Any] = to_json_value(promises | block_promises(scenario))
+        return of_blocks
     whole, scenario = scenario, scenario.last_piece
     if scenario.slotted:
         slot_promises = theory_of(scenario).slot_promises
@@ -172,6 +178,10 @@ def promises_text(scenario: Scenario, promises: dict[str, Any]) -> str:
     title = f"{scenario.name}: {scenario.claim}" if scenario.claim else scenario.name
     lines = [title, "", "assumptions", *_assumption_lines(promises["assumptions"])]
     lines += paper_legend(row["source"] for row in promises["assumptions"])
+    if "least_error" in promises:
+        return "\n".join([*lines, *block_lines(promises)])
+    if have_one_view(scenario):
+        scenario = scenario_of_estimates(scenario)
     if len(scenario.plant.changes):
         since = f"{scenario.plant.changes[-1]:g} s"
         lines += ["", f"steady states and limits: of the plant from {since} on"]

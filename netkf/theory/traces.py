@@ -15,7 +15,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.labels import covariance_notes
 from netkf.runs.summary import PromisedTraces
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.requirements import require_whole_state
+from netkf.theory.common.requirements import scenario_of_estimates
 from netkf.theory.hybrid.bounds import covariance_bound
 from netkf.theory.hybrid.coupled import (
     concerns_hybrid_paper,
@@ -35,7 +35,7 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     """Return traces at ``times``: bound on P, its limit, a central filter's; or the reason."""
     bound, reason = None, ""
     try:
-        require_whole_state(scenario)
+        scenario = scenario_of_estimates(scenario)
     except TheoryError as error:
         notes = tuple(covariance_notes(scenario))
         return PromisedTraces(None, np.nan, np.nan, str(error), limit_label="", notes=notes)

@@ -253,7 +253,7 @@ def state_table(
         np.full(rows, replica, dtype=np.int64),
         np.repeat(times, count),
         np.tile(np.array(nodes, dtype=np.int64), len(times)),
-        *_states_of_nodes(x, count, n, views).T,
+        *states_of_nodes(x, count, n, views).reshape(rows, n).T,
         *xhat.reshape(rows, n).T,
         *P[:, :, upper[0], upper[1]].reshape(rows, -1).T,
         sq_error.reshape(rows),
@@ -265,16 +265,18 @@ def state_table(
     return table
 
 
-def _states_of_nodes(
+def states_of_nodes(
     x: FloatArray, count: int, n: int, views: tuple[np.ndarray, ...] | None
 ) -> FloatArray:
-    """Return x (T N, n) as each of N nodes sees it, from states x (T, n) of the plant."""
+    """Return the true states (T, N, n) that each of N = ``count`` nodes estimates, from those x
+    (T, m) of the plant: all, or the entries ``views``, nan in others.
+    """
     if views is None:
-        return np.repeat(x, count, axis=0)
+        return np.repeat(x[:, None], count, axis=1)
     seen = np.full((len(x), count, n), np.nan)
     for k, view in enumerate(views):
         seen[:, k, : len(view)] = x[:, view]
-    return seen.reshape(-1, n)
+    return seen
 
 
 def first_difference(a: Run | pd.DataFrame, b: Run | pd.DataFrame) -> str | None:

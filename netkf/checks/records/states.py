@@ -17,7 +17,7 @@ from netkf.checks.rounding import EPS
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.run import Run
+from netkf.trace.run import Run, states_of_nodes
 from netkf.trace.schema import CODES
 
 TRUTH_TOLERANCE, START_TOLERANCE = 1e-8, 1e-9
@@ -41,7 +41,7 @@ def sample_fault(scenario: Scenario, run: Run, seed: int, replica: int) -> str:
     return (
         _status_fault(scenario, run)
         or (_truth_fault(scenario, run) if run.truth_known else "")
-        or (_error_fault(run) if run.truth_known else "")
+        or (_error_fault(scenario, run) if run.truth_known else "")
     )
 
 
@@ -49,7 +49,7 @@ def _status_fault(scenario: Scenario, run: Run) -> str:
     diverged = run.log[run.log["kind"] == CODES["diverged"]]
     if (run.status == "diverged") != bool(len(diverged)):
         return f"status {run.status} with {len(diverged)} events that say diverged"
-    if run.status == "complete" and not np.isfinite(run.xhat).all():
+    if run.status == "complete" and not np.isfinite(run.xhat[:, scenario.is_estimated]).all():
         return "status complete with estimates that are not finite"
     if run.fingerprint != hashlib.sha256(run.log.tobytes()).hexdigest():
         return "the fingerprint is not that of the events"
@@ -106,10 +106,12 @@ def drawn_states(
     return x, allowed
 
 
-def _error_fault(run: Run) -> str:
+def _error_fault(scenario: Scenario, run: Run) -> str:
+    x = states_of_nodes(run.x, len(run.nodes), run.xhat.shape[2], scenario.views)
     with np.errstate(over="ignore", invalid="ignore"):
-        gap = np.abs(run.x[:, None] - run.xhat - run.error)
-        size = np.abs(run.x).max(axis=1)[:, None] + np.abs(run.xhat).max(axis=2)
+        gap = np.where(scenario.is_estimated, np.abs(x - run.xhat - run.error), 0.0)
+        sizes = np.where(scenario.is_estimated, np.abs(run.xhat), 0.0)
+        size = np.abs(run.x).max(axis=1)[:, None] + sizes.max(axis=2)
         wrong = gap.max(axis=2, initial=0.0) > SUM_ROUNDINGS * EPS * size + 1e-300
     if not wrong.any():
         return ""
@@ -149,12 +151,14 @@ def start_fault(scenario: Scenario, run: Run) -> str:
     """Return one line about the first wrong estimate, covariance or weight at time 0; or empty."""
     plant, start = scenario.plant, scenario.filter
     for k, node in enumerate(scenario.nodes):
-        for name, given, default, seen in (
-            ("estimate", start.mean, plant.start_mean, run.xhat[0, k]),
-            ("covariance", start.cov, plant.start_cov, run.P[0, k]),
+        view = np.arange(plant.n)[scenario.view(k)]
+        square, size = np.ix_(view, view), len(view)
+        for name, given, default, entries, seen in (
+            ("estimate", start.mean, plant.start_mean, view, run.xhat[0, k, :size]),
+            ("covariance", start.cov, plant.start_cov, square, run.P[0, k, :size, :size]),
         ):
             value = given[k] if isinstance(given, tuple) else given
-            expected = np.asarray(default if value is None else value)
+            expected = np.asarray(default if value is None else value)[entries]
             if np.isnan(seen).all():  # a filter without covariances
                 continue
             gap = np.abs(seen - expected).max()

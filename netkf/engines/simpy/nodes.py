@@ -158,9 +158,11 @@ class PairFunction(NamedTuple):
         self, xhat: FloatArray, other: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return z (p,), and its matrices of both parts of the state, see PairReading."""
-        whole, (own, others) = np.zeros(self.n), self.entries
-        whole[own], whole[others] = xhat, other
-        z, J = (self.y, self.H) if isinstance(self.H, np.ndarray) else self.H(self.y, whole)
+        z, J, (own, others) = self.y, self.H, self.entries
+        if not isinstance(J, np.ndarray):
+            whole = np.zeros(self.n)
+            whole[own], whole[others] = xhat, other
+            z, J = J(z, whole)
         return z, J[:, own], J[:, others]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.plants.transitions import Transitions
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns
 from netkf.theory.common.forms import MEAN, Forms
@@ -62,7 +63,7 @@ class ClockColumns(ErrorColumns):
         first = forms.inputs(plant.start_root.shape[1])
         forms.table[self._x, MEAN] = plant.start_mean
         forms.table[self._x, first : forms.used] = plant.start_root
-        self._samples = timed_observations(scenario, run)
+        self._samples = timed_observations(scenario, Streams(run.seed, run.replica))
         rows = max((len(o.H) for s in self._samples.values() for o in s.values()), default=0)
         self._delivered = _delivered(self._log)
         self._filters = LinearVerbs(

@@ -49,10 +49,6 @@ def joseph_update(P: FloatArray, observation: Observation) -> FloatArray:
     return np.asarray(closed @ P @ closed.T + K @ R @ K.T)
 
 
-EstimatorObservations = dict[int, Observation]
-"""Observations by the index of the estimator that uses them."""
-
-
 def nodes_by_estimator(scenario: Scenario) -> list[tuple[int, ...]]:
     """Return the nodes whose readings each filter uses: one filter uses all if they are pooled."""
     if scenario.filter.algorithm.timing.pooled:
@@ -105,8 +101,12 @@ def _are_the_same(some: list[Observation], others: list[Observation]) -> bool:
     )
 
 
-def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], EstimatorObservations]:
-    """Return a function from an increasing slot to its readings by index of the estimator."""
+def slot_observations(
+    scenario: Scenario, run: Run, join: Callable[..., Any] = stack_observations
+) -> Callable[[int], dict[int, Any]]:
+    """Return a function from an increasing slot to its readings by index of the estimator, those of
+    all its sensors as ``join(readings, n)`` returns them.
+    """
     streams, n = Streams(run.seed, run.replica), scenario.plant.n
     noises = _noises(scenario)
     estimators = [
@@ -118,9 +118,9 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
         for nodes in nodes_by_estimator(scenario)
     ]
 
-    stacked: dict[int, tuple[list[Observation], Observation]] = {}
+    stacked: dict[int, tuple[list[Observation], Any]] = {}
 
-    def observe(slot: int) -> EstimatorObservations:
+    def observe(slot: int) -> dict[int, Any]:
         """Return the readings of ``slot``, H (p, n) and R (p, p), by index of the estimator."""
         observations = {}
         for estimator, paths in enumerate(estimators):
@@ -136,17 +136,20 @@ def slot_observations(scenario: Scenario, run: Run) -> Callable[[int], Estimator
             # Sensors that do not vary have the same matrices in all slots, stacked once.
             known = stacked.get(estimator)
             if known is None or not _are_the_same(known[0], readings):
-                known = stacked[estimator] = readings, stack_observations(readings, n)
+                known = stacked[estimator] = readings, join(readings, n)
             observations[estimator] = known[1]
         return observations
 
     return observe
 
 
-def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObservations]:
-    """Return the sampled readings of a run by time (s) and estimator; equal ones are one object."""
-    streams, n = Streams(run.seed, run.replica), scenario.plant.n
-    by_node, noises = scenario.sampled_sensors, _noises(scenario)
+def timed_observations(
+    scenario: Scenario, streams: Streams, join: Callable[..., Any] = stack_observations
+) -> dict[float, dict[int, Any]]:
+    """Return the sampled readings of the run with these ``streams`` by time (s) and estimator,
+    equal ones as one object, and those of all sensors as ``join(readings, n)`` returns them.
+    """
+    n, by_node, noises = scenario.plant.n, scenario.sampled_sensors, _noises(scenario)
     times = sample_times(scenario, streams)
     fixed = [
         Observation(sensor.H, *noise)
@@ -170,8 +173,6 @@ def timed_observations(scenario: Scenario, run: Run) -> dict[float, EstimatorObs
                     at_time = observations.setdefault(time, {})
                     at_time.setdefault(estimator, []).append(reading)
     return {
-        time: {
-            estimator: stack_observations(readings, n) for estimator, readings in at_time.items()
-        }
+        time: {estimator: join(readings, n) for estimator, readings in at_time.items()}
         for time, at_time in observations.items()
     }

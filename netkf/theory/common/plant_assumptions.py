@@ -74,12 +74,13 @@ def slot_plant_rows(scenario: Scenario) -> list[AssumptionRow]:
 def start_rows(scenario: Scenario, source: str) -> list[AssumptionRow]:
     """Return the row, by ``source``, that P_i(0) is at least the second moment of the error."""
     plant, smallest = scenario.plant, np.inf
-    starts = (scenario.initial_estimate(node) for node in scenario.nodes)
+    starts = ((*scenario.initial_estimate(i), k) for k, i in enumerate(scenario.nodes))
     # Most networks have one start for all nodes.
-    for mean, cov in {(id(mean), id(cov)): (mean, cov) for mean, cov in starts}.values():
+    for mean, cov, k in {(id(start[0]), id(start[1])): start for start in starts}.values():
         # E[(x - xhat)(x - xhat)'] = cov of x(0) + the square of the difference of the means
-        offset = plant.start_mean - mean
-        gap = cov - plant.start_cov - np.outer(offset, offset)
+        view = scenario.view(k) if len(mean) < plant.n else slice(None)
+        offset = plant.start_mean[view] - mean
+        gap = cov - plant.start_cov[view][:, view] - np.outer(offset, offset)
         smallest = min(smallest, float(np.linalg.eigvalsh(gap)[0]) / max(1.0, np.abs(cov).max()))
     return [
         (

@@ -9,7 +9,10 @@ from typing import Any
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.blocks import have_one_view, scenario_of_view
 
+OF_BLOCKS = ("assumptions", "central_covariance", "error_covariance")
+"""Functions that are given a scenario as it is, whatever blocks of the state nodes estimate."""
 WITH_TIME = (
     *("assumptions", "constant_gain_bound", "covariance_bound", "error_covariance"),
     *("information_level", "leader_agreement", "mean_matching"),
@@ -31,13 +34,18 @@ def require_scenario(functions: dict[str, Any]) -> dict[str, Any]:
     return wrapped
 
 
-def require_whole_state(scenario: Scenario) -> None:
-    """Raise TheoryError if nodes of a scenario estimate some blocks of the state only."""
-    if scenario.views is not None:
-        raise TheoryError(
-            "nothing is promised of nodes that estimate some blocks of the state; with "
-            'filter.estimates = "all" theory is about the whole state'
-        )
+def scenario_of_estimates(scenario: Scenario) -> Scenario:
+    """Return a scenario whose nodes estimate the whole state, that of the blocks that all nodes of
+    ``scenario`` estimate; raises TheoryError if these are different ones.
+    """
+    if scenario.views is None:
+        return scenario
+    if have_one_view(scenario):
+        return scenario_of_view(scenario)
+    raise TheoryError(
+        "not known of nodes that estimate different blocks of the state; of these are known "
+        "theory.central_covariance and theory.error_covariance"
+    )
 
 
 def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -51,7 +59,8 @@ def _check_first_argument(name: str, function: Callable[..., Any]) -> Callable[.
         if not isinstance(scenario, Scenario):
             remedy = f"load it first: netkf.theory.{name}(netkf.load(path))"
             raise ScenarioError("", f"theory.{name} takes a netkf.Scenario", scenario, remedy)
-        require_whole_state(scenario)
+        if name not in OF_BLOCKS:
+            scenario = scenario_of_estimates(scenario)
         return function(scenario if name in WITH_TIME else scenario.last_piece, *args, **kwargs)
 
     # Pickle finds a function by these two names: the wrapper replaces the original under them.

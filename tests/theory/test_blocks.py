@@ -1,0 +1,173 @@
+"""Theory of nodes that estimate blocks of the state.
+
+The truth is not ours: plain recursions of the joint second moments of all errors, with gains from
+the textbook, and the Kalman filter of all blocks.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+import netkf
+from netkf.theory import error_covariance
+from netkf.theory.common import block_columns
+from netkf.theory.errors import error_law
+from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, Scalar, load
+
+LOSSY = 'channel = { loss = { kind = "bernoulli", delivery = 0.7 } }\n'
+
+
+class Moments:
+    """Joint second moments C of the errors of three robots and, from sending on, of those that
+    they have told; each robot has the gains of a scalar recursion.
+    """
+
+    def __init__(self, rule: str, F: float, Q: float) -> None:
+        self.F, self.Q, self.C = F, Q, np.eye(3)
+        self.nodes = {node: MovingScalar(rule, F, Q) for node in (1, 2, 3)}
+
+    def predict(self) -> None:
+        self.C = self.F**2 * self.C + self.Q * np.eye(3)
+        for node in self.nodes.values():
+            node.predict()
+
+    def exchange(self, reads: bool, pairs: list[tuple[int, int]]) -> None:
+        """Let the first robot read, all tell, and receivers use what ``pairs`` (i, j) say."""
+        if reads:
+            node = self.nodes[1]
+            P = node.P
+            node.use(0.0, 0.0, 0.0, 0.1)
+            K = 1.0 - node.P / P
+            E = np.diag([1.0 - K, 1.0, 1.0])
+            self.C = E @ self.C @ E.T + np.diag([K**2 * 0.1, 0.0, 0.0])
+        twice = np.tile(np.eye(3), (2, 1))
+        C = twice @ self.C @ twice.T
+        sent = {i: (node.told, node.own) for i, node in self.nodes.items()}
+        for node in self.nodes.values():
+            node.told, node.own = node.P, 0.0
+            node._join()
+        for i, j in sorted(pairs):
+            # z = y + xhat_i = x_j - e_i + v, so that e_j <- (1 - K) e_j + K (e_i - v).
+            K = self.nodes[j].gain(*sent[i], 0.3)
+            E = np.eye(6)
+            E[j - 1, j - 1], E[j - 1, 3 + i - 1] = 1.0 - K, K
+            C = E @ C @ E.T
+            C[j - 1, j - 1] += K**2 * 0.3
+        self.C = C[:3, :3]
+
+
+class MovingScalar(Scalar):
+    """A scalar estimate with other dynamics that says by which gain it uses a reading."""
+
+    def __init__(self, rule: str, F: float, Q: float) -> None:
+        super().__init__(rule)
+        self.F, self.Q = F, Q
+
+    def predict(self) -> None:
+        self.told, self.own = self.F**2 * self.told, self.F**2 * self.own + self.Q
+        self._join()
+
+    def gain(self, told: float, own: float, noise: float) -> float:
+        """Use a reading of x = 0 that says 1: what it moves the estimate by is the gain."""
+        self.x = 0.0
+        self.use(1.0, told, own, noise)
+        return self.x
+
+
+def told_at(run: netkf.Run, time: float, length: float) -> list[tuple[int, int]]:
+    log = run.log[(run.log["t"] >= time - 1e-9) & (run.log["t"] < time + length - 1e-9)]
+    log = log[log["kind"] == netkf.trace.schema.CODES["deliver"]]
+    return list(zip(log["peer"].tolist(), log["node"].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("rule", ["split", "ci", "naive"])
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
+def test_errors_of_own_blocks_follow_their_joint_recursion(
+    tmp_path: Path, text: str, rule: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So few columns that they have to be turned into fewer.
+    monkeypatch.setattr(block_columns, "SPARE", 40)
+    scenario = load(text.replace("[filter]", LOSSY + "[filter]"), tmp_path, filter__rule=rule)
+    run = netkf.simulate(scenario)
+    joint = error_covariance(scenario, run, stacked=True)
+    step, F, Q = 1.0, 0.9, 0.2
+    if not scenario.slotted:
+        step, F, Q = 0.5, np.exp(-0.05), 0.25 * (1.0 - np.exp(-0.1)) / 0.2
+    moments = Moments(rule, F, Q)
+    for k in range(round(11.0 / step) + 1):
+        time = k * step
+        if k:
+            moments.predict()
+            moments.exchange(time == round(time), told_at(run, time, step))
+        if time == round(time):
+            # Weights are those with the least P, which hardly depends on them.
+            rtol = 1e-9 if rule == "naive" else 1e-6
+            np.testing.assert_allclose(joint[round(time)], moments.C, rtol=rtol, atol=1e-9)
+    bounded = run.P[:, :, 0, 0] >= np.diagonal(joint, axis1=1, axis2=2) - 1e-9
+    assert bounded.all() == (rule != "naive")
+
+
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
+def test_errors_of_local_filters_of_blocks_are_jointly_those_of_kalman_filters(
+    tmp_path: Path, text: str
+) -> None:
+    scenario = load(text, tmp_path, filter__kind="local", filter__estimates="own+neighbours")
+    run = netkf.simulate(scenario)
+    joint = error_covariance(scenario, run, stacked=True)
+    views = [[0, 1], [1, 0, 2], [2, 1]]
+    step, F, Q = 1.0, 0.9, 0.2
+    if not scenario.slotted:
+        step, F, Q = 0.5, np.exp(-0.05), 0.25 * (1.0 - np.exp(-0.1)) / 0.2
+    # Selects the states of all nodes, one after the other: e = S x - xhat.
+    S = np.concatenate([np.eye(3)[view] for view in views])
+    C, P = S @ S.T, [np.eye(len(view)) for view in views]
+    for k in range(1, round(11.0 / step) + 1):
+        C = F**2 * C + S @ S.T * Q
+        stays, noise = [], []
+        for i, view in enumerate(views):
+            P[i] = F**2 * P[i] + Q * np.eye(len(view))
+            rows = [[0.0] * view.index(j) + [1.0] for j in view[1:]]
+            H = np.array([row + [0.0] * (len(view) - len(row)) for row in rows])
+            H[:, 0] = -1.0
+            R = 0.3 * np.eye(len(H))
+            if i == 0 and k * step == round(k * step):
+                H, R = np.vstack([np.eye(len(view))[:1], H]), block_diag(0.1, R)
+            K = P[i] @ H.T @ np.linalg.inv(H @ P[i] @ H.T + R)
+            E = np.eye(len(view)) - K @ H
+            P[i] = E @ P[i] @ E.T + K @ R @ K.T
+            stays.append(E)
+            noise.append(K @ R @ K.T)
+        C = block_diag(*stays) @ C @ block_diag(*stays).T + block_diag(*noise)
+        if k * step == round(k * step):
+            t = round(k * step)
+            np.testing.assert_allclose(joint[t], C, rtol=1e-9, atol=1e-9)
+    blocks = error_covariance(scenario, run)
+    np.testing.assert_allclose(blocks, run.P, rtol=1e-9, atol=1e-9)
+    assert np.isnan(blocks[:, 0, 2]).all()
+    law = error_law(scenario, run)
+    size = 3 * scenario.width
+    assert law.covariance.shape == (13 * size, 13 * size)
+    last = law.covariance[-size:, -size:]
+    known = np.isfinite(np.diagonal(run.P[-1], axis1=1, axis2=2)).ravel()
+    np.testing.assert_allclose(last[known][:, known], joint[-1], atol=1e-12)
+    assert not last[~known].any()
+
+
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
+def test_blocks_that_change_and_whose_input_is_not_known(tmp_path: Path, text: str) -> None:
+    changed = "F = [[1.1]]" if text == ROBOTS else "A = [[0.2]]"
+    G = 'input = { kind = "constant", G = [[1.0]], value = [0.4] }\ncov = [[1.0]]'
+    text = text.replace("cov = [[1.0]]", f"schedule = [{{ from = 5.0, {changed} }}]\n{G}")
+    known = load(text, tmp_path, filter__rule="naive")
+    scenario = known.replace({"filter.model": {"input": False}})
+    run = netkf.simulate(scenario)
+    law = error_law(scenario, run)
+    np.testing.assert_allclose(law.P, run.P, rtol=1e-9)
+    # Noises and gains are the same, so that the input adds its response to the errors.
+    added = run.error - netkf.simulate(known).error
+    np.testing.assert_allclose(law.mean.reshape(added.shape), added, rtol=1e-9, atol=1e-9)
+    assert np.abs(added).max() > 0.1
