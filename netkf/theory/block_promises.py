@@ -72,8 +72,8 @@ def central_at_horizon(scenario: Scenario) -> FloatArray:
     changes = plant.changes[plant.changes < scenario.horizon].tolist()
     samples = timed_observations(central, Streams(0, 0))
     for time in sorted({*samples, *changes, scenario.horizon}):
-        matrices = plant.pieces[piece]
-        F, root = (law[0] for law in Transitions(matrices.A, matrices.B).laws([time - now]))
+        matrices, gap = plant.pieces[piece], np.array([time - now])
+        F, root = (law[0] for law in Transitions(matrices.A, matrices.B).laws(gap))
         P, now = F @ P @ F.T + root @ root.T, time
         piece += time in changes
         for H, _, noise in samples.get(time, {}).values():

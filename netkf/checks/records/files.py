@@ -18,6 +18,7 @@ from netkf.runs.documents import DamagedError
 from netkf.runs.run import run_to_directory, save
 from netkf.runs.stored import MANIFEST_FORM, StoredRun, read_checked_document, read_run
 from netkf.scenario.scenario import Scenario
+from netkf.trace.nees import traces, without_padding
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
@@ -51,6 +52,11 @@ def _directory_fault(run: Run, scenario: Scenario, directory: Path) -> str:
     """Return a fault of the files of ``run`` in a directory."""
     manifest = read_checked_document(directory, "manifest.json", MANIFEST_FORM)
     stored = read_run(directory, scenario, manifest)
+    if scenario.views is not None:
+        # Blocks that nobody estimates are not stored.
+        x, kept = np.full_like(run.x, np.nan), np.unique(np.concatenate(scenario.views))
+        x[:, kept] = run.x[:, kept]
+        run = dataclasses.replace(run, x=x)
     return _tables_fault(run, stored) or _summary_fault(run, stored)
 
 
@@ -74,7 +80,7 @@ def _tables_fault(run: Run, stored: StoredRun) -> str:
             return f"states.parquet: {name} is not that of the run"
     if not run.truth_known:
         return ""
-    square, nees = (run.error**2).sum(axis=2), _nees(run)
+    square, nees = _squares(run)
     for name, seen, expected in (
         ("sq_error", stored.sq_error, square),
         ("nees", np.where(np.isnan(nees), np.nan, stored.nees), nees),
@@ -84,15 +90,18 @@ def _tables_fault(run: Run, stored: StoredRun) -> str:
     return ""
 
 
-def _nees(run: Run) -> Any:
-    """Return e' P^-1 e (T, N); nan where P is not well conditioned, which decides nothing here."""
-    finite = np.asarray(np.isfinite(run.P).all(axis=(2, 3)))
-    P = np.where(finite[..., None, None], run.P, np.eye(run.P.shape[-1]))
+def _squares(run: Run) -> tuple[FloatArray, FloatArray]:
+    """Return e' e and e' P^-1 e (T, N), the latter nan where P is not well conditioned, which
+    decides nothing here.
+    """
+    e, P = without_padding(run.error, run.P)
+    finite = np.asarray(np.isfinite(P).all(axis=(2, 3)))
+    P = np.where(finite[..., None, None], P, np.eye(P.shape[-1]))
     with np.errstate(all="ignore"):
         usable = finite & (np.linalg.cond(P) < 1e6)
         P = np.where(usable[..., None, None], P, np.eye(P.shape[-1]))
-        solved = np.linalg.solve(P, run.error[..., None])[..., 0]
-        return np.where(usable, (run.error * solved).sum(axis=2), np.nan)
+        solved = np.linalg.solve(P, e[..., None])[..., 0]
+        return (e**2).sum(axis=2), np.where(usable, (e * solved).sum(axis=2), np.nan)
 
 
 def _equal(seen: Any, expected: Any) -> bool:
@@ -152,8 +161,8 @@ def _averages_fault(run: Run, summary: dict[str, Any], rows: dict[int, Any]) -> 
     blurred_from = summary.get("rounding_from")
     exact = after & (run.times < (np.inf if blurred_from is None else blurred_from))
     with np.errstate(all="ignore"):
-        square, nees = (_mean(values[exact]) for values in ((run.error**2).sum(axis=2), _nees(run)))
-        trace = _mean(np.trace(run.P, axis1=2, axis2=3)[after])
+        square, nees = (_mean(values[exact]) for values in _squares(run))
+        trace = _mean(traces(run.P)[after])
     columns = {"rms_error": square, "mean_trace": trace, "mean_nees": nees}
     for place in (*range(len(run.nodes)), None):
         row = summary["overall"] if place is None else rows[run.nodes[place]]
