@@ -10,15 +10,38 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_discrete_are
 
 import netkf
-from netkf.theory import error_covariance
+from netkf.theory import covariance_bound, error_covariance
 from netkf.theory.common import block_columns
 from netkf.theory.errors import error_law
+from netkf.theory.promises import compute_promises, promises_text
 from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, Scalar, load
 
 LOSSY = 'channel = { loss = { kind = "bernoulli", delivery = 0.7 } }\n'
+TARGET = """
+format = 1
+name = "a target"
+probe = 1.0
+horizon = 5.0
+[plant]
+kind = "diffusion"
+A = [[-0.1, 0.2], [0.0, -0.2]]
+B = [[0.1, 0.0], [0.0, 0.3]]
+schedule = [{ from = 2.0, A = [[-0.1, 0.0], [0.0, -0.2]] }]
+input = { kind = "constant", G = [[1.0], [0.0]], value = [0.4] }
+mean = [1.0, 0.0]
+cov = [[1.0, 0.2], [0.2, 1.0]]
+[[sensors]]
+nodes = [1]
+H = [[1.0, 0.0]]
+R = [[0.1]]
+[network]
+graph = { kind = "edges", edges = [[1, 2]] }
+activation = { kind = "poisson", rate = 2.0 }
+"""
+FILTER = '[filter]\nkind = "hybrid"\nepsilon = 0.3\n'
 
 
 class Moments:
@@ -171,3 +194,49 @@ def test_blocks_that_change_and_whose_input_is_not_known(tmp_path: Path, text: s
     added = run.error - netkf.simulate(known).error
     np.testing.assert_allclose(law.mean.reshape(added.shape), added, rtol=1e-9, atol=1e-9)
     assert np.abs(added).max() > 0.1
+
+
+def test_no_filter_of_blocks_is_better_than_the_central_one(tmp_path: Path) -> None:
+    scenario = load(ROBOTS, tmp_path, filter__estimates="own+neighbours")
+    promises = compute_promises(scenario)
+    H = np.array([[1.0, 0, 0], [-1, 1, 0], [1, -1, 0], [0, -1, 1], [0, 1, -1]])
+    R = np.diag([0.1, 0.3, 0.3, 0.3, 0.3])
+    P = solve_discrete_are(0.9 * np.eye(3), H.T, 0.2 * np.eye(3), R)
+    P = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.solve(R, H))
+    blocks = {(one["node"], one["block"]): one for one in promises["least_error"]["blocks"]}
+    assert len(blocks) == 7
+    for (_, block), one in blocks.items():
+        k = int(block.removeprefix("pose@")) - 1
+        np.testing.assert_allclose(one["value"], [[P[k, k]]], rtol=1e-9)
+    assert "by design" in promises["P"]
+    assert "pose@3" in promises_text(scenario, promises)
+    naive = compute_promises(scenario.replace({"filter.rule": "naive"}))
+    assert naive["P"].startswith("nothing is promised")
+    # Between samples the least covariance is that at the end.
+    clocked = load(CLOCKED, tmp_path, horizon=2.25)
+    P, Q = np.eye(3), 0.25 * (1.0 - np.exp(-0.1)) / 0.2
+    for k in range(1, 5):
+        P = np.exp(-0.1) * P + Q * np.eye(3)
+        rows = slice(k % 2, None)
+        P = np.linalg.inv(np.linalg.inv(P) + H[rows].T @ np.linalg.solve(R[rows, rows], H[rows]))
+    P = np.exp(-0.05) * P + 0.25 * (1.0 - np.exp(-0.05)) / 0.2 * np.eye(3)
+    least = compute_promises(clocked)["least_error"]
+    assert least["when"] == "at 2.25 s"
+    seen = [one["value"][0][0] for one in least["blocks"]]
+    np.testing.assert_allclose(seen, np.diag(P), rtol=1e-9)
+
+
+def test_blocks_that_all_estimate_are_a_plant_of_their_own(tmp_path: Path) -> None:
+    (tmp_path / "alone.toml").write_text(TARGET + FILTER)
+    robots = 'cov = [[1.0]]\nA = [[0.1]]\nB = [[0.2]]\nnodes = [1, 2]\nname = "pose"\n'
+    blocks = TARGET.replace(
+        '[plant]\nkind = "diffusion"', f'[[plants]]\n{robots}[[plants]]\nname = "target"'
+    )
+    blocks = blocks.replace("[[sensors]]", '[[sensors]]\nof = "target"')
+    (tmp_path / "blocks.toml").write_text(blocks + FILTER + 'estimates = "shared"\n')
+    alone, shared = (netkf.load(tmp_path / f"{name}.toml") for name in ("alone", "blocks"))
+    times = np.array([1.0, 4.0])
+    expected = covariance_bound(alone, times)
+    np.testing.assert_allclose(covariance_bound(shared, times), expected, rtol=1e-12)
+    one, other = (compute_promises(scenario) for scenario in (alone, shared))
+    assert one == other

@@ -68,7 +68,7 @@ class BlockColumns(ErrorColumns):
         self._x[:, MEAN], self._x[:, NOISE : self._used] = plant.start_mean, plant.start_root
         self._views: list[View | None] = [None] * self.estimators
         if scenario.views is not None:
-            self._views = [View(view, scenario.layout.places) for view in scenario.views]
+            self._views = [View(view, scenario.layout.places, {}) for view in scenario.views]
         self._models = [ColumnModel(scenario.model_of(h)) for h in range(self.estimators)]
         self._states = [self._begin(h) for h in range(self.estimators)]
         # What is under way, by whatever names it.

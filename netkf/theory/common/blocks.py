@@ -11,7 +11,7 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.columns import ErrorColumns, padded
 from netkf.theory.common.evidence import require_linear
 from netkf.trace.run import Run
 
@@ -94,7 +94,7 @@ class SeenErrors(ErrorColumns):
 
     def _forms(self) -> FloatArray:
         forms = self._whole._forms()
-        return np.concatenate([forms, np.zeros_like(forms[:1])])[self._rows.ravel()]
+        return np.asarray(padded(forms.T, 1).T[self._rows.ravel()])
 
     def covariances(self) -> FloatArray:
         """Return P (M, n, n), with the variance 1 of states that a node does not estimate."""
@@ -104,7 +104,8 @@ class SeenErrors(ErrorColumns):
             P[m * n : (m + 1) * n, m * n : (m + 1) * n] = own
         blocks = P[self._rows[:, :, None], self._rows[:, None, :]]
         outside = (self._rows == size)[:, :, None] | (self._rows == size)[:, None, :]
-        return np.where(outside, np.eye(self.n), blocks)
+        seen: FloatArray = np.where(outside, np.eye(self.n), blocks)
+        return seen
 
     def keep(self) -> None:
         """Store the present errors for ``law``."""
@@ -116,5 +117,5 @@ class SeenErrors(ErrorColumns):
         size = self._whole.estimators * self._whole.n
         starts = np.arange(0, len(mean), size)[:, None]
         rows = np.where(self._rows.ravel() == size, len(mean), starts + self._rows.ravel()).ravel()
-        padded_covariance: FloatArray = np.pad(covariance, (0, 1))
-        return np.append(mean, 0.0)[rows], padded_covariance[np.ix_(rows, rows)]
+        whole: FloatArray = np.pad(covariance, (0, 1))
+        return np.append(mean, 0.0)[rows], whole[np.ix_(rows, rows)]

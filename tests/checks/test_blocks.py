@@ -1,0 +1,35 @@
+"""What is checked of nodes that estimate blocks of the state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import netkf
+from netkf.checks.evidence import BROKEN
+from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
+
+BOUND = "P is at least the covariance of the error, given the events"
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "changes"),
+    [
+        (CLOCKED, "block-intersection", {}),
+        (ROBOTS, "block-intersection", {"filter__rule": "naive"}),
+        (ROBOTS, "central", {"filter__estimates": "own+neighbours"}),
+    ],
+    ids=["split", "naive", "central"],
+)
+def test_overconfident_filters_of_blocks_are_found_and_no_others(
+    tmp_path: Path, text: str, kind: str, changes: dict[str, str]
+) -> None:
+    scenario = load(text, tmp_path, horizon=3.0, filter__kind=kind, **changes)
+    verdict = netkf.check(scenario, runs=10)
+    rows = {row.promise: row for row in verdict.rows}
+    broken = [row.promise for row in verdict.rows if row.verdict == BROKEN]
+    assert broken == ([BOUND] if "filter__rule" in changes else [])
+    assert rows["P follows the equations along the events of each run"].verdict == "holds"
+    assert rows["files hold the run, and the summary counts it"].verdict == "holds"
+    assert rows["estimates, covariances and weights begin as [filter] says"].verdict == "holds"
