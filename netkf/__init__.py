@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from netkf import parts, testing, theory
     from netkf.checks.check import check
     from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
+    from netkf.logs.importing import import_log
     from netkf.runs.run import save
     from netkf.runs.simulate import simulate
     from netkf.scenario.model import Belief, Filtering, Network
@@ -45,6 +46,7 @@ _MODULE_OF = {
     "compare_filters": "netkf.studies.compare_filters",
     "consistency": "netkf.studies.consistency",
     "first_difference": "netkf.trace.run",
+    "import_log": "netkf.logs.importing",
     "load": "netkf.scenario.reading",
     "check": "netkf.checks.check",
     "monte_carlo": "netkf.ensembles.monte_carlo",
@@ -79,6 +81,7 @@ __all__ = [
     "compare_filters",
     "consistency",
     "first_difference",
+    "import_log",
     "load",
     "monte_carlo",
     "parts",

@@ -207,7 +207,7 @@ class ConstantGain(Filter):
             # A node may have several rows at one instant, and a gain weighs one reading.
             if not scenario.slotted and isinstance(getattr(sensor, "path", None), SourceFile):
                 raise ScenarioError(
-                    f"sensors[{k}].kind",
+                    f"{scenario.sensor_key(k)}.kind",
                     "must not be recorded for the constant-gain filter in continuous time",
                     "recorded",
                     "use linear sensors, slots, or another filter",

@@ -27,15 +27,16 @@ class Option(NamedTuple):
 class Command(NamedTuple):
     """A command: its name, its help, and its options; those in a tuple exclude each other.
 
-    The module of this package with its name has ``_run``, which runs it with the parsed options and
-    returns the exit status. Unless it ``takes_scenario``, there are no scenario file, ``--set`` and
-    ``--trust``.
+    The ``module`` of this package, by default that with its name, has ``_run``, which runs it with
+    the parsed options and returns the exit status. Unless it ``takes_scenario``, there are no
+    scenario file, ``--set`` and ``--trust``.
     """
 
     name: str
     help: str
     options: tuple[Option | tuple[Option, ...], ...]
     takes_scenario: bool = True
+    module: str = ""
 
     def add_to(self, commands: Any) -> None:
         """Add the parser of the command to ``commands``; namespaces have its function ``run``."""
@@ -52,7 +53,7 @@ class Command(NamedTuple):
     def run(self, options: argparse.Namespace) -> int:
         """Run the command with the parsed options; return the exit status."""
         # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
-        module: Any = import_module(f"netkf.cli.{self.name.replace('-', '_')}")
+        module: Any = import_module(f"netkf.cli.{self.module or self.name.replace('-', '_')}")
         status: int = module._run(options)
         return status
 
@@ -345,6 +346,22 @@ COMMANDS = (
         "print the JSON Schema of scenario files, for editors",
         (_flag("--markdown", "print a reference of all keys instead"),),
         takes_scenario=False,
+    ),
+    Command(
+        "import",
+        "write a log, or a data set that people know, as a scenario with its tables",
+        (
+            _option("log", "file or folder", type=Path, metavar="LOG"),
+            _option(
+                "--kind",
+                "mrclam: folder of a UTIAS MR.CLAM set, with Robot1_Odometry.dat and the others",
+                required=True,
+                choices=["mrclam"],
+            ),
+            _option("--out", "folder of the scenario", type=Path, required=True, metavar="DIR"),
+        ),
+        takes_scenario=False,
+        module="import_log",
     ),
     Command(
         "new",

@@ -26,6 +26,7 @@ from netkf.core.fields import (
     matrix,
     node_id,
     text,
+    vector,
 )
 from netkf.core.instants import TimeGrid
 from netkf.core.places import Place
@@ -90,6 +91,7 @@ class Block(Component):
               blocks of that name on the same node or shared, or the own blocks of these nodes;
               A (n, n') multiplies the state of each
     position  which of its entries, counted from 0, are the coordinates of its node
+    means     the mean of x(0) of each of ``nodes``, where they differ
     """
 
     name: str = field(text)
@@ -99,11 +101,26 @@ class Block(Component):
     position: tuple[int, ...] | None = field(
         list_of(integer(low=0), "numbers of entries"), default=None
     )
+    means: tuple[FloatArray, ...] | None = field(list_of(vector, "vectors"), default=None)
 
     @cached_property
     def copies(self) -> tuple[Any, ...]:
         """The plant of each of ``nodes``, or the one that all share."""
-        return tuple(self.plant.owned_by(node) for node in self.nodes or (None,))
+        plants = tuple(self.plant.owned_by(node) for node in self.nodes or (None,))
+        for plant, mean in zip(plants, self.means or (), strict=self.means is not None):
+            object.__setattr__(plant, "mean", mean)
+        return plants
+
+    def check_means(self) -> None:
+        """Raise ScenarioError unless ``means`` has one for each of ``nodes``, in place of mean."""
+        if self.means is None:
+            return
+        if self.plant.mean is not None:
+            raise ScenarioError("means", "cannot stand beside mean", None, "leave one of them out")
+        n, shapes = self.plant.n, [mean.shape for mean in self.means]
+        if shapes != [(n,)] * len(self.nodes or ()):
+            rule = f"must have {n} numbers for each of nodes, which are {len(self.nodes or ())}"
+            raise ScenarioError("means", rule, list(self.means), "correct the list")
 
     def check_position(self) -> None:
         """Raise ScenarioError unless ``position`` names different entries of blocks of nodes."""
@@ -253,6 +270,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
             raise ScenarioError(f"[{k}].path", rule, None, "add the tables, or leave them out")
         _check_shapes(k, block)
         with errors_under(f"[{k}]"):
+            block.check_means()
             for plant in block.copies:
                 plant.read()
     plants = _plants(blocks)

@@ -159,7 +159,7 @@ def _check_input(u: Input, n: int) -> None:
 def _check_sensors(scenario: DerivedScenario) -> None:
     n, index_of_node = scenario.plant.n, scenario.topology.index
     for k, sensor in enumerate(scenario.sensors):
-        key = f"sensors[{k}]"
+        key = scenario.sensor_key(k)
         if isinstance(sensor, RegressorSensor):
             check_regressor(scenario, key, sensor)
         elif not sensor.linear:

@@ -243,6 +243,10 @@ class ScenarioModel(Component):
         object.__setattr__(self, "declared_sensors", declared)
         object.__setattr__(self, "sensor_entries", entries)
 
+    def sensor_key(self, k: int) -> str:
+        """Return the key path of the entry that number ``k`` of ``sensors`` comes from."""
+        return f"sensors[{self.sensor_entries[k]}]"
+
     @property
     def all_plants(self) -> list[tuple[str, Any]]:
         """The plant, or that of each block, each with its key path."""

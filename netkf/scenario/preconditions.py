@@ -97,7 +97,7 @@ def _check_blocks(scenario: DerivedScenario) -> None:
             support = scenario.support(placed)
             if np.isin(support, view).all():
                 continue
-            key = f"sensors[{scenario.sensor_entries[placed.entry]}]"
+            key = scenario.sensor_key(placed.entry)
             if not knows_blocks or not np.isin(support, view).any():
                 rule = f"must read blocks that node {node} estimates, for the {name}"
                 remedy = 'write filter.estimates = "own+neighbours" or "all"'
@@ -145,7 +145,7 @@ def _check_increments(scenario: DerivedScenario) -> None:
     for k, sensor in enumerate(scenario.sensors):
         if scenario.node_filter.needs.samples and not takes_samples(sensor):
             raise ScenarioError(
-                f"sensors[{k}].sampling",
+                f"{scenario.sensor_key(k)}.sampling",
                 f"is missing, and the {name} uses samples, no continuous increments",
                 None,
                 f"add {SAMPLING}",
@@ -158,7 +158,7 @@ def _check_fixed_sensors(scenario: DerivedScenario) -> None:
             irregular = sensor.linear and sensor.record is not None
             varies = "H or R varies, or a value is missing" if irregular else "H varies"
             raise ScenarioError(
-                f"sensors[{k}]",
+                scenario.sensor_key(k),
                 f"must have a fixed H for the {filter_name(scenario)}, which computes with it "
                 "before there are readings",
                 f"kind {kind_name(sensor, 'sensor')!r}, whose {varies}",
@@ -179,7 +179,7 @@ def _check_every_reading(scenario: DerivedScenario) -> None:
                 if len(reading) != len(sensor.R) or np.isnan(reading).any():
                     seen = "several" if len(reading) > len(sensor.R) else "none"
                     raise ScenarioError(
-                        f"sensors[{placed.entry}].path",
+                        f"{scenario.sensor_key(placed.entry)}.path",
                         f"must have one whole row of node {node} for each slot for the "
                         f"{filter_name(scenario)}, whose gains and P count all readings",
                         f"{seen} for slot {slot} at {slot * scenario.slot_plant.period:g} s",
@@ -262,7 +262,7 @@ def _check_heard(scenario: DerivedScenario) -> None:
         for node in sensor.nodes:
             if node not in heard:
                 raise ScenarioError(
-                    f"sensors[{k}].nodes",
+                    f"{scenario.sensor_key(k)}.nodes",
                     f"must be nodes that others hear for the {filter_name(scenario)}, whose nodes "
                     "use only the readings that they send",
                     node,

@@ -22,7 +22,7 @@ from netkf.scenario.sampling import all_sample_times, sample_times
 def check_records(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a recorded table does not fit the scenario or lacks a needed row."""
     for k, sensor in enumerate(scenario.sensors):
-        key = f"sensors[{k}]"
+        key = scenario.sensor_key(k)
         if sensor.record is not None:
             _check_readings(scenario, key, sensor)
         elif not scenario.plant.truth_known:

@@ -39,7 +39,7 @@ def times_of_sensor(
     """Return the sample times (K,) in seconds of one sensor of a node, see ``sample_times``."""
     sensor = scenario.sensors[placed_sensor.entry]
     generator = _make_generator(streams, node, placed_sensor)
-    with errors_under(f"sensors[{placed_sensor.entry}]"):
+    with errors_under(scenario.sensor_key(placed_sensor.entry)):
         times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
     times = scenario.time_grid.before(scenario.horizon, times)
     # Rows of one instant are one sample.
@@ -118,7 +118,7 @@ def check_sampling(scenario: ScenarioModel) -> None:
     those that replica 0 needs.
     """
     for k, sensor in enumerate(scenario.sensors):
-        key = f"sensors[{k}]"
+        key = scenario.sensor_key(k)
         if isinstance(sensor, (LinearSensor, NonlinearSensor)):
             if sensor.sampling is not None:
                 _check_clock(scenario, key, sensor)

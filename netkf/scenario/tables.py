@@ -34,7 +34,7 @@ FORMAT = 1  # version of scenario files
 MAX_DEPTH = 30  # of tables and lists inside one another
 UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
-BLOCK_KEYS = ("name", "nodes", "coupling", "position")
+BLOCK_KEYS = ("name", "nodes", "coupling", "position", "means")
 """Keys in one of [[plants]], beside those of its plant."""
 FILTERING_KEYS = ("mean", "cov", "model", "linearise", "estimates")
 """Keys of the table of a filter, beside those of its kind."""

@@ -76,7 +76,7 @@ def _time_constants(scenario: Any) -> Iterator[TimeConstant]:
     network = scenario.network
     for key, part in (
         ("plant", scenario.plant),
-        *((f"sensors[{k}]", sensor) for k, sensor in enumerate(scenario.sensors)),
+        *((scenario.sensor_key(k), sensor) for k, sensor in enumerate(scenario.sensors)),
         ("network.activation", network.activation),
         ("network.channel.delay", network.channel.delay),
         ("filter", scenario.filter.algorithm),

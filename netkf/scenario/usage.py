@@ -121,7 +121,7 @@ def repeat_notes(scenario: DerivedScenario) -> tuple[str, ...]:
     for k, sensor in enumerate(scenario.sensors):
         clock = getattr(sensor, "sampling", None)
         if isinstance(clock, RecordedSampling):
-            key = f"sensors[{k}].sampling"
+            key = f"{scenario.sensor_key(k)}.sampling"
             tables[key] = "node and time", clock.path.name, clock.row_times
     positions = scenario.position_table
     if positions is not None:
@@ -170,9 +170,9 @@ def _find_sensor_uses(scenario: DerivedScenario) -> dict[str, RowUse]:
     for k, sensor in enumerate(scenario.sensors):
         component: RecordedSampling | ReadingTable
         if sensor.record is not None:
-            key, component = f"sensors[{k}]", sensor.record
+            key, component = scenario.sensor_key(k), sensor.record
         elif isinstance(sampling := getattr(sensor, "sampling", None), RecordedSampling):
-            key, component = f"sensors[{k}].sampling", sampling
+            key, component = f"{scenario.sensor_key(k)}.sampling", sampling
         else:
             continue
         table = (type(component).__name__, component.path)

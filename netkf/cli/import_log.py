@@ -1,0 +1,17 @@
+"""``netkf import``: write a log as a scenario with its tables."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Write the files, and print their paths and notes; return the exit status."""
+    from netkf.logs.importing import import_log
+
+    files, notes = import_log(options.log, options.kind, options.out)
+    print(f"written: {files[0]} with {', '.join(path.name for path in files[1:])}")
+    for note in notes:
+        print(f"note: {note}")
+    print(f"next: netkf run {files[0]}")
+    return 0
