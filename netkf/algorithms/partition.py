@@ -60,7 +60,7 @@ class PartitionState(NamedTuple):
              no larger. 0 between groups, where nothing is known
     gap : the time since then
     start : see Start
-    groups : entries of what the node estimates, and then of each other block
+    groups : entries of what the node estimates, and then of all other blocks of each owner
     model : that of the whole state
     places : all blocks; ``blocks``: the names and owners of those that it estimates
     """
@@ -122,7 +122,11 @@ class Partition(Filter):
         }
         blocks = tuple((place.name, place.node) for place in node.blocks) or tuple(places)
         own = np.concatenate([places[block] for block in blocks])
-        groups = (own, *(entries for key, entries in places.items() if key not in blocks))
+        others: dict[Any, list[np.ndarray]] = {}
+        for key, entries in places.items():
+            if key not in blocks:
+                others.setdefault(key if key[1] is None else key[1], []).append(entries)
+        groups = (own, *(np.concatenate(parts) for parts in others.values()))
         P = np.array(cov, dtype=np.float64)
         bounds = np.zeros((n, n))
         for group in groups:
