@@ -111,7 +111,7 @@ class Partition(Filter):
         linear_plant=True,
         notes=_notes,
     )
-    analysis = Analysis(P_by_design=("larger", "larger"))
+    analysis = Analysis(P_by_design=("larger", "larger"), affine=True)
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PartitionState:
         """Return the state at time 0; mean and cov are of the whole state."""
@@ -140,15 +140,15 @@ class Partition(Filter):
         """Return the state ``gap`` seconds later. Bounds follow from those at the last use in one
         step, so that they do not depend on how often somebody looks.
         """
-        n = len(state.x)
+        n, (before, noise), start = len(state.x), state.gap, state.start
         Phi = state.model.transition(np.zeros(n), gap)
-        moved, root = state.model.predict(np.zeros(n), np.zeros((n, n)), gap)
+        x, root = state.model.predict(state.x, np.zeros((n, n)), gap)
+        mean, _ = state.model.predict(start.mean, root, gap)
         Q = root @ root.T
-        (before, noise), start = state.gap, state.start
         return state._replace(
-            x=Phi @ state.x + moved,
+            x=x,
             gap=Gap(Phi @ before, symmetric(Phi @ noise @ Phi.T + Q)),
-            start=Start(Phi @ start.mean + moved, symmetric(Phi @ start.cov @ Phi.T + Q)),
+            start=Start(mean, symmetric(Phi @ start.cov @ Phi.T + Q)),
         )
 
     def _part(self, state: PartitionState, group: np.ndarray) -> tuple[FloatArray, FloatArray]:

@@ -32,6 +32,6 @@ def _run(options: argparse.Namespace) -> int:
     else:
         print(f"{result.scenario}\n\n{format_consistency(result, full=options.all)}")
     if not result:
-        nodes = ", ".join(str(row.node) for row in result.rows if row.verdict.startswith("BROKEN"))
+        nodes = ", ".join(row.label for row in result.rows if row.verdict.startswith("BROKEN"))
         print(f"netkf: errors are inconsistent with P at node {nodes}", file=sys.stderr)
     return 0 if result else FAILED

@@ -50,12 +50,40 @@ BIAS_TOLERANCE = 0.02
 """Relative distance of the expected value from n above which the verdict has a remark."""
 
 
-class RunConsistency(NamedTuple):
-    """NEES and NIS of one run.
+class JudgedBlock(NamedTuple):
+    """A block as one node estimates it: ``node`` (index), name of the ``block`` and whose it is,
+    as pose@3, its ``entries`` in the state of the node, and in that of the plant, (n,).
 
-    samples      : (T, N) NEES after time 0, nan if rounding blurs the error
-    nees, expected : (N,) means over time of NEES and of its expected value, nan if unknown
-    nis, expected_nis : (N,) means over time of NIS and of its expected value, nan if unknown
+    Without several blocks of ``[[plants]]`` a node has one, with all states and without a name.
+    """
+
+    node: int
+    block: str
+    entries: np.ndarray
+    states: np.ndarray
+
+
+def judged_blocks(scenario: Scenario) -> list[JudgedBlock]:
+    """Return the blocks that are judged, node by node."""
+    if len(scenario.layout.places) == 1:
+        whole = np.arange(scenario.plant.n)
+        return [JudgedBlock(k, "", whole, whole) for k in range(len(scenario.nodes))]
+    blocks = []
+    for k, places in enumerate(scenario.estimated):
+        first = 0
+        for place in places:
+            own, states = np.arange(place.n), np.arange(place.first, place.first + place.n)
+            blocks.append(JudgedBlock(k, place.label, first + own, states))
+            first += place.n
+    return blocks
+
+
+class RunConsistency(NamedTuple):
+    """NEES and NIS of one run, of K blocks as nodes estimate them, see ``judged_blocks``.
+
+    samples      : (T, K) NEES after time 0, nan if rounding blurs the error
+    nees, expected : (K,) means over time of NEES and of its expected value, nan if unknown
+    nis, expected_nis : (K,) means over time of NIS and of its expected value, nan if unknown
     blurred_from : (1,) first time (s) at which an error is left out, inf without one
     covariance_given : (1,) True if the filter gives a covariance
     """
@@ -74,31 +102,44 @@ class RunConsistency(NamedTuple):
 def run_consistency(
     scenario: Scenario, seed: int, replica: int, engine: str | Engine = "auto"
 ) -> RunConsistency:
-    """Simulate one ``replica`` of the runs of ``seed``; return its NEES (T, N) after time 0, and
-    the means over time (N,) of NEES and NIS of the N nodes, with their expected values given the
-    events of the run. A task of ``replicate``.
+    """Simulate one ``replica`` of the runs of ``seed``; return NEES (T, K) after time 0 of K blocks
+    as nodes estimate them, and the means over time (K,) of NEES and NIS, with their expected values
+    given the events of the run. A task of ``replicate``.
     """
-    run = simulate(scenario, seed, replica, engine)
-    _, nees = errors(run.error, run.P)
+    run, blocks = simulate(scenario, seed, replica, engine), judged_blocks(scenario)
     after_start = np.flatnonzero(run.times > 0.0)
     sigma = None  # (T, N, n, n), E[e e'] given the events; None if unknown or too large
     if _count_errors(scenario) <= MAX_ERRORS:
         with contextlib.suppress(TheoryError):
             sigma = error_squares(scenario, run)
-    # Samples in which the error is mostly rounding, by its standard deviation of P and of Sigma.
-    blurred = blurred_samples(run, run.P)
-    blurred |= False if sigma is None else blurred_samples(run, sigma)
-    nis, expected_nis = _mean_nis(scenario, run, sigma, blurred)
+    columns = [_block_consistency(run, sigma, block) for block in blocks]
+    nees, expected, blurred = (np.stack(column, axis=1) for column in zip(*columns, strict=True))
+    nis, expected_nis = _mean_nis(scenario, run, sigma, (blocks, blurred))
     times = run.times[blurred.any(axis=1) & (run.times > 0.0)]
     return RunConsistency(
         samples=np.where(blurred, np.nan, nees)[after_start],
         nees=_mean(nees[after_start], blurred[after_start]),
-        expected=_mean(_expected_nees(run.P, sigma)[after_start], blurred[after_start]),
+        expected=_mean(expected[after_start], blurred[after_start]),
         nis=nis,
         expected_nis=expected_nis,
         blurred_from=times[:1] if len(times) else np.full(1, np.inf),
         covariance_given=np.array([np.isfinite(run.P).any()]),
     )
+
+
+def _block_consistency(
+    run: Run, sigma: FloatArray | None, block: JudgedBlock
+) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Return NEES (T,) of a block, its expected value, and where the error is mostly rounding, by
+    its standard deviation of P or of Sigma.
+    """
+    own = block.entries
+    square = np.ix_(np.arange(len(run.times)), np.array([block.node]), own, own)
+    P, covariance = run.P[square], None if sigma is None else sigma[square]
+    blurred = blurred_samples(run, P)
+    blurred |= False if covariance is None else blurred_samples(run, covariance)
+    _, nees = errors(run.error[:, [block.node]][:, :, own], P)
+    return nees[:, 0], _expected_nees(P, covariance)[:, 0], blurred[:, 0]
 
 
 def _mean(values: FloatArray, blurred: np.ndarray) -> FloatArray:
@@ -127,16 +168,23 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 
 
 def _mean_nis(
-    scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
+    scenario: Scenario,
+    run: Run,
+    sigma: FloatArray | None,
+    judged: tuple[list[JudgedBlock], np.ndarray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean NIS (N,) of the nodes' own readings and its expected value; nan without slots,
-    and where errors alone do not tell innovations.
+    """Return mean NIS (K,) of the nodes' own readings of each block and its expected value; nan
+    without slots, and where errors alone do not tell innovations. ``judged`` are the blocks, and
+    the samples (T, K) in which rounding blurs them.
     """
-    unknown = np.full(len(run.nodes), np.nan)
+    unknown = np.full(len(judged[0]), np.nan)
     if not scenario.slotted or not scenario.plant.linear:
         return unknown, unknown.copy()
-    innovations = _Innovations(scenario, run, sigma, blurred)
-    pairs = [np.array(list(innovations.of_node(i))) for i in range(len(run.nodes))]
+    innovations = _Innovations(scenario, run, sigma)
+    pairs = [
+        np.array(list(innovations.of_block(block, judged[1][:, k])))
+        for k, block in enumerate(judged[0])
+    ]
     means = np.array([p.mean(axis=0) if len(p) else (np.nan, np.nan) for p in pairs])
     return means[:, 0], means[:, 1]
 
@@ -144,10 +192,8 @@ def _mean_nis(
 class _Innovations:
     """Innovations of a run in slots, from predictions that are samples (or one step after one)."""
 
-    def __init__(
-        self, scenario: Scenario, run: Run, sigma: FloatArray | None, blurred: np.ndarray
-    ) -> None:
-        self._scenario, self._run, self._sigma, self._blurred = scenario, run, sigma, blurred
+    def __init__(self, scenario: Scenario, run: Run, sigma: FloatArray | None) -> None:
+        self._scenario, self._run, self._sigma = scenario, run, sigma
         self._streams = Streams(run.seed, run.replica)
         # Samples of a predicting filter are predictions; others are predicted by one slot.
         self._steps = 0 if scenario.node_filter.timing.predicts else 1
@@ -167,10 +213,29 @@ class _Innovations:
         path = memoryless.truth(self._streams.generator("plant"))
         self._noise = [path.state(slot) for slot in self._slots]
 
-    def of_node(self, i: int) -> Iterator[tuple[float, float]]:
-        """Yield NIS of the i-th node's linear readings and its expected value (nan: unknown)."""
-        # Where the node's sensors are listed in the scenario.
-        placed = self._scenario.placed_sensors.get(self._run.nodes[i], ())
+    def _readings_of(self, block: JudgedBlock) -> tuple[Any, ...]:
+        """Return the node's sensors that read a block, and nothing that it does not estimate."""
+        scenario, i = self._scenario, block.node
+        placed = scenario.placed_sensors.get(self._run.nodes[i], ())
+        if not block.block or not scenario.is_linear:
+            return placed
+        view = np.arange(scenario.plant.n)[scenario.view(i)]
+        supports = [(sensor, scenario.support(sensor)) for sensor in placed]
+        # What drives its blocks from outside is not in its errors.
+        outside = np.setdiff1d(np.arange(scenario.plant.n), view)
+        if any(piece.F[np.ix_(view, outside)].any() for piece in scenario.linear_plant.pieces):
+            return ()
+        return tuple(
+            sensor
+            for sensor, support in supports
+            if np.isin(support, view).all() and np.isin(block.states, support).any()
+        )
+
+    def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
+        """Yield NIS of the linear readings of a block and its expected value (nan: unknown), but
+        for samples (T,) that are ``blurred``.
+        """
+        i, placed = block.node, self._readings_of(block)
         # A nonlinear reading has no H given the errors alone.
         if not placed or not self._scenario.is_linear:
             return
@@ -184,13 +249,16 @@ class _Innovations:
         )
         for k, slot, noise in zip(self._samples, self._slots, self._noise, strict=True):
             source = k - self._steps  # the sample that is, or is advanced to, the prediction
-            if self._blurred[k, i] or self._blurred[source, i]:
+            if blurred[k] or blurred[source]:
                 continue
+            view = self._scenario.view(i)
             H = np.concatenate([sensor.matrix(slot) for sensor in sensors])
             last = (slot - 1, noise) if self._steps else None
             e, P, Sigma = self._prediction(source, i, last)
             # The innovation H e + noise: sensors read the error in place of the state.
-            v = np.concatenate([sensor.reading(slot, e) for sensor in sensors])
+            whole = np.zeros(H.shape[1])
+            whole[view] = e
+            v, H = np.concatenate([sensor.reading(slot, whole) for sensor in sensors]), H[:, view]
             S = H @ P @ H.T + believed_R
             expected = np.nan
             if Sigma is not None:
@@ -201,11 +269,13 @@ class _Innovations:
         self, k: int, i: int, last: tuple[int, FloatArray] | None
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
         """Return error (n,), P (n, n) and E[e e'] of sample k, or of its prediction by one slot:
-        ``last``, its number and the noise (n,) of the plant in it.
+        ``last``, its number and the noise of the plant in it.
         """
         run, scenario = self._run, self._scenario
-        e, P = run.error[k, i], run.P[k, i]
-        Sigma = None if self._sigma is None else self._sigma[k, i]
+        own = scenario.is_estimated[i]
+        square = np.ix_(own, own)
+        e, P = run.error[k, i, own], run.P[k, i][square]
+        Sigma = None if self._sigma is None else self._sigma[k, i][square]
         if last is None:
             return e, P, Sigma
         slot, noise = last
@@ -213,27 +283,31 @@ class _Innovations:
         # Of the plant, and of the filters' model, which may differ from it.
         now = bisect.bisect_right(whole.change_slots, slot)
         believed = bisect.bisect_right(scenario.followed_slots, slot)
-        plant, (F, Q) = whole.pieces[now], scenario.believed_pieces[believed]
-        model_is_true = np.array_equal(F, plant.F)
+        view: Any = scenario.view(i)
+        pieces = (whole.pieces[now].F, whole.pieces[now].Q), scenario.believed_pieces[believed]
+        (true_F, true_Q), (F, Q) = ([M[view][:, view] for M in piece] for piece in pieces)
+        model_is_true = np.array_equal(F, true_F)
         if Sigma is not None:
-            Sigma = plant.F @ Sigma @ plant.F.T + plant.Q if model_is_true else None
-        predicted = plant.F @ e + noise
+            Sigma = true_F @ Sigma @ true_F.T + true_Q if model_is_true else None
+        predicted = true_F @ e + noise[view]
         # x - xhat of the next slot, with the plant's F, F' of the model: F x + w - F' xhat
         # = F e + w + (F - F') xhat.
         if not model_is_true:
-            predicted = predicted + (plant.F - F) @ run.xhat[k, i]
+            predicted = predicted + (true_F - F) @ run.xhat[k, i, own]
         if whole.input is not None:
             gains, share = whole.input_gains, float(scenario.knows_input)
             unknown = (gains[now] - share * gains[believed]) @ whole.input.at(float(run.times[k]))
-            if unknown.any():
-                predicted, Sigma = predicted + unknown, None
+            if unknown[view].any():
+                predicted, Sigma = predicted + unknown[view], None
         return predicted, F @ P @ F.T + Q, Sigma
 
 
 @dataclass(frozen=True)
 class NodeConsistency:
-    """The consistency of one node over all runs.
+    """The consistency of one node, or of one block that it estimates, over all runs.
 
+    block        : the name of the block and whose it is, as pose@3; empty for the whole state
+    n            : its number of states
     nees         : mean NEES over runs and samples
     width        : half width of the interval of NEES minus its expected value (n if unknown)
     expected     : expected value of NEES, nan if unknown
@@ -250,15 +324,23 @@ class NodeConsistency:
     nis: float
     expected_nis: float
     verdict: str
+    block: str = ""
+    n: int = 0
+
+    @property
+    def label(self) -> str:
+        """The node, and the block if there are several."""
+        return f"{self.node} ({self.block})" if self.block else str(self.node)
 
 
 @dataclass(frozen=True)
 class Consistency(NotebookTable):
-    """Rows by node; false if the errors of a node contradict their expected size.
+    """Rows by node, and by block where the state has several; false if errors contradict their
+    expected size.
 
     ``low`` and ``high`` are the two-sided chi-square bounds at ``confidence`` on the mean NEES of a
-    sample over the runs if P is exact; divided by n they bound the ANEES. ``notes`` are sentences
-    on what was left out, and why.
+    sample over the runs if P is exact, of the largest number of states ``n``; divided by n they
+    bound the ANEES. ``notes`` are sentences on what was left out, and why.
     """
 
     scenario: str
@@ -272,7 +354,7 @@ class Consistency(NotebookTable):
 
     def __repr__(self) -> str:
         broken = sum(row.verdict.startswith("BROKEN") for row in self.rows)
-        nodes = f"{len(self.rows)} nodes"
+        nodes = f"{len(self.rows)} {'blocks' if self.rows[0].block else 'nodes'}"
         nodes = f"{broken} of {nodes} BROKEN" if broken else nodes
         return f"<netkf consistency of {self.scenario!r}: {nodes}; {self.runs:,} runs>"
 
@@ -281,7 +363,7 @@ class Consistency(NotebookTable):
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row per node."""
+        """One row per node, or per block of each node."""
         import pandas as pd
 
         return pd.DataFrame([vars(row) for row in self.rows])
@@ -297,10 +379,11 @@ def consistency(
     scheduler: str | None = None,
     engine: str = "auto",
 ) -> Consistency:
-    """Compare NEES and, in slots, NIS of ``runs`` runs with their expected values.
+    """Compare NEES and, in slots, NIS of ``runs`` runs with their expected values, for each block
+    of ``[[plants]]`` that a node estimates, or else for each node.
 
     The verdicts compare the NEES of each run with its exact expected value given the events of the
-    run (run by run, Student's interval; all nodes together at ``confidence``), or with n if that is
+    run (run by run, Student's interval; all rows together at ``confidence``), or with n if that is
     unknown (push-sum with frozen or asymptotic gains, a user's own filter). ``seed`` and the
     options from ``workers`` on are those of ``netkf.monte_carlo``.
 
@@ -335,21 +418,23 @@ def _without_horizon(scenario: Scenario) -> Scenario:
 def judge_consistency(
     scenario: Scenario, runs: Sequence[RunConsistency], confidence: float
 ) -> Consistency:
-    """Return the consistency of each node over ``runs``, together at ``confidence``."""
+    """Return the consistency of each block over ``runs``, together at ``confidence``."""
     # ``level`` is the probability that some interval misses.
-    n, count, level = scenario.width, len(runs), 1.0 - confidence
-    low, high = nees_bounds(n, count, confidence)
+    blocks, count, level = judged_blocks(scenario), len(runs), 1.0 - confidence
+    sizes = [len(block.entries) for block in blocks]
+    low, high = np.array([nees_bounds(n, count, confidence) for n in sizes]).T
     shortest = min(len(run.samples) for run in runs)  # runs that diverged ended early
     means = np.mean([run.samples[:shortest] for run in runs], axis=0)
     usable, inside = np.isfinite(means).sum(axis=0), ((means >= low) & (means <= high)).sum(axis=0)
-    # Shares (N,) of samples whose mean NEES over the runs is in ``low`` .. ``high``.
+    # Shares (K,) of samples whose mean NEES over the runs is in ``low`` .. ``high``.
     shares_inside = inside / np.where(usable, usable, np.nan)
-    # Bonferroni over the nodes, two-sided.
-    quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(scenario.nodes)))
+    # Bonferroni over the blocks, two-sided.
+    quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(blocks)))
     rows = [
-        _judge_node(scenario, runs, i, float(shares_inside[i]), quantile)
-        for i in range(len(scenario.nodes))
+        _judge_block(scenario, runs, (k, block), float(shares_inside[k]), quantile)
+        for k, block in enumerate(blocks)
     ]
+    largest = int(np.argmax(sizes))
     blurred_from = min(run.blurred_from[0] for run in runs)
     notes = () if any(run.covariance_given[0] for run in runs) else (NO_COVARIANCE,)
     if _count_errors(scenario) > MAX_ERRORS:
@@ -363,25 +448,33 @@ def judge_consistency(
         notes = (*notes, f"{reason}: those samples are left out; shorten the horizon")
     return Consistency(
         scenario=scenario.name,
-        n=n,
+        n=sizes[largest],
         runs=count,
         confidence=confidence,
-        low=low,
-        high=high,
+        low=float(low[largest]),
+        high=float(high[largest]),
         rows=tuple(rows),
         notes=notes,
     )
 
 
-def _judge_node(
-    scenario: Scenario, runs: Sequence[RunConsistency], i: int, share_inside: float, quantile: float
+def _judge_block(
+    scenario: Scenario,
+    runs: Sequence[RunConsistency],
+    judged: tuple[int, JudgedBlock],
+    share_inside: float,
+    quantile: float,
 ) -> NodeConsistency:
-    """Return the i-th node's row; intervals reach ``quantile`` standard errors to each side."""
+    """Return the row of a block and its number; intervals reach ``quantile`` standard errors to
+    each side.
+    """
+    i, block = judged
+    n = len(block.entries)
     nees = np.array([run.nees[i] for run in runs])
     expected = np.array([run.expected[i] for run in runs])
     is_known = bool(np.isfinite(expected).all())
     # NEES of an exact P has the mean n.
-    excesses = nees - (expected if is_known else scenario.width)
+    excesses = nees - (expected if is_known else n)
     width = quantile * float(excesses.std(ddof=1)) / math.sqrt(len(runs))
     if not any(run.covariance_given[0] for run in runs):
         verdict = NO_COVARIANCE
@@ -389,9 +482,9 @@ def _judge_node(
         verdict = UNDECIDED
     else:
         mean = float(expected.mean()) if is_known else None
-        verdict = _verdict(scenario, float(excesses.mean()), width, mean)
+        verdict = _verdict(scenario, n, (float(excesses.mean()), width), mean)
     return NodeConsistency(
-        node=scenario.nodes[i],
+        node=scenario.nodes[block.node],
         nees=float(nees.mean()),
         width=width,
         expected=float(expected.mean()),
@@ -399,12 +492,18 @@ def _judge_node(
         nis=float(np.mean([run.nis[i] for run in runs])),
         expected_nis=float(np.mean([run.expected_nis[i] for run in runs])),
         verdict=verdict,
+        block=block.block,
+        n=n,
     )
 
 
-def _verdict(scenario: Scenario, excess: float, width: float, expected: float | None) -> str:
-    """Return the verdict on NEES that is ``excess`` (+- ``width``) above ``expected`` (None: n)."""
-    n = scenario.width
+def _verdict(
+    scenario: Scenario, n: int, interval: tuple[float, float], expected: float | None
+) -> str:
+    """Return the verdict on NEES of n states that is by an ``interval``, centre and half width,
+    above ``expected`` (None: n).
+    """
+    excess, width = interval
     if not math.isfinite(excess):
         return "no NEES: P is singular, or P or the errors are not finite"
     if expected is None:
@@ -431,7 +530,10 @@ def _explain_bias(scenario: Scenario, conservative: bool) -> str:
         return "P is conservative by design" if by_design else "P is conservative"
     if bias == "smaller":
         return "P is overconfident by design"
-    starts = (scenario.initial_estimate(node)[0] for node in scenario.nodes)
+    mean = scenario.filter.mean
+    starts = (
+        mean if isinstance(mean, tuple) else (scenario.plant.start_mean if mean is None else mean,)
+    )
     if all(np.array_equal(start, scenario.plant.start_mean) for start in starts):
         return "P is overconfident"
     return "P is overconfident: filters start elsewhere than the state"

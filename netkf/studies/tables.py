@@ -98,19 +98,22 @@ def format_answer(sizing: Sizing) -> str:
 
 
 def format_consistency(consistency: Consistency, full: bool = True) -> str:
-    """Return the result of ``netkf.consistency`` for a terminal: one row per node with NEES and NIS
-    beside their expected values, and a legend of the columns.
+    """Return the result of ``netkf.consistency`` for a terminal: one row per node, or block of a
+    node, with NEES and NIS beside their expected values, and a legend of the columns.
 
     Unless ``full``, a large network has rows for the nodes whose P is inconsistent, and for the
     first and last of the others.
     """
-    header = ["node", "NEES", "expected", "inside", "NIS", "expected", "verdict"]
+    of_blocks = bool(consistency.rows[0].block)
+    header = ["node", *["block"] * of_blocks]
+    header += ["NEES", "expected", "inside", "NIS", "expected", "verdict"]
     listed = list(consistency.rows)
     if not full and len(listed) > MAX_ROWS:
         listed = sorted(listed, key=lambda row: not row.verdict.startswith("BROKEN"))
     rows = [
         [
             str(row.node),
+            *[row.block] * of_blocks,
             format_number(row.nees) + (f" +- {row.width:.1g}" if math.isfinite(row.width) else ""),
             format_number(row.expected),
             f"{row.inside:.0%}",
@@ -120,17 +123,20 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
         ]
         for row in listed
     ]
-    level = f"{consistency.confidence:g}"
+    level, rows_are = f"{consistency.confidence:g}", "blocks" if of_blocks else "nodes"
+    all_sizes = sorted({row.n for row in consistency.rows})
+    sizes = ", ".join(map(str, all_sizes))
+    of_largest = f"; for n = {all_sizes[-1]}, others by theirs" if len(all_sizes) > 1 else ""
     ends = f"{consistency.low:.4g} .. {consistency.high:.4g}"
     scaled = f"{consistency.low / consistency.n:.4g} .. {consistency.high / consistency.n:.4g}"
     return "\n".join(
         [
             format_table(header, rows if full else shorten_rows(rows, MAX_ROWS)),
             "",
-            f"{consistency.runs:,} runs, n = {consistency.n}; +-: half width of the interval on "
-            f"the difference from the expected NEES, all nodes together at confidence {level}",
+            f"{consistency.runs:,} runs, n = {sizes}; +-: half width of the interval on the "
+            f"difference from the expected NEES, all {rows_are} together at confidence {level}",
             f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
-            f"chi-square bounds at {level} where P is exact",
+            f"chi-square bounds at {level} where P is exact{of_largest}",
             *(f"note: {note}" for note in consistency.notes),
         ]
     )

@@ -20,6 +20,7 @@ from netkf.studies.consistency import (
 )
 from netkf.studies.metrics import expected_metrics
 from netkf.studies.tables import format_consistency
+from tests.algorithms.test_block_intersection import ROBOTS, load
 from tests.checks.broken import Overconfident
 from tests.conftest import SCENARIOS
 
@@ -217,3 +218,32 @@ def test_errors_beyond_all_numbers_are_reported_without_a_warning():
     found = netkf.consistency(netkf.load(SCENARIOS / "push_sum_planar.toml", changes), 10)
     assert any("errors are not finite" in row.verdict for row in found.rows)
     assert "nan" not in format_consistency(found)
+
+
+def test_each_block_of_a_node_is_judged(tmp_path):
+    naive = load(
+        ROBOTS, tmp_path, filter__rule="naive", filter__estimates="own+neighbours", horizon=8.0
+    )
+    found = netkf.consistency(naive, runs=12, seed=3)
+    pairs = [(row.node, row.block) for row in found.rows]
+    assert len(set(pairs)) == 7
+    assert (2, "pose@3") in pairs
+    assert any(row.verdict.endswith("overconfident") for row in found.rows)
+    row = found.rows[pairs.index((2, "pose@3"))]
+    ratios = []
+    for replica in range(12):
+        block = netkf.simulate(naive, seed=3, replica=replica).block("pose", 3, by=2)
+        kept = (block.times > 0.0) & (block.times < 8.0)
+        ratios.append((block.error[kept, 0] ** 2 / block.P[kept, 0, 0]).mean())
+    np.testing.assert_allclose(row.nees, np.mean(ratios), rtol=1e-9)
+    # Where P is exact NEES has the mean n, and NIS that of the readings of a block.
+    filtering = {"kind": "central", "estimates": "own+neighbours"}
+    central = netkf.consistency(naive.replace({"filter": filtering}), runs=10)
+    expected = {(row.node, row.block): row for row in central.rows}
+    for pair, readings in {(1, "pose@1"): 2, (2, "pose@1"): 1, (2, "pose@2"): 2}.items():
+        np.testing.assert_allclose(expected[pair].expected, 1.0, rtol=1e-9)
+        np.testing.assert_allclose(expected[pair].expected_nis, readings, rtol=1e-9)
+        assert 0.5 * readings < expected[pair].nis < 2.0 * readings
+    text = format_consistency(found)
+    assert "pose@3" in text
+    assert "all blocks together" in text

@@ -132,7 +132,7 @@ class BlockColumns(ErrorColumns):
             parts = whole if view is None else view.readings(*whole[0])
             for part in parts:
                 (pairs if isinstance(part, PairReading) else samples).append(part)
-        n = len(self._models[h].information)
+        n = int(self._scenario.is_estimated[h].sum())
         y = np.concatenate([self._x[:0], *(y for y, *_ in samples)])
         H = np.concatenate([np.empty((0, n)), *(H for _, H, _ in samples)])
         reading = Reading(y, H, block_diagonal([R for *_, R in samples]), time, tuple(pairs))
