@@ -346,19 +346,30 @@ def _stacked_schedule(blocks: Sequence[Block], layout: Layout) -> list[dict[str,
     plants: list[Any] = [block.plant for block in blocks]
     schedule = []
     for start in sorted({change.start for plant in plants for change in plant.schedule}):
-        present = []
-        for block, plant in zip(blocks, plants, strict=True):
-            k = sum(change.start <= start for change in plant.schedule)
-            u = plant.input
-            if u is not None:
-                u = dataclasses.replace(u, G=plant.input_gains[k])
-            piece = dataclasses.replace(plant.pieces[k], input=u)
-            present.append(dataclasses.replace(block, plant=piece))
+        present = blocks_from(blocks, start)
         entry = {"from": start, **_stacked_matrices(present, layout)}
         if (stacked := _stacked_input(present, layout)) is not None:
             entry["G"] = stacked.G
         schedule.append(entry)
     return schedule
+
+
+def blocks_from(blocks: Sequence[Block], time: float, **keys: Any) -> list[Block]:
+    """Return linear ``blocks`` that are always as they are from ``time`` (seconds) on, their plants
+    with other values of some ``keys``.
+    """
+    present = []
+    for block in blocks:
+        plant: Any = block.plant
+        k = sum(change.start <= time for change in plant.schedule)
+        u = plant.input
+        if u is not None:
+            u = dataclasses.replace(u, G=plant.input_gains[k])
+        names = "FQ" if isinstance(plant, SlotPlant) else "AB"
+        matrices = {name: getattr(plant.pieces[k], name) for name in names}
+        piece = dataclasses.replace(plant, **matrices, **keys, input=u, schedule=())
+        present.append(dataclasses.replace(block, plant=piece))
+    return present
 
 
 def _check_shapes(k: int, block: Block) -> None:

@@ -35,6 +35,7 @@ from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import Link
+from netkf.plants.blocks import blocks_from
 from netkf.plants.changes import dividing_period
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion, default_sensing_period
@@ -130,10 +131,15 @@ class DerivedScenario(ScenarioModel):
         )
         if cov is not None:
             filtering = dataclasses.replace(filtering, cov=cov)
+        if self.plants:
+            start = self.plant.changes[number - 1] if number else -math.inf
+            keys = {} if self.slotted else {"sensing_period": matrices["sensing_period"]}
+            blocks = tuple(blocks_from(self.plants, start, **keys))
+            return dataclasses.replace(
+                self, plants=blocks, sensors=self.declared_sensors, filter=filtering
+            )
         plant = dataclasses.replace(self.plant, **matrices, schedule=())  # type: ignore[call-arg]
-        # The stacked plant and its sensors, where the state consists of blocks.
-        blocks: dict[str, Any] = {"plants": (), "sensors": self.sensors} if self.plants else {}
-        return dataclasses.replace(self, plant=plant, filter=filtering, **blocks)
+        return dataclasses.replace(self, plant=plant, filter=filtering)
 
     @cached_property
     def followed_changes(self) -> FloatArray:
