@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from netkf.algorithms.baselines import Central, Local
 from netkf.algorithms.belief_propagation import BeliefPropagation
+from netkf.algorithms.block_belief_propagation import BlockBeliefPropagation
+from netkf.algorithms.block_cross_covariances import BlockCrossCovariances
 from netkf.algorithms.block_intersection import BlockIntersection
 from netkf.algorithms.consensus_innovations import ConsensusInnovations
 from netkf.algorithms.constant_gain import ConstantGain
@@ -147,6 +149,8 @@ __all__ = [
     "BeliefPropagation",
     "Bernoulli",
     "Block",
+    "BlockBeliefPropagation",
+    "BlockCrossCovariances",
     "BlockIntersection",
     "Broadcast",
     "Central",

@@ -43,6 +43,8 @@ class Needs:
                 ``translate(payload, own, common)``: ``own`` is the payload that the node itself
                 would send, ``common`` says which states both estimate (``translation.Common``). By
                 default payloads are one vector of the state
+    own_blocks : each block must be estimated by one node alone, and first errors of different nodes
+                 must be independent
     check : ``check(scenario)`` raises ScenarioError where settings of the filter do not fit a
             ``netkf.Scenario``
     notes : ``notes(scenario)`` returns notes on the filter for the user, one line each
@@ -64,6 +66,7 @@ class Needs:
     blocks: bool = False
     coupled: bool = False
     translate: Callable[[Any, Any, Common], Any] = read_vector
+    own_blocks: bool = False
     check: Callable[[Any], None] | None = None
     notes: Callable[[Any], tuple[str, ...]] | None = None
 

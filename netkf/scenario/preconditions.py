@@ -7,6 +7,7 @@ here is the only place that checks them, in slots and in continuous time.
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ def check_preconditions(scenario: DerivedScenario) -> None:
         _check_one_model(scenario)
     if scenario.views is not None:
         _check_blocks(scenario)
+    if needs.own_blocks:
+        _check_own_blocks(scenario)
     if not scenario.slotted:
         _check_increments(scenario)
     if needs.linear_plant and not scenario.plant.linear:
@@ -138,6 +141,25 @@ def _translates(scenario: DerivedScenario) -> bool:
     shapes = kernels.record(algorithm, [info], [model]).payload.values()
     says_more = kernels.sends_readings or kernels.addressed
     return not says_more and list(shapes) == [start[0].shape]
+
+
+def _check_own_blocks(scenario: DerivedScenario) -> None:
+    """Check that nodes have no block in common, and that their first errors are independent."""
+    name, estimates = filter_name(scenario), scenario.filter.estimates
+    if len(scenario.nodes) > 1:
+        blocks = list(itertools.chain.from_iterable(scenario.estimated)) if scenario.plants else []
+        if len(set(blocks)) < max(1, len(blocks)):
+            rule = f"must give each block to one node alone for the {name}"
+            remedy = 'give nodes blocks in [[plants]] and write estimates = "own"'
+            raise ScenarioError("filter.estimates", rule, estimates, remedy)
+    cov = scenario.plant.start_cov if scenario.filter.cov is None else scenario.filter.cov
+    for k, node in enumerate(scenario.nodes):
+        P, view = cov[k] if isinstance(cov, tuple) else cov, scenario.view(k)
+        others = np.ones(scenario.plant.n, dtype=bool)
+        others[view] = False
+        if P[view][:, others].any():
+            rule = f"must be zero between the blocks of node {node} and others for the {name}"
+            raise ScenarioError("filter.cov", rule, P, "leave it out, or write 0 there")
 
 
 def _check_increments(scenario: DerivedScenario) -> None:

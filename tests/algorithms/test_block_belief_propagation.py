@@ -1,0 +1,137 @@
+"""Belief propagation over blocks: on a tree the posterior of the readings that have arrived, by a
+plain solution for all states of all nodes together.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.trace.schema import KINDS
+from tests.algorithms.test_block_intersection import BELIEF, CLOCKED, ROBOTS, load
+
+EDGES = [[1, 2], [2, 3], [2, 4], [4, 5]]
+NEIGHBOURS = {
+    node: [b if a == node else a for a, b in EDGES if node in (a, b)] for node in range(1, 6)
+}
+READINGS, N = 9, 5
+Key = tuple[int, int, int]
+"""A reading: its number, the node that reads, and the node that is read."""
+LOSSY = {"loss": {"kind": "bernoulli", "delivery": 0.6}, "symmetric": False}
+DELAYED = LOSSY | {"delay": {"kind": "exponential", "mean": 0.6}}
+SLOTS = 1.0, 0.9, 0.2
+CLOCKS = 0.5, np.exp(-0.05), 0.25 * (1.0 - np.exp(-0.1)) / 0.2
+"""Seconds from reading to reading; transition and noise from one to the next."""
+
+
+def posterior(
+    known: set[Key], y: dict[Key, float], last: int, F: float, Q: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and variance of all nodes at reading number ``last``, by one solution for all
+    instants; entry (k, i) of the state is k * N + i - 1.
+    """
+    variances = np.array(
+        [F ** (2 * k) + Q * sum(F ** (2 * s) for s in range(k)) for k in range(99)]
+    )
+    k = np.arange(last + 1)
+    C = variances[np.minimum.outer(k, k)] * F ** np.abs(np.subtract.outer(k, k))
+    C = np.kron(C, np.eye(N))
+    H, R = np.zeros((len(known), len(C))), np.zeros(len(known))
+    for row, (k, i, j) in enumerate(sorted(known)):
+        H[row, k * N + j - 1] += 1.0
+        if i != j:
+            H[row, k * N + i - 1] -= 1.0
+        R[row] = 0.1 if i == j else 0.3
+    K = C @ H.T @ np.linalg.inv(H @ C @ H.T + np.diag(R))
+    x = K @ np.array([y[key] for key in sorted(known)])
+    return x[-N:], np.diag(C - K @ H @ C)[-N:]
+
+
+def known_to_all(run: netkf.Run, y: dict[Key, float], period: float) -> dict[float, list[set[Key]]]:
+    """Return the readings in the beliefs of all nodes at each sample, from the events of a run: a
+    message has those of its sender's side of a link, with those of the pair up to its sending.
+    """
+
+    def own(i: int, t: float) -> set[Key]:
+        return {key for key in y if key[1] == key[2] == i and period * key[0] <= t}
+
+    told: dict[tuple[int, int], tuple[float, set[Key]]] = {}
+    sent, inbox, found = {}, list[tuple[int, int, int]](), {}
+    rows = run.log[["t", "kind", "node", "peer", "message"]].tolist()
+    # A sample of a slot is of its end.
+    end = 0.99 if run.times[1] == 1.0 else 0.0
+    samples = [(t + end, len(KINDS), 0, 0, 0) for t in run.times]
+    for t, code, node, peer, number in sorted(rows + samples, key=lambda row: row[0]):
+        kind = KINDS[code] if code < len(KINDS) else "sample"
+        if kind == "send":
+            side = [told[node, k][1] for k in NEIGHBOURS[node] if k != peer and (node, k) in told]
+            pair = {key for key in y if {*key[1:]} == {node, peer} and period * key[0] <= t}
+            sent[node, peer, number] = t, own(node, t).union(pair, *side)
+        elif kind == "deliver":
+            inbox.append((peer, node, number))
+        elif kind == "absorb":
+            for message in [one for one in inbox if one[1] == node]:
+                inbox.remove(message)
+                link, content = (node, message[0]), sent[message]
+                # One that was overtaken is not used.
+                if link not in told or told[link][0] <= content[0]:
+                    told[link] = content
+        elif kind == "sample":
+            heard = {
+                i: [told[i, j][1] for j in NEIGHBOURS[i] if (i, j) in told] for i in NEIGHBOURS
+            }
+            found[round(t - end, 6)] = [own(i, t).union(*heard[i]) for i in NEIGHBOURS]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("text", "law", "steps", "channel"),
+    [(ROBOTS, SLOTS, 1, LOSSY), (ROBOTS, SLOTS, 2, LOSSY), (CLOCKED, CLOCKS, 1, DELAYED)],
+    ids=["slots", "two steps", "late and overtaken"],
+)
+def test_on_trees_it_is_the_posterior_of_what_has_arrived(
+    tmp_path: Path,
+    text: str,
+    law: tuple[float, float, float],
+    steps: int,
+    channel: dict[str, object],
+) -> None:
+    random, (period, F, Q) = np.random.default_rng(1), law
+    keys = [(k, i, j) for k in range(1, READINGS + 1) for i in NEIGHBOURS for j in NEIGHBOURS[i]]
+    keys += [(k, 1, 1) for k in range(1, READINGS + 1)]
+    y = {key: float(random.normal()) for key in keys}
+    pairs = [f"{period * k},{i},{j},{y[k, i, j]}" for k, i, j in y if i != j]
+    own = [f"{period * k},{i},{y[k, i, j]}" for k, i, j in y if i == j]
+    (tmp_path / "pairs.csv").write_text("t,node,to,y0\n" + "\n".join(pairs) + "\n")
+    (tmp_path / "own.csv").write_text("t,node,y0\n" + "\n".join(own) + "\n")
+    text = text.replace('of = "pose"\nnodes = [1]', 'kind = "recorded"\npath = "own.csv"')
+    text = text.replace('kind = "relative"', 'kind = "relative"\npath = "pairs.csv"')
+    text = "\n".join(line for line in text.split("\n") if not line.startswith("sampling"))
+    changes = {
+        "plants__0__nodes": list(NEIGHBOURS),
+        "network__graph": {"kind": "edges", "edges": EDGES},
+        "network__channel": channel,
+        "horizon": period * (READINGS + 1),
+        "probe": period,
+        "filter": BELIEF | {"estimates": "own", "steps": steps},
+    }
+    run = netkf.simulate(load(text, tmp_path, **changes))
+    known = known_to_all(run, y, period)
+    # The last sample has events beyond the horizon, which are not recorded.
+    for k, t in enumerate(run.times[:-1]):
+        for i in range(N if k else 0):
+            x, P = posterior(known[round(t, 6)][i], y, k, F, Q)
+            np.testing.assert_allclose(run.xhat[k, i, 0], x[i], atol=1e-10)
+            np.testing.assert_allclose(run.P[k, i, 0, 0], P[i], rtol=1e-9)
+    assert run.count("lost") > 10
+
+
+def test_loops_are_noted(tmp_path: Path) -> None:
+    graph = {"kind": "edges", "edges": [[1, 2], [2, 3], [3, 1]]}
+    belief = {"filter": BELIEF | {"estimates": "own"}}
+    noted = load(ROBOTS, tmp_path, network__graph=graph, **belief).notes
+    assert any("loops" in note and "P is too small" in note for note in noted)
+    assert not any("loops" in note for note in load(ROBOTS, tmp_path, **belief).notes)
