@@ -129,7 +129,7 @@ class Observed(Filter):
     @property
     def needs(self) -> Any:
         """Those of the user's filter, without its own checks of a scenario."""
-        return replace(self.watched.part.needs, check=None, notes=None)
+        return replace(self.watched.part.needs, own_blocks=False, check=None, notes=None)
 
     @property
     def link_weights(self) -> Any:

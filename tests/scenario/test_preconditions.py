@@ -27,10 +27,12 @@ OWN = {
     "kcf": {"epsilon": 0.1},
     "push-sum": {"gamma": 2, "delta": 4.5},
 }
+OF_OWN_BLOCKS = ("block-belief-propagation", "block-cross-covariances")
 FILTERS = {
     name: {"kind": kind, **dict(c.split("=") for c in choice), **OWN.get(name, {})}
     for name in kinds()["filter"]
     for kind, *choice in [name.split(" ")]
+    if name not in OF_OWN_BLOCKS
 }
 INNER = {
     f"trigger around {name}": {
@@ -255,6 +257,13 @@ REFUSED_UNDER_CLOCKS = {
                        "track-fusion rule=ci", "track-fusion rule=ici"},
     "a directed line": {"gossip", "push-sum"},
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", OF_OWN_BLOCKS)
+def test_filters_of_own_blocks_refuse_one_plant_for_all_nodes(kind, tmp_path):
+    rule = f"filter.estimates: must give each block to one node alone for the {kind}"
+    with pytest.raises(netkf.ScenarioError, match=rule):
+        CASES["all is there"].scenario({"kind": kind}, tmp_path)
 
 
 @pytest.mark.parametrize("case", CONTINUOUS)

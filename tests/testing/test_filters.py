@@ -45,6 +45,14 @@ SOUND = {
         parts.BeliefPropagation(memory="all"),
     ],
     "consensus-innovations": [parts.ConsensusInnovations()],
+    "block-belief-propagation": [
+        parts.BlockBeliefPropagation(),
+        parts.BlockBeliefPropagation(steps=2, window=2),
+    ],
+    "block-cross-covariances": [
+        parts.BlockCrossCovariances(),
+        parts.BlockCrossCovariances(steps=1),
+    ],
     "block-intersection": [parts.BlockIntersection(), parts.BlockIntersection(rule="ci")],
     "partition": [parts.Partition()],
     "kcf": [parts.Kcf(epsilon=0.2)],
