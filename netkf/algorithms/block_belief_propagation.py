@@ -249,7 +249,7 @@ def evidence_of(state: PathState, message: PathMessage, belief: Path) -> Rows:
     x: FloatArray = state.belief().x.reshape(-1, n)
     x_j: FloatArray = message.belief.x.reshape(-1, m)
     found, both = list[Rows](), ((True, state.seen), (False, message.seen))
-    for is_own, t, pair in ((own, t, pair) for own, seen in both for t, pair in seen):
+    for is_own, t, pair in ((own, *one) for own, seen in both for one in seen):
         if t not in mine or t not in theirs:
             continue
         k, j = mine[t], theirs[t]
@@ -266,5 +266,5 @@ def evidence_of(state: PathState, message: PathMessage, belief: Path) -> Rows:
     rows = scipy.linalg.solve_triangular(root, np.column_stack([H[:, :K], z]), lower=True)
     if len(rows) > K + 1:
         # As many rows as states say the same; the last one is about none.
-        rows = np.linalg.qr(rows, mode="r")[:K]
+        rows = np.asarray(np.linalg.qr(rows, mode="r"))[:K]
     return Rows(rows[:, K], rows[:, :K], np.eye(len(rows)))
