@@ -13,6 +13,7 @@ from netkf.figures.figure_data import FigureData, UnavailableError, reduce_resul
 from netkf.figures.names import FORMATS
 from netkf.figures.network import network_figure
 from netkf.figures.pictures import overview
+from netkf.figures.plane import plane_figure
 from netkf.figures.stability import (
     law_figure,
     reason_to_omit_stability,
@@ -29,6 +30,7 @@ FIGURES: Mapping[str, Callable[[FigureData], Picture]] = {
     "quantiles": quantiles_figure,
     "ratios": ratios_figure,
     "network": network_figure,
+    "plane": plane_figure,
     "nees": nees_figure,
     "nis": nis_figure,
     "whiteness": whiteness_figure,

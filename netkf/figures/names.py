@@ -3,7 +3,7 @@
 FORMATS = ("png", "svg", "pdf")
 """Formats of picture files, which are their suffixes."""
 FIGURE_NAMES = (
-    *("overview", "error", "quantiles", "ratios", "network", "nees", "nis", "whiteness"),
+    *("overview", "error", "quantiles", "ratios", "network", "plane", "nees", "nis", "whiteness"),
     *("age", "links", "stability", "law", "delivery"),
 )
 """The figures of runs and ensembles; a sweep has ``stability`` only."""

@@ -6,6 +6,7 @@ those of a run's own copy of its scenario, which must not change when defaults o
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 from collections.abc import Mapping
@@ -102,12 +103,15 @@ def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
     """Return the table of one of [[plants]], with the values of the ``stacked`` plant that all
     share.
     """
-    plant = block.plant
+    plant = copy.copy(block.plant)
     if style.with_defaults:
-        plant = dataclasses.replace(plant, mean=plant.start_mean, cov=plant.start_cov)
+        defaults = {"mean": plant.start_mean, "cov": plant.start_cov}
+        if block.means is not None:
+            del defaults["mean"]
         if isinstance(stacked, Diffusion):
-            period = stacked.sensing_period
-            plant = dataclasses.replace(plant, sensing_period=period)  # type: ignore[call-arg]
+            defaults["sensing_period"] = stacked.sensing_period
+        for name, value in defaults.items():
+            object.__setattr__(plant, name, value)
     own = _field_values(block, style)
     del own["plant"]
     if block.coupling:

@@ -11,6 +11,7 @@ from netkf.cli.main import main
 from netkf.figures.catalogue import FIGURES, FigureSet
 from netkf.figures.names import FIGURE_NAMES
 from netkf.figures.style import style_context
+from tests.conftest import SCENARIOS
 from tests.figures.conftest import KINDS
 
 SLACK = 1.0
@@ -226,3 +227,38 @@ def test_a_missing_matplotlib_is_one_line(results, monkeypatch, capsys, tmp_path
         results("ring").plot()
     assert main(["plot", str(tmp_path)]) == 2
     assert "pip install 'netkf[plot]'" in capsys.readouterr().err
+
+
+def test_paths_in_the_plane_are_those_of_the_nodes_and_their_own_estimates():
+    """Errors and the share inside ellipses computed again with numpy alone."""
+    file = SCENARIOS / "blocks" / "mrclam_small" / "scenario.toml"
+    run = netkf.simulate(netkf.load(file, {"horizon": 8.0}))
+    figure = run.plot("plane")
+    assert_well_laid_out(figure)
+    blocks = {node: run.block("pose", node) for node in run.nodes}
+    errors = {node: (one.x - one.xhat)[:, :2] for node, one in blocks.items()}
+    rms = {node: np.sqrt(np.mean(np.sum(e**2, axis=1))) for node, e in errors.items()}
+    (best, low), *_, (worst, high) = sorted(rms.items(), key=lambda pair: pair[1])
+    title = f"RMS error of positions: {low:.3g} (node {best}) to {high:.3g} (node {worst})"
+    assert figure.get_suptitle() == title
+    inside = [
+        e @ np.linalg.solve(P[:2, :2], e) <= -2.0 * np.log(0.05)
+        for node, one in blocks.items()
+        for e, P in zip(errors[node][1:], one.P[1:], strict=True)
+    ]
+    text = " ".join(figure._supxlabel.get_text().split())
+    assert f"{np.mean(inside):.0%} of the sampled positions are where P says that 95%" in text
+    axes = figure.axes[0]
+    drawn = [line.get_xydata() for line in axes.lines]
+    assert len(drawn) == 10
+    np.testing.assert_array_equal(drawn[2], blocks[2].x[:, :2])
+    np.testing.assert_array_equal(drawn[3], blocks[2].xhat[:, :2])
+    seen = axes.collections[0].get_offsets()
+    assert len(seen) == 15
+
+
+def test_the_plane_needs_nodes_that_estimate_their_coordinates(drawing):
+    for kind, words in (("ring", "position = [0, 1]"), ("ensemble", "Only single runs have paths")):
+        assert words in " ".join(
+            " ".join(t for t, _ in shown_texts(drawing(kind).draw("plane"))).split()
+        )

@@ -1,0 +1,136 @@
+"""The figure ``plane``: paths of nodes whose plants say their coordinates, and their estimates."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse, Patch
+
+from netkf.figures.figure_data import FigureData, UnavailableError
+from netkf.figures.style import INK, MUTED, SERIES, Picture, finish_figure, new_figure
+from netkf.linalg.arrays import FloatArray
+from netkf.trace.run import Run
+
+LEVEL = 0.95
+SQUARE = -2.0 * math.log(1.0 - LEVEL)
+"""Squared distance, in units of P, within which a share LEVEL of plane Gaussian errors is."""
+ELLIPSES = 6  # of each node
+
+
+class _Path(NamedTuple):
+    """True positions x, the node's own estimates xhat (T, 2) of them, and their P (T, 2, 2)."""
+
+    node: int
+    x: FloatArray
+    xhat: FloatArray
+    P: FloatArray
+
+
+def plane_figure(data: FigureData) -> Picture:
+    """Draw the path of each node and its estimate of it, with ellipses of P at some instants."""
+    if data.run is None:
+        reason = "Only single runs have paths: draw one of them, netkf.open(DIR).replica(0)."
+        raise UnavailableError(reason)
+    data.require_samples()
+    paths = _paths(data.run)
+    if not paths:
+        reason = "No node estimates coordinates of its own: those that a plant of [[plants]] names"
+        raise UnavailableError(f"{reason} by position = [0, 1].")
+    landmarks = _landmarks(data.scenario)
+    points = np.concatenate([*(path.xhat for path in paths), landmarks])
+    width, height = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
+    # Of one scale along both axes.
+    figure = new_figure(6.6, 1.7 + float(np.clip(5.9 * height / max(width, 1e-9), 2.5, 7.0)))
+    axes = figure.subplots()
+    axes.scatter(*landmarks.T, marker="+", s=45, linewidths=1.2, color=INK, zorder=4)
+    for k, path in enumerate(paths):
+        _draw_path(axes, path, SERIES[k % len(SERIES)].colour)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.08)
+    axes.set(xlabel="first coordinate", ylabel="second coordinate")
+    handles = _legend(data, len(landmarks) > 0)
+    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    finish_figure(figure, data.title(_headline(data, paths)), data.caption(_coverage(data, paths)))
+    return figure
+
+
+def _paths(run: Run) -> list[_Path]:
+    scenario, paths = run.scenario, []
+    for block in scenario.plants:
+        if block.position is None or len(block.position) != 2:
+            continue
+        place = np.ix_(range(len(run.times)), block.position, block.position)
+        for node in block.nodes or ():
+            own = scenario.estimated[scenario.topology.index[node]]
+            if any((one.name, one.node) == (block.name, node) for one in own):
+                pose, chosen = run.block(block.name, node), list(block.position)
+                xy = pose.x[:, chosen], pose.xhat[:, chosen]
+                paths.append(_Path(node, *xy, pose.P[place]))
+    return paths
+
+
+def _landmarks(scenario: Any) -> FloatArray:
+    """Return the places (L, 2) that robots look at."""
+    seen = [
+        np.asarray(sensor.positions)
+        for sensor in scenario.sensors
+        if getattr(sensor, "heading", None) is not None and not isinstance(sensor.positions, str)
+    ]
+    return np.unique(np.concatenate([np.zeros((0, 2)), *seen]), axis=0)
+
+
+def _draw_path(axes: Any, path: _Path, colour: str) -> None:
+    axes.plot(*path.x.T, color=colour, linewidth=1.2, zorder=2)
+    axes.plot(*path.xhat.T, color=colour, linewidth=1.2, linestyle=(0, (1, 1.4)), zorder=3)
+    for k in np.unique(np.linspace(0, len(path.xhat) - 1, ELLIPSES).astype(int)):
+        if np.isfinite(path.P[k]).all():
+            sizes, axis = np.linalg.eigh(path.P[k])
+            axes.add_patch(
+                Ellipse(
+                    path.xhat[k],
+                    *(2.0 * np.sqrt(SQUARE * np.maximum(sizes, 0.0))),
+                    angle=math.degrees(math.atan2(axis[1, 0], axis[0, 0])),
+                    facecolor=colour,
+                    edgecolor=colour,
+                    linewidth=0.6,
+                    alpha=0.25,
+                )
+            )
+    end = path.xhat[-1]
+    axes.scatter(*end, s=90, color="white", edgecolors=colour, zorder=5)
+    axes.text(*end, str(path.node), fontsize=6.5, ha="center", va="center", zorder=6)
+
+
+def _legend(data: FigureData, has_landmarks: bool) -> list[Any]:
+    true = Line2D([], [], color=MUTED, linewidth=1.2, label="true path")
+    estimated = Line2D([], [], color=MUTED, linestyle=(0, (1, 1.4)), label="estimate of the node")
+    ellipse = Patch(facecolor=MUTED, alpha=0.25, label=f"{LEVEL:.0%} of errors, by P")
+    mark = Line2D([], [], color=INK, marker="+", linestyle="", label="landmark")
+    return [*([true] if data.shows_errors else []), estimated, ellipse, *([mark] * has_landmarks)]
+
+
+def _headline(data: FigureData, paths: list[_Path]) -> str:
+    if not data.shows_errors:
+        return "Where nodes believe to be"
+    errors = {p.node: math.sqrt(np.nanmean(np.sum((p.x - p.xhat) ** 2, axis=1))) for p in paths}
+    worst, best = max(errors, key=lambda k: errors[k]), min(errors, key=lambda k: errors[k])
+    best_text = f"{errors[best]:.3g} (node {best}) to " if len(errors) > 1 else ""
+    return f"RMS error of positions: {best_text}{errors[worst]:.3g} (node {worst})"
+
+
+def _coverage(data: FigureData, paths: list[_Path]) -> str:
+    if not data.shows_errors:
+        return ""
+    e = np.concatenate([(path.x - path.xhat)[1:] for path in paths])
+    P = np.concatenate([path.P[1:] for path in paths])
+    known = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(e).all(axis=1)
+    if not known.any():
+        return ""
+    squares = np.einsum(
+        "ki,kij,kj->k", e[known], np.linalg.pinv(P[known], hermitian=True), e[known]
+    )
+    share = f"{np.mean(squares <= SQUARE):.0%}"
+    return f"{share} of the sampled positions are where P says that {LEVEL:.0%} are."
