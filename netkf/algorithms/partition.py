@@ -12,9 +12,8 @@ proportion to the root of the trace of ``A_ab P_b A_ab'``: without coupling it i
 a Kalman filter.
 
 Farina, Ferrari-Trecate and Scattolini, "Moving-horizon partition-based state estimation of
-large-scale systems", Automatica 46(5), 2010, whose bounds have equal weights; Khan and Moura,
-"Distributing the Kalman filter for large-scale systems", IEEE Trans. Signal Processing 56(10),
-2008.
+large-scale systems", Automatica 46(5), 2010; Khan and Moura, "Distributing the Kalman filter for
+large-scale systems", IEEE Trans. Signal Processing 56(10), 2008.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from scipy.optimize import minimize_scalar
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.traits import Analysis, Needs, Timing
+from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, symmetric
 
@@ -63,6 +62,7 @@ class PartitionState(NamedTuple):
     groups : entries of what the node estimates, and then of all other blocks of each owner
     model : that of the whole state
     places : all blocks; ``blocks``: the names and owners of those that it estimates
+    waits : messages may take time
     """
 
     x: FloatArray
@@ -73,20 +73,19 @@ class PartitionState(NamedTuple):
     model: Any
     places: dict[tuple[str, int | None], np.ndarray]
     blocks: tuple[tuple[str, int | None], ...]
+    waits: bool
 
 
 class Told(NamedTuple):
-    """What a node sends: its estimate (n',) of its ``blocks``, with the bound P (n', n')."""
+    """What a node sends: its estimate (n',) of its ``blocks``, with the bound P (n', n'). Where a
+    message may take time also all that is needed to predict them: what it knows of the ``whole``
+    state, see PartitionState.
+    """
 
     xhat: FloatArray
     P: FloatArray
     blocks: tuple[tuple[str, int | None], ...]
-
-
-def _notes(scenario: Any) -> tuple[str, ...]:
-    if scenario.slotted or scenario.network.channel.delay.longest == 0.0:
-        return ()
-    return ("the partition filter uses no message that took time: those with a delay are late",)
+    whole: tuple[FloatArray, FloatArray, tuple[np.ndarray, ...]] | None
 
 
 @built_in("partition")
@@ -99,18 +98,11 @@ class Partition(Filter):
     grows. Before it has heard of a block, and wherever the bound has become worse than that, it
     has what was known at the start, predicted. What two nodes both estimate, and a reading of one
     block of the node and one of another, is used by covariance intersection. P is never below the
-    covariance of the error. Under clocks a message that took time is late.
+    covariance of the error. Under clocks, where messages may take time, they also tell what the
+    sender has of other blocks, by which the receiver predicts what it hears to the present.
     """
 
-    timing = Timing(max_age=0.0)
-    needs = Needs(
-        one_way=True,
-        samples=True,
-        blocks=True,
-        coupled=True,
-        linear_plant=True,
-        notes=_notes,
-    )
+    needs = Needs(one_way=True, samples=True, blocks=True, coupled=True, linear_plant=True)
     analysis = Analysis(P_by_design=("larger", "larger"), affine=True)
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PartitionState:
@@ -132,8 +124,9 @@ class Partition(Filter):
         for group in groups:
             bounds[np.ix_(group, group)] = P[np.ix_(group, group)]
         gap, start = Gap(np.eye(n), np.zeros((n, n))), Start(np.array(mean), P)
+        waits = node.max_delay > 0.0
         return PartitionState(
-            np.array(mean), bounds, gap, start, groups, model, places, tuple(blocks)
+            np.array(mean), bounds, gap, start, groups, model, places, blocks, waits
         )
 
     def predict(self, state: PartitionState, gap: float) -> PartitionState:
@@ -153,13 +146,9 @@ class Partition(Filter):
 
     def _part(self, state: PartitionState, group: np.ndarray) -> tuple[FloatArray, FloatArray]:
         """Return the estimate (k,) and bound (k, k) of a group now."""
-        (Phi, Q), (mean, cov), square = state.gap, state.start, np.ix_(group, group)
-        terms = [
-            M @ state.bounds[other[:, None], other] @ M.T
-            for other in state.groups
-            for M in [Phi[group[:, None], other]]
-        ]
-        P, known = symmetric(_bound_of_sum(terms) + Q[square]), cov[square]
+        P = _bound_after(state.gap, state.bounds, state.groups, group)
+        mean, cov = state.start
+        known = cov[np.ix_(group, group)]
         return (state.x[group], P) if np.trace(P) <= np.trace(known) else (mean[group], known)
 
     def _present(self, state: PartitionState) -> tuple[FloatArray, FloatArray]:
@@ -206,7 +195,8 @@ class Partition(Filter):
 
     def emit(self, state: PartitionState, exchange: Exchange) -> tuple[PartitionState, Told]:
         """Return the estimate of its own blocks as a message."""
-        return state, Told(*self.estimate(state), state.blocks)
+        whole = (*self._present(state), state.groups) if state.waits else None
+        return state, Told(*self.estimate(state), state.blocks, whole)
 
     def absorb(
         self, state: PartitionState, messages: Sequence[Message], exchange: Exchange
@@ -216,19 +206,16 @@ class Partition(Filter):
             return state
         x, bounds = self._present(state)
         for message in messages:
-            told, theirs = message.payload, {}
-            for entry, index in enumerate(np.concatenate([state.places[b] for b in told.blocks])):
-                theirs[int(index)] = entry
+            told = message.payload
+            xhat, P = _predicted(state.model, told, message.age)
+            entries = np.concatenate([state.places[block] for block in told.blocks])
             for group in state.groups:
-                mine = [k for k, index in enumerate(group.tolist()) if index in theirs]
-                if not mine:
-                    continue
-                heard = [theirs[index] for index in group[mine].tolist()]
-                z, C, H = told.xhat[heard], told.P[np.ix_(heard, heard)], np.eye(len(group))[mine]
-                square = np.ix_(group, group)
-                x[group], bounds[square] = _intersected(
-                    x[group], bounds[square], z, H, (C, 0.0 * C)
-                )
+                common, mine, theirs = np.intersect1d(group, entries, return_indices=True)
+                if len(common):
+                    square, H = np.ix_(group, group), np.eye(len(group))[mine]
+                    z, C = xhat[theirs], P[np.ix_(theirs, theirs)]
+                    fused = _intersected(x[group], bounds[square], z, H, (C, 0.0 * C))
+                    x[group], bounds[square] = fused
         return self._used(state, x, bounds)
 
     def estimate(self, state: PartitionState) -> tuple[FloatArray, FloatArray]:
@@ -238,7 +225,8 @@ class Partition(Filter):
     def shift(self, state: Any, offset: FloatArray) -> Any:
         """Return a state, or a message, with ``offset`` (n,) added to estimates."""
         if isinstance(state, Told):
-            return state._replace(xhat=state.xhat + offset)
+            whole = state.whole and (state.whole[0] + offset, *state.whole[1:])
+            return state._replace(xhat=state.xhat + offset, whole=whole)
         start = state.start._replace(mean=state.start.mean + offset)
         return state._replace(x=state.x + offset, start=start)
 
@@ -250,6 +238,28 @@ def _bound_of_sum(terms: Sequence[FloatArray]) -> FloatArray:
     parts = [(float(np.sqrt(np.trace(term))), term) for term in terms if term.any()]
     total = sum(size for size, _ in parts)
     return np.asarray(sum((total / size * term for size, term in parts), np.zeros_like(terms[0])))
+
+
+def _bound_after(
+    gap: Gap, bounds: FloatArray, groups: Sequence[np.ndarray], group: np.ndarray
+) -> FloatArray:
+    """Return the bound (k, k) of a group after a gap, from ``bounds`` (n, n) of all groups."""
+    terms = [
+        M @ bounds[other[:, None], other] @ M.T
+        for other in groups
+        for M in [gap.Phi[group[:, None], other]]
+    ]
+    return symmetric(_bound_of_sum(terms) + gap.Q[np.ix_(group, group)])
+
+
+def _predicted(model: Any, told: Told, age: float) -> tuple[FloatArray, FloatArray]:
+    """Return what a message told, estimate (n',) and bound (n', n'), ``age`` seconds later."""
+    if age <= 0.0 or told.whole is None:
+        return told.xhat, told.P
+    (x, bounds, groups), n = told.whole, len(told.whole[0])
+    x, root = model.extrapolate(x, np.zeros((n, n)), age)
+    gap = Gap(model.transition(np.zeros(n), age), root @ root.T)
+    return x[groups[0]], _bound_after(gap, bounds, groups, groups[0])
 
 
 def _used_as_is(

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from netkf.algorithms.filter import Exchange, Message, PairReading, Reading
-from netkf.algorithms.models import ChangingFlowModel, ChangingSlotModel
+from netkf.algorithms.models import ChangingFlowModel, ChangingSlotModel, SlotModel
 from netkf.engines.simpy.nodes import View
 from netkf.engines.simpy.slots import SlotSchedule, Stage
 from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
@@ -52,6 +52,18 @@ class ColumnModel:
         nothing = np.zeros(len(xhat))
         root = self.moving.predict(nothing, root, gap)[1]
         return self.moving.transition(nothing, gap) @ xhat, root
+
+    def extrapolate(
+        self, xhat: FloatArray, root: FloatArray, age: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimate (n, C) and the root (n, n) ``age`` seconds after one that was told;
+        in slots as they are.
+        """
+        nothing = np.zeros(len(xhat))
+        if age <= 0.0 or isinstance(self.moving, SlotModel):
+            return xhat, root
+        root = self.moving.extrapolate(nothing, root, age)[1]
+        return self.moving.transition(nothing, age) @ xhat, root
 
 
 class BlockColumns(ErrorColumns):
