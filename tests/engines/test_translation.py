@@ -134,11 +134,11 @@ def test_what_is_told_late_of_one_block_leaves_the_others(folder: Path) -> None:
     np.testing.assert_allclose(both.xhat[:, :, 1], shared.xhat[:, :, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["kcf", "hybrid", "diffusion-kalman", "one-bit"])
+@pytest.mark.parametrize("kind", ["kcf", "hybrid", "hcmci", "diffusion-kalman", "one-bit"])
 def test_other_messages_are_refused_by_name(folder: Path, kind: str) -> None:
     settings: dict[str, Any] = {"kind": kind, "estimates": "own"}
     if kind == "hybrid":
         settings["epsilon"] = 0.3
-    changes = {"filter": settings, **(CLOCKED if kind == "hybrid" else {})}
+    changes = {"filter": settings, **(CLOCKED if kind in ("hybrid", "hcmci") else {})}
     with pytest.raises(netkf.ScenarioError, match=r"filter.estimates: .*say no blocks.*translate"):
         scenario(folder, "own", **changes)
