@@ -142,3 +142,56 @@ def test_other_messages_are_refused_by_name(folder: Path, kind: str) -> None:
     changes = {"filter": settings, **(CLOCKED if kind in ("hybrid", "hcmci") else {})}
     with pytest.raises(netkf.ScenarioError, match=r"filter.estimates: .*say no blocks.*translate"):
         scenario(folder, "own", **changes)
+
+
+TUPLES = """
+from dataclasses import dataclass
+
+import kcf
+from netkf.parts import Needs
+
+
+def translate(payload, own, common):
+    read = common.before(own[0]).copy()
+    read[common.mine] = payload[0][common.theirs]
+    return read, payload[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Tuples(kcf.Kcf):
+    needs = Needs(translate=translate)
+
+    def emit(self, state, exchange):
+        return state, (state.prior, "a prediction")
+
+    def absorb(self, state, messages, exchange):
+        assert all(m.payload[1] == "a prediction" for m in messages)
+        return super().absorb(state, [m._replace(payload=m.payload[0]) for m in messages], exchange)
+"""
+
+
+@pytest.mark.parametrize("changes", [{}, CLOCKED], ids=["slots", "late under clocks"])
+def test_a_class_says_how_its_messages_are_read(folder: Path, changes: dict[str, Any]) -> None:
+    (folder / "tuples.py").write_text(TUPLES)
+    run, expected = (
+        netkf.simulate(scenario(folder, "named", kind, **changes))
+        for kind in ("tuples:Tuples", "kcf:Kcf")
+    )
+    sys.modules.pop("tuples")
+    assert run.count("deliver") == expected.count("deliver") > 20
+    np.testing.assert_allclose(run.xhat, expected.xhat, atol=1e-12)
+
+
+def test_what_is_told_late_leaves_blocks_whose_dynamics_are_not_linear(folder: Path) -> None:
+    unicycle = {
+        **{"name": "pose", "nodes": list(NODES), "f": "unicycle", "step": 0.05},
+        **{"input": {"kind": "constant", "value": [1.0, 0.8]}, "B": np.diag([0.1] * 3).tolist()},
+        **{"mean": [0.0, 0.0, 0.5], "cov": np.diag([0.1] * 3).tolist()},
+    }
+    H = {"sensors.0.H": [[1.0, 0.0, 0.0]]}
+    both, alone = (
+        netkf.simulate(scenario(folder, estimates, **{**CLOCKED, "plants.0": unicycle, **H}))
+        for estimates in ("named", "own")
+    )
+    assert both.count("deliver") > 20
+    np.testing.assert_allclose(both.xhat[:, :, :3], alone.xhat[:, :, :3], atol=1e-10)
