@@ -227,14 +227,7 @@ def fixed_readings(scenario: Scenario) -> Assumption:
 
 def exact_start(scenario: Scenario) -> Assumption:
     """Return the assumption, a row, that filters start with the mean and covariance of x(0)."""
-    start, filtering = scenario.plant, scenario.filter
-    different = [
-        node
-        for k, node in enumerate(scenario.nodes)
-        for given, true in ((filtering.mean, start.start_mean), (filtering.cov, start.start_cov))
-        if given is not None
-        and not np.array_equal(given[k] if isinstance(given, tuple) else given, true)
-    ]
+    different = scenario.other_starts
     evidence = "mean and covariance are the plant's"
     if different:
         evidence = f"node {different[0]}{' and others' if different[1:] else ''}: not the plant's"

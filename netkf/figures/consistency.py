@@ -40,19 +40,22 @@ def nees_figure(data: FigureData) -> Picture:
     data.require_samples()
     data.require_truth()
     data.require_covariance()
-    n = data.scenario.width
-    low, high = nees_bounds(n, data.runs)
+    (n, unit), sizes = data.nees_unit, data.scenario.sizes.tolist()
+    low, high = np.array([nees_bounds(size, data.runs) for size in sizes]).T
     values = data.nees[data.averaged]
-    values = values[np.isfinite(values)]
-    if not values.size:
+    known = np.isfinite(values)
+    if not known.any():
         raise UnavailableError("NEES is unavailable: it needs an error and a regular P.")
     figure = new_figure(7.4, 4.2)
     draw_nees(figure.add_subplot(), data)
-    inside = float(((values >= low) & (values <= high)).mean())
+    inside = float(((values >= low) & (values <= high))[known].mean())
     divisor = f" over {data.runs:,} runs" if data.runs > 1 else ""
-    note = f"Band: chi-square with {data.runs * n:,} degrees of freedom{divisor}."
+    freedom = " and ".join(f"{data.runs * size:,}" for size in sorted(set(sizes)))
+    note = f"Band: chi-square with {freedom} degrees of freedom{divisor}."
     headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES; their mean "
-    headline += f"is {float(values.mean()):.3g} where exact covariances give {n}"
+    mean = float((values / unit)[known].mean())
+    headline += f"{'is' if len(set(sizes)) == 1 else 'over n is'} {mean:.3g} where exact "
+    headline += f"covariances give {n}"
     finish_figure(figure, data.title(headline), data.caption(note, notes="nees"))
     return figure
 

@@ -181,13 +181,16 @@ def ratios_figure(data: FigureData) -> Picture:
     """Draw mean trace P over its bound, or NEES / n, of each node; raises UnavailableError."""
     rows = [row for row in data.node_averages if _is_known(row.get("ratio"))]
     key, label, reference_label = "ratio", "mean trace P / Tanwani's bound H(12)", "the bound"
-    scale = 1.0
     if not rows:
         data.require_truth()
-        key, n = "mean_nees", data.scenario.width
-        label, reference_label = f"mean NEES / n, n = {n}", "errors as P says"
-        scale = 1.0 / n
-        rows = [row for row in data.node_averages if _is_known(row.get(key))]
+        key, sizes = "mean_nees", data.scenario.sizes.tolist()
+        same = f", n = {sizes[0]}" if len(set(sizes)) == 1 else ""
+        label, reference_label = f"mean NEES / n{same}", "errors as P says"
+        rows = [
+            row | {name: row[name] / n for name in (key, f"{key}_se") if _is_known(row.get(name))}
+            for row, n in zip(data.node_averages, sizes, strict=True)
+            if _is_known(row.get(key))
+        ]
         if not rows:
             raise UnavailableError("There are no ratios: no bound applies and NEES is unknown.")
     # Large networks: the nodes with the smallest and the largest ratios.
@@ -196,7 +199,7 @@ def ratios_figure(data: FigureData) -> Picture:
         rows = [*rows[: MAX_ROWS // 2], *rows[-MAX_ROWS // 2 :]]
     figure = new_figure(7.4, min(9.0, 1.7 + 0.17 * len(rows)))
     axes = figure.add_subplot()
-    _draw_ratios(axes, data, rows, key, scale)
+    _draw_ratios(axes, data, rows, key)
     axes.axvline(1.0, color=EXACT, ls="--", lw=1.2, label=reference_label)
     axes.set(xlabel=label, ylabel="node")
     draw_legend(axes)
@@ -206,7 +209,7 @@ def ratios_figure(data: FigureData) -> Picture:
         if len(data.node_averages) > MAX_ROWS
         else ""
     )
-    headline = bound_headline(data) if key == "ratio" else _nees_headline(rows, key, scale)
+    headline = bound_headline(data) if key == "ratio" else _nees_headline(rows, key)
     finish_figure(
         figure,
         data.title(headline),
@@ -215,21 +218,17 @@ def ratios_figure(data: FigureData) -> Picture:
     return figure
 
 
-def _nees_headline(rows: list[dict[str, Any]], key: str, scale: float) -> str:
-    ratios = [row[key] * scale for row in rows]
+def _nees_headline(rows: list[dict[str, Any]], key: str) -> str:
+    ratios = [row[key] for row in rows]
     span = f"{min(ratios):.3g} to {max(ratios):.3g}" if len(ratios) > 1 else f"{ratios[0]:.3g}"
     return f"Squared errors are {span} times what P says; no bound applies"
 
 
-def _draw_ratios(
-    axes: Any, data: FigureData, rows: list[dict[str, Any]], key: str, scale: float
-) -> None:
-    """Draw ``scale`` times the entry ``key`` of each node's row, with 95% bars and a line at 1."""
+def _draw_ratios(axes: Any, data: FigureData, rows: list[dict[str, Any]], key: str) -> None:
+    """Draw the entry ``key`` of each node's row, with 95% bars and a line at 1."""
     positions = np.arange(len(rows))
-    values = scale * np.array([row[key] for row in rows])
-    widths = (
-        scale * NORMAL_QUANTILE * np.array([_known_or_zero(row.get(f"{key}_se")) for row in rows])
-    )
+    values = np.array([row[key] for row in rows])
+    widths = NORMAL_QUANTILE * np.array([_known_or_zero(row.get(f"{key}_se")) for row in rows])
     axes.hlines(positions, np.minimum(values, 1.0), np.maximum(values, 1.0), color=FAINT, lw=0.8)
     has_sensor = np.array([row["node"] in data.scenario.placed_sensors for row in rows])
     for group, colour, marker, label in (

@@ -24,6 +24,7 @@ from netkf.runs.summary import (
     summarise,
 )
 from netkf.scenario.scenario import Scenario
+from netkf.trace.nees import traces
 from netkf.trace.run import Run
 
 SIMULATE = "get it from netkf.simulate, netkf.monte_carlo or netkf.open"
@@ -71,6 +72,14 @@ class FigureData:
     delivered: dict[tuple[int, int], int] = field(default_factory=dict)
     messages: dict[str, Any] = field(default_factory=dict)
     run: Run | None = None
+
+    @property
+    def nees_unit(self) -> tuple[int, Any]:
+        """What NEES should be, and by what it is divided for that, of all or of each node (N,): n
+        and 1, or 1 and n where nodes have states of different size.
+        """
+        sizes = self.scenario.sizes
+        return (int(sizes[0]), 1.0) if np.ptp(sizes) == 0 else (1, sizes)
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -267,8 +276,8 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
     return FigureData(
         scenario=scenario,
         times=ensemble.times,
-        sq_error=np.trace(ensemble.mean_error, axis1=2, axis2=3),
-        trace=np.trace(ensemble.mean_P, axis1=2, axis2=3),
+        sq_error=traces(ensemble.mean_error),
+        trace=traces(ensemble.mean_P),
         nees=ensemble.mean_nees,
         node_averages=node_rows(
             scenario, ensemble.average, mean_bounds(scenario, promised), ensemble.se_average
@@ -281,8 +290,8 @@ def reduce_ensemble(scenario: Scenario, ensemble: Ensemble, promised: PromisedTr
         diverged=ensemble.diverged,
         rounding_from=ensemble.rounding_from,
         # The standard error of a trace is at most the sum of the standard errors of the diagonal.
-        se_error=np.trace(ensemble.se_error, axis1=2, axis2=3),
-        se_trace=np.trace(ensemble.se_P, axis1=2, axis2=3),
+        se_error=traces(ensemble.se_error),
+        se_trace=traces(ensemble.se_P),
         se_nees=ensemble.se_nees,
         messages=dict(ensemble.messages),
     )

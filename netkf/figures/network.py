@@ -64,22 +64,23 @@ def _colour_quantities(data: FigureData) -> dict[str, dict[int, float]]:
     key, label = error_label(data)
     quantities = {label: node_values(data, key)}
     if data.runs == 1 and any("sent" in row for row in data.node_averages):
-        kilobytes = _message_bytes(data) / 1000.0  # of a transmission
+        kilobytes = {node: size / 1000.0 for node, size in _message_bytes(data).items()}
         quantities["messages sent, all hearers counted"] = node_values(data, "sent")
         transmissions = node_values(data, "transmissions")
         quantities["kilobytes transmitted"] = {
-            node: count * kilobytes for node, count in transmissions.items()
+            node: count * kilobytes[node] for node, count in transmissions.items()
         }
     return quantities
 
 
-def _message_bytes(data: FigureData) -> int:
-    n = data.scenario.width
-    return 8 * (n + n * (n + 1) // 2)
+def _message_bytes(data: FigureData) -> dict[int, int]:
+    sizes = data.scenario.sizes.tolist()
+    return {node: 8 * (n + n * (n + 1) // 2) for node, n in zip(data.nodes, sizes, strict=True)}
 
 
 def _explain_widths(data: FigureData) -> str:
-    size = _message_bytes(data)
+    sizes = sorted(set(_message_bytes(data).values()))
+    size = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} .. {sizes[-1]}"
     links = "Links are as wide as the messages that they delivered. " if data.delivered else ""
     if len(data.scenario.topology.links) > MAX_LINKS:
         links += f"{MAX_LINKS:,} links are drawn. "

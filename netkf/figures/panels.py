@@ -152,7 +152,10 @@ def _draw_bound(axes: Any, times: FloatArray, roots: FloatArray) -> None:
 
 def draw_nees(axes: Any, data: FigureData) -> None:
     """Draw NEES over time with its interval if P is exact, or a message if it is unknown."""
-    values, n, runs = data.nees, data.scenario.width, data.runs
+    values, runs, sizes = data.nees, data.runs, data.scenario.sizes
+    # Nodes with states of different size are compared by NEES / n.
+    n, unit = data.nees_unit
+    values = values / unit
     if not np.isfinite(values).any():
         draw_message(axes, "NEES is unavailable: it needs an error and a regular P")
         return
@@ -160,11 +163,17 @@ def draw_nees(axes: Any, data: FigureData) -> None:
     if len(data.nodes) > 1:
         mean = values.mean(axis=1)
         axes.plot(data.times, mean, color=INK, lw=2.0, label="mean of all nodes", zorder=4)
-    low, high = nees_bounds(n, runs)
-    axes.axhspan(low, high, color=EXACT, alpha=0.15, lw=0, label=f"{CONFIDENCE:.0%} if P is exact")
+    ends = [
+        (size, np.array(nees_bounds(size, runs)) * n / size) for size in np.unique(sizes).tolist()
+    ]
+    for size, (low, high) in ends:
+        label = f"{CONFIDENCE:.0%} if P is exact" + (f", n = {size}" if len(ends) > 1 else "")
+        axes.axhspan(low, high, color=EXACT, alpha=0.15, lw=0, label=label)
+    high = max(ends[0][1])
     bias = covariance_bias(data.scenario)
     label = f"n = {n}" + (f", P is {bias} by design" if bias else "")
-    axes.axhline(n, color=EXACT, lw=1.1, ls="-.", label=label)
+    axes.axhline(n, color=EXACT, lw=1.1, ls="-.", label=label if len(ends) == 1 else "expected")
     set_scale(axes, np.append(values, high))
-    axes.set(ylabel="NEES" if runs == 1 else f"mean NEES of {runs:,} runs", xlabel=SECONDS)
+    name = "NEES" if len(ends) == 1 else "NEES / n"
+    axes.set(ylabel=name if runs == 1 else f"mean {name} of {runs:,} runs", xlabel=SECONDS)
     draw_legend(axes)

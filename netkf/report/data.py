@@ -240,12 +240,20 @@ def _sample_columns(
     bound = source.promised.bound if source.promised is not None else None
     if bound is not None and bound.shape == (total, len(run.nodes)):
         columns["bound"] = packer.add(bound[rows], "f8")
-    low, high = nees_bounds(n)
+    sizes = source.scenario.sizes.tolist()
+    intervals = {size: list(nees_bounds(size)) for size in sizes}
     step = 1
     if len(rows) < total:
         # Thinned samples are said to be thinned, even if the first two are neighbours.
         step = max(int(rows[1] - rows[0]), 2) if len(rows) > 1 else 2
-    return {"columns": columns, "count": len(rows), "step": step, "nees_interval": [low, high]}
+    views = source.scenario.views or [np.arange(n)]
+    one_state = all(np.array_equal(views[0], view) for view in views)
+    of_nodes = {
+        "one_state": one_state,
+        "sizes": sizes,
+        "nees_intervals": [intervals[size] for size in sizes],
+    }
+    return {"columns": columns, "count": len(rows), "step": step, **of_nodes}
 
 
 def _message_columns(thinned: ThinnedMessages, run: StoredRun, packer: Packer) -> dict[str, Any]:

@@ -230,16 +230,17 @@ def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
     trace, trace_se = _matrix_traces(ensemble.mean_P), _matrix_traces(ensemble.se_P)
     square, square_se = _matrix_traces(ensemble.mean_error), _matrix_traces(ensemble.se_error)
     nodes: dict[str, Any] = {}
+    sizes = source.scenario.sizes.tolist()
     for k, node in enumerate(ensemble.nodes):
         nodes[str(node)] = {
+            "nees_interval": list(nees_bounds(sizes[k], max(1, source.runs))),
             "trace": _interval_curves(trace[:, k], trace_se[:, k]),
             "square": _interval_curves(square[:, k], square_se[:, k]),
             "nees": _interval_curves(ensemble.mean_nees[:, k], ensemble.se_nees[:, k]),
         }
         if ensemble.bound is not None:
             nodes[str(node)]["bound"] = to_json_value(ensemble.bound[:, k].tolist())
-    interval = list(nees_bounds(source.scenario.width, max(1, source.runs)))
-    return {"times": ensemble.times.tolist(), "nodes": nodes, "nees_interval": interval}
+    return {"times": ensemble.times.tolist(), "nodes": nodes}
 
 
 def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[str, Any] | None:

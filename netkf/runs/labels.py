@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from netkf.algorithms.registry import overridden
 from netkf.scenario.scenario import Scenario
 
@@ -30,7 +32,8 @@ def nees_note(scenario: Scenario) -> str:
     """Return a note for users on NEES if P differs from the covariance of the error by design; else
     an empty text.
     """
-    n, design = scenario.width, covariance_bias(scenario)
+    sizes, design = np.unique(scenario.sizes).tolist(), covariance_bias(scenario)
+    n = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} .. {sizes[-1]}"
     if design == "smaller":
         return (
             "until others hear of its samples a node counts them as if all nodes had taken them: "

@@ -815,6 +815,21 @@ class DerivedScenario(ScenarioModel):
         view = self.model_views[index]
         return xhat[view], P[np.ix_(view, view)]
 
+    @property
+    def other_starts(self) -> list[int]:
+        """The ids of nodes whose filters do not start with mean and covariance of x(0)."""
+        start, filtering = self.plant, self.filter
+        pairs = (filtering.mean, start.start_mean), (filtering.cov, start.start_cov)
+        return [
+            node
+            for k, node in enumerate(self.nodes)
+            if any(
+                given is not None
+                and not np.array_equal(given[k] if isinstance(given, tuple) else given, true)
+                for given, true in pairs
+            )
+        ]
+
     def weight(self, receiver: int, sender: int) -> float:
         """Return the weight that ``receiver`` (id) gives to the estimate of ``sender`` (id) when it
         averages estimates: pi_ij of paper H (7), a_ji of paper D (8).

@@ -289,6 +289,11 @@ class ScenarioModel(Component):
         return np.array([entries < len(view) for view in views])
 
     @property
+    def sizes(self) -> np.ndarray:
+        """The numbers (N,) of states that nodes estimate."""
+        return np.asarray(self.is_estimated.sum(axis=1))
+
+    @property
     def width(self) -> int:
         """The largest number of states that a node estimates."""
         return self.plant.n if self.views is None else max(map(len, self.views))

@@ -195,7 +195,7 @@ def compare_filters(
             # No quantities, consistency and traffic, but the reason why it cannot run.
             rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
             continue
-        base, n = values[first] if label != first else None, scenario.width
+        base, n = values[first] if label != first else None, float(scenario.sizes.mean())
         diverged = int(values[label].diverged.sum())
         rows.append(
             ComparedFilter(

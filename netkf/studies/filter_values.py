@@ -15,6 +15,7 @@ from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import mean_over_runs
 from netkf.trace.batch import RunBatch
+from netkf.trace.nees import without_padding
 from netkf.trace.schema import CODES
 
 BYTES = 8
@@ -59,7 +60,8 @@ def _largest_error(batch: RunBatch, r: int, blurred_from: float) -> float:
     usable = (times > 0.0) & ~(times >= blurred_from)
     if batch.diverged[r]:
         usable[-1:] = False
-    sizes = np.linalg.norm(batch.error[r, :length][usable], axis=-1)
+    e, _ = without_padding(batch.error[r, :length][usable], batch.P[r, :length][usable])
+    sizes = np.linalg.norm(e, axis=-1)
     return float(sizes.max()) if sizes.size else math.nan
 
 
@@ -91,8 +93,9 @@ def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
     }
     # The exchange of the slot, by which some filters send different things; -1 under clocks.
     phases = sent["phase"].tolist() if slotted else [-1] * len(sent)
+    sizes = dict(zip(scenario.nodes, scenario.sizes.tolist(), strict=True))
     numbers = sum(
-        scenario.node_filter.analysis.payload_numbers(scenario.width, rows.get(node, 0), phase)
+        scenario.node_filter.analysis.payload_numbers(sizes[node], rows.get(node, 0), phase)
         for node, phase in zip(sent["node"].tolist(), phases, strict=True)
     )
     return Traffic(len(sent), BYTES * numbers)
@@ -114,11 +117,11 @@ class Quantity(NamedTuple):
 
 
 def estimate_quantities(
-    values: FilterValues, first: FilterValues | None, n: int, level: float
+    values: FilterValues, first: FilterValues | None, n: float, level: float
 ) -> dict[str, Quantity]:
-    """Return ``rms_error``, ``worst_instant`` and ``nees_ratio`` (NEES / n) of a filter with n
-    states, with the paired differences from the ``first`` one; each interval misses with
-    probability ``level``.
+    """Return ``rms_error``, ``worst_instant`` and ``nees_ratio`` (NEES / n) of a filter of n
+    states, the mean of the nodes', with the paired differences from the ``first`` one; each
+    interval misses with probability ``level``.
     """
     quantities = {}
     base = _influences(first, n) if first is not None else {}
@@ -139,7 +142,7 @@ def estimate_quantities(
     return quantities
 
 
-def _influences(values: FilterValues, n: int) -> dict[str, tuple[float, FloatArray]]:
+def _influences(values: FilterValues, n: float) -> dict[str, tuple[float, FloatArray]]:
     """Return each quantity with its influence values (R,), whose mean has its error."""
     # Delta method: differences of two filters have the error of differences of influences.
     rms = math.sqrt(float(values.square.mean()))
@@ -161,7 +164,7 @@ def _width(values: FloatArray, level: float) -> float:
     return quantile * mean_over_runs(values).error
 
 
-def credibility(values: FilterValues, n: int, level: float) -> str:
+def credibility(values: FilterValues, n: float, level: float) -> str:
     """Return whether P fits the errors of a filter: "overconfident", "conservative" or
     "consistent", as the interval of NEES / n, which misses with probability ``level``, lies
     above, below or around 1; "-" where NEES is unknown or one run shows nothing.

@@ -22,6 +22,7 @@ from netkf.scenario.model import Filtering
 from netkf.scenario.scenario import Scenario
 from netkf.theory import covariance_bound, riccati_step
 from netkf.theory.errors import error_squares
+from netkf.trace.nees import traces
 from netkf.trace.schema import KINDS
 
 MAX_ERRORS = 24
@@ -73,9 +74,8 @@ def expected_metrics(scenario: Scenario, seed: int, replica: int, engine: Engine
     run = simulate(scenario, seed, replica, engine)
     if run.status != "complete":
         return block_metrics(scenario, seed, range(replica, replica + 1), engine)
-    squares = np.trace(error_squares(scenario, run), axis1=2, axis2=3)
-    square = time_average(scenario, squares)[None]
-    trace = time_average(scenario, np.trace(run.P, axis1=2, axis2=3))[None]
+    square = time_average(scenario, traces(error_squares(scenario, run)))[None]
+    trace = time_average(scenario, traces(run.P))[None]
     counts = np.array([[run.count(kind) for kind in KINDS]])
     return RunMetrics(
         mean_square=square,
@@ -155,23 +155,31 @@ def bound_traces(scenario: Scenario) -> FloatArray:
     pooled = scenario.filter.algorithm.timing.pooled
     entities = [0] * len(scenario.nodes) if pooled else range(len(scenario.nodes))
     starts = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
-    columns = [_slot_traces(scenario, k, P) for k, P in zip(entities, starts, strict=True)]
+    covariances = (_slot_covariances(scenario, k, P) for k, P in zip(entities, starts, strict=True))
+    columns = [
+        traces(P[:, scenario.view(k)][:, :, scenario.view(k)] if pooled else P)
+        for k, P in enumerate(covariances)
+    ]
     return time_average(scenario, np.stack(columns, axis=1))
 
 
 def central_trace(scenario: Scenario) -> float:
-    """Return the trace of the covariance of a filter with all readings and the true model.
+    """Return the trace of the covariance of a filter with all readings and the true model, of the
+    states that nodes estimate, averaged over the nodes.
 
     It is averaged over the samples after time 0, and that of the prediction if the scenario's
     filter predicts. Raises TheoryError if readings are recorded or H is random.
     """
     algorithm = Central()
     central = dataclasses.replace(scenario, filter=Filtering(algorithm=algorithm))
-    if not scenario.slotted:
-        return float(bound_traces(central)[0])
-    _require_fixed_H(scenario)
-    traces = _slot_traces(scenario, 0, scenario.plant.start_cov, central.model_pieces)
-    return float(time_average(scenario, traces[:, None])[0])
+    if scenario.slotted:
+        _require_fixed_H(scenario)
+        P = _slot_covariances(scenario, 0, scenario.plant.start_cov, central.model_pieces)
+    else:
+        P = covariance_bound(central, scenario.times)[:, 0]
+    views = [slice(None)] if scenario.views is None else scenario.views
+    columns = [traces(P[:, view][:, :, view]) for view in views]
+    return float(time_average(scenario, np.stack(columns, axis=1)).mean())
 
 
 def _require_fixed_H(scenario: Scenario) -> None:
@@ -183,10 +191,10 @@ def _require_fixed_H(scenario: Scenario) -> None:
         scenario.observation_matrices(node)  # raises where H is random
 
 
-def _slot_traces(
+def _slot_covariances(
     scenario: Scenario, entity: int, start: FloatArray, pieces: Sequence[Any] = ()
 ) -> FloatArray:
-    """Return the traces (T,) of P of a Kalman filter in slots from P(0) = ``start``, of the node
+    """Return P (T, n, n) of a Kalman filter in slots from P(0) = ``start``, of the node
     with an index in the models of all ``pieces``, by default those of the scenario.
     """
     predicts = scenario.filter.algorithm.timing.predicts
@@ -194,9 +202,9 @@ def _slot_traces(
     # At most n rows with the same information: a central filter may read hundreds.
     H = whiten_observation(models[0].H, models[0].R)
     R, changes = np.eye(len(H)), scenario.slot_plant.change_slots
-    P, traces = start, np.empty(max(scenario.sampled_slots) + 1)
-    traces[0] = np.trace(start)
-    for slot in range(1, len(traces)):
+    P, covariances = start, np.empty((max(scenario.sampled_slots) + 1, *start.shape))
+    covariances[0] = start
+    for slot in range(1, len(covariances)):
         piece = bisect.bisect_right(changes, slot - 1, hi=len(models) - 1)
         F, Q = models[piece].F, models[piece].Q
         if predicts:
@@ -205,5 +213,5 @@ def _slot_traces(
             P = F @ P @ F.T + Q
             S = H @ P @ H.T + R
             P = P - P @ H.T @ np.linalg.solve(S, H @ P) if len(H) else P
-        traces[slot] = np.trace(P)
-    return np.asarray(traces[np.array(scenario.sampled_slots)])
+        covariances[slot] = P
+    return np.asarray(covariances[np.array(scenario.sampled_slots)])

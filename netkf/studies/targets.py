@@ -91,15 +91,7 @@ def theory_is_exact(scenario: Scenario, target: Target) -> bool:
     """Return True if ``quantity_by_theory`` is the quantity itself, False if it is a bound."""
     if scenario.filter.algorithm.timing.talks:
         return False
-    return not target.of_errors or _starts_with_the_truth(scenario)
-
-
-def _starts_with_the_truth(scenario: Scenario) -> bool:
-    plant = scenario.plant
-    return all(
-        np.array_equal(P, plant.start_cov) and np.array_equal(x, plant.start_mean)
-        for x, P in map(scenario.initial_estimate, scenario.nodes)
-    )
+    return not target.of_errors or not scenario.other_starts
 
 
 def _explain_errors(scenario: Scenario) -> str:
@@ -110,7 +102,7 @@ def _explain_errors(scenario: Scenario) -> str:
     start = rows[rows["assumption"].str.startswith("P_i(0) >= ")]
     if not start["holds"].all():
         raise TheoryError("P_i(0) is below the covariance of the first error: P need not bound it")
-    exact = _starts_with_the_truth(scenario) and not scenario.filter.algorithm.timing.talks
+    exact = not scenario.other_starts and not scenario.filter.algorithm.timing.talks
     return "" if exact else "; P_i in turn bounds the covariance of the error, Tanwani's H (10)"
 
 

@@ -59,7 +59,7 @@ const Figures = (() => {
         const all = overNodes(run, traces(run));
         series.push({ label: name + "square root of trace P, all nodes; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
       }
-      if (!run.truth && i >= 0) series.push({ label: name + "distance of node " + run.names[i] + "'s estimate from the mean of all nodes'", x, y: apart(run, i), colour, width: 2.5 });
+      if (!run.truth && i >= 0 && run.samples.one_state) series.push({ label: name + "distance of node " + run.names[i] + "'s estimate from the mean of all nodes'", x, y: apart(run, i), colour, width: 2.5 });
       if (i >= 0) series.push({ label: name + "square root of trace P of node " + run.names[i], x, y: root(column(run, traces(run), i)), colour: r ? "orange" : "green", width: 2, dash: "dashed" });
       if (i >= 0 && run.samples.bound) series.push({ label: name + "square root of the bound H(12) on the mean of trace P", x, y: root(column(run, run.samples.bound, i)), colour: "ink", width: 2, dash: r ? "dashed" : "solid" });
     });
@@ -78,8 +78,9 @@ const Figures = (() => {
       series.push({ label: letter(runs, r) + "NEES of node " + run.names[i], x: run.samples.t, y: column(run, run.samples.nees, i), colour: COLOURS[r], width: 1.8, dash: r ? "dashed" : "solid" });
     });
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
-    return { title: "Does P fit the error?", unit: "NEES", timed: true, series, band: runs[0].samples.nees_interval,
-      lines: [{ label: "expected where P is exact:", y: runs[0].n, colour: "green", dash: "dashed" }], note: "Squared error in units of P." };
+    const { sizes, nees_intervals } = runs[0].samples, i = Math.max(0, app.nodeOf(runs[0]));
+    return { title: "Does P fit the error?", unit: "NEES", timed: true, series, band: nees_intervals[i],
+      lines: [{ label: "expected where P is exact:", y: sizes[i], colour: "green", dash: "dashed" }], note: "Squared error in units of P." };
   }
 
   const PARTS = 30; // parts of a run over which squared innovations are averaged
@@ -198,8 +199,8 @@ const Figures = (() => {
       const [y, low, high] = entry.nees;
       series.push({ label: (ensembles.length > 1 ? "AB"[r] + ": " : "") + "mean NEES of node " + app.nodeId, x: found.times, y, low, high, colour: COLOURS[r], width: 2 });
     });
-    const known = ensembles.find(Boolean);
-    return series.length ? { title: "Does P fit the error, on average?", unit: "mean NEES", timed: true, series, band: known.nees_interval, note: "Shaded in the colour of a curve: two standard errors." } : null;
+    const known = ensembles.find((found) => found && found.nodes[String(app.nodeId)]);
+    return series.length ? { title: "Does P fit the error, on average?", unit: "mean NEES", timed: true, series, band: known.nodes[String(app.nodeId)].nees_interval, note: "Shaded in the colour of a curve: two standard errors." } : null;
   }
 
   function difference(app, found) {

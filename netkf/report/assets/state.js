@@ -65,8 +65,9 @@ const State = (() => {
   }
 
   function traceOf(upper, n) {
-    let sum = 0;
-    for (let i = 0, at = 0; i < n; at += n - i, i++) sum += upper[at];
+    let sum = NaN;
+    // A node may estimate fewer states than others.
+    for (let i = 0, at = 0; i < n; at += n - i, i++) if (Number.isFinite(upper[at])) sum = (sum || 0) + upper[at];
     return sum;
   }
 

@@ -170,7 +170,7 @@ const Why = (() => {
       parts.push("Sampled at " + Format.time(run.samples.t[k]) + " s:");
       if (run.truth) parts.push("error " + Format.number(s.error) + ",");
       parts.push("square root of trace P " + Format.number(Math.sqrt(s.trace)) + ".");
-      if (Number.isFinite(s.nees)) parts.push("NEES " + Format.number(s.nees) + ", expected " + run.n + " where P is exact.");
+      if (Number.isFinite(s.nees)) parts.push("NEES " + Format.number(s.nees) + ", expected " + run.samples.sizes[node] + " where P is exact.");
     }
     const lost = found.links.reduce((sum, link) => sum + bad(run, link).length, 0);
     const oldest = found.links[0];
