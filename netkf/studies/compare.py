@@ -127,9 +127,11 @@ class RunDirectory:
                 return None
             traces = [name for name in names if DIAGONAL.match(name)]
             truth = [name for name in names if name[:1] == "x" and name[1:].isdecimal()]
-            states = read_numbers(file, ["run", "t", "node", "sq_error", "nees", *traces, *truth])
+            states = read_numbers(file, ["run", "t", "node", "sq_error", "nees"])
+            # A node may estimate fewer states than others.
+            states = states.join(read_numbers(file, [*traces, *truth], allow_empty=True))
         complete = states["run"].nunique() == self.runs
-        states["mean_trace"] = states[traces].sum(axis=1)
+        states["mean_trace"] = states[traces].sum(axis=1, min_count=1)
         return states[states["t"] > 0.0] if complete else None
 
     @property
@@ -315,9 +317,11 @@ def _same_truth(first: RunDirectory, other: RunDirectory) -> bool:
     # The same seed is not enough: keys of the plant may differ.
     if a is None or b is None or first.manifest["seed"] != other.manifest["seed"]:
         return False
-    columns = ["run", "t", *(c for c in a.columns if c.startswith("x") and c[1:].isdecimal())]
+    # Of each node: it may estimate a part of the state.
+    keys = ["run", "t", "node"]
+    columns = [*keys, *(c for c in a.columns if c.startswith("x") and c[1:].isdecimal())]
     if not set(columns) <= set(b.columns):
         return False
-    states = [s[columns].drop_duplicates().set_index(["run", "t"]) for s in (a, b)]
+    states = [s[columns].set_index(keys) for s in (a, b)]
     shared = states[0].index.intersection(states[1].index)
     return bool(len(shared)) and bool(states[0].loc[shared].equals(states[1].loc[shared]))

@@ -123,8 +123,8 @@ class Replayer:
         self._deliveries.chosen, self._deliveries.without_delay = chosen, without_delay
         scenario = self._full if to_horizon else self._short
         run = simulate(scenario, self._seed, self._replica)
-        k = self._node
-        outcome = Outcome(run.xhat[-1, k], run.P[-1, k], run.error[-1, k])
+        k, n = self._node, int(self.scenario.sizes[self._node])
+        outcome = Outcome(run.xhat[-1, k, :n], run.P[-1, k, :n, :n], run.error[-1, k, :n])
         if run.times[-1] != self.at:  # it diverged before
             outcome = Outcome(*(np.full_like(part, np.nan) for part in outcome))
         self._outcomes[chosen, to_horizon] = outcome

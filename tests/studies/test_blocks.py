@@ -1,0 +1,77 @@
+"""Every command on nodes that estimate blocks, of different number, of the state."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.cli.main import main
+from netkf.studies.metrics import central_trace
+from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
+
+COMMANDS = {
+    "theory": ["theory", "{file}"],
+    "consistency": ["consistency", "{file}", "--runs", "12", "--set", "seed=3", "--json"],
+    "sweep": ["sweep", "{file}", "--vary", "seed=1,2", "--runs", "2", "--no-plot", "--json"],
+    "size": [
+        *("size", "{file}", "--vary", "horizon=1.0:2.0", "--target", "within_central<=9"),
+        *("--runs", "40", "--json"),
+    ],
+    "compare-filters": [
+        *("compare-filters", "{file}", "--filters", "block-intersection,central", "--runs", "2"),
+        "--json",
+    ],
+    "why": ["why", "{run}", "--json"],
+    "compare": ["compare", "{run}", "{many}", "--json"],
+    "plot": ["plot", "{run}", "--out", "{out}/plot"],
+    "plot of many": ["plot", "{many}", "--out", "{out}/plot"],
+    "report": ["report", "{run}", "--out", "{out}/page.html"],
+    "report of many": ["report", "{many}", "--out", "{out}/page.html"],
+}
+
+
+@pytest.fixture(scope="module", params=[ROBOTS, CLOCKED], ids=["slots", "clocks"])
+def places(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("blocks")
+    text = request.param.replace('estimates = "own"', 'estimates = "own+neighbours"')
+    (folder / "robots.toml").write_text(text.replace("horizon = 12.0", "horizon = 4.0"))
+    found = {"file": folder / "robots.toml", "out": folder}
+    for name, options in {"run": [], "many": ["--runs", "2", "--trace", "full"]}.items():
+        found[name] = folder / name
+        command = ["run", str(found["file"]), "--no-plot", "--out", str(found[name]), *options]
+        assert main(command) == 0
+    return found
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_takes_nodes_with_states_of_different_size(
+    places: dict[str, Path], name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = main([part.format(**places) for part in COMMANDS[name]])
+    seen = capsys.readouterr()
+    assert (status, "Traceback" in seen.err) == (0, False), seen.err
+    if "--json" not in COMMANDS[name]:
+        return
+    document = json.loads(seen.out)
+    if name == "compare-filters":
+        assert all(row["worst_instant"] > 0.0 for row in document["rows"])
+
+
+def test_ratios_are_by_the_number_of_states_of_each_node(tmp_path: Path) -> None:
+    changes = {"filter__kind": "central", "filter__estimates": "own+neighbours"}
+    scenario = load(ROBOTS, tmp_path, horizon=40.0, **changes)
+    assert scenario.sizes.tolist() == [2, 3, 2]
+    compared = netkf.compare_filters(scenario, ["central"], runs=4)
+    # P is exact: NEES / n is 1 on average.
+    (row,) = compared.rows
+    assert abs(row.quantities["nees_ratio"].value - 1.0) < 0.3
+    run = netkf.simulate(scenario)
+    after = run.times > 0.0
+    traces = [np.trace(run.P[after, k, :n, :n], axis1=1, axis2=2) for k, n in enumerate((2, 3, 2))]
+    np.testing.assert_allclose(central_trace(scenario), np.mean(traces), rtol=1e-9)
+    ensemble = netkf.monte_carlo(scenario, runs=2)
+    assert np.isfinite(ensemble.mean_nees[1:]).all()
