@@ -73,7 +73,7 @@ class PathState(NamedTuple):
         evidence = [rows for sender, rows in self.heard.items() if sender != without]
         if not evidence:
             return self.own
-        z, H, R = stacked(evidence, len(self.own.x) - self.n)
+        z, H, R = stacked(evidence, self.own.x[: -self.n])
         x, P, _ = updated(*self.own, Rows(z, np.pad(H, ((0, 0), (0, self.n))), R))
         return Path(x, P)
 
@@ -149,7 +149,7 @@ class BlockBeliefPropagation(Filter):
     @property
     def analysis(self) -> Analysis:
         """The size of a message to one receiver."""
-        return Analysis(payload_numbers=self._numbers)
+        return Analysis("belief_propagation", affine=True, payload_numbers=self._numbers)
 
     def _numbers(self, n: int, _rows: int, _phase: int) -> float:
         size = self.window * n
@@ -168,7 +168,7 @@ class BlockBeliefPropagation(Filter):
         b = state.belief().x[-n:]
         Phi = state.model.transition(b, gap)
         moved, root = state.model.predict(b, np.zeros((n, n)), gap)
-        x = np.append(x[:-n], moved + Phi @ (x[-n:] - b))
+        x = np.concatenate([x[:-n], moved + Phi @ (x[-n:] - b)])
         step = scipy.linalg.block_diag(np.eye(len(x) - n), Phi)
         P = step @ P @ step.T
         P[-n:, -n:] += root @ root.T
@@ -244,10 +244,10 @@ def evidence_of(state: PathState, message: PathMessage, belief: Path) -> Rows:
     """Return what a message with the sender's ``belief`` says of the window of a node, as readings
     with unit noise: all readings of the pair at instants that both remember.
     """
-    n, m = state.n, len(belief.x) // len(message.times)
+    n, m, known = state.n, len(belief.x) // len(message.times), state.belief()
     mine, theirs = (dict(zip(t, range(len(t)), strict=True)) for t in (state.times, message.times))
-    x: FloatArray = state.belief().x.reshape(-1, n)
-    x_j: FloatArray = message.belief.x.reshape(-1, m)
+    # By instant.
+    x, x_j = (p.x.reshape(-1, k, *p.x.shape[1:]) for p, k in ((known, n), (message.belief, m)))
     found, both = list[Rows](), ((True, state.seen), (False, message.seen))
     for is_own, t, pair in ((own, *one) for own, seen in both for one in seen):
         if t not in mine or t not in theirs:
@@ -261,10 +261,11 @@ def evidence_of(state: PathState, message: PathMessage, belief: Path) -> Rows:
             G[:, k * n : (k + 1) * n], G_j[:, j * m : (j + 1) * m] = H_k, H_j
             found.append(Rows(z - G_j @ belief.x, np.hstack([G, G_j]), R))
     K = len(state.times) * n
-    z, H, R = stacked(found, K + len(belief.x))
+    z, H, R = stacked(found, np.concatenate([known.x[:K], belief.x]))
     root = np.linalg.cholesky(H[:, K:] @ belief.P @ H[:, K:].T + R)
-    rows = scipy.linalg.solve_triangular(root, np.column_stack([H[:, :K], z]), lower=True)
-    if len(rows) > K + 1:
-        # As many rows as states say the same; the last one is about none.
-        rows = np.asarray(np.linalg.qr(rows, mode="r"))[:K]
-    return Rows(rows[:, K], rows[:, :K], np.eye(len(rows)))
+    z, H = (scipy.linalg.solve_triangular(root, part, lower=True) for part in (z, H[:, :K]))
+    if len(H) > K:
+        # As many readings as states say the same.
+        turned, H = np.linalg.qr(H)
+        z = turned.T @ z
+    return Rows(z, H, np.eye(len(H)))

@@ -106,7 +106,7 @@ class PairState(NamedTuple):
 
     def told(self, pairs: tuple[PairReading, ...] = ()) -> PairState:
         """Return the state that tells its estimate as it is, without own readings to use."""
-        own = stacked([], len(self.xhat))
+        own = stacked([], self.xhat)
         message = PairMessage(self.xhat, self.P, self.ties, self.message.blocks, own, pairs)
         return self._replace(message=message)
 
@@ -154,7 +154,11 @@ class BlockCrossCovariances(Filter):
 
     needs = Needs(one_way=True, samples=True, blocks=True, own_blocks=True, check=require_both_ways)
     # To one receiver, of whom it says two factors and two cores.
-    analysis = Analysis(payload_numbers=lambda n, *_: n + n * (n + 1) // 2 + 4 * n * n)
+    analysis = Analysis(
+        paper="block_cross_covariances",
+        affine=True,
+        payload_numbers=lambda n, *_: n + n * (n + 1) // 2 + 4 * n * n,
+    )
 
     @property
     def timing(self) -> Timing:
@@ -171,7 +175,7 @@ class BlockCrossCovariances(Filter):
         one, nothing = np.eye(len(mean)), np.zeros((len(mean), 0))
         ties = {k: Tie(one, nothing, NEVER, one, nothing, NEVER) for k in node.senders}
         xhat, P = np.array(mean), np.array(cov)
-        message = PairMessage(xhat, P, ties, places, stacked([], len(mean)))
+        message = PairMessage(xhat, P, ties, places, stacked([], xhat))
         return PairState(xhat, P, ties, model, node.node, message)
 
     def predict(self, state: PairState, gap: float) -> PairState:
@@ -260,14 +264,14 @@ def joint_of(mine: PairMessage, theirs: PairMessage, ties: tuple[Tie, Tie], time
     stay, stay_j = (updated(one.xhat, one.P, one.own)[2] for one in (mine, theirs))
     A, A_j = stay @ A, stay_j @ A_j
     usable, X = can_invert(A) and can_invert(A_j), stay @ X @ stay_j.T
-    seen = stacked([own, *others], n + m)
+    seen = stacked([own, *others], x)
     if usable and len(seen.z):
         # An error does not correlate with the innovations that have updated it: so this is the
         # cross-covariance, whether the other node hears them too or not.
         X = updated(x, P, seen)[1][:n, n:]
         C = np.linalg.solve(A, np.linalg.solve(A_j, X.T).T)
     tie = Tie(A, C, since, np.eye(n), X, time)
-    return Joint(x, P, own, stacked(others, n + m), tie, usable)
+    return Joint(x, P, own, stacked(others, x), tie, usable)
 
 
 def shared_factors(mine: Tie, theirs: Tie) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -326,8 +330,8 @@ def pair_rows(
             yield Rows(z, np.hstack([H, G]), pair.R)
 
 
-def stacked(seen: Sequence[Rows], n: int) -> Rows:
-    """Return all readings of a state (n,) as one."""
-    y = np.concatenate([np.zeros(0), *(z for z, _, _ in seen)])
-    H = np.concatenate([np.zeros((0, n)), *(H for _, H, _ in seen)])
-    return Rows(y, H, block_diagonal([R for _, _, R in seen]))
+def stacked(seen: Sequence[Rows], x: FloatArray) -> Rows:
+    """Return all readings of a state like x (n,) as one."""
+    z = np.concatenate([x[:0], *(z for z, _, _ in seen)])
+    H = np.concatenate([np.zeros((0, len(x))), *(H for _, H, _ in seen)])
+    return Rows(z, H, block_diagonal([R for _, _, R in seen]))

@@ -179,6 +179,14 @@ OF_EQUATIONS = {
             needs=(KNOWN, "the graph has no loops", START, REACH),
         )
     ),
+    # Of two nodes P is the covariance of the error.
+    "block_cross_covariances": about_equations(
+        replace(
+            EXACT,
+            source="Luft et al. 2018, derived",
+            needs=(KNOWN, "no node has two neighbours", START, REACH),
+        )
+    ),
     "consensus_innovations": about_equations(
         replace(EXACT, source="Das and Moura 2017", needs=(KNOWN, NO_LOSS, START, REACH))
     ),

@@ -53,6 +53,8 @@ def _about_P(scenario: Scenario) -> str:
         return "P is at least the covariance of the error, given the events, by design"
     if not name.talks and scenario.is_linear:
         return "P is the covariance of the error where the filters know plant, sensors and start"
+    if takes_columns(scenario.node_filter) and scenario.node_filter.analysis.paper:
+        return "P is the covariance of the error, given the events, where all assumptions hold"
     held = "netkf consistency and netkf check compare it with that of the errors"
     if not takes_columns(scenario.node_filter):
         held = "netkf consistency compares it with the errors"

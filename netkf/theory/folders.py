@@ -77,6 +77,19 @@ def _belief_rows(scenario: Scenario) -> list[AssumptionRow]:
     return model_and_start_rows(scenario, "Weiss and Freeman 2001", *_tree_rows(scenario))
 
 
+def _pair_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return the row under which kept cross-covariances are those of the errors."""
+    pairs = max(scenario.topology.degrees.values()) < 2
+    evidence = "both know how their errors correlate"
+    if not pairs:
+        evidence = "how errors correlate with those of third nodes is approximated"
+    return [("no node has two neighbours", "Luft et al. 2018", pairs, evidence)]
+
+
+def _cross_covariance_rows(scenario: Scenario) -> list[AssumptionRow]:
+    return model_and_start_rows(scenario, "Luft et al. 2018", *_pair_rows(scenario))
+
+
 def _pseudo_state_rows(scenario: Scenario) -> list[AssumptionRow]:
     source, otherwise = "Das and Moura 2017", "gains are those without losses"
     row = _no_loss(scenario, source, "every message arrives in its slot", otherwise)
@@ -125,6 +138,7 @@ def _reset_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 OF_PAPERS = {
     "belief_propagation": PaperTheory(_belief_rows, _tree_rows),
+    "block_cross_covariances": PaperTheory(_cross_covariance_rows, _pair_rows),
     "consensus_innovations": PaperTheory(_pseudo_state_rows),
     "constant_gain": PaperTheory(
         slot_jumps=constant_gains.slot_jumps, clock_jumps=constant_gains.clock_jumps

@@ -129,6 +129,31 @@ def test_on_trees_it_is_the_posterior_of_what_has_arrived(
     assert run.count("lost") > 10
 
 
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
+def test_p_is_right_where_nodes_forget_and_too_small_on_loops(tmp_path: Path, text: str) -> None:
+    short = BELIEF | {"estimates": "own", "window": 2}
+    shares = []
+    for edges in ([[1, 2], [2, 3]], [[1, 2], [2, 3], [3, 1]]):
+        changes = {"network__channel": LOSSY, "filter": short}
+        scenario = load(text, tmp_path, network__graph={"kind": "edges", "edges": edges}, **changes)
+        run = netkf.simulate(scenario)
+        shares.append(netkf.theory.error_covariance(scenario, run) / run.P)
+    np.testing.assert_allclose(shares[0], 1.0, rtol=1e-9)
+    assert shares[1].min() > 1.0 - 1e-9
+    assert shares[1].max() > 1.05
+
+
+def test_check_knows_that_p_is_right_on_trees_alone(tmp_path: Path) -> None:
+    promise = "P is the covariance of the error, given the events"
+    for edges, verdict in (([[1, 2]], "holds"), ([[1, 2], [2, 3], [3, 1]], "not promised")):
+        graph = {"kind": "edges", "edges": edges, "nodes": [1, 2, 3]}
+        keys = {"filter": BELIEF | {"estimates": "own"}, "network__graph": graph, "horizon": 5.0}
+        scenario = load(ROBOTS, tmp_path, **keys)
+        table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+        assert table.loc[promise, "verdict"] == verdict
+        assert "broken" not in set(table["verdict"])
+
+
 def test_loops_are_noted(tmp_path: Path) -> None:
     graph = {"kind": "edges", "edges": [[1, 2], [2, 3], [3, 1]]}
     belief = {"filter": BELIEF | {"estimates": "own"}}

@@ -13,7 +13,7 @@ import scipy.linalg
 import netkf
 from netkf.algorithms.block_cross_covariances import NEVER, Tie, joint_of
 from netkf.trace.schema import CODES
-from tests.algorithms.test_block_intersection import KEPT, ROBOTS, load
+from tests.algorithms.test_block_intersection import KEPT, ROBOTS, TWO, load
 
 # Two blocks of two states that move differently; the first node knows more than the second.
 F_1, F_2 = np.array([[1.0, 0.3], [0.0, 0.9]]), np.array([[0.8, 0.1], [-0.2, 1.0]])
@@ -143,6 +143,21 @@ def test_pairs_take_turns_and_third_nodes_are_approximated(tmp_path: Path) -> No
     assert 0.99 < share.min() < 1.0 - 1e-3
     assert 1.01 < share.max() < 1.05
     assert 1.0 - 1e-12 < np.min(ratios) <= np.max(ratios) < 1.03
+
+
+@pytest.mark.parametrize(("changes", "verdict"), [(TWO, "holds"), ({}, "not promised")])
+def test_check_knows_of_how_many_nodes_p_is_right(
+    tmp_path: Path, changes: dict[str, object], verdict: str
+) -> None:
+    lossy = {"loss": {"kind": "bernoulli", "delivery": 0.6}, "symmetric": False}
+    own = {"filter": KEPT | {"estimates": "own"}, "network__channel": lossy}
+    scenario = load(ROBOTS, tmp_path, **changes, **own)
+    run = netkf.simulate(scenario)
+    share = netkf.theory.error_covariance(scenario, run) / run.P
+    assert np.abs(share - 1.0).max() < (1e-9 if changes else 0.02)
+    table = netkf.check(scenario, 10, confidence=0.999, workers=1).table.set_index("promise")
+    assert table.loc["P is the covariance of the error, given the events", "verdict"] == verdict
+    assert "broken" not in set(table["verdict"])
 
 
 def test_factors_that_cannot_be_inverted_are_not_used(tmp_path: Path) -> None:
