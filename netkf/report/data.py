@@ -22,6 +22,8 @@ from netkf.report.packing import Packer
 from netkf.report.worst import WorstSample
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import nees_bounds
+from netkf.studies.consistency import judged_blocks
+from netkf.trace.nees import errors
 from netkf.trace.schema import CODES
 
 BINS = 60
@@ -247,11 +249,17 @@ def _sample_columns(
         # Thinned samples are said to be thinned, even if the first two are neighbours.
         step = max(int(rows[1] - rows[0]), 2) if len(rows) > 1 else 2
     views = source.scenario.views or [np.arange(n)]
-    one_state = all(np.array_equal(views[0], view) for view in views)
+    blocks = judged_blocks(source.scenario)
+    if run.truth_known and len(blocks) > len(sizes):
+        for k, (h, _, own, _) in enumerate(blocks):
+            square = np.ix_(rows, [h], own, own)
+            e, P = run.error[np.ix_(rows, [h], own)], run.P[square]
+            columns[f"nees_of_block_{k}"] = packer.add(errors(e, P)[1][:, 0], "f8")
     of_nodes = {
-        "one_state": one_state,
+        "one_state": all(np.array_equal(views[0], view) for view in views),
         "sizes": sizes,
         "nees_intervals": [intervals[size] for size in sizes],
+        "blocks": [[block.node, block.block] for block in blocks],
     }
     return {"columns": columns, "count": len(rows), "step": step, **of_nodes}
 

@@ -54,6 +54,9 @@ def test_every_command_takes_nodes_with_states_of_different_size(
     status = main([part.format(**places) for part in COMMANDS[name]])
     seen = capsys.readouterr()
     assert (status, "Traceback" in seen.err) == (0, False), seen.err
+    if name == "report":
+        # NEES of each block, beside that of a node.
+        assert '[1,"pose@3"]' in (places["out"] / "page.html").read_text().replace(" ", "")
     if "--json" not in COMMANDS[name]:
         return
     document = json.loads(seen.out)

@@ -76,6 +76,11 @@ const Figures = (() => {
       const i = app.nodeOf(run);
       if (!run.truth || i < 0) return;
       series.push({ label: letter(runs, r) + "NEES of node " + run.names[i], x: run.samples.t, y: column(run, run.samples.nees, i), colour: COLOURS[r], width: 1.8, dash: r ? "dashed" : "solid" });
+      // Of each block that the node estimates, beside that of all of them.
+      run.samples.blocks.forEach(([node, name], k) => {
+        const y = run.samples["nees_of_block_" + k];
+        if (node === i && y) series.push({ label: letter(runs, r) + name + " by node " + run.names[i], x: run.samples.t, y: Array.from(y), colour: COLOURS[r], width: 0.8, dash: "dotted" });
+      });
     });
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
     const { sizes, nees_intervals } = runs[0].samples, i = Math.max(0, app.nodeOf(runs[0]));
