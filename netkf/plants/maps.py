@@ -78,7 +78,7 @@ class NonlinearPlant(RecordedStates, SlotPlant):
         linear plants only.
         """
         if self.record is not None:
-            return RecordedPath(self.record.slots(self.period), np.full(self.n, np.nan))
+            return RecordedPath(self.recorded_truth, self.period)
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         return MapPath(self, start, random)
 

@@ -7,7 +7,6 @@ has no row for a slot has no reading in that slot.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -56,7 +55,7 @@ class UnknownPlant(LinearPlant):
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """Return a path of nan (n,) in all slots; nothing is drawn from ``random``."""
-        return RecordedPath({}, np.full(self.n, math.nan))
+        return RecordedPath(RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n), self.period)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,7 @@ class RecordedPlant(RecordedStates, LinearPlant):
 
     def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
         """Return the states of the table, nan in slots without one; ``random`` is not used."""
-        return RecordedPath(self.record.slots(self.period), np.full(self.n, math.nan))
+        return RecordedPath(self.recorded_truth, self.period)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,101 +33,62 @@ TURN = 2.0 * math.pi
 class StateTable:
     """The states of the rows of a table, as a plant takes them, of whose states ``headings`` are
     angles: these count whole turns on, from the one that is nearest to the plant's mean at 0.
+
+    With a ``period`` of slots in seconds rows are those of slots, unless states are interpolated.
     """
 
     def __init__(self, plant: RecordedStates, columns: Columns) -> None:
         self.columns = columns
         self._mean, self._headings = plant.start_mean, plant.headings
         self._interpolate, self._n = plant.interpolate, plant.n
+        slots = None if plant.interpolate else getattr(plant, "period", None)
+        self._period: float | None = slots
         names = [f"x{k}" for k in range(plant.n)]
         self._states = np.stack([columns[name] for name in names], axis=1)
 
     @cached_property
     def truth(self) -> RecordedTruth:
-        """The true state as engines read it; raises ScenarioError for two states at one time."""
-        first = self._first(self.row_keys(None), "there may be one row a time, or equal ones")
-        times, states = self._ordered([first[key] for key in range(len(first))])
-        return RecordedTruth(times, states, self._n, self._interpolate)
-
-    def slots(self, period: float) -> SlotStates:
-        """Return the states (n,) by number of the slot of ``period`` seconds; raises ScenarioError
-        for a mistake in the file.
+        """The true state as engines read it; raises ScenarioError for two states at one time or in
+        one slot.
         """
-        if self._interpolate is not None:
-            return InterpolatedStates(self.truth, period)
-        first = self._first(self.row_keys(period), "there may be one row a slot, or equal ones")
-        numbers = sorted(slot for slot in first if slot >= 0)
-        _, states = self._ordered([first[slot] for slot in numbers])
-        return dict(zip(numbers, states, strict=True))
-
-    def _first(self, keys: list[int], rule: str) -> dict[int, int]:
-        return first_rows(self.columns, keys, self._states.tolist(), rule)
-
-    def _ordered(self, rows: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Return times (K,) and states (K, n) of ``rows``, with headings that count whole turns."""
+        what = "time" if self._period is None else "slot"
+        rule = f"there may be one row a {what}, or equal ones"
+        first = first_rows(self.columns, self.row_keys, self._states.tolist(), rule)
+        keys = sorted(first) if self._period is None else sorted(k for k in first if k >= 0)
+        rows = [first[key] for key in keys]
         times, states = self.columns["t"][rows], self._states[rows]
-        for entry in self._headings if len(rows) else ():
+        if self._period is not None:
+            times = self._period * np.array(keys, dtype=np.float64)
+        for entry in self._headings if rows else ():
             states[:, entry] = np.unwrap(states[:, entry])
             start = states[int(np.argmin(np.abs(times))), entry]
             states[:, entry] += TURN * np.round((self._mean[entry] - start) / TURN)
-        return times, states
+        return RecordedTruth(times, states, self._n, self._interpolate)
 
-    def row_keys(self, period: float | None) -> list[int]:
-        """Return the subject of each row, in the order of the table: its slot of ``period`` seconds
-        or, with None or if states are interpolated, its place among the times of the table.
+    @property
+    def row_keys(self) -> list[int]:
+        """The subject of each row, in the order of the table: its slot, or its place among the
+        times of the table.
         """
-        if period is None or self._interpolate is not None:
-            times = self.columns["t"]
-            order = np.argsort(times, kind="stable")
-            keys = np.zeros(len(order), dtype=np.int64)
-            keys[order[1:]] = np.cumsum(np.diff(times[order]) > TOLERANCE)
-            return [int(key) for key in keys]
         columns = self.columns
+        if self._period is None:
+            order = np.argsort(columns["t"], kind="stable")
+            keys = np.zeros(len(order), dtype=np.int64)
+            keys[order[1:]] = np.cumsum(np.diff(columns["t"][order]) > TOLERANCE)
+            return [int(key) for key in keys]
         columns.refuse_early(np.flatnonzero(columns["t"] < 0.0), "t must be at least 0")
-        return [slot_number(columns, row, period) for row in range(len(columns.lines))]
+        return [slot_number(columns, row, self._period) for row in range(len(columns.lines))]
 
-    def use(self, needed: Iterable[float], period: float | None) -> RowUse:
-        """Return the use of the rows that say the states at the ``needed`` times in seconds, or in
-        the needed slots of ``period`` seconds.
-        """
-        if period is not None and self._interpolate is None:
-            used = {int(slot) for slot in needed}
-        else:
-            times = (time if period is None else time * period for time in needed)
-            used = {key for time in times for key in self.truth.rows_at(time)}
-        return count_rows(self.columns.source.name, self.row_keys(period), used.__contains__)
+    def use(self, times: Iterable[float]) -> RowUse:
+        """Return the use of the rows that say the states at the ``times`` in seconds."""
+        rows = {row for time in times for row in self.truth.rows_at(time)}
+        if self._period is not None:
+            rows = {round(float(self.truth.times[row]) / self._period) for row in rows}
+        return count_rows(self.columns.source.name, self.row_keys, rows.__contains__)
 
     def require_times(self, times: FloatArray, what: str) -> None:
         """Raise ScenarioError if a state is missing at ``times`` (K,), for the use ``what``."""
         demand_states(self.columns.source, self.truth, times, what)
-
-    def require_slots(self, slots: Iterable[int], period: float) -> None:
-        """Raise ScenarioError if the table has no state for one of the ``slots`` (numbers)."""
-        states = self.slots(period)
-        missing = next((slot for slot in slots if slot not in states), None)
-        if missing is not None:
-            remedy = "add the row or shorten the horizon"
-            if self._interpolate is None:
-                remedy = 'add the row, or write interpolate = "linear" or "hold"'
-            time = f"slot {missing}, t = {missing * period:g}"
-            rule = f"{self.columns.source.name} has no state for {time}"
-            raise ScenarioError("path", rule, None, remedy)
-
-
-class StackedStates:
-    """The states of several blocks together, each from its own table."""
-
-    def __init__(self, tables: Sequence[StateTable]) -> None:
-        self._tables = tables
-
-    @cached_property
-    def truth(self) -> RecordedTruth:
-        """The true state as engines read it."""
-        return StackedTruth([table.truth for table in self._tables])
-
-    def slots(self, period: float) -> SlotStates:
-        """Return the states (n,) by number of the slot of ``period`` seconds."""
-        return StackedSlots([table.slots(period) for table in self._tables])
 
 
 class StackedTruth(RecordedTruth):
@@ -150,55 +111,24 @@ class StackedTruth(RecordedTruth):
     absolute = local
 
 
-class InterpolatedStates:
-    """The states of slots of ``period`` seconds in the ``truth`` of a table with rows at any
-    times.
-    """
+class StackedStates:
+    """The states of several blocks together, each from its own table."""
+
+    def __init__(self, tables: Sequence[StateTable]) -> None:
+        self.truth = StackedTruth([table.truth for table in tables])
+
+
+class RecordedPath:
+    """The states of slots of ``period`` seconds in a recorded ``truth``."""
+
+    frame_slots: int | None = None
 
     def __init__(self, truth: RecordedTruth, period: float) -> None:
         self._truth, self._period = truth, period
 
-    def __contains__(self, slot: int) -> bool:
-        return bool(self._truth.rows_at(slot * self._period))
-
-    def get(self, slot: int, otherwise: FloatArray) -> FloatArray:
-        """Return the state (n,) of a slot, ``otherwise`` (n,) if it is unknown."""
-        return self._truth.local(slot * self._period) if slot in self else otherwise
-
-
-class StackedSlots:
-    """The states of slots of several tables, one after the other; known where all of them are."""
-
-    def __init__(self, parts: Sequence[Any]) -> None:
-        self._parts = parts
-
-    def __contains__(self, slot: int) -> bool:
-        return all(slot in part for part in self._parts)
-
-    def get(self, slot: int, otherwise: FloatArray) -> FloatArray:
-        """Return the state (n,) of a slot, ``otherwise`` (n,) if it is unknown."""
-        if slot not in self:
-            return otherwise
-        return np.concatenate([part.get(slot, otherwise) for part in self._parts])
-
-
-SlotStates = dict[int, FloatArray] | InterpolatedStates | StackedSlots
-"""Recorded states by slot."""
-
-
-class RecordedPath:
-    """The truth of a run from a table: states (n,) by slot number, ``otherwise`` (n,) in slots that
-    it lacks.
-    """
-
-    frame_slots: int | None = None
-
-    def __init__(self, states: SlotStates, otherwise: FloatArray) -> None:
-        self._states, self._otherwise = states, otherwise
-
     def state(self, slot: int) -> FloatArray:
-        """Return the state (n,) in slot number ``slot``."""
-        return self._states.get(slot, self._otherwise)
+        """Return the state (n,) in slot number ``slot``; nan where it is unknown."""
+        return self._truth.local(slot * self._period)
 
     local = absolute = state
 
@@ -240,8 +170,7 @@ class RecordedStates(Plant):
 
     def _read_states(self) -> None:
         if self.record is not None:
-            period = getattr(self, "period", None)
-            _ = self.record.truth if period is None else self.record.slots(period)
+            _ = self.record.truth
 
     @property
     def headings(self) -> tuple[int, ...]:
@@ -268,6 +197,6 @@ class RecordedStates(Plant):
 
     @property
     def recorded_truth(self) -> RecordedTruth:
-        """The recorded states as engines read them in continuous time."""
+        """The recorded states as engines read them."""
         truth: RecordedTruth = self.record.truth
         return truth

@@ -32,12 +32,10 @@ def check_records(scenario: DerivedScenario) -> None:
                 None,
                 'write kind = "recorded" and path = "readings.csv"',
             )
-    if scenario.slotted:
-        slots, period = sorted(_state_slots(scenario)), scenario.slot_plant.period
-        for key, plant in scenario.all_plants:
-            if plant.record is not None:
-                with errors_under(key):
-                    plant.record.require_slots(slots, period)
+    for key, plant in scenario.all_plants if scenario.slotted else ():
+        for slot in sorted(_state_slots(scenario)) if plant.record is not None else ():
+            with errors_under(key):
+                plant.record.require_times(np.array([slot * plant.period]), f"slot {slot}")
     if scenario.slotted and scenario.filter.algorithm.timing.talks:
         _check_exchanges(scenario)
 
@@ -111,10 +109,8 @@ def count_state_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
     """Return the use of the rows of recorded states by key path."""
     if scenario.plant.record is None:
         return {}
-    needed: Any = _state_slots(scenario) if scenario.slotted else _state_times(scenario).tolist()
-    return _sum_by_key(
-        (key, plant.record.use(needed, _period(scenario))) for key, plant in scenario.all_plants
-    )
+    times = _state_times(scenario).tolist()
+    return _sum_by_key((key, plant.record.use(times)) for key, plant in scenario.all_plants)
 
 
 def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
@@ -133,7 +129,7 @@ def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
 def count_plant_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
     """Return the use of the rows of recorded states and inputs if all are used, by key path."""
     tables = [
-        (key, plant.record.columns.source.name, plant.record.row_keys(_period(scenario)))
+        (key, plant.record.columns.source.name, plant.record.row_keys)
         for key, plant in scenario.all_plants
         if plant.record is not None
     ]
@@ -147,10 +143,6 @@ def _recorded_inputs(scenario: Any) -> Iterator[tuple[str, RecordedInput]]:
             yield f"{key}.input", plant.input.on_grid(scenario.time_grid)
 
 
-def _period(scenario: DerivedScenario) -> float | None:
-    return scenario.slot_plant.period if scenario.slotted else None
-
-
 def _sum_by_key(uses: Iterable[tuple[str, RowUse]]) -> dict[str, RowUse]:
     by_key: dict[str, list[RowUse]] = {}
     for key, use in uses:
@@ -159,7 +151,9 @@ def _sum_by_key(uses: Iterable[tuple[str, RowUse]]) -> dict[str, RowUse]:
 
 
 def _state_times(scenario: DerivedScenario) -> FloatArray:
-    """Return the times (K,) at which replica 0 needs states of a recorded diffusion."""
+    """Return the times (K,) in seconds at which replica 0 needs recorded states."""
+    if scenario.slotted:
+        return scenario.slot_plant.period * np.array(sorted(_state_slots(scenario)))
     times = [scenario.times]
     if any(sensor.is_random for sensor in scenario.sensors):
         times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))
