@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse, Patch
 
 from netkf.figures.figure_data import FigureData, UnavailableError
-from netkf.figures.style import INK, MUTED, SERIES, Picture, finish_figure, new_figure
+from netkf.figures.style import INK, SERIES, Picture, finish_figure, new_figure
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.run import Run
 
@@ -18,10 +17,12 @@ LEVEL = 0.95
 SQUARE = -2.0 * math.log(1.0 - LEVEL)
 """Squared distance, in units of P, within which a share LEVEL of plane Gaussian errors is."""
 ELLIPSES = 6  # of each node
+_ANGLES = np.linspace(0.0, 2.0 * math.pi, 60)
+CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
 class _Path(NamedTuple):
-    """True positions x, the node's own estimates xhat (T, 2) of them, and their P (T, 2, 2)."""
+    """True positions x and the node's own estimates xhat (T, 2), and their P (T, 2, 2)."""
 
     node: int
     x: FloatArray
@@ -44,15 +45,16 @@ def plane_figure(data: FigureData) -> Picture:
     width, height = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
     # Of one scale along both axes.
     figure = new_figure(6.6, 1.7 + float(np.clip(5.9 * height / max(width, 1e-9), 2.5, 7.0)))
-    axes = figure.subplots()
-    axes.scatter(*landmarks.T, marker="+", s=45, linewidths=1.2, color=INK, zorder=4)
+    axes: Any = figure.subplots()
+    label = "landmark" if len(landmarks) else ""
+    axes.scatter(*landmarks.T, marker="+", s=45, linewidths=1.2, color=INK, zorder=4, label=label)
+    labels = ["true path", "estimate of the node", f"{LEVEL:.0%} of errors, by P"]
     for k, path in enumerate(paths):
-        _draw_path(axes, path, SERIES[k % len(SERIES)].colour)
+        _draw_path(axes, path, SERIES[k % len(SERIES)].colour, labels if k == 0 else [""] * 3)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.set(xlabel="first coordinate", ylabel="second coordinate")
-    handles = _legend(data, len(landmarks) > 0)
-    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     finish_figure(figure, data.title(_headline(data, paths)), data.caption(_coverage(data, paths)))
     return figure
 
@@ -82,34 +84,19 @@ def _landmarks(scenario: Any) -> FloatArray:
     return np.unique(np.concatenate([np.zeros((0, 2)), *seen]), axis=0)
 
 
-def _draw_path(axes: Any, path: _Path, colour: str) -> None:
-    axes.plot(*path.x.T, color=colour, linewidth=1.2, zorder=2)
-    axes.plot(*path.xhat.T, color=colour, linewidth=1.2, linestyle=(0, (1, 1.4)), zorder=3)
+def _draw_path(axes: Any, path: _Path, colour: str, labels: Sequence[str]) -> None:
+    true, estimate, ellipse = labels
+    axes.plot(*path.x.T, color=colour, linewidth=1.2, label=true)
+    dotted = {"linestyle": (0, (1, 1.4)), "linewidth": 1.2}
+    axes.plot(*path.xhat.T, color=colour, **dotted, zorder=3, label=estimate)
     for k in np.unique(np.linspace(0, len(path.xhat) - 1, ELLIPSES).astype(int)):
-        if np.isfinite(path.P[k]).all():
-            sizes, axis = np.linalg.eigh(path.P[k])
-            axes.add_patch(
-                Ellipse(
-                    path.xhat[k],
-                    *(2.0 * np.sqrt(SQUARE * np.maximum(sizes, 0.0))),
-                    angle=math.degrees(math.atan2(axis[1, 0], axis[0, 0])),
-                    facecolor=colour,
-                    edgecolor=colour,
-                    linewidth=0.6,
-                    alpha=0.25,
-                )
-            )
+        sizes, directions = np.linalg.eigh(np.nan_to_num(path.P[k]))
+        ring = CIRCLE * np.sqrt(SQUARE * np.maximum(sizes, 0.0)) @ directions.T
+        axes.fill(*(path.xhat[k] + ring).T, color=colour, alpha=0.25, linewidth=0.6, label=ellipse)
+        ellipse = ""
     end = path.xhat[-1]
     axes.scatter(*end, s=90, color="white", edgecolors=colour, zorder=5)
     axes.text(*end, str(path.node), fontsize=6.5, ha="center", va="center", zorder=6)
-
-
-def _legend(data: FigureData, has_landmarks: bool) -> list[Any]:
-    true = Line2D([], [], color=MUTED, linewidth=1.2, label="true path")
-    estimated = Line2D([], [], color=MUTED, linestyle=(0, (1, 1.4)), label="estimate of the node")
-    ellipse = Patch(facecolor=MUTED, alpha=0.25, label=f"{LEVEL:.0%} of errors, by P")
-    mark = Line2D([], [], color=INK, marker="+", linestyle="", label="landmark")
-    return [*([true] if data.shows_errors else []), estimated, ellipse, *([mark] * has_landmarks)]
 
 
 def _headline(data: FigureData, paths: list[_Path]) -> str:
@@ -124,13 +111,13 @@ def _headline(data: FigureData, paths: list[_Path]) -> str:
 def _coverage(data: FigureData, paths: list[_Path]) -> str:
     if not data.shows_errors:
         return ""
-    e = np.concatenate([(path.x - path.xhat)[1:] for path in paths])
-    P = np.concatenate([path.P[1:] for path in paths])
-    known = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(e).all(axis=1)
-    if not known.any():
+    squares = [
+        e @ np.linalg.pinv(P, hermitian=True) @ e
+        for path in paths
+        for e, P in zip((path.x - path.xhat)[1:], path.P[1:], strict=True)
+        if np.isfinite(P).all()
+    ]
+    if not squares:
         return ""
-    squares = np.einsum(
-        "ki,kij,kj->k", e[known], np.linalg.pinv(P[known], hermitian=True), e[known]
-    )
-    share = f"{np.mean(squares <= SQUARE):.0%}"
-    return f"{share} of the sampled positions are where P says that {LEVEL:.0%} are."
+    inside = np.mean(np.array(squares) <= SQUARE)
+    return f"{inside:.0%} of the sampled positions are where P says that {LEVEL:.0%} are."

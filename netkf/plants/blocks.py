@@ -113,14 +113,11 @@ class Block(Component):
 
     def check_means(self) -> None:
         """Raise ScenarioError unless ``means`` has one for each of ``nodes``, in place of mean."""
-        if self.means is None:
-            return
-        if self.plant.mean is not None:
-            raise ScenarioError("means", "cannot stand beside mean", None, "leave one of them out")
-        n, shapes = self.plant.n, [mean.shape for mean in self.means]
-        if shapes != [(n,)] * len(self.nodes or ()):
-            rule = f"must have {n} numbers for each of nodes, which are {len(self.nodes or ())}"
-            raise ScenarioError("means", rule, list(self.means), "correct the list")
+        n, wanted = self.plant.n, len(self.nodes or ())
+        given = [mean.shape for mean in self.means or ()]
+        if self.means is not None and (given != [(n,)] * wanted or self.plant.mean is not None):
+            rule = f"must be {wanted} lists of {n}, one for each of nodes, in place of mean"
+            raise ScenarioError("means", rule, list(self.means), "correct them, or remove mean")
 
     def check_position(self) -> None:
         """Raise ScenarioError unless ``position`` names different entries of blocks of nodes."""

@@ -105,7 +105,7 @@ def _block_table(block: Block, stacked: Plant, style: _Style) -> dict[str, Any]:
     """
     plant = copy.copy(block.plant)
     if style.with_defaults:
-        defaults = {"mean": plant.start_mean, "cov": plant.start_cov}
+        defaults: dict[str, Any] = {"mean": plant.start_mean, "cov": plant.start_cov}
         if block.means is not None:
             del defaults["mean"]
         if isinstance(stacked, Diffusion):
