@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path
@@ -19,16 +18,11 @@ notes.
 """
 
 
-class Imported(NamedTuple):
-    """The ``files`` that were written, the scenario first, and ``notes`` on what the log has."""
-
-    files: tuple[Path, ...]
-    notes: tuple[str, ...]
-
-
-def import_log(log: str | Path, kind: str, out: str | Path) -> Imported:
+def import_log(
+    log: str | Path, kind: str, out: str | Path
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write the ``log`` of a ``kind``, a file or a folder, as a scenario with its tables into the
-    folder ``out``; nothing is overwritten.
+    folder ``out``; nothing is overwritten. Return the paths, the scenario first, and notes.
 
     ``kind`` is "mrclam", the UTIAS multi-robot data sets. Raises ScenarioError with file and line
     for a log that cannot be read, before anything is written, and WriteError.
@@ -46,4 +40,4 @@ def import_log(log: str | Path, kind: str, out: str | Path) -> Imported:
     make_directory(folder)
     for path in paths:
         write_text(path, texts[path.name])
-    return Imported(tuple(paths), notes)
+    return tuple(paths), notes

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -105,8 +106,8 @@ def read_mrclam(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
     start = np.array([float(origin)])
     means = [np.round(_poses_at(poses[node], start)[0], 6).tolist() for node in nodes]
     log = re.sub(r"[^\w.-]", "_", folder.resolve().name)
-    keys: dict[str, Any] = {"log": log, "horizon": horizon, "origin": origin, "nodes": nodes}
-    parts = [SCENARIO.format(**keys, means=means)]
+    keys = {"log": log, "horizon": horizon, "nodes": nodes, "means": means}
+    parts = [SCENARIO.format(**keys, origin=f"{Decimal(origin):f}")]
     is_mark = readings["to"].isin(points)
     for path, rows, kind in (
         ("landmarks.csv", readings[is_mark], "range-bearing"),
@@ -139,7 +140,7 @@ def _read(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     except (OSError, UnicodeDecodeError) as error:
         rule = f"cannot be read ({getattr(error, 'strerror', None) or error})"
         raise ScenarioError(str(path), rule, None, "check the folder") from None
-    if not rows:
+    if not rows and columns is not COLUMNS["Measurement"]:  # a robot may see nothing
         raise ScenarioError(str(path), "has no rows", None, "check the folder")
     return pd.DataFrame.from_dict(rows, orient="index", columns=list(columns))
 

@@ -197,13 +197,6 @@ dynamics = Rule(
 )
 
 
-def headings_of(f: Any) -> tuple[int, ...]:
-    """Return which states are headings: of a motion that netkf knows, or that a class names."""
-    if isinstance(f, str):
-        return MOTIONS[f].headings
-    return tuple(getattr(getattr(f, "part", None), "headings", ()))
-
-
 def functions_of(f: Any, n: int, m: int, in_slots: bool) -> Any:
     """Return f and its Jacobian for n states and m components of the input, as two functions that
     kernels can call: in slots the map of one, else the rate of change.

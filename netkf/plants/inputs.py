@@ -52,10 +52,6 @@ class Input(Component, OnGrid):
 
     grid_values: ClassVar[tuple[str, ...]] = ("exogenous",)
 
-    def owned_by(self, node: int) -> Self:
-        """Return the input of the block of ``node`` (id): the same for all, but from tables."""
-        return self
-
     @property
     @abstractmethod
     def exogenous(self) -> Exogenous:

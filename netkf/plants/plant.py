@@ -16,7 +16,7 @@ from netkf.core.instants import OnGrid, TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root, product
 from netkf.plants.changes import matrices_of_pieces
-from netkf.plants.inputs import Input
+from netkf.plants.inputs import Input, RecordedInput
 from netkf.rng.normals import Normals
 
 
@@ -59,7 +59,7 @@ class Plant(Component, OnGrid):
         plant = copy.copy(self)
         plant.__dict__.pop("record", None)
         object.__setattr__(plant, "node", node)
-        if plant.input is not None:
+        if isinstance(plant.input, RecordedInput):
             object.__setattr__(plant, "input", plant.input.owned_by(node))
         return plant
 

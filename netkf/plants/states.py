@@ -20,7 +20,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
-from netkf.plants.dynamics import headings_of
+from netkf.plants.dynamics import MOTIONS
 from netkf.plants.plant import Plant
 from netkf.plants.readings import slot_number
 from netkf.plants.truth import TOLERANCE, RecordedTruth, demand_states
@@ -161,21 +161,23 @@ class RecordedStates(Plant):
             rule = "means nothing without path"
             raise ScenarioError("interpolate", rule, self.interpolate, "leave it out")
         if isinstance(self.path, SourceFile) and "node" not in self._columns:
-            self._read_states()  # a mistake in the file is found on construction
+            _ = self.recorded_truth  # a mistake in the file is found on construction
 
     def read(self) -> None:
         """Raise ScenarioError for a mistake in its tables."""
         super().read()
-        self._read_states()
-
-    def _read_states(self) -> None:
         if self.record is not None:
-            _ = self.record.truth
+            _ = self.recorded_truth
 
     @property
     def headings(self) -> tuple[int, ...]:
-        """Which states are angles, that tables may count from anywhere."""
-        return headings_of(getattr(self, "f", None))
+        """Which states are angles, that tables may count from anywhere: of a motion that netkf
+        knows, or that a class names.
+        """
+        f = getattr(self, "f", None)
+        if isinstance(f, str):
+            return MOTIONS[f].headings
+        return tuple(getattr(getattr(f, "part", None), "headings", ()))
 
     @property
     def is_random(self) -> bool:  # type: ignore[override]

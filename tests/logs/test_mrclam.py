@@ -88,7 +88,7 @@ def test_every_number_is_that_of_the_log(log, tmp_path, capsys):
             r"Robot1_Groundtruth.dat: line 2 must have 4",
         ),
         ("Robot1_Measurement.dat", "1 2 nan 4\n", r"Robot1_Measurement.dat: line 1 must have 4"),
-        ("Robot1_Measurement.dat", "# nothing\n", r"Robot1_Measurement.dat: has no rows"),
+        ("Robot1_Odometry.dat", "# nothing\n", r"Robot1_Odometry.dat: has no rows"),
         ("Barcodes.dat", "1 5\n2 5\n", r"Barcodes.dat: line 2 repeats a barcode"),
         ("Landmark_Groundtruth.dat", None, r"Landmark_Groundtruth.dat: cannot be read"),
         ("Robot2_Groundtruth.dat", "200 1 1 1\n", "true poses of all robots for a second"),
@@ -99,6 +99,16 @@ def test_a_bad_line_is_refused_with_its_file_and_number(log, tmp_path, name, tex
     with pytest.raises(ScenarioError, match=message):
         netkf.import_log(log, "mrclam", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_robot_may_see_nothing_and_stamps_may_be_written_in_any_way(log, tmp_path):
+    (log / "Robot2_Measurement.dat").write_text("# nothing\n")
+    (log / "Robot1_Groundtruth.dat").write_text("+1.e2 0 0 3.1\n103. 3 0 -2.9\n")
+    (log / "Robot2_Groundtruth.dat").write_text(".5 2 2 0\n104 2 4 0.5\n")
+    netkf.import_log(log, "mrclam", tmp_path / "out")
+    scenario = netkf.load(tmp_path / "out" / "scenario.toml")
+    assert (scenario.horizon, scenario.time.origin) == (3.0, 100)
+    assert [one.nodes for one in scenario.declared_sensors] == [(1,), (1,)]
 
 
 def test_nothing_is_overwritten_and_a_log_must_be_one(log, tmp_path, capsys):
@@ -126,9 +136,9 @@ def test_the_small_set_is_that_of_its_script_and_the_scenario_that_of_the_set(tm
         ]
         # The last digit may be rounded otherwise elsewhere.
         np.testing.assert_allclose(*pair, rtol=0, atol=1.1e-3)
-    result = netkf.import_log(SMALL, "mrclam", tmp_path / "made")
-    assert len(result.notes) == 4
-    for file in result.files:
+    files, notes = netkf.import_log(SMALL, "mrclam", tmp_path / "made")
+    assert len(notes) == 4
+    for file in files:
         assert file.read_text() == (MADE / file.name).read_text(), file.name
 
 
