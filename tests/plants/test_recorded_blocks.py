@@ -174,3 +174,51 @@ def test_a_plant_of_all_has_no_rows_by_node(tmp_path):
     plant["input"] = {"kind": "constant", "value": [1.0, 0.1]}
     with pytest.raises(ScenarioError, match=r"plant.path: truth.csv has a column node"):
         from_table(table, tmp_path)
+
+
+SEEN = """t,node,to,y0,R0
+2026-03-01T12:00:01Z,1,7,4.0,0.04
+2026-03-01T12:00:01Z,1,8,3.0,0.09
+2026-03-01T12:00:01.5Z,1,7,,
+2026-03-01T12:00:01.5Z,2,8,2.0,0.01
+2026-03-01T12:00:02Z,1,8,2.5,0.04
+"""
+MARKS = {7: np.array([3.0, 2.0]), 8: np.array([1.0, -1.0])}
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+def test_ranges_with_noise_of_their_own_and_an_origin_are_those_of_a_plain_ekf(tmp_path, engine):
+    """Two ranges at one instant, one without a value, stamps as times of a day."""
+    table = team(tmp_path, input={"kind": "constant", "value": [1.0, 0.4]})
+    (tmp_path / "seen.csv").write_text(SEEN)
+    places = [MARKS[7].tolist(), MARKS[8].tolist()]
+    sensor = {"kind": "range", "of": "pose", "path": "seen.csv", "R": [[1.0]], "positions": places}
+    table |= {"sensors": [sensor], "time": {"origin": "2026-03-01T12:00:00Z"}}
+    run = netkf.simulate(from_table(table, tmp_path), engine=engine)
+    rows = {1: {2: [(7, 4.0, 0.04), (8, 3.0, 0.09)], 4: [(8, 2.5, 0.04)]}, 2: {3: [(8, 2.0, 0.01)]}}
+    own = table | {"filter": {"kind": "block-intersection", "estimates": "own"}}
+    alone = netkf.simulate(from_table(own, tmp_path), engine="simpy")
+    for node, first in ((1, 0), (2, 3)):
+        x, P = _ekf(START[node], rows[node])
+        np.testing.assert_allclose(run.xhat[-1, 0, first : first + 3], x, rtol=1e-9)
+        np.testing.assert_allclose(run.P[-1, 0, first:, first:][:3, :3], P, rtol=1e-8, atol=1e-12)
+        np.testing.assert_allclose(alone.block("pose", node).xhat[-1], x, rtol=1e-8)
+
+
+def _ekf(start, rows, v=1.0, w=0.4, T=0.5):
+    x, P = np.array(start), np.diag([0.1, 0.1, 0.02])
+    for k in range(1, 5):
+        dx = v / w * (math.sin(x[2] + w * T) - math.sin(x[2]))
+        dy = v / w * (math.cos(x[2]) - math.cos(x[2] + w * T))
+        J = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+        x, P = x + np.array([dx, dy, w * T]), J @ P @ J.T + np.diag([1e-3, 1e-3, 4e-4])
+        seen = rows.get(k, [])
+        if not seen:
+            continue
+        d = [x[:2] - MARKS[to] for to, _, _ in seen]
+        r = np.array([math.hypot(*one) for one in d])
+        H = np.array([[*(one / length), 0.0] for one, length in zip(d, r, strict=True)])
+        S = H @ P @ H.T + np.diag([R for _, _, R in seen])
+        K = P @ H.T @ np.linalg.inv(S)
+        x, P = x + K @ (np.array([y for _, y, _ in seen]) - r), P - K @ H @ P
+    return x, P
