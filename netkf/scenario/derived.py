@@ -483,15 +483,18 @@ class DerivedScenario(ScenarioModel):
             if sampled is None:
                 sampled = all_sample_times(sample_times(self, streams))
             if not self.plant.is_random:
-                require_states(self, sample_times(self, streams))
+                require_states(self, sample_times(self, streams), streams)
                 return self.plant.recorded_truth
             random, *inside = map(streams.generator, ("plant", "samples", "probe"))
-            return self.plant.curve(random, (sampled, inside[0]), (self.times, inside[1]))
+            # Readings do not depend on when the network ticks.
+            ticks = tick_times(self, streams) if self.links_follow_state else np.empty(0)
+            shown = np.union1d(self.times, ticks)
+            return self.plant.curve(random, (sampled, inside[0]), (shown, inside[1]))
         plant, horizon = self.diffusion, self.horizon
         recorded, on_grid = not plant.is_random, uses_grid(self)
         if sampled is None or recorded:
             by_sensor = sample_times(self, streams)
-            require_states(self, by_sensor)
+            require_states(self, by_sensor, streams)
             sampled = all_sample_times(by_sensor)
         if self.links_follow_state:
             # Of a path that is drawn at some instants only, states do not depend on which.

@@ -161,9 +161,13 @@ def _state_times(scenario: DerivedScenario) -> FloatArray:
 
 
 def _state_slots(scenario: DerivedScenario) -> set[int]:
-    """Return the slots whose states a run needs: the sampled ones and those with drawn readings."""
-    has_drawn_readings = any(sensor.is_random for sensor in scenario.sensors)
-    return {*scenario.sampled_slots, *(sensed_slots(scenario) if has_drawn_readings else ())}
+    """Return the slots whose states a run needs: the sampled ones, those with drawn readings, and
+    those with messages where links follow the state.
+    """
+    slots = {*scenario.sampled_slots}
+    if any(sensor.is_random for sensor in scenario.sensors):
+        slots.update(sensed_slots(scenario))
+    return slots.union(exchange_slots(scenario)) if scenario.links_follow_state else slots
 
 
 def record_notes(scenario: DerivedScenario) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
+from netkf.scenario.positions import tick_times
 
 MAX_SAMPLES = 1e9  # samples of one sensor; more suggest a wrong unit of time
 
@@ -96,15 +97,19 @@ def uses_grid(scenario: ScenarioModel) -> bool:
     return is_drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
-def require_states(scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray]) -> None:
+def require_states(
+    scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray], streams: Streams
+) -> None:
     """Raise ScenarioError if recorded states lack that at a time that a run needs.
 
-    These are the probe times, and the sample times of sensors whose readings are drawn. ``times``
-    are the sample times (K,) in seconds by (node, ordinal).
+    These are the probe times, the sample times of sensors whose readings are drawn, and ticks where
+    links follow the state. ``times`` are the sample times (K,) in seconds by (node, ordinal).
     """
+    ticks = tick_times(scenario, streams) if scenario.links_follow_state else np.empty(0)
     for key, plant in scenario.all_plants if scenario.plant.record is not None else ():
         with errors_under(key):
             plant.record.require_times(scenario.times, "the probe")
+            plant.record.require_times(ticks, "a tick of the network")
             for node, placed_sensor in _iterate_sampled_sensors(scenario):
                 if scenario.sensors[placed_sensor.entry].is_random:
                     needed, use = times[node, placed_sensor.ordinal], f"a sample of node {node}"
@@ -139,7 +144,8 @@ def check_sampling(scenario: ScenarioModel) -> None:
                 'write sampling = { kind = "periodic", period = ... }',
             )
     if not scenario.slotted and scenario.plant.record is not None:
-        require_states(scenario, sample_times(scenario, Streams(scenario.seed)))
+        streams = Streams(scenario.seed)
+        require_states(scenario, sample_times(scenario, streams), streams)
 
 
 def _check_clock(scenario: ScenarioModel, key: str, sensor: LinearSensor | NonlinearSensor) -> None:

@@ -222,3 +222,32 @@ def _ekf(start, rows, v=1.0, w=0.4, T=0.5):
         K = P @ H.T @ np.linalg.inv(S)
         x, P = x + K @ (np.array([y for _, y, _ in seen]) - r), P - K @ H @ P
     return x, P
+
+
+LOSS = {"kind": "distance", "delivery": {"kind": "logistic", "half": 6.0, "width": 1.0}}
+TICKS = {"kind": "poisson", "rate": 9.0, "at": "nodes"}
+HOLES = "t,node,x0,x1,x2\n0,1,0,0,3\n0,2,3,4,-1\n1,1,0,0,3\n1,2,3,4,-1\n"
+
+
+@pytest.mark.parametrize("time", [None, FLOW])
+def test_positions_are_asked_for_whenever_messages_are_sent(tmp_path, time):
+    table = team(tmp_path, time, position=[0, 1], input=RECORDED)
+    table["network"]["channel"] = {"loss": LOSS}
+    table["network"]["activation"] = TICKS if time else {"kind": "broadcast"}
+    table["filter"] = {"kind": "block-intersection", "estimates": "own"}
+    run = netkf.simulate(from_table(table, tmp_path))
+    assert run.count("deliver") > 0
+    for plant in table["plants"]:
+        plant |= {"kind": "recorded", "path": "truth.csv", "interpolate": "linear"}
+    run = netkf.simulate(from_table(table, tmp_path))
+    assert run.count("deliver") > 0
+    # Readings are recorded and only two states are shown: messages need the others.
+    (tmp_path / "truth.csv").write_text(HOLES)
+    (tmp_path / "seen.csv").write_text(SEEN.replace("2026-03-01T12:00:0", "").replace("Z", ""))
+    for plant in table["plants"]:
+        del plant["interpolate"]
+    places = [MARKS[7].tolist(), MARKS[8].tolist()]
+    table["sensors"] = [{"kind": "range", "of": "pose", "path": "seen.csv", "positions": places}]
+    what = "a tick of the network" if time else "slot 1"
+    with pytest.raises(ScenarioError, match=f"truth.csv has no state for {what}"):
+        from_table({**table, "probe": 1.0, "horizon": 1.5}, tmp_path)
