@@ -252,8 +252,8 @@ def _sample_columns(
     blocks = judged_blocks(source.scenario)
     if run.truth_known and len(blocks) > len(sizes):
         for k, (h, _, own, _) in enumerate(blocks):
-            square = np.ix_(rows, [h], own, own)
-            e, P = run.error[np.ix_(rows, [h], own)], run.P[square]
+            square = np.ix_(rows, np.array([h]), own, own)
+            e, P = run.error[np.ix_(rows, np.array([h]), own)], run.P[square]
             columns[f"nees_of_block_{k}"] = packer.add(errors(e, P)[1][:, 0], "f8")
     of_nodes = {
         "one_state": all(np.array_equal(views[0], view) for view in views),

@@ -47,16 +47,14 @@ def block_promises(scenario: Scenario) -> dict[str, Any]:
 
 
 def _about_P(scenario: Scenario) -> str:
-    name = scenario.node_filter.timing
-    design = covariance_bias(scenario)
-    if design == "larger":
+    if covariance_bias(scenario) == "larger":
         return "P is at least the covariance of the error, given the events, by design"
-    if not name.talks and scenario.is_linear:
+    if not scenario.node_filter.timing.talks and scenario.is_linear:
         return "P is the covariance of the error where the filters know plant, sensors and start"
     if takes_columns(scenario.node_filter) and scenario.node_filter.analysis.paper:
         return "P is the covariance of the error, given the events, where all assumptions hold"
     held = "netkf consistency and netkf check compare it with that of the errors"
-    if not takes_columns(scenario.node_filter):
+    if not (scenario.is_linear and takes_columns(scenario.node_filter)):
         held = "netkf consistency compares it with the errors"
     return f"nothing is promised of P: {held}"
 

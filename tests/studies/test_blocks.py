@@ -11,7 +11,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.studies.metrics import central_trace
-from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
+from tests.algorithms.test_block_intersection import ROBOTS, load
 
 COMMANDS = {
     "theory": ["theory", "{file}"],
@@ -27,17 +27,17 @@ COMMANDS = {
     ],
     "why": ["why", "{run}", "--json"],
     "compare": ["compare", "{run}", "{many}", "--json"],
-    "plot": ["plot", "{run}", "--out", "{out}/plot"],
-    "plot of many": ["plot", "{many}", "--out", "{out}/plot"],
+    "plot": ["plot", "{run}", "--figure", "overview,nees,ratios,nis", "--out", "{out}/plot"],
+    "plot of many": ["plot", "{many}", "--figure", "error,nees", "--out", "{out}/many"],
     "report": ["report", "{run}", "--out", "{out}/page.html"],
     "report of many": ["report", "{many}", "--out", "{out}/page.html"],
 }
 
 
-@pytest.fixture(scope="module", params=[ROBOTS, CLOCKED], ids=["slots", "clocks"])
-def places(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("blocks")
-    text = request.param.replace('estimates = "own"', 'estimates = "own+neighbours"')
+    text = ROBOTS.replace('estimates = "own"', 'estimates = "own+neighbours"')
     (folder / "robots.toml").write_text(text.replace("horizon = 12.0", "horizon = 4.0"))
     found = {"file": folder / "robots.toml", "out": folder}
     for name, options in {"run": [], "many": ["--runs", "2", "--trace", "full"]}.items():
