@@ -471,9 +471,17 @@ def owned(slotted, estimates, filtering):
 
 
 @pytest.mark.parametrize("slotted", [True, False])
-@pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
-def test_nodes_know_the_inputs_of_blocks(slotted, estimates):
-    driven = owned(slotted, estimates, {"kind": "block-intersection"})
+@pytest.mark.parametrize(
+    ("kind", "estimates"),
+    [
+        ("block-intersection", "own"),
+        ("block-intersection", "own+neighbours"),
+        ("block-cross-covariances", "own"),
+        ("block-belief-propagation", "own"),
+    ],
+)
+def test_nodes_know_the_inputs_of_blocks(slotted, kind, estimates):
+    driven = owned(slotted, estimates, {"kind": kind})
     run, free = (netkf.simulate(one, engine="simpy") for one in (driven, driven.undriven))
     assert np.abs(run.x - free.x).max() > 10.0
     for name in ("error", "P"):

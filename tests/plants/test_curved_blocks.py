@@ -162,7 +162,10 @@ def test_nodes_that_estimate_their_own_block_have_its_filter(scenario):
         np.testing.assert_allclose(own.P, whole.P[:, 0, entries, entries], atol=1e-12)
 
 
-def test_split_covariance_intersection_of_poses(scenario):
+@pytest.mark.parametrize(
+    "kind", ["block-intersection", "block-cross-covariances", "block-belief-propagation"]
+)
+def test_what_others_read_of_a_pose_helps(scenario, kind):
     sensors = [
         {
             "kind": "range-bearing",
@@ -173,7 +176,7 @@ def test_split_covariance_intersection_of_poses(scenario):
         },
         {"kind": "relative-range-bearing", "of": "pose", "heading": 2, "R": R_SEEN.tolist()},
     ]
-    filtering = {"kind": "block-intersection", "estimates": "own"}
+    filtering = {"kind": kind, "estimates": "own"}
     run = netkf.simulate(scenario.replace({"sensors": sensors, "filter": filtering}))
     assert run.status == "complete"
     first, last = (run.block("pose", 2).P[k, :2, :2].trace() for k in (0, -1))
