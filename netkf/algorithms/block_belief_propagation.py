@@ -35,6 +35,10 @@ MAX_WINDOW = 1000
 """A message of more states could not be sent: a larger value is a mistake."""
 
 
+ROUNDING = 1e-9
+"""Relative deviation of traces that rounding explains."""
+
+
 class Path(NamedTuple):
     """What is known of states at several instants: ``x`` (K n,) with covariance P (K n, K n)."""
 
@@ -76,6 +80,11 @@ class PathState(NamedTuple):
         z, H, R = stacked(evidence, self.own.x[: -self.n])
         x, P, _ = updated(*self.own, Rows(z, np.pad(H, ((0, 0), (0, self.n))), R))
         return Path(x, P)
+
+    @property
+    def uncertainty(self) -> float:
+        """The trace of the covariance of the present state."""
+        return float(np.trace(self.belief().P[-self.n :, -self.n :]))
 
     def marked(self, time: float, window: int) -> PathState:
         """Return the state with the present in its window of so many instants."""
@@ -126,8 +135,8 @@ class BlockBeliefPropagation(Filter):
     have read of each other.
 
     steps   messages on each directed link in a slot
-    window  instants that nodes remember: of readings of older ones, of their own and of pairs, only
-            what they say of later states is kept, each message by itself
+    window  instants that nodes remember. A message replaces that which was heard before, of which
+            only what it says of the window is kept, unless that makes P smaller than the new one
 
     On a tree P is the covariance of the error, whatever is lost, late or out of order, also with
     noise of the plant: lost messages keep the last one heard. With a window as long as the run it
@@ -205,19 +214,23 @@ class BlockBeliefPropagation(Filter):
         """Return the state with the evidence of each sender replaced by that of its message, unless
         the one that the node has was sent later.
         """
-        time, heard, sent = _time(state, exchange), {}, dict(state.sent)
+        time = _time(state, exchange)
         own = {(place.name, -1 if place.node is None else place.node) for place in state.blocks}
-        told = [message.payload for message in messages]
-        if any(t == time and pair.other in own for one in told for t, pair in one.seen):
+        told = {message.sender: message.payload for message in messages}
+        if any(t == time and pair.other in own for one in told.values() for t, pair in one.seen):
             state = state.marked(time, self.window)
-        for sender, message in zip((m.sender for m in messages), told, strict=True):
-            if message.times[-1] < sent.get(sender, 0.0):
+        for sender, message in told.items():
+            if message.times[-1] < state.sent.get(sender, 0.0):
                 continue
             rows = evidence_of(state, message, message.without.get(state.node, message.belief))
-            # Evidence that was kept may be older than the windows of both.
-            if len(rows.z):
-                heard[sender], sent[sender] = rows, message.times[-1]
-        return state._replace(heard={**state.heard, **heard}, sent=sent)
+            after = state._replace(
+                heard={**state.heard, sender: rows},
+                sent={**state.sent, sender: message.times[-1]},
+            )
+            # What was kept of an older message may say more, if windows are short.
+            if after.uncertainty <= (1.0 + ROUNDING) * state.uncertainty:
+                state = after
+        return state
 
     def estimate(self, state: PathState) -> tuple[FloatArray, FloatArray]:
         """Return xhat (n,) and P (n, n)."""
