@@ -24,7 +24,7 @@ from netkf.algorithms.kernels.rates import RateTables, move_by_rate, scratch_of_
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import CLOSE, usable
 from netkf.algorithms.kernels.square_root import lower_root
-from netkf.linalg.arrays import FloatArray, square_root, symmetric
+from netkf.linalg.arrays import FloatArray, enlarged, square_root, symmetric
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, aligned
 from netkf.linalg.vector_functions import VectorFunction
@@ -221,11 +221,13 @@ class MapModel(SlotModel):
         """Predict from the slot that begins at ``time`` (seconds) on."""
         self.__dict__["slot"] = round(time / self.period)
 
-    def tables(self, lanes: int = 1, active: int = 1, delay: int = 0) -> MapTables:
-        """Return the model as kernels take it, for so many ``lanes`` with ``active`` runs; see
-        ``MapTables`` for ``delay``.
+    def tables(
+        self, lanes: int = 1, active: int = 1, delay: int = 0, width: int | None = None
+    ) -> MapTables:
+        """Return the model as kernels take it, for so many ``lanes`` with ``active`` runs and
+        records of ``width`` states, by default as many as it has; see ``MapTables`` for ``delay``.
         """
-        n = len(self.Q)
+        n, width = len(self.Q), width or len(self.Q)
         distance, weight, center = spread_of(self.linearise, n)
         return MapTables(
             f=self.f.address,
@@ -237,11 +239,11 @@ class MapModel(SlotModel):
             weight=weight,
             center=center,
             u=np.array(self.u, order="C"),
-            root_Q=np.array(self.root_Q, order="C"),
+            root_Q=enlarged(self.root_Q, width, width),
             x=np.zeros(n),
             moved=np.zeros(n),
             J=np.zeros((n, n)),
-            J_lanes=aligned((n, n, lanes)),
+            J_lanes=aligned((width, width, lanes)),
             points=np.zeros((2 * n + 1, n)),
             work=np.zeros((n, 3 * n + 1)),
         )

@@ -18,6 +18,7 @@ __all__ = [
     "IntArray",
     "address_of",
     "block_diagonal",
+    "enlarged",
     "readonly_array",
     "is_definite",
     "is_semidefinite",
@@ -98,6 +99,13 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
         row += block.shape[0]
         column += block.shape[1]
     return matrix
+
+
+def enlarged(array: FloatArray, *shape: int) -> FloatArray:
+    """Return an array of this ``shape`` that begins with ``array`` and has zeros beyond it."""
+    whole = np.zeros(shape)
+    whole[tuple(slice(length) for length in array.shape)] = array
+    return whole
 
 
 def as_kernel_array(matrix: FloatArray) -> FloatArray:

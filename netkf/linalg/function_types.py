@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numba
@@ -16,6 +17,7 @@ carray, _POINTER = _numba.carray, _numba.types.CPointer(types.float64)
 _SIGNATURE = types.void(_POINTER, _POINTER, types.float64, types.float64, _POINTER)
 
 
+@lru_cache
 def compile_function(function: Any, shapes: tuple[Any, Any, Any], takes_period: bool) -> Any:
     """Return the C function of a kernel, see ``VectorFunction``."""
     of_x, of_u, of_out = shapes

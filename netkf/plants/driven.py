@@ -143,6 +143,17 @@ class MovedFunction:
         """The number p of values of a reading."""
         return int(self._function.size)
 
+    @property
+    def parts(self) -> list[MovedFunction]:
+        """The functions of single readings."""
+        parts = getattr(self._function, "parts", [self._function])
+        return [MovedFunction(part, self._m) for part in parts]
+
+    def support(self, n: int) -> np.ndarray:
+        """Return the entries (k,) of a state of ``n`` that the reading depends on."""
+        entries: np.ndarray = self._function.support(n)
+        return entries
+
     def value(self, x: FloatArray) -> FloatArray:
         """Return the reading (p,) without noise at the state x (n,)."""
         return np.asarray(self._function.value(x + self._m))

@@ -202,6 +202,8 @@ def functions_of(f: Any, n: int, m: int, in_slots: bool) -> Any:
     kernels can call: in slots the map of one, else the rate of change.
     """
     shapes = [((n,), (m,), out) for out in ((n,), (n, n))]
+    if isinstance(f, StackedDynamics) and len(f.parts) == 1 and f.parts[0].matrix is None:
+        return functions_of(f.parts[0].f, n, m, in_slots)
     if isinstance(f, StackedDynamics):
         pairs = [
             functions_of(

@@ -69,7 +69,8 @@ class MapTables(Struct):
     active : runs side by side that there are, at most L
     distance, weight, center : ``Spread``
     x, moved, J, J_lanes, points, work : scratch, (n,), (n,), (n, n), (n, n, L), (2 n + 1, n) and
-        (n, 3 n + 1)
+        (n, 3 n + 1); root_Q and J_lanes are larger where a node's record has room for more states
+        than it estimates
     """
 
     f: int
@@ -129,16 +130,16 @@ def move_estimate(
         for q in range(model.active):
             _move_points(model, x, root, k, q, slot)
         return
-    n, (moved, noise) = len(size), scratch
+    n, own, (moved, noise) = len(size), len(model.x), scratch
     for q in range(model.active):
-        for i in range(n):
+        for i in range(own):
             model.x[i] = x[k, i, q]
         t = slot * model.period
         call_function(model.jacobian, model.x, model.u[slot], t, model.period, model.J)
         call_function(model.f, model.x, model.u[slot], t, model.period, model.moved)
-        for i in range(n):
+        for i in range(own):
             x[k, i, q] = model.moved[i]
-            for j in range(n):
+            for j in range(own):
                 model.J_lanes[i, j, q] = model.J[i, j]
     # The root of [J S, root_Q], as transform_root forms it of a matrix that all runs share.
     for i in range(n):

@@ -59,7 +59,9 @@ class CompiledEngine(Engine):
         if not has_numba():
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
         if scenario.views is not None:
-            return f'engine "compiled" needs filters that all estimate the whole state; {remedy}'
+            rule = "under clocks" if not scenario.slotted else "with regressors"
+            if not scenario.slotted or any(hasattr(sensor, "C") for sensor in scenario.sensors):
+                return f'engine "compiled" cannot run nodes of different states {rule}; {remedy}'
         # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
         unknown: list[tuple[str, Component]] = []
         if type(scenario.plant) not in PLANTS:

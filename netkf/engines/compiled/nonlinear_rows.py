@@ -8,12 +8,13 @@ the node begins with ``linearise_rows``, which writes the whitened linear readin
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.maps import Spread, set_point
-from netkf.linalg.arrays import FloatArray
+from netkf.algorithms.kernels.maps import set_point, spread_of
+from netkf.linalg.arrays import FloatArray, enlarged
 from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
 from netkf.linalg.structs import Struct
@@ -36,9 +37,11 @@ class NonlinearRows(Struct):
     length, functions : (H, p) and (H, p, 3), of the first row of a user's sensor the number of its
         rows, and the addresses of h, its Jacobian and the difference of two readings
     R : (S or 1, H, p, p), the covariance of the noise in each slot, in nonlinear rows
-    origin : (S or 1, n), where states are counted from in each slot
+    origin : (S or 1, N), where the N states of the plant are counted from in each slot
+    entries : (H or 1, n), which of these each filter estimates, -1 beyond
+    count : (H or 1,), how many these are
     active : runs side by side that there are, at most L
-    distance, weight, center : ``kernels.maps.Spread``
+    distance, weight : (H or 1,), with ``center`` a ``kernels.maps.Spread``
     x, y, value, mean, points, G, J, C, part, matrix, nothing : scratch, (n,), (p,) three times,
         (2 n + 1, p), (p, n) twice, (p, p), (p,), (p, n) and (0,)
     """
@@ -52,9 +55,11 @@ class NonlinearRows(Struct):
     functions: np.ndarray
     R: FloatArray
     origin: FloatArray
+    entries: np.ndarray
+    count: np.ndarray
     active: int
-    distance: float
-    weight: float
+    distance: FloatArray
+    weight: FloatArray
     center: float
     x: FloatArray
     y: FloatArray
@@ -70,10 +75,12 @@ class NonlinearRows(Struct):
 
 
 class NonlinearSetup:
-    """The nonlinear rows of a scenario with H filters of at most p rows of n states."""
+    """The nonlinear rows of a scenario with H filters of at most p rows, of the states ``entries``
+    (H or 1, n) of the plant, -1 beyond those that a filter estimates.
+    """
 
-    def __init__(self, filters: int, p: int, n: int) -> None:
-        self._shape, self._n = (filters, p), n
+    def __init__(self, filters: int, p: int, entries: np.ndarray) -> None:
+        self._shape, self._entries = (filters, p), entries
         self.kind = np.zeros((filters, p), dtype=np.int64)
         self.states = np.zeros((filters, p, 3), dtype=np.int64)
         self.dimensions, self.relative, self.length = (
@@ -95,30 +102,58 @@ class NonlinearSetup:
             turned = row + len(R) - sensor.turns
             self.kind[h, row:turned], self.kind[h, turned : rows.stop] = RANGE, BEARING
             self.dimensions[h, rows] = len(sensor.states)
-            self.states[h, rows, : len(sensor.states)] = sensor.states
+            self.states[h, rows, : len(sensor.states)] = self._places(h, sensor.states)
             self.relative[h, rows] = isinstance(sensor, RelativePositionSensor)
             if sensor.heading is not None:
-                self.heading[h, rows] = sensor.heading
+                self.heading[h, rows] = self._places(h, [sensor.heading])
             return
         self.kind[h, row], self.kind[h, row + 1 : rows.stop] = CUSTOM, OF_CUSTOM
         self.length[h, row] = p = len(R)
-        functions = _functions_of(sensor, p, self._n)
+        functions = _functions_of(sensor, p, self._of(h), 1 + self._entries.max())
         self.functions += functions
         self.addresses[h, row] = [function.address for function in functions]
+
+    def _of(self, h: int) -> np.ndarray:
+        entries: np.ndarray = self._entries[min(h, len(self._entries) - 1)]
+        return entries
+
+    def _places(self, h: int, states: Sequence[int]) -> np.ndarray:
+        """Return which of the states of filter ``h`` these states of the plant are."""
+        return np.array([np.flatnonzero(self._of(h) == state)[0] for state in states])
+
+    def reference(self, sensor: Any, place: int, h: int) -> FloatArray:
+        """Return what the readings of a sensor are measured from at a ``place`` (id), as rows of H
+        say it (n,): coordinates, numbers of states, or for a user's sensor the id.
+        """
+        made = np.zeros(self._entries.shape[1])
+        if not has_known_h(sensor):
+            made[0] = place
+        elif isinstance(sensor, RelativePositionSensor):
+            others = self._places(h, sensor.other_states(place))
+            made[: len(others)] = others
+        else:
+            positions = np.asarray(sensor.positions, dtype=np.float64)
+            made[: positions.shape[1]] = positions[sensor.places.index(place)]
+        return made
 
     def raise_error(self) -> None:
         """Raise the error of a user's sensor, if a call has failed."""
         for function in self.functions:
             function.raise_error()
 
-    def tables(self, points: Spread, active: int) -> NonlinearRows:
-        """Return the rows as kernels take them, for ``active`` runs side by side."""
-        (_, p), n = self._shape, self._n
+    def tables(self, method: str, active: int) -> NonlinearRows:
+        """Return the rows as kernels take them, for ``active`` runs side by side; ``method`` is how
+        filters linearise.
+        """
+        (_, p), n, count = self._shape, self._entries.shape[1], (self._entries >= 0).sum(axis=1)
+        points = [spread_of(method, n) for n in count.tolist()]
         return NonlinearRows(
             kind=self.kind, states=self.states, dimensions=self.dimensions, relative=self.relative,
             heading=self.heading, length=self.length, functions=self.addresses, R=self.R.copy(),
-            origin=np.zeros((1, n)), active=active, distance=points.distance,
-            weight=points.weight, center=points.center, x=np.zeros(n), y=np.zeros(p),
+            origin=np.zeros((1, 1 + self._entries.max())), entries=self._entries, count=count,
+            active=active, distance=np.array([spread.distance for spread in points]),
+            weight=np.array([spread.weight for spread in points]), center=points[0].center,
+            x=np.zeros(n), y=np.zeros(p),
             value=np.zeros(p), mean=np.zeros(p), points=np.zeros((2 * n + 1, p)),
             G=np.zeros((p, n)), J=np.zeros((p, n)), C=np.zeros((p, p)), part=np.zeros(p),
             matrix=np.zeros((p, n)), nothing=np.zeros(0),
@@ -136,30 +171,25 @@ def has_known_h(sensor: NonlinearSensor) -> bool:
     )
 
 
-def reference(sensor: Any, place: int, n: int) -> FloatArray:
-    """Return what the readings of a sensor are measured from at a ``place`` (id), as rows of H say
-    it (n,): coordinates, numbers of states, or for a user's sensor the id.
+def _functions_of(
+    sensor: NonlinearSensor, p: int, entries: np.ndarray, states: int
+) -> list[VectorFunction]:
+    """Return h, its Jacobian and the difference of a user's sensor, of ``entries`` (n,) of all
+    states; t is the id of a node.
     """
-    made = np.zeros(n)
-    if not has_known_h(sensor):
-        made[0] = place
-    elif isinstance(sensor, RelativePositionSensor):
-        others = sensor.other_states(place)
-        made[: len(others)] = others
-    else:
-        positions = np.asarray(sensor.positions, dtype=np.float64)
-        made[: positions.shape[1]] = positions[sensor.places.index(place)]
-    return made
+    n, own = len(entries), entries[entries >= 0]
 
-
-def _functions_of(sensor: NonlinearSensor, p: int, n: int) -> list[VectorFunction]:
-    """Return h, its Jacobian and the difference of a user's sensor; t is the id of a node."""
+    def whole(x: FloatArray) -> FloatArray:
+        state = np.zeros(states)
+        state[own] = x[: len(own)]
+        return state
 
     def h(x: FloatArray, _: FloatArray, node: float) -> Any:
-        return sensor.h(x, int(node))
+        return sensor.h(whole(x), int(node))
 
     def jacobian(x: FloatArray, _: FloatArray, node: float) -> Any:
-        return sensor.jacobian(x, int(node))
+        J = np.asarray(sensor.jacobian(whole(x), int(node)), dtype=np.float64)
+        return enlarged(J[:, own], len(J), n)
 
     def difference(y: FloatArray, expected: FloatArray, _: float) -> Any:
         return sensor.difference(y, expected)
@@ -275,12 +305,13 @@ def subtract_rows(
 
 
 @kernel(inlined=True)
-def move_state(rows: NonlinearRows, x: FloatArray, k: int, q: int, s: int) -> None:
-    """Write the state ``x[k]`` (n, L) of lane ``q`` in slot number ``s`` of the plan into
-    ``rows.x``, in the coordinates of the plant.
+def move_state(rows: NonlinearRows, x: FloatArray, k: int, q: int, s: int, h: int) -> None:
+    """Write the states ``x[k]`` (n, L) of filter ``h`` in lane ``q``, in slot number ``s`` of the
+    plan, into ``rows.x``, in the coordinates of the plant.
     """
-    for j in range(len(rows.x)):
-        rows.x[j] = x[k, j, q] + rows.origin[min(s, len(rows.origin) - 1), j]
+    slot = min(s, len(rows.origin) - 1)
+    for j in range(rows.count[h]):
+        rows.x[j] = x[k, j, q] + rows.origin[slot, rows.entries[h, j]]
 
 
 @kernel
@@ -290,13 +321,14 @@ def linearise_rows(rows: NonlinearRows, record: Any, h: int, run: Any, s: int) -
     """
     n, p, r = len(run.size), rows.kind.shape[1], run.first_y + h
     for q in range(rows.active):
-        move_state(rows, record.xhat, h, q, s)
+        own = min(h, len(rows.count) - 1)
+        move_state(rows, record.xhat, h, q, s, own)
         for i in range(p):
             rows.y[i] = run.y[r, i, q]
             for k in range(p):
                 rows.C[i, k] = rows.R[min(s, len(rows.R) - 1), h, i, k]
         read_rows(rows, h, run.H, r, q, rows.mean)
-        if rows.distance > 0.0:
+        if rows.distance[own] > 0.0:
             _use_points(rows, record, h, run.H, r, q, s)
         else:
             differentiate_rows(rows, h, run.H, r, q)
@@ -316,22 +348,25 @@ def linearise_rows(rows: NonlinearRows, record: Any, h: int, run: Any, s: int) -
 def _use_points(
     rows: NonlinearRows, record: Any, h: int, H: FloatArray, r: int, q: int, s: int
 ) -> None:
-    n, p, points = rows.J.shape[1], rows.kind.shape[1], rows.points
+    own, slot = min(h, len(rows.count) - 1), min(s, len(rows.origin) - 1)
+    n, p, points = rows.count[own], rows.kind.shape[1], rows.points
+    distance, weight = rows.distance[own], rows.weight[own]
     for k in range(1, 2 * n + 1):
-        set_point(record.xhat, record.root, h, q, rows.distance, k, rows.x)
+        set_point(record.xhat, record.root, h, q, distance, k, rows.x[:n])
         for j in range(n):
-            rows.x[j] += rows.origin[min(s, len(rows.origin) - 1), j]
+            rows.x[j] += rows.origin[slot, rows.entries[own, j]]
         read_rows(rows, h, H, r, q, rows.value)
         subtract_rows(rows, h, rows.value, rows.mean, points[k])
     for i in range(p):
         # The mean of the deviations from the reading at the estimate.
         mean = 0.0
         for k in range(1, 2 * n + 1):
-            mean += rows.weight * points[k, i]
+            mean += weight * points[k, i]
         points[0, i] = mean
         for j in range(n):
             odd = points[2 * j + 1, i] - points[2 * j + 2, i]
-            rows.G[i, j] = rows.weight * rows.distance * odd
+            rows.G[i, j] = weight * distance * odd
+        rows.J[i, n:] = 0.0
         # H = G S^-1; columns of the root that are 0 say nothing.
         for j in range(n - 1, -1, -1):
             total = rows.G[i, j]
@@ -349,7 +384,7 @@ def _use_points(
                 even = points[2 * j + 1, i] + points[2 * j + 2, i] - 2.0 * points[0, i]
                 other = points[2 * j + 1, k] + points[2 * j + 2, k] - 2.0 * points[0, k]
                 total += even * other
-            rows.C[i, k] += 0.5 * rows.weight * total + rows.center * points[0, i] * points[0, k]
+            rows.C[i, k] += 0.5 * weight * total + rows.center * points[0, i] * points[0, k]
     for i in range(p):
         rows.mean[i] += points[0, i]
 
@@ -390,19 +425,19 @@ def no_rows(rows: Any, record: Any, h: int, run: Any, s: int) -> None:
 
 @kernel
 def add_values(
-    rows: NonlinearRows, x: FloatArray, y: FloatArray, H: FloatArray, drawn: np.ndarray
+    rows: NonlinearRows, x: FloatArray, y: FloatArray, places: FloatArray, drawn: np.ndarray
 ) -> None:
     """Add the values at the true states ``x`` (B, S, n, L) to the noises ``y`` (B S H, p, L) of the
-    nonlinear rows with a flag in ``drawn`` (H, p); ``H`` (B S H, p, n, L) says from where.
+    nonlinear rows with a flag in ``drawn`` (H, p); ``places`` (H, p, n, ...) says from where.
     """
     filters = len(rows.kind)
     for b in range(x.shape[0]):
         for s in range(x.shape[1]):
             for q in range(rows.active):
-                move_state(rows, x[b], s, q, s)
+                move_state(rows, x[b], s, q, s, 0)
                 for h in range(filters):
                     r = (b * x.shape[1] + s) * filters + h
-                    read_rows(rows, h, H, r, q, rows.value)
+                    read_rows(rows, h, places, h, 0, rows.value)
                     for i in range(rows.kind.shape[1]):
                         if drawn[h, i] != 0:
                             y[r, i, q] += rows.value[i]

@@ -32,10 +32,19 @@ def record_samples(
     if not len(times):
         return True
     known = error if scenario.plant.truth_known else None
-    sound_filters = sound_mask(xhat, P, error=known, of_roots=True)
+    if scenario.views is None:
+        sound_filters = sound_mask(xhat, P, error=known, of_roots=True)
+    else:
+        parts = [
+            (xhat[:, k, : len(view)], P[:, k, : len(view), : len(view)], error[:, k, : len(view)])
+            for k, view in enumerate(scenario.views)
+        ]
+        # Blocks are drawn, hence known.
+        masks = [sound_mask(x, P, error=e, of_roots=True) for x, P, e in parts]
+        sound_filters = np.stack(masks, axis=1)
     sound = sound_filters.all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.
-    if scenario.node_filter.timing.pooled:
+    if scenario.node_filter.timing.pooled and scenario.views is None:
         nodes = len(scenario.nodes)
         xhat, P, error = (np.repeat(values, nodes, axis=1) for values in (xhat, P, error))
         sound_filters = np.repeat(sound_filters, nodes, axis=1)

@@ -50,25 +50,27 @@ class SlotFilters:
         """
         self._setup, self._kernels = setup, kernels
         self._rows: Any = None
-        H, W, n = setup.estimators, len(setup.links.sender), setup.n
+        H, W, n = setup.estimators, len(setup.links.sender), setup.width
         means = setup.xhat if with_means else np.zeros(setup.xhat.shape)
         self.records = make_records(
             setup.algorithm,
             list(zip(means, setup.root, strict=True)),
             setup.infos,
-            setup.models,
+            setup.model_pieces[0],
             links=W,
             messages=H + W if kernels.addressed else H,
             blocks=blocks,
             lanes=LANES,
         )
         size = size_of(n, kernels.unrolled)
-        F, root_Q = setup.tables[0]
-        model: Any = SlotTables(F=F.copy(), root_Q=root_Q.copy())
         cls: Any = SlotRun
+        self._models: list[Any] = [
+            SlotTables(F=F.copy(), root_Q=root_Q.copy()) for F, root_Q in setup.tables[0]
+        ]
         if isinstance(setup.models[0], MapModel):
             delay = 0 if setup.algorithm.timing.predicts else 1
-            model = setup.models[0].tables(LANES, active, delay)
+            models = setup.models[: len(self._models)]
+            self._models = [m.tables(LANES, active, delay, n) for m in models]
             cls = MapRun
         cls = cls.of_size(n) if isinstance(size, tuple) else cls
         # Inbox: a node hears at most all of its links.
@@ -76,7 +78,7 @@ class SlotFilters:
         self._run = cls(
             size=size,
             lanes=MANY,
-            model=model,
+            model=self._models[0],
             first=setup.links.first,
             sender=setup.links.sender,
             opposite=opposite_links(setup.links.first, setup.links.sender),
@@ -105,6 +107,10 @@ class SlotFilters:
             now=0.0,
             **scratch_of(n, LANES),
         )
+        words = len(self._models[0].memory)
+        memories = [model.memory for model in self._models] if setup.own_models else []
+        # None where the model of the run is that of all filters.
+        self._memories = np.array(memories, dtype=np.int64).reshape(-1, words)
         # L entries are copied at a time, so that the last copy may go beyond the last entry.
         for_means, for_roots = H * n + LANES, H * n * n + LANES
         self.sample_scratch: tuple[FloatArray, FloatArray, FloatArray] = (
@@ -146,6 +152,7 @@ class SlotFilters:
             predicts=self._setup.algorithm.timing.predicts,
             direction=self._setup.links.direction,
             varies=H.shape[0] * H.shape[1] > 1,
+            models=self._memories,
             start=0,
             end=0,
             **drawn,
@@ -161,12 +168,13 @@ class SlotFilters:
         for start, end in itertools.pairwise([*starts, count]):
             piece, first = bisect.bisect_right(slots, start), plan.first + start
             if len(setup.tables) > 1:
-                self._run.model.F[:], self._run.model.root_Q[:] = setup.tables[piece]
+                for model, tables in zip(self._models, setup.tables[piece], strict=True):
+                    model.F[:], model.root_Q[:] = tables
             models = setup.model_pieces[piece]
             prepare(setup.algorithm, record, setup.infos, models, first, end - start)
             part = plan._replace(start=start, end=end)
             loop(record, self.records.memories, self._run, part, samples, rows)
-        if isinstance(setup.models[0], MapModel):
-            setup.models[0].raise_error()
+        for believed in setup.models if isinstance(setup.models[0], MapModel) else ():
+            believed.raise_error()
         if setup.nonlinear is not None:
             setup.nonlinear.raise_error()

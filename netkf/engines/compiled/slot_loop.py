@@ -6,6 +6,7 @@ call; what is drawn for them is in a :class:`SlotPlan`.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -50,6 +51,7 @@ class SlotPlan(NamedTuple):
         sends nothing; empty if all nodes send that are asked
     uniform : (B, S, E, H, L), uniform numbers for these decisions; empty unless randomised
     varies : whether H differs from block to block and slot to slot
+    models : (H, words), the struct of each filter's model, (0, words) if ``run.model`` is all's
     start, end : the slots that a call simulates, of those of the plan
     begin, stop : a call may simulate a part of one slot: from the arrival of the messages of step
         ``begin`` to the sending of those of step ``stop``; WHOLE: from its begin, to its end
@@ -69,6 +71,7 @@ class SlotPlan(NamedTuple):
     sent: np.ndarray
     uniform: FloatArray
     varies: bool
+    models: np.ndarray
     begin: int
     stop: int
     start: int
@@ -78,15 +81,17 @@ class SlotPlan(NamedTuple):
 class SlotSamples(NamedTuple):
     """T samples of R runs that the loop writes, and the true states of S slots that they need.
 
-    x, xhat, P : (R, T, n), (R, T, H n) and (R, T, H n n) in the coordinates of the plant, with all
-                 filters side by side
-    error : (R, T, H n), x - xhat
+    x, xhat, P : (R, T, n), (R, T, H w) and (R, T, H w w) in the coordinates of the plant, with all
+                 filters of at most w states side by side
+    error : (R, T, H w), x - xhat
     absolute, local : (B, S, n, L), true states in all slots, in the coordinates of the plant and
                       relative to the moving origin that estimates refer to
     framed : whether the origin moves; otherwise both are the same
     total : (B, L), sum of all samples of xhat and P so far: finite if all of them are
-    sampled_xhat, sampled_error, sampled_P : (>= H n, L), (>= H n, L) and (>= H n n, L), a sample
+    sampled_xhat, sampled_error, sampled_P : (>= H w, L), (>= H w, L) and (>= H w w, L), a sample
     runs : (L,), the run of each lane, -1 if it is idle
+    entries : (H, w), the entries of the state that each filter estimates, -1 beyond, where samples
+              are nan
     """
 
     x: FloatArray
@@ -101,6 +106,7 @@ class SlotSamples(NamedTuple):
     sampled_error: FloatArray
     sampled_P: FloatArray
     runs: np.ndarray
+    entries: np.ndarray
 
 
 def exchange_of(kernels: Kernels) -> Any:
@@ -119,6 +125,7 @@ def exchange_of(kernels: Kernels) -> Any:
                     if plan.uniform.shape[0] > 0:
                         store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
                 run.reading = h
+                choose_model(run, plan, h)
                 emit(record, h, h + run.first[h] if addressed else h, run)
                 if decides:
                     store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
@@ -127,6 +134,7 @@ def exchange_of(kernels: Kernels) -> Any:
         if e != plan.stop:
             for h in range(nodes):
                 run.reading = h
+                choose_model(run, plan, h)
                 fill_inbox(run, plan, b, s, e, h, addressed)
                 absorb(record, h, run)
 
@@ -161,6 +169,7 @@ def slot_loop(kernels: Kernels, linear: bool = True) -> Any:
                     e += 1
             elif plan.sensed[s] and begun:
                 for h in range(nodes):
+                    choose_model(run, plan, h)
                     if stage == PREDICT:
                         predict(record, h, run)
                     else:
@@ -204,6 +213,13 @@ def slot_loop(kernels: Kernels, linear: bool = True) -> Any:
                     sample_slot(block, run, plan, samples, b, s)
 
     return loop
+
+
+@kernel(inlined=True)
+def choose_model(run: SlotRun, plan: SlotPlan, h: int) -> None:
+    """Make the model of filter ``h`` that of the run, where filters have models of their own."""
+    if len(plan.models) > 0:
+        run.model = struct_like(run.model, plan.models[h])
 
 
 @kernel
@@ -258,15 +274,19 @@ def store_sample(
     """Write the sample of slot ``s`` of block ``b``: ``xhat`` (H, n, L), ``root`` (H, n, n, L)."""
     k, lanes = plan.sample[s], run.lanes
     n, first = len(run.size), b * len(lanes)
-    sum_of_all = load(lanes, samples.total, b)
+    sum_of_all, states = load(lanes, samples.total, b), samples.absolute.shape[2]
     for h in range(len(xhat)):
         for i in range(n):
+            entry = samples.entries[h, i]
+            if entry < 0:
+                clear_sample(samples, lanes, h, i, n)
+                continue
             x = load(lanes, xhat, h, i)
             # Relative to the moving origin: a difference of large absolute states loses digits.
-            local = load(lanes, samples.local, b, s, i)
+            local = load(lanes, samples.local, b, s, entry)
             store(lanes, samples.sampled_error, h * n + i, local - x)
             if samples.framed:
-                x += load(lanes, samples.absolute, b, s, i) - local
+                x += load(lanes, samples.absolute, b, s, entry) - local
             store(lanes, samples.sampled_xhat, h * n + i, x)
             sum_of_all += x
             # P = S S' and its mirror image, because samples hold covariances.
@@ -282,11 +302,22 @@ def store_sample(
         # The last block may have more lanes than there are runs left.
         used = first + q < len(samples.x)
         samples.runs[q] = first + q if used else -1
-        for i in range(n if used else 0):
+        for i in range(states if used else 0):
             samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
     scatter_sample(lanes, samples.sampled_xhat, samples.xhat[:, k], samples.runs)
     scatter_sample(lanes, samples.sampled_error, samples.error[:, k], samples.runs)
     scatter_sample(lanes, samples.sampled_P, samples.P[:, k], samples.runs)
+
+
+@kernel
+def clear_sample(samples: SlotSamples, lanes: Lanes, h: int, i: int, n: int) -> None:
+    """Write nan as component ``i`` of ``n`` of a sample of filter ``h``, which has fewer."""
+    nothing = spread(lanes, math.nan)
+    store(lanes, samples.sampled_error, h * n + i, nothing)
+    store(lanes, samples.sampled_xhat, h * n + i, nothing)
+    for j in range(i + 1):
+        store(lanes, samples.sampled_P, (h * n + i) * n + j, nothing)
+        store(lanes, samples.sampled_P, (h * n + j) * n + i, nothing)
 
 
 @kernel

@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
-from netkf.algorithms.kernels.maps import spread_of
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
-from netkf.engines.compiled.nonlinear_rows import NonlinearRows, add_values, reference
+from netkf.engines.compiled.nonlinear_rows import NonlinearRows, add_values
 from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import record_samples
@@ -79,8 +78,8 @@ class SampledStates(NamedTuple):
     """T samples of R runs with H filters each, in the coordinates of the plant.
 
     x : (R, T, n), states of the plant
-    xhat, error : (R, T, H, n), estimates and x - xhat
-    P : (R, T, H, n, n)
+    xhat, error : (R, T, H, w), estimates and x - xhat, nan where a filter has fewer states than w
+    P : (R, T, H, w, w)
     """
 
     x: FloatArray
@@ -126,8 +125,10 @@ class SlotRuns:
         # NEVER: a slot that no run reaches, for a node that never stops.
         self._nonlinear: NonlinearRows | None = None
         if setup.nonlinear is not None:
-            points = spread_of(scenario.filter.linearise, setup.n)
-            self._nonlinear = setup.nonlinear.tables(points, min(runs, LANES))
+            method, active = scenario.filter.linearise, min(runs, LANES)
+            self._nonlinear = self._drawn = setup.nonlinear.tables(method, active)
+            if setup.drawn is not setup.nonlinear:
+                self._drawn = setup.drawn.tables(method, active)
             self._filters.set_rows(self._nonlinear)
         self._stopped = arrays.get("stopped", np.full(never, NEVER))
         self._conserved = arrays.get("conserved", aligned((blocks, setup.estimators, 2, LANES)))
@@ -232,7 +233,7 @@ class SlotRuns:
         )
         kernel_samples = SlotSamples(
             x, xhat, P, error, absolute, local, drawn and absolute is not local, self._total,
-            *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
+            *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64), self.setup.entries,
         )  # fmt: skip
         slots = times.first + sampled
         self._simulate(times, messages, (y, H, rebased), kernel_samples)
@@ -296,9 +297,9 @@ class SlotRuns:
 
     def _empty_samples(self, count: int) -> SampledStates:
         """Return space for ``count`` samples of all R runs, in memory that is reused."""
-        runs, estimators, n = self.runs, self.setup.estimators, self.setup.n
-        filter_shape = runs, count, estimators, n
-        shapes = (runs, count, n), filter_shape, (*filter_shape, n), filter_shape
+        runs, setup = self.runs, self.setup
+        filter_shape = runs, count, setup.estimators, setup.width
+        shapes = (runs, count, setup.n), filter_shape, (*filter_shape, setup.width), filter_shape
         offsets = np.cumsum([math.prod(shape) for shape in shapes])
         # One allocation for all: numpy requests huge pages for large ones, which are cheap to get.
         arrays = np.split(_samples.array(int(offsets[-1])), offsets[:-1])
@@ -499,7 +500,7 @@ class SlotRuns:
         y: FloatArray = unset((*shape, LANES))
         H: FloatArray = setup.H
         if setup.varies:
-            H = unset((*shape, setup.n, LANES))
+            H = unset((*shape, setup.width, LANES))
             H[:] = setup.H
         x = local
         if rebased.any() and setup.algorithm.timing.predicts:
@@ -519,9 +520,10 @@ class SlotRuns:
             responses = self._scenario.input_responses
             if responses is not None and responses.believed is not None:
                 slots_of_all = np.arange(self._slot, self._slot + count)
-                self._nonlinear.origin = responses.believed.states(slots_of_all)
-            flat_y, flat_H = y.reshape(-1, *y.shape[3:]), H.reshape(-1, *H.shape[3:])
-            add_values(self._nonlinear, x, flat_y, flat_H, setup.nonlinear.drawn)
+                origin = responses.believed.states(slots_of_all)
+                self._nonlinear.origin = self._drawn.origin = origin
+            flat_y = y.reshape(-1, *y.shape[3:])
+            add_values(self._drawn, x, flat_y, setup.places, setup.nonlinear.drawn)
             setup.nonlinear.raise_error()
         if not (self._recorded or self._own) or not times.sensed.any():
             return y, H
@@ -531,7 +533,8 @@ class SlotRuns:
             y[:, times.sensed, s.estimator, rows] = 0.0  # in lanes without a run
             for run, path in enumerate(paths):
                 b, lane = divmod(run, LANES)
-                own = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R, s.root)
+                read, of_all = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R, s.root)
+                own = read, setup.seen(of_all, s.estimator)
                 for out, values in zip((y, H), own, strict=True):
                     out[b, times.sensed, s.estimator, rows, ..., lane] = values
         for s, path in self._recorded:
@@ -542,7 +545,8 @@ class SlotRuns:
             # L^-1 y and L^-1 H, with the R = L L' that filters believe; all runs read the same.
             whitened_y, whitened_H = path.whitened(slots, s.R, s.rows)
             y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
-            H[:, times.sensed, s.estimator, rows] = whitened_H[..., None]
+            own_H = setup.seen(whitened_H, s.estimator)
+            H[:, times.sensed, s.estimator, rows] = own_H[..., None]
         return y, H
 
     def _read_nonlinear(
@@ -551,16 +555,18 @@ class SlotRuns:
         """Write the recorded values of a nonlinear sensor, nan where there is none, what they are
         measured from, and the covariances of their noise.
         """
+        setup = self.setup.nonlinear
         assert self._nonlinear is not None
+        assert setup is not None
         sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
-        n, p = self.setup.n, len(s.R)
+        p = len(s.R)
         y[:, sensed, s.estimator, s.row : s.row + s.rows] = np.nan
         if len(self._nonlinear.R) != len(sensed):
             self._nonlinear.R = np.repeat(self._nonlinear.R[:1], len(sensed), axis=0)
         for k in np.flatnonzero(sensed).tolist():
             for m, (values, anchor, R) in enumerate(path.readings_at(self._slot + k, s.R)):
                 rows = slice(s.row + m * p, s.row + (m + 1) * p)
-                place = reference(sensor, s.node if anchor < 0 else anchor, n)
+                place = setup.reference(sensor, s.node if anchor < 0 else anchor, s.estimator)
                 y[:, k, s.estimator, rows] = values[:, None]
                 H[:, k, s.estimator, rows] = place[:, None]
                 self._nonlinear.R[k, s.estimator, rows, rows] = R
@@ -670,6 +676,23 @@ def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress
     return COMPLETE
 
 
+def by_node(scenario: Scenario, samples: SampledStates) -> SampledStates:
+    """Return samples of a filter that all nodes share as those of nodes that estimate parts of the
+    state, where a scenario says so.
+    """
+    if scenario.views is None or not scenario.node_filter.timing.pooled:
+        return samples
+    views, width = scenario.views, scenario.width
+    shape = *samples.xhat.shape[:2], len(views), width
+    xhat, P, error = (np.full(s, np.nan) for s in (shape, (*shape, width), shape))
+    for k, view in enumerate(views):
+        n = len(view)
+        xhat[:, :, k, :n] = samples.xhat[:, :, 0, view]
+        error[:, :, k, :n] = samples.error[:, :, 0, view]
+        P[:, :, k, :n, :n] = samples.P[:, :, 0][..., view[:, None], view]
+    return SampledStates(samples.x, xhat, P, error)
+
+
 def _record_block(
     scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
 ) -> bool:
@@ -681,7 +704,7 @@ def _record_block(
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
     # One run: index 0 of all arrays.
-    x, xhat, P, error = (values[0] for values in block.samples)
+    x, xhat, P, error = (values[0] for values in by_node(scenario, block.samples))
     times = block.times.start[block.sampled]
 
     def pass_rows_on(k: int) -> None:
@@ -730,11 +753,14 @@ def slot_batch(
         runs.count_events(block)
         for rows in runs.first_events(block) if fingerprint else ():
             events_hash.update(rows.data)
-    x, xhat, P, error = runs.samples
-    broken = runs.broken
+    broken, error = runs.broken, runs.samples.error
     if scenario.plant.truth_known:
+        known = error
+        if runs.setup.views is not None:
+            known = np.where(runs.setup.entries < 0, 0.0, error)
         with np.errstate(over="ignore", invalid="ignore"):
-            broken |= ~np.isfinite(np.einsum("rtfn,rtfn->r", error, error))
+            broken |= ~np.isfinite(np.einsum("rtfn,rtfn->r", known, known))
+    x, xhat, P, error = by_node(scenario, runs.samples)
     return RunBatch(
         replicas=replicas,
         times=runs.setup.sample_times,

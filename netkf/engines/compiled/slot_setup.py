@@ -12,7 +12,7 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo, may_be_silent
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import SlotModel, first_roots
-from netkf.engines.compiled.nonlinear_rows import NonlinearSetup, reference
+from netkf.engines.compiled.nonlinear_rows import NonlinearSetup
 from netkf.engines.compiled.outcomes import delivery_table
 from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
@@ -25,7 +25,7 @@ from netkf.engines.compiled.slot_messages import (
     SlotLinks,
     Stages,
 )
-from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.linalg.arrays import FloatArray, block_diagonal, enlarged
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.channels import GilbertElliott, identical_per_link
@@ -64,6 +64,9 @@ class SlotSetup:
         self.n, self.nodes = scenario.plant.n, np.array(scenario.nodes, dtype=np.int64)
         # Frames are for exact errors of unstable plants; 0: the origin never moves.
         self.frame = frame_slots(scenario.linear_plant.F) or 0 if scenario.exact_errors else 0
+        # A filter that all nodes share estimates the whole state.
+        self.views = None if algorithm.timing.pooled else scenario.views
+        self.width = self.n if self.views is None else scenario.width
         self._set_slots(scenario)
         self._set_stages(scenario)
         self._set_sensors(scenario)
@@ -128,6 +131,11 @@ class SlotSetup:
         pooled = self.algorithm.timing.pooled
         self.estimators = 1 if pooled else len(scenario.nodes)
         rows = np.zeros(self.estimators, dtype=np.int64)
+        views = [np.arange(self.n)] * self.estimators if self.views is None else self.views
+        # The entries of the state that each filter estimates, -1 beyond the last.
+        self.entries = np.full((self.estimators, self.width), -1)
+        for h, view in enumerate(views):
+            self.entries[h, : len(view)] = view
         self.sensing = np.array(scenario.sensing_nodes, dtype=np.int64)
         self.assigned: list[AssignedSensor] = []
         for node in scenario.sensing_nodes:
@@ -166,7 +174,7 @@ class SlotSetup:
         linear = not self.regressor_sensors and not self.nonlinear_sensors
         self.varies = len(self.kernel_sensors) < len(self.assigned) or not linear
         # The same in all blocks of runs and all slots, hence 1, 1.
-        self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.n, LANES))
+        self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.width, LANES))
         self._set_nonlinear_rows(scenario)
         self._set_kernel_sensors(scenario)
 
@@ -174,14 +182,26 @@ class SlotSetup:
         self.nonlinear: NonlinearSetup | None = None
         if not self.nonlinear_sensors:
             return
-        self.nonlinear = NonlinearSetup(self.estimators, self.p, self.n)
+        # Readings are of the whole state, and linearised in what their node estimates.
+        whole = np.arange(self.n)[None]
+        self.nonlinear = self.drawn = NonlinearSetup(self.estimators, self.p, whole)
+        # What drawn readings are measured from, as rows of H say it.
+        self.places = self.H[0, 0]
+        if self.views is not None:
+            self.nonlinear = NonlinearSetup(self.estimators, self.p, self.entries)
+            self.places = np.zeros((self.estimators, self.p, self.n, 1))
         for s in self.nonlinear_sensors:
             sensor: Any = scenario.located_sensors[s.placed_sensor.entry]
-            rows = len(s.R)
+            h, rows = s.estimator, len(s.R)
             for first in range(s.row, s.row + s.rows, rows):
-                self.nonlinear.add(sensor, s.estimator, first, s.R)
-                place = reference(sensor, s.node, self.n) if sensor.record is None else 0.0
-                self.H[0, 0, s.estimator, first : first + rows] = np.array(place)[..., None]
+                for setup, places in {
+                    self.drawn: self.places,
+                    self.nonlinear: self.H[0, 0],
+                }.items():
+                    setup.add(sensor, h, first, s.R)
+                    if sensor.record is None:
+                        place = setup.reference(sensor, s.node, h)
+                        places[h, first : first + rows] = place[:, None]
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
         count, p, n = len(self.kernel_sensors), self.p, self.n
@@ -203,7 +223,8 @@ class SlotSetup:
                 regressor_index[m], H[m, 0, 0] = self.regressor_sensors.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = solve_lower(s.root, sensor.H)
-            self.H[0, 0, s.estimator, s.row : s.row + rows] = H[m, :rows, :, None]
+            own = self.seen(H[m, :rows], s.estimator)
+            self.H[0, 0, s.estimator, s.row : s.row + rows] = own[..., None]
         regressors: list[Any] = [
             scenario.sensors[s.placed_sensor.entry] for s in self.regressor_sensors
         ]
@@ -230,26 +251,49 @@ class SlotSetup:
             C,
         )
 
+    def seen(self, H: FloatArray, h: int) -> FloatArray:
+        """Return the columns (..., w) of H (..., n) of what filter ``h`` estimates, then zeros."""
+        if self.views is None:
+            return H
+        return enlarged(H[..., self.views[h]], *H.shape[:-1], self.width)
+
     def _set_states(self, scenario: Scenario) -> None:
         infos: Sequence[NodeInfo] = scenario.node_infos
         if self.algorithm.timing.pooled:
             infos = infos[:1]
-        self.model_pieces: list[Sequence[Any]] = [
+        pieces: list[list[Any]] = [
             [_widened(model, rows) for model, rows in zip(piece, self.rows.tolist(), strict=True)]
             for piece in scenario.model_pieces
         ]
-        models = self.model_pieces[0]
+        models = pieces[0]
+        # The models of what filters estimate; records have room for the states of the widest.
         self.infos, self.models = infos, models
+        self.model_pieces: list[Sequence[Any]] = [
+            [_enlarged(model, self.width) for model in piece] for piece in pieces
+        ]
         self.model_slots = scenario.model_slots
         self.period = scenario.slot_plant.period
         starts = [scenario.initial_estimate(info.node) for info in infos]
-        # All filters of a scenario believe one F and Q at a time.
-        self.tables = [(np.array(m.F), lower_root(m.root_Q)) for m, *_ in self.model_pieces]
+        # Filters of the same states believe one F and Q at a time.
+        count, size = len(models) if self.own_models else 1, (self.width, self.width)
+        self.tables = [
+            [
+                (enlarged(np.array(m.F), *size), enlarged(lower_root(m.root_Q), *size))
+                for m in piece[:count]
+            ]
+            for piece in pieces
+        ]
         # Exchanges conserve quantities with these names.
         first = self.algorithm.init(models[0], *starts[0], infos[0])
         self.conserved_names = tuple(self.algorithm.analysis.conserved(first))
-        self.xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
+        starts = [(enlarged(x, size[0]), enlarged(cov, *size)) for x, cov in starts]
+        self.xhat = np.stack([mean for mean, _ in starts])
         self.root = first_roots([cov for _, cov in starts])
+
+    @property
+    def own_models(self) -> bool:
+        """True if filters have models of their own, since they estimate different states."""
+        return bool((self.entries != self.entries[0]).any())
 
     @cached_property
     def index_of_direction(self) -> dict[Link, int]:
@@ -357,7 +401,7 @@ class SlotSetup:
     def bytes_of_slot(self) -> int:
         """Return the bytes of states, readings and messages of one slot of one run."""
         # Readings, their H if it varies, and states.
-        floats = self.estimators * self.p * (1 + self.varies * self.n) + 3 * self.n
+        floats = self.estimators * self.p * (1 + self.varies * self.width) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.max_pairs + 8)
         mask = self.decides or self.may_miss
         asked = len(self.nodes) * (mask + 8 * self.algorithm.timing.randomised)
@@ -374,7 +418,8 @@ class SlotSetup:
 
     def batch_runs(self) -> int:
         """Return the number of runs that are simulated side by side: as many as fit the memory."""
-        sample_bytes = max(1, 8 * len(self.samples) * self.estimators * (2 + self.n) * self.n)
+        floats = self.estimators * (2 + self.width) * self.width
+        sample_bytes = max(1, 8 * len(self.samples) * floats)
         # A power of two, so that a batch is one node of the merge tree; at least a block of lanes,
         # unless not even that fits.
         runs_in_memory = min(BATCH_BYTES // sample_bytes, BLOCK_BYTES // (8 * self.bytes_of_slot()))
@@ -384,7 +429,8 @@ class SlotSetup:
     def quick_runs(self) -> int:
         """Return the number of runs, a power of two, that take some ten milliseconds together."""
         # A rough count for one slot: a filter's prediction and update, and its messages.
-        flops = self.estimators * (50 + 4 * self.n**3) + 10 * len(self.fresh) * len(self.directions)
+        flops = self.estimators * (50 + 4 * self.width**3)
+        flops += 10 * len(self.fresh) * len(self.directions)
         runs = min(QUICK_FLOPS // (max(1, self.slots) * flops), MAX_SLOT_RUNS)
         return int(max(LANES, 1 << (runs.bit_length() - 1) if runs else 0))
 
@@ -401,6 +447,13 @@ def _widened(model: SlotModel, rows: int) -> SlotModel:
         return model
     H = np.concatenate([model.H, np.zeros((added, model.H.shape[1]))])
     return dataclasses.replace(model, H=H, R=block_diagonal([model.R, np.eye(added)]))
+
+
+def _enlarged(model: SlotModel, width: int) -> SlotModel:
+    if len(model.Q) == width:
+        return model
+    F, Q = (enlarged(M, width, width) for M in (model.F, model.Q))
+    return dataclasses.replace(model, F=F, Q=Q, H=enlarged(model.H, len(model.H), width))
 
 
 BLOCK_BYTES = 1 << 24

@@ -242,7 +242,7 @@ def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSam
     nothing = np.zeros((1, 0, 1))
     return SlotSamples(
         nothing, nothing, nothing, nothing, local, local, False, np.zeros((blocks, LANES)),
-        *filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
+        *filters.sample_scratch, np.zeros(LANES, dtype=np.int64), np.zeros((0, 0), dtype=np.int64),
     )  # fmt: skip
 
 
