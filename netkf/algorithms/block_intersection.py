@@ -14,63 +14,267 @@ the presence of unknown correlations", ACC 1997.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
-from netkf.algorithms.models import first_root
+from netkf.algorithms.blocks import block_tables
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.block_fusion import (
+    CI,
+    NAIVE,
+    SPLIT,
+    fuse,
+    fusion_of,
+    semidefinite_root,
+)
+from netkf.algorithms.kernels.estimates import update_by_row
+from netkf.algorithms.kernels.pairs import block_of_pair, linearise_pair
+from netkf.algorithms.kernels.run import copy_estimate, predict_estimate, transition, use_reading
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import field, one_of
-from netkf.core.places import Place
-from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import Lanes, load, spread, store
 
-NAIVE, CI, SPLIT = "naive", "ci", "split"
-MARGIN = 1e-6
-"""Weights of covariance intersection are in [MARGIN, 1 - MARGIN]."""
+RULES = {"naive": NAIVE, "ci": CI, "split": SPLIT}
 
 
-class BlockState(NamedTuple):
-    """Estimate ``xhat`` (n,) of the ``blocks``, its covariance P (n, n), the part ``dependent``
-    (n, n) of P that may correlate with errors of other nodes, the ``model``, whether the node is
-    ``alone`` in estimating its blocks, and the readings ``pairs`` of this instant.
+@kernel(inlined=True)
+def add_covariance(
+    lanes: Lanes, n: int, root: FloatArray, h: int, factor: float, out: FloatArray, k: int
+) -> None:
+    """Replace ``out[k]`` (n, n, L) by P + ``factor`` times itself, P that of ``root[h]``."""
+    for i in range(n):
+        for j in range(i + 1):
+            total = factor * load(lanes, out, k, i, j)
+            for m in range(j + 1):
+                total += load(lanes, root, h, i, m) * load(lanes, root, h, j, m)
+            store(lanes, out, k, i, j, total)
+            store(lanes, out, k, j, i, total)
+
+
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict node ``h``. The plant's noise is independent of others, if nobody else estimates the
+    same blocks.
     """
+    lanes, n, dependent = run.lanes, len(run.size), record.dependent
+    if record.rule == SPLIT:
+        Phi, moved = run.noise, run.moved
+        transition(run.model, run, record.xhat, h, Phi)
+        if record.alone[h] == 0:
+            add_covariance(lanes, n, record.root, h, -1.0, dependent, h)
+        for i in range(n):
+            for j in range(n):
+                total = spread(lanes, 0.0)
+                for m in range(n):
+                    total += load(lanes, Phi, i, m) * load(lanes, dependent, h, m, j)
+                store(lanes, moved, i, j, total)
+        for i in range(n):
+            for j in range(i + 1):
+                total = spread(lanes, 0.0)
+                for m in range(n):
+                    total += load(lanes, moved, i, m) * load(lanes, Phi, j, m)
+                store(lanes, dependent, h, i, j, total)
+                store(lanes, dependent, h, j, i, total)
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    if record.rule == CI:
+        add_covariance(lanes, n, record.root, h, 0.0, dependent, h)
+    elif record.rule == SPLIT and record.alone[h] == 0:
+        add_covariance(lanes, n, record.root, h, -1.0, dependent, h)
 
-    xhat: FloatArray
-    P: FloatArray
-    dependent: FloatArray
-    model: Any
-    blocks: tuple[Place, ...]
-    alone: bool
-    pairs: tuple[PairReading, ...] = ()
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Use the readings of the node's own states, row by row; those of pairs go with messages."""
+    lanes, n, root, D = run.lanes, len(run.size), record.root, record.dependent
+    first, matrix = run.first_y + run.reading, run.first_H + run.matrix[run.reading]
+    gains, row = run.moved_mean, run.gains
+    for r in range(run.rows[run.reading] if record.rule == SPLIT else 0):
+        variance = spread(lanes, 1.0)
+        for j in range(n):
+            entry = spread(lanes, 0.0)
+            for i in range(j, n):
+                entry += load(lanes, run.H, matrix, r, i) * load(lanes, root, h, i, j)
+            store(lanes, row, j, entry)
+            variance += entry * entry
+        for i in range(n):
+            total = spread(lanes, 0.0)
+            for j in range(i + 1):
+                total += load(lanes, root, h, i, j) * load(lanes, row, j)
+            store(lanes, gains, i, total / variance)
+        # D <- (I - g h) D (I - g h)'.
+        both = spread(lanes, 0.0)
+        for i in range(n):
+            total = spread(lanes, 0.0)
+            for j in range(n):
+                total += load(lanes, run.H, matrix, r, j) * load(lanes, D, h, j, i)
+            store(lanes, row, i, total)
+            both += total * load(lanes, run.H, matrix, r, i)
+        for i in range(n):
+            for j in range(n):
+                g, other = load(lanes, gains, i), load(lanes, gains, j)
+                entry = load(lanes, D, h, i, j) + g * both * other
+                entry -= g * load(lanes, row, j) + load(lanes, row, i) * other
+                store(lanes, D, h, i, j, entry)
+        scratch = (run.row, run.moved_mean)
+        place = (first, matrix, r)
+        update_by_row(lanes, run.size, record.xhat, root, h, run.y, run.H, place, True, scratch)
+    if record.rule != SPLIT:
+        use_reading(run, record.xhat, root, h, run.reading, True)
+    if record.rule == CI:
+        add_covariance(lanes, n, root, h, 0.0, D, h)
 
 
-class BlockEstimate(NamedTuple):
-    """What a node sends: its estimate, see BlockState, and its readings of pairs."""
+@kernel
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the estimate. What a node has told may be in errors of others from now on."""
+    lanes, n, payload = run.lanes, len(run.size), record.payload
+    copy_estimate(run, payload.xhat, payload.root, m, record.xhat, record.root, h, True)
+    for i in range(n):
+        for j in range(n):
+            store(lanes, payload.dependent, m, i, j, load(lanes, record.dependent, h, i, j))
+    if record.rule == SPLIT:
+        add_covariance(lanes, n, record.root, h, 0.0, record.dependent, h)
 
-    xhat: FloatArray
-    P: FloatArray
-    dependent: FloatArray
-    blocks: tuple[Place, ...]
-    pairs: tuple[PairReading, ...]
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Use the messages of this instant one after the other, by sender."""
+    for k in range(run.count):
+        # What took time is of another instant.
+        for q in range(len(run.lanes) if not run.age[k] > 0.0 else 0):
+            if run.arrived[k, q] == 1:
+                hear(record, h, run, k, q)
 
 
-class Observation(NamedTuple):
-    """``z = H x + e + f + v``: z (p,), H (p, n), the covariance ``dependent`` (p, p) of e, which
-    may correlate with the node's error in any way, and those of f and v, which do not: ``told``
-    (p, p) of the sender's error f, which the sender goes on having, and ``noise`` (p, p) of v,
-    which nobody else has.
-    """
+@kernel
+def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
+    """Use message ``k`` of the inbox in lane ``q``."""
+    f, tables, pairs, m, r = record.fusion, record.tables, run.pairs, run.message[k], run.heard[k]
+    n, root, count = len(f.x), record.root, 0
+    for i in range(n):
+        f.x[i] = record.xhat[h, i, q]
+    set_covariances(root, record.dependent, h, q, f.P, f.dependent)
+    payload = record.payload
+    set_covariances(payload.root, payload.dependent, m, q, record.heard_P, record.heard_D)
+    for i in range(tables.entry.shape[1]):
+        if tables.entry[run.link[k], i] >= 0:
+            count += 1
+    if count > 0:
+        use_common(record, run.link[k], m, q)
+        fuse(f, count, record.rule)
+    if r >= 0 and len(pairs.row) > 0:
+        for c in range(pairs.first[r], pairs.first[r + 1]):
+            block = block_of_pair(pairs, c)
+            if block >= 0 and tables.first[h, block] >= 0:
+                use_pair(record, h, run, (m, r, c), q)
+                fuse(f, pairs.length[c], record.rule)
+    for i in range(n):
+        record.xhat[h, i, q] = f.x[i]
+        for j in range(n):
+            record.dependent[h, i, j, q] = f.dependent[i, j]
+    semidefinite_root(f.P, n)
+    for i in range(n):
+        for j in range(i + 1):
+            root[h, i, j, q] = f.P[i, j]
 
-    z: FloatArray
-    H: FloatArray
-    dependent: FloatArray
-    told: FloatArray
-    noise: FloatArray
+
+@kernel
+def set_covariances(
+    root: FloatArray, dependent: FloatArray, m: int, q: int, P: FloatArray, D: FloatArray
+) -> None:
+    """Write P of ``root[m]`` and the ``dependent[m]`` part of it, in lane ``q``."""
+    for i in range(len(P)):
+        for j in range(i + 1):
+            total = 0.0
+            for c in range(j + 1):
+                total += root[m, i, c, q] * root[m, j, c, q]
+            P[i, j] = P[j, i] = total
+            D[i, j] = D[j, i] = dependent[m, i, j, q]
+
+
+@kernel
+def use_common(record: Any, link: int, m: int, q: int) -> None:
+    """Make the sender's estimate of what both estimate an observation."""
+    f, entry = record.fusion, record.tables.entry
+    row = 0
+    for i in range(entry.shape[1]):
+        if entry[link, i] < 0:
+            continue
+        f.z[row] = record.payload.xhat[m, i, q]
+        f.H[row, :] = 0.0
+        f.H[row, entry[link, i]] = 1.0
+        column = 0
+        for j in range(entry.shape[1]):
+            if entry[link, j] >= 0:
+                f.heard[row, column] = record.heard_D[i, j]
+                f.told[row, column] = record.heard_P[i, j] - record.heard_D[i, j]
+                f.noise[row, column] = 0.0
+                column += 1
+        row += 1
+
+
+@kernel
+def use_pair(record: Any, h: int, run: Any, which: tuple[int, int, int], q: int) -> None:
+    """Make a reading of a pair, ``which`` = (m, r, c) with payload m, an observation."""
+    f, tables, pairs, (m, r, c) = record.fusion, record.tables, run.pairs, which
+    rows, own, block = pairs.rows, pairs.own, block_of_pair(pairs, c)
+    first, size, count = tables.first[h, block], tables.size[block], pairs.length[c]
+    rows.x[:] = 0.0
+    for i in range(own):
+        rows.x[i] = record.payload.xhat[m, i, q]
+    # What the node knew before the message.
+    for i in range(size):
+        rows.x[own + i] = record.xhat[h, first + i, q]
+    linearise_pair(pairs, run, r, c, q)
+    for a in range(count):
+        f.z[a] = rows.value[a]
+        f.H[a, :] = 0.0
+        for i in range(own):
+            f.z[a] -= rows.J[a, i] * record.payload.xhat[m, i, q]
+        for i in range(size):
+            f.H[a, first + i] = rows.J[a, own + i]
+        for b in range(count):
+            P = D = 0.0
+            for i in range(own):
+                for j in range(own):
+                    P += rows.J[a, i] * record.heard_P[i, j] * rows.J[b, j]
+                    D += rows.J[a, i] * record.heard_D[i, j] * rows.J[b, j]
+            f.heard[a, b], f.told[a, b], f.noise[a, b] = D, P - D, rows.C[a, b]
+
+
+def block_record(
+    filtering: BlockIntersection, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the record: what is in every node's error but may be in those of others too."""
+    n, tables = len(models[0].information), block_tables(infos, models)
+    width = tables.entry.shape[1]
+    rows = max(width, *(info.rows for info in infos))
+    return Record(
+        node={"dependent": (n, n)},
+        payload={"xhat": (width,), "root": (width, width), "dependent": (width, width)},
+        settings={
+            "rule": RULES[filtering.rule],
+            "alone": np.array([info.alone for info in infos], dtype=np.int64),
+            "tables": tables,
+            "fusion": fusion_of(n, rows),
+            "heard_P": np.zeros((width, width)),
+            "heard_D": np.zeros((width, width)),
+        },
+    )
+
+
+def begin_block(filtering: BlockIntersection, node: Any, info: NodeInfo, _model: Any) -> None:
+    """Set what may depend on others at time 0: errors are independent, but for rule "ci"."""
+    P = node["root"] @ node["root"].T
+    is_own = filtering.rule == "split" and info.alone
+    node["dependent"][:] = 0.0 if is_own or filtering.rule == "naive" else P
 
 
 @built_in("block-intersection")
@@ -89,7 +293,7 @@ class BlockIntersection(Filter):
     instant.
     """
 
-    rule: str = field(one_of(SPLIT, CI, NAIVE), default=SPLIT)
+    rule: str = field(one_of("split", "ci", "naive"), default="split")
 
     timing = Timing(clocks=("directions", "nodes", "readings"))
     needs = Needs(one_way=True, samples=True, blocks=True)
@@ -97,138 +301,18 @@ class BlockIntersection(Filter):
     @property
     def analysis(self) -> Analysis:
         """That P is no smaller than the covariance of the error, unless the rule is naive."""
-        design = ("", "") if self.rule == NAIVE else ("larger", "larger")
+        design = ("", "") if self.rule == "naive" else ("larger", "larger")
         return Analysis(P_by_design=design, affine=True)
 
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> BlockState:
-        """Return the state at time 0. Errors are independent then, but for ``rule`` "ci"."""
-        places = node.blocks or (Place("plant", None, 0, len(mean)),)
-        P, alone = np.array(cov, dtype=np.float64), node.alone
-        dependent = self._dependent(P, P if alone else np.zeros_like(P))
-        return BlockState(np.array(mean), P, dependent, model, places, alone)
+    kernels = Kernels(
+        block_record,
+        begin_block,
+        predict=predict,
+        update=update,
+        emit=emit,
+        absorb=absorb,
+        sends_readings=True,
+        counts_sends=True,
+    )
 
-    def _dependent(self, P: FloatArray, independent: FloatArray) -> FloatArray:
-        """Return the dependent part (n, n) of an error with covariance P (n, n), of which a part is
-        ``independent`` (n, n).
-        """
-        if self.rule == NAIVE:
-            return np.zeros_like(P)
-        return P.copy() if self.rule == CI else symmetric(P - independent)
-
-    def predict(self, state: BlockState, gap: float) -> BlockState:
-        """Return the state ``gap`` seconds later. The plant's noise is independent of others, if
-        nobody else estimates the same blocks.
-        """
-        Phi = state.model.transition(state.xhat, gap)
-        xhat, root = state.model.predict(state.xhat, first_root(state.P), gap)
-        P = symmetric(root @ root.T)
-        independent = P - Phi @ state.dependent @ Phi.T
-        if not state.alone:
-            independent = Phi @ (state.P - state.dependent) @ Phi.T
-        dependent = self._dependent(P, independent)
-        return state._replace(xhat=xhat, P=P, dependent=dependent, pairs=())
-
-    def update(self, state: BlockState, reading: Reading) -> BlockState:
-        """Return the state after the readings of its own states; those of pairs are kept for the
-        messages of this instant.
-        """
-        state = state._replace(pairs=reading.pairs)
-        if not len(reading.y):
-            return state
-        none = np.zeros_like(reading.R)
-        return self._fused(state, Observation(reading.y, reading.H, none, none, reading.R))
-
-    def emit(self, state: BlockState, exchange: Exchange) -> tuple[BlockState, BlockEstimate]:
-        """Return the estimate as a message. What a node has told may be in errors of others from
-        now on.
-        """
-        payload = BlockEstimate(state.xhat, state.P, state.dependent, state.blocks, state.pairs)
-        dependent = self._dependent(state.P, np.zeros_like(state.P))
-        return state._replace(dependent=dependent), payload
-
-    def absorb(
-        self, state: BlockState, messages: Sequence[Message], exchange: Exchange
-    ) -> BlockState:
-        """Return the state after all messages of this instant, one after the other by sender."""
-        for message in messages:
-            if message.age > 0.0:
-                continue
-            for observation in self._observations(state, message.payload):
-                state = self._fused(state, observation)
-        return state
-
-    def _observations(self, state: BlockState, told: BlockEstimate) -> Iterator[Observation]:
-        """Yield what a message says of the node's states."""
-        own = {(place.name, place.node): place for place in state.blocks}
-        known = {(place.name, place.node): place for place in told.blocks}
-        common = [key for key in own if key in known]
-        if common:
-            mine, theirs = (
-                np.concatenate([np.arange(p.first, p.first + p.n) for p in places])
-                for places in ([own[key] for key in common], [known[key] for key in common])
-            )
-            chosen, H = np.ix_(theirs, theirs), np.eye(len(state.xhat))[mine]
-            yield self._told(told.xhat[theirs], H, told.P[chosen], told.dependent[chosen])
-        for pair in told.pairs:
-            name, owner = pair.other
-            place = own.get((name, owner if owner >= 0 else None))
-            # A block that the sender estimates too has been told.
-            if place is None or (place.name, place.node) in known:
-                continue
-            entries = slice(place.first, place.first + place.n)
-            z, H_theirs, H_mine = pair.H(told.xhat, state.xhat[entries])
-            H = np.zeros((len(z), len(state.xhat)))
-            H[:, entries] = H_mine
-            P, dependent = (H_theirs @ C @ H_theirs.T for C in (told.P, told.dependent))
-            seen = self._told(z - H_theirs @ told.xhat, H, P, dependent)
-            yield seen._replace(noise=pair.R)
-
-    def _told(
-        self, z: FloatArray, H: FloatArray, P: FloatArray, dependent: FloatArray
-    ) -> Observation:
-        """Return an observation whose error is the sender's, with covariance P (p, p)."""
-        return Observation(z, H, dependent, P - dependent, np.zeros_like(P))
-
-    def _fused(self, state: BlockState, seen: Observation) -> BlockState:
-        """Return the state after an observation: a Kalman update with both dependent parts
-        enlarged, by 1 / w and 1 / (1 - w) (Li and Nashashibi 2013).
-        """
-        own, noise = state.P - state.dependent, seen.told + seen.noise
-
-        def weighted(w: float, v: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-            P, C = state.dependent / w + own, seen.dependent / v + noise
-            S = seen.H @ P @ seen.H.T + C
-            # Singular where both know something for certain.
-            K = P @ seen.H.T @ np.linalg.pinv(S, hermitian=True)
-            return P, C, np.asarray(K)
-
-        def trace_after(w: float) -> float:
-            P, _, K = weighted(w, 1.0 - w)
-            return float(np.trace(P - K @ seen.H @ P))
-
-        P, C, K = weighted(1.0, 1.0)
-        # Where one has no dependent part there is nothing to weigh.
-        if seen.dependent.any() and state.dependent.any():
-            bounds = (MARGIN, 1.0 - MARGIN)
-            found = minimize_scalar(trace_after, bounds=bounds, options={"xatol": 1e-10})
-            w = min((found.x, *bounds), key=trace_after)
-            # The limit of w = 1: what was heard is not used.
-            if trace_after(w) >= float(np.trace(state.P)):
-                return state
-            P, C, K = weighted(w, 1.0 - w)
-        stays = np.eye(len(P)) - K @ seen.H
-        after = symmetric(stays @ P @ stays.T + K @ C @ K.T)
-        independent = stays @ own @ stays.T + K @ seen.noise @ K.T
-        return state._replace(
-            xhat=state.xhat + K @ (seen.z - seen.H @ state.xhat),
-            P=after,
-            dependent=self._dependent(after, independent),
-        )
-
-    def estimate(self, state: BlockState) -> tuple[FloatArray, FloatArray]:
-        """Return xhat (n,) and P (n, n)."""
-        return state.xhat, state.P
-
-    def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return a state, or a message, with ``offset`` (n,) added to the estimate."""
-        return state._replace(xhat=state.xhat + offset)
+    shift = Filter.shift  # affine in readings and messages

@@ -92,6 +92,7 @@ class NodeInfo(NamedTuple):
     blocks : its blocks of ``[[plants]]`` at their places in its own state (plants.blocks.Place)
     whole : all blocks at their places in the whole state, if ``Needs.coupled`` says so
     alone : no other node estimates one of these
+    heard : the blocks of each of ``senders``, at their places in its own state
     sampled : H (p, n) and R (p, p) of its sensors that take samples (in slots: of all) together, as
               the node believes them, where they are fixed; p = 0 without such sensors
     """
@@ -111,6 +112,7 @@ class NodeInfo(NamedTuple):
     blocks: tuple[Any, ...] = ()
     alone: bool = True
     whole: tuple[Any, ...] = ()
+    heard: tuple[tuple[Any, ...], ...] = ()
 
 
 class Exchange(NamedTuple):

@@ -20,7 +20,12 @@ import numpy as np
 from netkf.algorithms.kernels.estimates import transform_root, update_by_row
 from netkf.algorithms.kernels.gains import GainTable, gain_table
 from netkf.algorithms.kernels.maps import MapTables, move_estimate, spread_of
-from netkf.algorithms.kernels.rates import RateTables, move_by_rate, scratch_of_rates
+from netkf.algorithms.kernels.rates import (
+    DIFFERENCE,
+    RateTables,
+    move_by_rate,
+    scratch_of_rates,
+)
 from netkf.algorithms.kernels.root_flow import FlowTable, flow_root, flow_table, gain_update_root
 from netkf.algorithms.kernels.run import CLOSE, usable
 from netkf.algorithms.kernels.square_root import lower_root
@@ -29,9 +34,6 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, aligned
 from netkf.linalg.vector_functions import VectorFunction
 
-DIFFERENCE = 1e-5
-"""Steps of differences, as shares of states above 1: errors of rounding and of curvature are alike.
-"""
 TABLES = 32
 """Flow tables in the cache, at most 256 KiB each."""
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.algorithms.kernels.gains import stack_gains
 from netkf.algorithms.kernels.maps import SingleMapRun
+from netkf.algorithms.kernels.pairs import no_pairs
 from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
@@ -34,19 +35,29 @@ from netkf.algorithms.models import (
     first_root,
     whiten_reading,
 )
+from netkf.algorithms.python_pairs import PythonPairs
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Size
 
-_NO_READING: Any = (np.zeros(0), np.zeros((0, 0)))
+
+class Whitened(NamedTuple):
+    """A reading of a node's own states, y (p,) and H (p, n), whitened, and those of pairs."""
+
+    y: FloatArray
+    H: FloatArray
+    pairs: tuple[Any, ...] = ()
+
+
+_NO_READING = Whitened(np.zeros(0), np.zeros((0, 0)))
 OWN = 0
 """The reading of ``update`` in the tables of a run; those of messages follow."""
 
 
 class Payload:
-    """A message of a kernel filter: its ``fields`` by name, and the ``reading``, whitened (y, H),
-    that the sender had taken at that instant, or None.
+    """A message of a kernel filter: its ``fields`` by name, and the ``reading``, Whitened, that the
+    sender had taken at that instant, or None.
     """
 
     def __init__(self, fields: dict[str, np.ndarray], reading: Any, sender: NodeState) -> None:
@@ -160,6 +171,7 @@ class Surroundings:
         self.model, self.period = model, getattr(model, "period", 0.0)
         self.clocked = isinstance(model, FlowModel)
         self._piece = 0
+        self._pairs = PythonPairs(info, n) if filtering.needs.blocks else None
         # Not unrolled: one compiled kernel serves all n.
         size, cls = size_of(n, unrolled=False), _run_class(model)
         degree = max(1, info.degree, len(info.senders))
@@ -184,6 +196,7 @@ class Surroundings:
             arrived=np.ones((degree, 1), dtype=np.uint8),
             sends=np.ones(1, dtype=np.uint8),
             uniform=np.zeros(1),
+            pairs=no_pairs() if self._pairs is None else self._pairs.none(),
             reading=OWN,
             first_y=0,
             first_H=0,
@@ -209,18 +222,23 @@ class Surroundings:
             self._piece = model.piece
             tables.F[:], tables.root_Q[:] = model.F, model.root_Q
 
-    def set_readings(self, readings: Sequence[tuple[FloatArray, FloatArray]]) -> None:
-        """Make these whitened readings (y (p,), H (p, n)) the numbers 0, 1, ... of the run."""
-        run, most = self.struct, max((len(y) for y, _ in readings), default=0)
+    def set_readings(self, readings: Sequence[Whitened], senders: Sequence[Any] = ()) -> None:
+        """Make these readings the numbers 0, 1, ... of the run; ``senders`` are the payloads that
+        bring those after the first.
+        """
+        if self._pairs is not None:
+            self.struct.pairs, readings = self._pairs.take(readings, senders)
+        run, most = self.struct, max((len(y) for y, *_ in readings), default=0)
         count, p = run.y.shape[:2]
         if len(readings) > count or most > p:
             count, p = max(count, len(readings)), max(p, most)
             run.y, run.H = np.zeros((count, p, 1)), np.zeros((count, p, len(run.size), 1))
             run.rows, run.matrix = np.zeros(count, dtype=np.int64), np.arange(count)
-        for k, (y, H) in enumerate(readings):
-            if len(y):
-                run.y[k, : len(y), 0], run.H[k, : len(y), :, 0] = y, H
-            run.rows[k] = len(y)
+        for k, (y, H, _) in enumerate(readings):
+            run.y[k, : len(y), 0] = y
+            if len(H):
+                run.H[k, : len(H), :, 0] = H
+            run.rows[k] = len(H)
 
     def set_inbox(self, own: Any, messages: Sequence[Any], slotted: bool) -> None:
         """Make these messages the inbox of the run; their readings are numbered after the
@@ -237,6 +255,7 @@ class Surroundings:
             run.arrived = np.ones((count, 1), dtype=np.uint8)
         run.count = count
         readings: list[Any] = [own or _NO_READING]
+        brought: list[Any] = []
         for k, message in enumerate(messages):
             # A sender that was not announced gets the next link.
             run.link[k] = self.links.setdefault(message.sender, len(self.links))
@@ -247,7 +266,13 @@ class Surroundings:
             if reading is not None:
                 run.heard[k] = len(readings)
                 readings.append(reading)
-        self.set_readings(readings)
+                brought.append(message.payload)
+        self.set_readings(readings, brought)
+
+    def raise_error(self) -> None:
+        """Raise the error of what linearises a reading of a pair, if a call has failed."""
+        if self._pairs is not None:
+            self._pairs.raise_error()
 
     def prepare(self, record: Any, slot: int) -> None:
         """Let the filter set what it knows of a slot before the run."""
@@ -335,11 +360,14 @@ def update(state: NodeState, reading: Any) -> NodeState:
         state.kernels.update(new.record, 0, run)
         run.model.increments = 0
         return new
-    whitened = whiten_reading(reading.y, reading.H, reading.R) if len(reading.y) else None
+    whitened = _NO_READING
+    if len(reading.y):
+        whitened = Whitened(*whiten_reading(reading.y, reading.H, reading.R))
+    whitened = whitened._replace(pairs=reading.pairs)
     # In slots a node without a sensor gets readings without rows.
-    surroundings.set_readings([whitened or _NO_READING])
+    surroundings.set_readings([whitened])
     state.kernels.update(new.record, 0, run)
-    new.reading = whitened
+    new.reading = whitened if len(whitened.y) or whitened.pairs else None
     return new
 
 
@@ -375,15 +403,14 @@ def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeStat
     surroundings.prepare(record, exchange.slot)
     surroundings.set_inbox(new.reading, messages, exchange.slot >= 0)
     if messages:
-        names = type(record.payload).struct_fields
-        fields = {
-            name: np.concatenate(
-                [_field(message.payload, name, surroundings.info.node) for message in messages]
-            )
-            for name in names
-        }
+        fields = {}
+        for name in type(record.payload).struct_fields:
+            shape = getattr(record.payload, name).shape[1:]
+            parts = [_field(message.payload, name, surroundings.info.node) for message in messages]
+            fields[name] = np.concatenate([_fitted(part, shape) for part in parts])
         record.payload = type(record.payload)(**fields)
     state.kernels.absorb(record, 0, run)
+    surroundings.raise_error()
     return new
 
 
@@ -411,6 +438,16 @@ def shift(state: Any, offset: FloatArray) -> Any:
         new.kernels.shift_payload(record, m, run)
     # A reading keeps the coordinates of its time.
     return Payload(fields, state.reading, state.sender)
+
+
+def _fitted(field: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a field of one message (1, ...) of a node of more or fewer states in a ``shape``."""
+    if field.shape[1:] == shape:
+        return field
+    made = np.zeros((1, *shape), dtype=field.dtype)
+    least = tuple(slice(min(sizes)) for sizes in zip(field.shape, made.shape, strict=True))
+    made[least] = field[least]
+    return made
 
 
 def _field(payload: Any, name: str, receiver: int) -> np.ndarray:

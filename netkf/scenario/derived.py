@@ -383,6 +383,7 @@ class DerivedScenario(ScenarioModel):
                 total_information, max_delay, k, tuple(sorted(senders[node])), network, most_rows,
                 self._own_sensors(k, sampled.get(node, ())), self._own_places(k),
                 self._is_alone(k, counts), whole,
+                tuple(self._own_places(self.topology.index[i]) for i in sorted(senders[node])),
             )
             for k, node in enumerate(self.nodes)
         )  # fmt: skip

@@ -20,6 +20,7 @@ from netkf.algorithms.kernels.run import (
     carry_mean_in_slot,
     predict_copy,
     predict_estimate,
+    transition,
     update_estimate,
     update_in_slot,
 )
@@ -228,6 +229,23 @@ def _predict_own_by_map(
     model: MapTables, run: Any, x: FloatArray, root: FloatArray, k: int, _h: int
 ) -> None:
     predict_by_map(model, run, x, root, k)
+
+
+@transition.register(MapTables)
+@kernel
+def _transition_of_map(model: MapTables, run: Any, x: FloatArray, k: int, out: FloatArray) -> None:
+    own, slot = len(model.x), min(run.slot - model.delay, len(model.u) - 1)
+    for i in range(len(run.size)):
+        for j in range(len(run.size)):
+            store(run.lanes, out, i, j, 0.0)
+    for q in range(model.active):
+        for i in range(own):
+            model.x[i] = x[k, i, q]
+        t = slot * model.period
+        call_function(model.jacobian, model.x, model.u[slot], t, model.period, model.J)
+        for i in range(own):
+            for j in range(own):
+                out[i, j, q] = model.J[i, j]
 
 
 carry.register(MapTables)(carry_in_slot)

@@ -23,6 +23,7 @@ from netkf.algorithms.kernels.run import (
     carry_mean,
     predict_copy,
     predict_estimate,
+    transition,
     update_estimate,
     update_in_slot,
 )
@@ -31,6 +32,9 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
 from netkf.linalg.structs import Struct
 
+DIFFERENCE = 1e-5
+"""Steps of differences, as shares of states above 1: errors of rounding and of curvature are alike.
+"""
 STAGES = 4
 
 
@@ -249,6 +253,27 @@ def _carry_mean_by_rate(model: RateTables, run: Any, x: FloatArray, m: int, age:
         move_by_rate(model, model.mean, model.root, 0, run.now, age)
     for i in range(x.shape[1]):
         x[m, i, 0] = model.mean[0, i, 0]
+
+
+@transition.register(RateTables)
+@kernel
+def _transition_by_rate(
+    model: RateTables, run: Any, x: FloatArray, k: int, out: FloatArray
+) -> None:
+    n = x.shape[1]
+    for c in range(n):
+        # Central differences of means.
+        step = DIFFERENCE * max(1.0, abs(x[k, c, 0]))
+        for side in range(2):
+            for i in range(n):
+                model.mean[0, i, 0] = x[k, i, 0]
+                for j in range(n):
+                    model.root[0, i, j, 0] = 0.0
+            model.mean[0, c, 0] += step if side == 0 else -step
+            move_by_rate(model, model.mean, model.root, 0, run.now, run.gap)
+            for i in range(n):
+                before = out[i, c, 0] if side == 1 else 0.0
+                out[i, c, 0] = before + (0.5 - side) / step * model.mean[0, i, 0]
 
 
 update_estimate.register(RateTables)(update_in_slot)

@@ -79,6 +79,7 @@ class SlotRun(Struct):
     receiver : for ``emit`` of an addressed filter, ``records.Kernels``
     sends : (L,), 1 on entry of ``emit``; it writes 0 where the node sends nothing
     uniform : (L,), uniform numbers for ``emit`` of a randomised filter
+    pairs : those of readings that are also about blocks which their node does not estimate
     offset : (n, L), by which ``shift`` moves estimates
     gap, slot, phase, step : seconds of a prediction, numbers of slot, exchange and repetition
     now : under clocks the end of the prediction, or the time to which messages are predicted
@@ -113,6 +114,7 @@ class SlotRun(Struct):
     noise: FloatArray
     whitened: FloatArray
     total: FloatArray
+    pairs: Any
     reading: int
     first_y: int
     first_H: int
@@ -257,6 +259,40 @@ def carry_mean(model: Any, run: Any, x: FloatArray, m: int, age: float) -> None:
 @generic
 def update_estimate(model: Any, run: Any, x: FloatArray, root: FloatArray, k: int, h: int) -> None:
     """Update estimate ``k`` with the reading of node ``h``, ``run.reading``, or its increments."""
+
+
+@generic
+def transition(model: Any, run: Any, x: FloatArray, k: int, out: FloatArray) -> None:
+    """Write the derivative (n, n, L) of what estimate ``k`` is predicted to, ``run.gap`` seconds
+    later, by the estimate, into ``out``.
+    """
+
+
+@transition.register(SlotTables)
+@kernel
+def _transition_of_slot(
+    model: SlotTables, run: Any, _x: FloatArray, _k: int, out: FloatArray
+) -> None:
+    n = len(run.size)
+    for i in range(n):
+        for j in range(n):
+            store(run.lanes, out, i, j, model.F[i, j])
+
+
+@transition.register(ClockTables)
+@kernel
+def _transition_of_gap(
+    model: ClockTables, run: Any, _x: FloatArray, _k: int, out: FloatArray
+) -> None:
+    n = len(run.size)
+    for c in range(n):
+        for i in range(n):
+            model.mean[0, i] = 1.0 if i == c else 0.0
+            for j in range(i + 1):
+                model.mean_root[0, i, j] = 0.0
+        move(model, run, model.stride - 1, model.mean_root, model.mean, 0, run.gap)
+        for i in range(n):
+            out[i, c, 0] = model.mean[0, i]
 
 
 @predict_copy.register(SlotTables)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from netkf.algorithms.kernels.pairs import no_pairs
 from netkf.algorithms.kernels.run import (
     ALL,
     ClockRun,
@@ -64,6 +65,7 @@ class ClockFilters:
             **self._inbox(messages, n),
             sends=np.ones(1, dtype=np.uint8),
             uniform=np.zeros(1),
+            pairs=no_pairs(),
             reading=0,
             first_y=0,
             first_H=0,

@@ -19,6 +19,7 @@ from netkf.engines.compiled.clock_loop import clock_loop
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.own_sensors import is_own, reads_in_python
 from netkf.engines.compiled.slot_loop import slot_loop
+from netkf.engines.compiled.slot_pairs import blocks_refusal
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
 from netkf.linalg import compiling
@@ -58,10 +59,8 @@ class CompiledEngine(Engine):
         remedy = 'use engine="simpy", or "auto", which chooses'
         if not has_numba():
             return f'engine "compiled" needs numba, which is not installed; {remedy}'
-        if scenario.views is not None:
-            rule = "under clocks" if not scenario.slotted else "with regressors"
-            if not scenario.slotted or any(hasattr(sensor, "C") for sensor in scenario.sensors):
-                return f'engine "compiled" cannot run nodes of different states {rule}; {remedy}'
+        if scenario.views is not None and (rule := blocks_refusal(scenario)) is not None:
+            return f'engine "compiled" cannot run {rule}; {remedy}'
         # ``type`` and not ``isinstance``: kernels do not know what a derived class changes.
         unknown: list[tuple[str, Component]] = []
         if type(scenario.plant) not in PLANTS:

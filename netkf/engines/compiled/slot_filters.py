@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels.maps import MapRun
+from netkf.algorithms.kernels.pairs import Pairs, no_pairs
 from netkf.algorithms.kernels.run import (
     ALL,
     SlotRun,
@@ -44,9 +45,10 @@ class SlotFilters:
         blocks: int,
         with_means: bool = True,
         active: int = LANES,
+        pairs: Pairs | None = None,
     ) -> None:
         """Make the filters at time 0; unless ``with_means`` all estimates are zero. At most
-        ``active`` lanes of a block have runs.
+        ``active`` lanes of a block have runs; ``pairs`` are readings of these, where there are any.
         """
         self._setup, self._kernels = setup, kernels
         self._rows: Any = None
@@ -95,6 +97,7 @@ class SlotFilters:
             arrived=aligned((most, LANES), np.uint8),
             sends=aligned((LANES,), np.uint8),
             uniform=aligned((LANES,)),
+            pairs=no_pairs() if pairs is None else pairs,
             reading=0,
             first_y=0,
             first_H=0,

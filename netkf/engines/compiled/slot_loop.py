@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.algorithms.kernels.nonlinear_rows import linearise_rows, no_rows
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
-from netkf.engines.compiled.nonlinear_rows import linearise_rows, no_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import struct_like
@@ -203,7 +203,7 @@ def slot_loop(kernels: Kernels, linear: bool = True) -> Any:
         for b in range(len(memories)):
             block = struct_like(record, memories[b])
             for s in range(plan.start, plan.end):
-                run.slot = plan.first + s
+                run.slot, run.pairs.slot = plan.first + s, s
                 run.first_y = (b * slots + s) * nodes
                 run.first_H = run.first_y if plan.varies else 0
                 if plan.predicts and plan.begin == WHOLE:

@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels.nonlinear_rows import NonlinearRows, add_values
+from netkf.algorithms.kernels.pairs import Pairs
 from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
-from netkf.engines.compiled.nonlinear_rows import NonlinearRows, add_values
 from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import record_samples
@@ -49,9 +50,11 @@ from netkf.engines.compiled.slot_messages import (
     draw_uniforms,
     make_rows,
 )
+from netkf.engines.compiled.slot_pairs import matrix_of
 from netkf.engines.compiled.slot_setup import BATCH_BYTES, AssignedSensor, SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned, blocks_of, by_run, in_lanes, unset
+from netkf.linalg.portable import cholesky, solve_lower
 from netkf.network.deliveries import Deliveries
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.slot_paths import (
@@ -120,7 +123,12 @@ class SlotRuns:
         self._total = aligned((blocks, LANES))
         kernels = compiled_kernels(setup.algorithm, clocked=False)
         assert kernels is not None
-        self._filters = SlotFilters(setup, kernels, blocks, active=min(runs, LANES))
+        self._pairs: Pairs | None = None
+        if setup.pairs is not None:
+            method = scenario.filter.linearise
+            self._pairs = setup.pairs.tables(method, min(runs, LANES), setup.whitened)
+        active = min(runs, LANES)
+        self._filters = SlotFilters(setup, kernels, blocks, active=active, pairs=self._pairs)
         arrays, never = self._filters.records.arrays, (blocks, setup.estimators, LANES)
         # NEVER: a slot that no run reaches, for a node that never stops.
         self._nonlinear: NonlinearRows | None = None
@@ -523,11 +531,22 @@ class SlotRuns:
                 origin = responses.believed.states(slots_of_all)
                 self._nonlinear.origin = self._drawn.origin = origin
             flat_y = y.reshape(-1, *y.shape[3:])
-            add_values(self._drawn, x, flat_y, setup.places, setup.nonlinear.drawn)
+            add_values(self._drawn, x, flat_y, setup.places, setup.drawn.drawn)
             setup.nonlinear.raise_error()
-        if not (self._recorded or self._own) or not times.sensed.any():
-            return y, H
+        if (self._recorded or self._own) and times.sensed.any():
+            self._read_in_python(times, x, y, H)
+        return y, H
+
+    def _read_in_python(
+        self, times: SlotTimes, x: FloatArray, y: FloatArray, H: FloatArray
+    ) -> None:
+        """Write what recorded sensors and those of users read in S slots."""
+        setup, count = self.setup, len(times.start)
         slots = (self._slot + np.flatnonzero(times.sensed)).tolist()
+        self._clear_pairs(count)
+        is_recorded = [s for s, _ in self._recorded if s in setup.nonlinear_sensors]
+        if self._nonlinear is not None and is_recorded and len(self._nonlinear.R) != count:
+            self._nonlinear.R = np.repeat(self._nonlinear.R[:1], count, axis=0)
         for s, paths in self._own:
             rows = slice(s.row, s.row + s.rows)
             y[:, times.sensed, s.estimator, rows] = 0.0  # in lanes without a run
@@ -539,6 +558,9 @@ class SlotRuns:
                     out[b, times.sensed, s.estimator, rows, ..., lane] = values
         for s, path in self._recorded:
             rows = slice(s.row, s.row + s.rows)
+            if s.pair >= 0:
+                self._read_pairs(s, path, times.sensed, y, H)
+                continue
             if s in setup.nonlinear_sensors:
                 self._read_nonlinear(s, path, times.sensed, y, H)
                 continue
@@ -547,7 +569,54 @@ class SlotRuns:
             y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
             own_H = setup.seen(whitened_H, s.estimator)
             H[:, times.sensed, s.estimator, rows] = own_H[..., None]
-        return y, H
+
+    def _clear_pairs(self, count: int) -> None:
+        """Make room for the pairs of ``count`` slots, of which records have none so far."""
+        pairs = self._pairs
+        if pairs is None or all(s.pair < 0 for s, _ in self._recorded):
+            return
+        pairs.block, pairs.H = (
+            np.repeat(part[:1], count, axis=0) for part in (pairs.block, pairs.H)
+        )
+        pairs.rows.R = np.repeat(pairs.rows.R[:1], count, axis=0)
+        for s, _ in self._recorded:
+            pairs.block[:, s.pair : s.pair + s.rows // len(s.R) if s.pair >= 0 else s.pair] = -1
+
+    def _read_pairs(
+        self, s: AssignedSensor, path: Any, sensed: np.ndarray, y: FloatArray, H: FloatArray
+    ) -> None:
+        """Write the recorded values of a sensor that reads pairs."""
+        setup, pairs, scenario, h = self.setup, self._pairs, self._scenario, s.estimator
+        assert pairs is not None
+        assert setup.pairs is not None
+        sensor: Any = scenario.located_sensors[s.placed_sensor.entry]
+        p, believed = len(s.R), scenario.input_responses and scenario.input_responses.believed
+        rows = slice(s.row, s.row + s.rows)
+        y[:, sensed, h, rows] = 0.0 if sensor.linear else np.nan
+        for k in np.flatnonzero(sensed).tolist():
+            for m, (values, anchor, R) in enumerate(path.readings_at(self._slot + k, s.R)):
+                place, pair = setup.pairs.other(h, sensor, anchor), s.pair + m
+                if place is None and not sensor.linear:
+                    self._write_nonlinear((s, sensor), (k, m), (values, anchor, R), y, H)
+                    continue
+                z = values
+                if sensor.linear:
+                    matrix = matrix_of(sensor, anchor, setup.n)
+                    if believed is not None:
+                        z = values - matrix @ believed.states(np.array([self._slot + k]))[0]
+                if place is None:
+                    there = np.isfinite(values)
+                    own = np.column_stack([z, setup.seen(matrix, h)])[there]
+                    whitened = solve_lower(cholesky(R[there][:, there]), own)
+                    some = slice(s.row + m * p, s.row + m * p + len(whitened))
+                    y[:, k, h, some] = whitened[:, :1]
+                    H[:, k, h, some] = whitened[:, 1:, None]
+                    continue
+                first = int(pairs.row[pair])
+                y[:, k, h, first : first + p] = z[:, None]
+                pairs.block[k, pair], pairs.rows.R[k, pair, :p, :p] = setup.pairs.number(place), R
+                if sensor.linear:
+                    pairs.H[k, pair, :p] = setup.pairs.columns(pair, matrix, place)
 
     def _read_nonlinear(
         self, s: AssignedSensor, path: Any, sensed: np.ndarray, y: FloatArray, H: FloatArray
@@ -555,21 +624,30 @@ class SlotRuns:
         """Write the recorded values of a nonlinear sensor, nan where there is none, what they are
         measured from, and the covariances of their noise.
         """
-        setup = self.setup.nonlinear
-        assert self._nonlinear is not None
-        assert setup is not None
         sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
-        p = len(s.R)
         y[:, sensed, s.estimator, s.row : s.row + s.rows] = np.nan
-        if len(self._nonlinear.R) != len(sensed):
-            self._nonlinear.R = np.repeat(self._nonlinear.R[:1], len(sensed), axis=0)
         for k in np.flatnonzero(sensed).tolist():
-            for m, (values, anchor, R) in enumerate(path.readings_at(self._slot + k, s.R)):
-                rows = slice(s.row + m * p, s.row + (m + 1) * p)
-                place = setup.reference(sensor, s.node if anchor < 0 else anchor, s.estimator)
-                y[:, k, s.estimator, rows] = values[:, None]
-                H[:, k, s.estimator, rows] = place[:, None]
-                self._nonlinear.R[k, s.estimator, rows, rows] = R
+            for m, reading in enumerate(path.readings_at(self._slot + k, s.R)):
+                self._write_nonlinear((s, sensor), (k, m), reading, y, H)
+
+    def _write_nonlinear(
+        self,
+        of: tuple[AssignedSensor, Any],
+        which: tuple[int, int],
+        reading: tuple[FloatArray, int, FloatArray],
+        y: FloatArray,
+        H: FloatArray,
+    ) -> None:
+        """Write reading m of slot k, ``which`` = (k, m), of a recorded nonlinear sensor."""
+        (s, sensor), (k, m), (values, anchor, R) = of, which, reading
+        setup, nonlinear, p = self.setup.nonlinear, self._nonlinear, len(s.R)
+        assert nonlinear is not None
+        assert setup is not None
+        rows = slice(s.row + m * p, s.row + (m + 1) * p)
+        place = setup.reference(sensor, s.node if anchor < 0 else anchor, s.estimator)
+        y[:, k, s.estimator, rows] = values[:, None]
+        H[:, k, s.estimator, rows] = place[:, None]
+        nonlinear.R[k, s.estimator, rows, rows] = R
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
         """Return the EVENT rows (K,) of a block of one run, and the number of rows before each of

@@ -25,6 +25,7 @@ from netkf.engines.compiled.slot_messages import (
     SlotLinks,
     Stages,
 )
+from netkf.engines.compiled.slot_pairs import SlotPairs
 from netkf.linalg.arrays import FloatArray, block_diagonal, enlarged
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
@@ -43,7 +44,8 @@ from netkf.scenario.scenario import Scenario
 class AssignedSensor(NamedTuple):
     """A sensor of ``node``: which filter reads it (``estimator``), its first ``row`` there and the
     number of its ``rows``, of a recorded one the most in a slot; ``R`` (p, p) is the covariance of
-    its noise as the filters believe it, ``root`` its Cholesky factor.
+    its noise as the filters believe it, ``root`` its Cholesky factor. ``pair`` is the first of its
+    readings in ``SlotPairs``, -1 if it reads what its filter estimates and nothing else.
     """
 
     node: int
@@ -53,6 +55,7 @@ class AssignedSensor(NamedTuple):
     rows: int
     R: FloatArray
     root: FloatArray
+    pair: int = -1
 
 
 class SlotSetup:
@@ -129,7 +132,7 @@ class SlotSetup:
 
     def _set_sensors(self, scenario: Scenario) -> None:
         pooled = self.algorithm.timing.pooled
-        self.estimators = 1 if pooled else len(scenario.nodes)
+        self.estimators, self.p = 1 if pooled else len(scenario.nodes), 1
         rows = np.zeros(self.estimators, dtype=np.int64)
         views = [np.arange(self.n)] * self.estimators if self.views is None else self.views
         # The entries of the state that each filter estimates, -1 beyond the last.
@@ -149,7 +152,11 @@ class SlotSetup:
                     AssignedSensor(node, placed_sensor, estimator, row, count, R, cholesky(R))
                 )
                 rows[estimator] += count
-        self.rows, self.p = rows, int(rows.max(initial=1))
+        self.pairs: SlotPairs | None = None
+        if self.views is not None and self.algorithm.needs.blocks:
+            self.pairs = SlotPairs(scenario, self.entries)
+            rows = self._set_pairs(self.pairs, scenario)
+        self.rows, self.p = rows, max(self.p, int(rows.max(initial=1)))
         # Python reads recorded sensors and those of users, kernels read the others; some of these
         # have regressors as H.
         self.recorded_sensors: list[AssignedSensor] = []
@@ -178,6 +185,26 @@ class SlotSetup:
         self._set_nonlinear_rows(scenario)
         self._set_kernel_sensors(scenario)
 
+    def _set_pairs(self, pairs: SlotPairs, scenario: Scenario) -> np.ndarray:
+        """Put readings of pairs behind those of own states; return how many rows these have."""
+        rows, assigned = np.zeros(self.estimators, dtype=np.int64), list[AssignedSensor]()
+        others = [pairs.others(s.estimator, s.placed_sensor) for s in self.assigned]
+        for s, other in zip(self.assigned, others, strict=True):
+            assigned.append(s._replace(row=int(rows[s.estimator])))
+            # In a record each row may be about another block.
+            if not other or scenario.sensors[s.placed_sensor.entry].record is not None:
+                rows[s.estimator] += s.rows
+        ends = rows.copy()
+        for k, (s, other) in enumerate(zip(assigned, others, strict=True)):
+            if other:
+                row = int(ends[s.estimator])
+                pair = pairs.add(s, row, other)
+                is_drawn = scenario.sensors[s.placed_sensor.entry].record is None
+                assigned[k] = s._replace(pair=pair, row=row if is_drawn else s.row)
+                ends[s.estimator] += s.rows
+        self.assigned, self.p = assigned, int(ends.max(initial=1))
+        return rows
+
     def _set_nonlinear_rows(self, scenario: Scenario) -> None:
         self.nonlinear: NonlinearSetup | None = None
         if not self.nonlinear_sensors:
@@ -194,10 +221,10 @@ class SlotSetup:
             sensor: Any = scenario.located_sensors[s.placed_sensor.entry]
             h, rows = s.estimator, len(s.R)
             for first in range(s.row, s.row + s.rows, rows):
-                for setup, places in {
-                    self.drawn: self.places,
-                    self.nonlinear: self.H[0, 0],
-                }.items():
+                tables = {self.drawn: self.places}
+                if s.pair < 0 or sensor.record is not None:
+                    tables[self.nonlinear] = self.H[0, 0]
+                for setup, places in tables.items():
                     setup.add(sensor, h, first, s.R)
                     if sensor.record is None:
                         place = setup.reference(sensor, s.node, h)
@@ -205,6 +232,7 @@ class SlotSetup:
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
         count, p, n = len(self.kernel_sensors), self.p, self.n
+        self.whitened: dict[int, FloatArray] = {}
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         regressor_index = np.full(count, -1, dtype=np.int64)
         for m, s in enumerate(self.kernel_sensors):
@@ -223,6 +251,9 @@ class SlotSetup:
                 regressor_index[m], H[m, 0, 0] = self.regressor_sensors.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = solve_lower(s.root, sensor.H)
+            if s.pair >= 0:
+                self.whitened[s.pair] = H[m, :rows]
+                continue
             own = self.seen(H[m, :rows], s.estimator)
             self.H[0, 0, s.estimator, s.row : s.row + rows] = own[..., None]
         regressors: list[Any] = [

@@ -1,0 +1,63 @@
+"""What kernels must know of the blocks of nodes to translate what one tells another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from netkf.core.places import Place
+from netkf.linalg.arrays import IntArray
+from netkf.linalg.structs import Struct
+
+Key = tuple[str, int | None]
+"""Name and owner of a block."""
+
+
+class BlockTables(Struct):
+    """Where blocks are in the states of H nodes, of w components at most.
+
+    entry : (W, w), for each directed link by receiver and component of the sender's state which
+            component of the receiver's it is, -1: none
+    first, size : (H, B) and (B,), of each block its first component in the state of each node, -1
+                  where that does not estimate it, and the number of its components
+    """
+
+    entry: IntArray
+    first: IntArray
+    size: IntArray
+
+
+def places_of(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
+    """Return the blocks of a node of n states by name and owner; one of all states without any."""
+    places = blocks or (Place("", None, 0, n),)
+    return {(place.name, place.node): place for place in places}
+
+
+def block_numbers(infos: Sequence[Any]) -> dict[Key, int]:
+    """Return a number for each block that nodes with these ``NodeInfo`` estimate."""
+    keys = [(place.name, place.node) for info in infos for place in info.blocks]
+    return {key: number for number, key in enumerate(dict.fromkeys(keys))}
+
+
+def block_tables(infos: Sequence[Any], models: Sequence[Any]) -> BlockTables:
+    """Return where the blocks of nodes with these infos and models are."""
+    widths = [len(models[0].information)]
+    widths += [sum(p.n for p in places) for info in infos for places in info.heard]
+    numbers = block_numbers(infos)
+    rows, first = [], np.full((len(infos), max(1, len(numbers))), -1)
+    size = np.zeros(first.shape[1], dtype=np.int64)
+    for h, (info, model) in enumerate(zip(infos, models, strict=True)):
+        own = places_of(info.blocks, len(model.information))
+        for place in info.blocks:
+            number = numbers[place.name, place.node]
+            first[h, number], size[number] = place.first, place.n
+        for k in range(max(len(info.senders), 1 if len(infos) == 1 else 0)):
+            row = np.full(max(widths), -1)
+            heard = info.heard[k] if k < len(info.heard) else ()
+            for key, place in places_of(heard, len(model.information)).items():
+                if key in own:
+                    row[place.entries] = np.arange(place.n) + own[key].first
+            rows.append(row)
+    return BlockTables(entry=np.array(rows).reshape(-1, max(widths)), first=first, size=size)

@@ -1,0 +1,129 @@
+"""Readings of pairs: what a node reads of its own states and of a block that it does not estimate.
+
+A message brings the reading that its sender had (``run.heard``), and with it these. What a receiver
+makes of one is a linear reading ``z = J_own x_own + J_other x_other + v`` at the estimates of both.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from netkf.algorithms.kernels.nonlinear_rows import (
+    LINEAR,
+    NonlinearRows,
+    differentiate_rows,
+    linear_rows,
+    read_rows,
+    subtract_rows,
+)
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.functions import call_function
+from netkf.linalg.structs import Struct
+
+IN_PYTHON = 5
+"""The kind of a pair whose function returns z and J (p, 1 + n) together, beside those of rows."""
+
+
+class Pairs(Struct):
+    """K readings of pairs, of at most p rows, of n numbers: the node's own states, ``own`` at most,
+    and then those of the other block.
+
+    first : (R + 1,), those of reading number r are ``first[r]`` to ``first[r + 1]`` - 1
+    row, length : (K,), the first row of each in ``run.y`` of its reading, and how many it has
+    block : (S or 1, K), number of the other block in each slot of a plan, -1: nothing is read
+    H : (S or 1, K, p, n), of those that are linear
+    rows, places : NonlinearRows of K filters, and from where they read, (K, p, n, 1)
+    slot : number of the slot in the plan
+    """
+
+    first: IntArray
+    row: IntArray
+    length: IntArray
+    block: IntArray
+    H: FloatArray
+    rows: NonlinearRows
+    places: FloatArray
+    own: int
+    slot: int
+
+
+def pairs_of(rows: NonlinearRows, own: int, first: IntArray) -> Pairs:
+    """Return pairs of nobody yet, for readings with these ``first`` ones."""
+    K, p = rows.kind.shape
+    return Pairs(
+        first=first,
+        row=np.zeros(K, dtype=np.int64),
+        length=np.zeros(K, dtype=np.int64),
+        block=np.full((1, K), -1),
+        H=np.zeros((1, K, p, len(rows.x))),
+        rows=rows,
+        places=np.zeros((K, p, len(rows.x), 1)),
+        own=own,
+        slot=0,
+    )
+
+
+@cache
+def no_pairs() -> Pairs:
+    """Return no pairs, for filters that know no blocks."""
+    return pairs_of(linear_rows(0, 1, np.zeros((0, 1), dtype=np.int64)), 0, np.zeros(1, dtype=int))
+
+
+@kernel
+def block_of_pair(pairs: Pairs, k: int) -> int:
+    """Return the number of the other block of pair ``k``, -1 if nothing is read."""
+    return int(pairs.block[min(pairs.slot, len(pairs.block) - 1), k])
+
+
+@kernel
+def linearise_pair(pairs: Pairs, run: Any, r: int, k: int, q: int) -> None:
+    """Write z, J and the covariance of the noise of pair ``k`` of reading number ``r`` in lane
+    ``q`` into ``rows.value`` (p,), ``rows.J`` (p, n) and ``rows.C`` (p, p), at the estimates
+    ``rows.x`` (n,).
+    """
+    rows, first, slot = pairs.rows, run.first_y + r, min(pairs.slot, len(pairs.H) - 1)
+    count, n, noise = pairs.length[k], len(rows.x), min(pairs.slot, len(rows.R) - 1)
+    for i in range(count):
+        rows.y[i] = rows.value[i] = run.y[first, pairs.row[k] + i, q]
+        for j in range(count):
+            rows.C[i, j] = rows.R[noise, k, i, j]
+        for j in range(n):
+            rows.J[i, j] = pairs.H[slot, k, i, j]
+    if rows.kind[k, 0] == IN_PYTHON:
+        call_function(rows.functions[k, 0, 0], rows.x, rows.y, float(k), 0.0, rows.matrix)
+        for i in range(count):
+            rows.value[i] = rows.matrix[i, 0]
+            for j in range(n):
+                rows.J[i, j] = rows.matrix[i, 1 + j]
+    elif rows.kind[k, 0] != LINEAR:
+        _linearise(pairs, rows, k, count)
+    for i in range(count):
+        # A value that is missing says nothing.
+        if math.isnan(rows.value[i]):
+            rows.value[i] = 0.0
+            for j in range(n):
+                rows.J[i, j] = 0.0
+            for j in range(count):
+                rows.C[i, j] = rows.C[j, i] = 0.0
+            rows.C[i, i] = 1.0
+
+
+@kernel
+def _linearise(pairs: Pairs, rows: NonlinearRows, k: int, count: int) -> None:
+    n, slot = len(rows.x), min(pairs.slot, len(rows.origin) - 1)
+    for j in range(n):
+        if rows.entries[k, j] >= 0:
+            rows.x[j] += rows.origin[slot, rows.entries[k, j]]
+    read_rows(rows, k, pairs.places, k, 0, rows.mean)
+    differentiate_rows(rows, k, pairs.places, k, 0)
+    subtract_rows(rows, k, rows.y, rows.mean, rows.value)
+    for j in range(n):
+        if rows.entries[k, j] >= 0:
+            rows.x[j] -= rows.origin[slot, rows.entries[k, j]]
+        for i in range(count):
+            rows.value[i] += rows.J[i, j] * rows.x[j]

@@ -1,0 +1,163 @@
+"""Readings in slots that are also about a block which their node does not estimate."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.algorithms.blocks import block_numbers
+from netkf.algorithms.kernels.pairs import Pairs, pairs_of
+from netkf.core.places import Place
+from netkf.engines.compiled.nonlinear_rows import NonlinearSetup, has_known_h
+from netkf.engines.compiled.own_sensors import is_own
+from netkf.linalg.arrays import FloatArray
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.scenario import Scenario
+
+
+class SlotPair(NamedTuple):
+    """One of at most so many readings of a slot: of filter ``h``, from ``row`` on of its reading,
+    with the noise covariance ``R`` (p, p), of a ``sensor``. The other block is ``place``; of a
+    record that of its row, which names an ``anchor``, else -1.
+    """
+
+    h: int
+    row: int
+    R: FloatArray
+    sensor: Any
+    anchor: int
+    place: Place
+
+
+class SlotPairs:
+    """The readings of pairs of a scenario, in the order of their filters."""
+
+    def __init__(self, scenario: Scenario, entries: np.ndarray) -> None:
+        """``entries`` (H, w) are those of the state that each filter estimates."""
+        self._scenario, self._entries = scenario, entries
+        self._places = scenario.layout.places
+        self.numbers = block_numbers(scenario.node_infos)
+        self.all: list[SlotPair] = []
+
+    def others(self, h: int, placed: PlacedSensor) -> dict[int, Place]:
+        """Return by anchor the blocks beside those of filter ``h`` that a sensor reads; -1 is the
+        anchor of one that names none.
+        """
+        sensor: Any = self._scenario.located_sensors[placed.entry]
+        anchors = anchors_of(sensor, self._scenario.nodes[h])
+        found = {anchor: self.other(h, sensor, anchor) for anchor in anchors}
+        return {anchor: place for anchor, place in found.items() if place is not None}
+
+    def other(self, h: int, sensor: Any, anchor: int) -> Place | None:
+        """Return the block beside those of filter ``h`` that a reading is about."""
+        n = self._scenario.plant.n
+        if sensor.linear:
+            support = np.flatnonzero(matrix_of(sensor, anchor, n).any(axis=0))
+        else:
+            support = sensor.support(n, sensor.nodes[0] if anchor < 0 else anchor)
+        outside = np.setdiff1d(support, self._entries[h])
+        return next((p for p in self._places if len(outside) and outside[0] < p.first + p.n), None)
+
+    def add(self, s: Any, row: int, others: dict[int, Place]) -> int:
+        """Add an AssignedSensor, with its first value in ``row``; return the number of its first
+        pair.
+        """
+        sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
+        p, first = len(s.R), len(self.all)
+        anchor, place = next(iter(others.items()))
+        for k in range(row, row + s.rows, p):
+            self.all.append(SlotPair(s.estimator, k, s.R, sensor, anchor, place))
+        return first
+
+    def columns(self, k: int, H: FloatArray, place: Place) -> FloatArray:
+        """Return the columns (p, n) of H (p, N) of the states of pair ``k``, with this block."""
+        own, w = self._entries[self.all[k].h], self._entries.shape[1]
+        made, count = np.zeros((len(H), self._width)), int((own >= 0).sum())
+        made[:, :count] = H[:, own[:count]]
+        made[:, w : w + place.n] = H[:, place.entries]
+        return made
+
+    @property
+    def _width(self) -> int:
+        return int(self._entries.shape[1] + max(place.n for place in self._places))
+
+    def tables(self, method: str, active: int, whitened: dict[int, FloatArray]) -> Pairs:
+        """Return the pairs as kernels take them; ``whitened`` has the H (p, N) of linear sensors
+        whose readings are drawn, with white noise, by number of the pair.
+        """
+        w, count = self._entries.shape[1], len(self.all)
+        p = max((len(pair.R) for pair in self.all), default=1)
+        entries = np.full((count, self._width), -1)
+        for k, pair in enumerate(self.all):
+            entries[k, :w] = self._entries[pair.h]
+            entries[k, w : w + pair.place.n] = np.arange(pair.place.n) + pair.place.first
+        setup = NonlinearSetup(count, p, entries)
+        for k, pair in enumerate(self.all):
+            if not pair.sensor.linear:
+                setup.add(pair.sensor, k, 0, pair.R)
+        first = np.searchsorted([pair.h for pair in self.all], np.arange(len(self._entries) + 1))
+        pairs = pairs_of(setup.tables(method, active), w, first.astype(np.int64))
+        for k, pair in enumerate(self.all):
+            pairs.row[k], pairs.length[k] = pair.row, len(pair.R)
+            if pair.sensor.record is None:
+                pairs.block[0, k] = self.number(pair.place)
+            if not pair.sensor.linear:
+                node = pair.sensor.nodes[0] if pair.anchor < 0 else pair.anchor
+                pairs.places[k, :, :, 0] = setup.reference(pair.sensor, node, k)
+            elif k in whitened:
+                pairs.H[0, k, : len(pair.R)] = self.columns(k, whitened[k], pair.place)
+                pairs.rows.R[0, k] = np.eye(p)
+        self.setup = setup
+        return pairs
+
+    def number(self, place: Place) -> int:
+        """Return the number of a block, -1 if no node estimates it."""
+        return self.numbers.get((place.name, place.node), -1)
+
+
+def anchors_of(sensor: Any, node: int) -> tuple[int, ...]:
+    """Return the anchors of all readings of a sensor of ``node`` (id), -1 for the node itself."""
+    if sensor.record is None:
+        return (-1,)
+    return tuple(dict.fromkeys(sensor.record.rows(node).anchors.tolist()))
+
+
+def matrix_of(sensor: Any, anchor: int, n: int) -> FloatArray:
+    """Return H (p, n) of a linear sensor, at an ``anchor`` where it has one for each."""
+    matrices = getattr(sensor, "_pairs", {})
+    return np.asarray(matrices[anchor] if anchor in matrices else sensor.matrix_of(n))
+
+
+def blocks_refusal(scenario: Scenario) -> str | None:
+    """Return what the compiled engine cannot read where nodes estimate different states."""
+    if not scenario.slotted:
+        return "nodes of different states under clocks"
+    if any(hasattr(sensor, "C") for sensor in scenario.sensors):
+        return "nodes of different states with regressors"
+    for node, view in zip(scenario.nodes, scenario.views or (), strict=True):
+        for placed in scenario.placed_sensors.get(node, ()):
+            if _mixes(scenario, placed, node, view):
+                key = f"sensors[{scenario.sensor_entries[placed.entry]}]"
+                return f"{key}, which reads blocks of node {node} and of others in a way of its own"
+    return None
+
+
+def _mixes(scenario: Scenario, placed: PlacedSensor, node: int, view: np.ndarray) -> bool:
+    """Return True if a sensor that reads blocks beside those of a ``view`` does more than read one
+    of them at a time, with all of its values.
+    """
+    sensor: Any = scenario.located_sensors[placed.entry]
+    if np.isin(scenario.support(placed), view).all():
+        return False
+    if not sensor.linear:
+        moved = scenario.input_responses is not None
+        return sensor.record is not None and (moved or not has_known_h(sensor))
+    ends = np.cumsum([place.n for place in scenario.layout.places])
+    for anchor in anchors_of(sensor, node):
+        rows = matrix_of(sensor, anchor, scenario.plant.n)
+        outside = [np.setdiff1d(np.flatnonzero(row), view) for row in rows]
+        blocks = [np.unique(np.searchsorted(ends, entries, side="right")) for entries in outside]
+        if any(len(one) > 1 or not np.array_equal(one, blocks[0]) for one in blocks):
+            return True
+    return is_own(sensor)
