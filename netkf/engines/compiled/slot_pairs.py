@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,33 +83,38 @@ class SlotPairs:
     def _width(self) -> int:
         return int(self._entries.shape[1] + max(place.n for place in self._places))
 
-    def tables(self, method: str, active: int, whitened: dict[int, FloatArray]) -> Pairs:
-        """Return the pairs as kernels take them; ``whitened`` has the H (p, N) of linear sensors
-        whose readings are drawn, with white noise, by number of the pair.
-        """
+    @cached_property
+    def nonlinear(self) -> NonlinearSetup:
+        """What kernels know of those that are not linear."""
         w, count = self._entries.shape[1], len(self.all)
-        p = max((len(pair.R) for pair in self.all), default=1)
         entries = np.full((count, self._width), -1)
         for k, pair in enumerate(self.all):
             entries[k, :w] = self._entries[pair.h]
             entries[k, w : w + pair.place.n] = np.arange(pair.place.n) + pair.place.first
+        p = max((len(pair.R) for pair in self.all), default=1)
         setup = NonlinearSetup(count, p, entries)
         for k, pair in enumerate(self.all):
             if not pair.sensor.linear:
                 setup.add(pair.sensor, k, 0, pair.R)
+        return setup
+
+    def tables(self, method: str, active: int, whitened: dict[int, FloatArray]) -> Pairs:
+        """Return the pairs as kernels take them; ``whitened`` has the H (p, N) of linear sensors
+        whose readings are drawn, with white noise, by number of the pair.
+        """
         first = np.searchsorted([pair.h for pair in self.all], np.arange(len(self._entries) + 1))
-        pairs = pairs_of(setup.tables(method, active), w, first.astype(np.int64))
+        rows = self.nonlinear.tables(method, active)
+        pairs = pairs_of(rows, self._entries.shape[1], first.astype(np.int64))
         for k, pair in enumerate(self.all):
             pairs.row[k], pairs.length[k] = pair.row, len(pair.R)
             if pair.sensor.record is None:
                 pairs.block[0, k] = self.number(pair.place)
             if not pair.sensor.linear:
                 node = pair.sensor.nodes[0] if pair.anchor < 0 else pair.anchor
-                pairs.places[k, :, :, 0] = setup.reference(pair.sensor, node, k)
+                pairs.places[k, :, :, 0] = self.nonlinear.reference(pair.sensor, node, k)
             elif k in whitened:
                 pairs.H[0, k, : len(pair.R)] = self.columns(k, whitened[k], pair.place)
-                pairs.rows.R[0, k] = np.eye(p)
-        self.setup = setup
+                pairs.rows.R[0, k] = np.eye(rows.kind.shape[1])
         return pairs
 
     def number(self, place: Place) -> int:

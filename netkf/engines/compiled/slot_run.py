@@ -286,6 +286,8 @@ class SlotRuns:
         if len(messages.sent):
             # Only now, since the kernel decides for all nodes that are asked, readings or not.
             messages.sent[:, unread] = 0
+        if self.setup.pairs is not None:
+            self.setup.pairs.nonlinear.raise_error()
         self._slot += count
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
@@ -530,6 +532,8 @@ class SlotRuns:
                 slots_of_all = np.arange(self._slot, self._slot + count)
                 origin = responses.believed.states(slots_of_all)
                 self._nonlinear.origin = self._drawn.origin = origin
+                if self._pairs is not None:
+                    self._pairs.rows.origin = origin
             flat_y = y.reshape(-1, *y.shape[3:])
             add_values(self._drawn, x, flat_y, setup.places, setup.drawn.drawn)
             setup.nonlinear.raise_error()

@@ -1,0 +1,114 @@
+"""Nodes that estimate different parts of the state: the compiled engine makes what SimPy makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import netkf
+from tests.algorithms.test_block_intersection import ROBOTS, load
+from tests.engines.agreement import assert_agree
+
+POSES = """
+format = 1
+name = "blocks of different size"
+horizon = 9.0
+probe = 1.0
+seed = 5
+[[plants]]
+name = "pose"
+nodes = [1, 2]
+F = [[0.9, 0.1], [0.0, 0.8]]
+Q = [[0.2, 0.0], [0.0, 0.1]]
+period = 1.0
+cov = [[1.0, 0.2], [0.2, 0.5]]
+input = { kind = "sine", G = [[1.0], [0.5]], amplitude = 1.0, frequency = 0.1 }
+schedule = [{ from = 4.0, F = [[0.7, 0.0], [0.2, 0.9]] }]
+[[plants]]
+name = "pose"
+nodes = [3]
+F = [[0.95, 0.0, 0.1], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]]
+Q = [[0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.1]]
+period = 1.0
+cov = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+mean = [4.0, 1.0, 0.0]
+[[sensors]]
+of = "pose"
+nodes = [1, 2]
+H = [[1.0, 0.0], [0.0, 1.0]]
+R = [[0.1, 0.02], [0.02, 0.3]]
+[[sensors]]
+of = "pose"
+nodes = [3]
+H = [[1.0, 0.0, 1.0]]
+R = [[0.1]]
+[network]
+graph = { kind = "edges", edges = [[1, 2], [2, 3]] }
+activation = { kind = "broadcast" }
+channel = { loss = { kind = "bernoulli", delivery = 0.7 } }
+[filter]
+kind = "local"
+estimates = "own"
+"""
+RANGES = """
+[[sensors]]
+kind = "range"
+of = "pose"
+nodes = [2]
+positions = [[3.0, 1.0]]
+R = [[0.1]]
+"""
+SIGHTS = """
+[[sensors]]
+kind = "relative-range-bearing"
+of = "pose"
+R = [[0.1, 0.0], [0.0, 0.05]]
+[[sensors]]
+kind = "relative"
+path = "seen.csv"
+R = [[0.2, 0.0], [0.0, 0.1]]
+nodes = [1, 2]
+"""
+SEEN = "t,node,to,y0,y1\n1,1,2,0.3,0.2\n2,1,2,0.1,\n2,1,2,,0.4\n3,2,1,-0.3,0.1\n5,1,2,0.5,0.5\n"
+
+
+def poses(folder: Path, more: str, **changes: object) -> netkf.Scenario:
+    (folder / "seen.csv").write_text(SEEN)
+    return load(POSES.replace("[network]", more + "[network]"), folder, **changes)
+
+
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours", ["pose"]])
+@pytest.mark.parametrize("more", ["", RANGES])
+def test_local_filters_of_own_states(tmp_path: Path, estimates: object, more: str) -> None:
+    run = assert_agree(poses(tmp_path, more, filter__estimates=estimates))
+    assert np.isnan(run.xhat).any()
+
+
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours", "all"])
+@pytest.mark.parametrize("rule", ["split", "ci", "naive"])
+def test_block_intersection(tmp_path: Path, rule: str, estimates: object) -> None:
+    assert_agree(load(ROBOTS, tmp_path, filter__rule=rule, filter__estimates=estimates))
+
+
+@pytest.mark.parametrize("linearise", ["ekf", "ukf"])
+@pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
+def test_readings_of_pairs(tmp_path: Path, estimates: str, linearise: str) -> None:
+    changes = {"filter__kind": "block-intersection", "filter__linearise": linearise}
+    assert_agree(poses(tmp_path, RANGES + SIGHTS, filter__estimates=estimates, **changes))
+
+
+def test_unicycles() -> None:
+    scenario = netkf.load("scenarios/blocks/cooperative_localisation.toml", {"horizon": 6.0})
+    assert_agree(scenario)
+
+
+@pytest.mark.parametrize("kind", ["local", "central"])
+def test_many_runs_together(tmp_path: Path, kind: str) -> None:
+    scenario = poses(tmp_path, "", filter={"kind": kind, "estimates": "own"})
+    fast, slow = (
+        netkf.monte_carlo(scenario, 3, workers=1, engine=name) for name in ("compiled", "simpy")
+    )
+    for name in ("mean_P", "mean_nees"):
+        np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=1e-10)
