@@ -35,12 +35,10 @@ def record_samples(
     if scenario.views is None:
         sound_filters = sound_mask(xhat, P, error=known, of_roots=True)
     else:
-        parts = [
-            (xhat[:, k, : len(view)], P[:, k, : len(view), : len(view)], error[:, k, : len(view)])
-            for k, view in enumerate(scenario.views)
-        ]
-        # Blocks are drawn, hence known.
-        masks = [sound_mask(x, P, error=e, of_roots=True) for x, P, e in parts]
+        masks = []
+        for k, n in enumerate(map(len, scenario.views)):
+            own = None if known is None else known[:, k, :n]
+            masks.append(sound_mask(xhat[:, k, :n], P[:, k, :n, :n], error=own, of_roots=True))
         sound_filters = np.stack(masks, axis=1)
     sound = sound_filters.all(axis=1)
     # The trace shows a row for each node, though all of them share a pooled filter.

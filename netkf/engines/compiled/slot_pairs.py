@@ -136,34 +136,37 @@ def matrix_of(sensor: Any, anchor: int, n: int) -> FloatArray:
 
 
 def blocks_refusal(scenario: Scenario) -> str | None:
-    """Return what the compiled engine cannot read where nodes estimate different states."""
+    """Return what the compiled engine cannot do where nodes estimate different states."""
     if not scenario.slotted:
         return "nodes of different states under clocks"
+    if scenario.common_entries:
+        return "filters whose messages other nodes must translate"
     if any(hasattr(sensor, "C") for sensor in scenario.sensors):
         return "nodes of different states with regressors"
     for node, view in zip(scenario.nodes, scenario.views or (), strict=True):
         for placed in scenario.placed_sensors.get(node, ()):
-            if _mixes(scenario, placed, node, view):
+            if _reads_in_its_own_way(scenario, placed, node, view):
                 key = f"sensors[{scenario.sensor_entries[placed.entry]}]"
-                return f"{key}, which reads blocks of node {node} and of others in a way of its own"
+                return f"{key}, which reads other blocks than those of node {node} in its own way"
     return None
 
 
-def _mixes(scenario: Scenario, placed: PlacedSensor, node: int, view: np.ndarray) -> bool:
-    """Return True if a sensor that reads blocks beside those of a ``view`` does more than read one
-    of them at a time, with all of its values.
-    """
+def _reads_in_its_own_way(
+    scenario: Scenario, placed: PlacedSensor, node: int, view: np.ndarray
+) -> bool:
+    """Return True if a sensor is not only of a ``view``, nor with all values of one block more."""
     sensor: Any = scenario.located_sensors[placed.entry]
-    if np.isin(scenario.support(placed), view).all():
+    if np.isin(scenario.support(placed), view).all() or scenario.node_filter.timing.pooled:
         return False
     if not sensor.linear:
         moved = scenario.input_responses is not None
         return sensor.record is not None and (moved or not has_known_h(sensor))
-    ends = np.cumsum([place.n for place in scenario.layout.places])
+    outside, places = np.ones(scenario.plant.n, dtype=bool), scenario.layout.places
+    outside[view] = False
+    block = np.repeat(np.arange(len(places)), [place.n for place in places])
     for anchor in anchors_of(sensor, node):
-        rows = matrix_of(sensor, anchor, scenario.plant.n)
-        outside = [np.setdiff1d(np.flatnonzero(row), view) for row in rows]
-        blocks = [np.unique(np.searchsorted(ends, entries, side="right")) for entries in outside]
-        if any(len(one) > 1 or not np.array_equal(one, blocks[0]) for one in blocks):
+        H = matrix_of(sensor, anchor, scenario.plant.n)
+        read = [frozenset(block[outside & (row != 0.0)].tolist()) for row in H]
+        if len(set(read)) > 1:
             return True
     return is_own(sensor)

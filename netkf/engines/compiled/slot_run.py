@@ -247,7 +247,9 @@ class SlotRuns:
         self._simulate(times, messages, (y, H, rebased), kernel_samples)
         if not drawn and responses is not None and responses.believed is not None:
             # Recorded states may be unknown, where coordinates begin is not.
-            samples.xhat[:, times.sample[sampled]] += responses.believed.states(slots)[:, None]
+            # Beyond the last state of a filter there is nan.
+            moved = responses.believed.states(slots)[:, self.setup.entries]
+            samples.xhat[:, times.sample[sampled]] += moved
         return SlotBlock(sampled, samples, times, messages)
 
     def _simulate(
