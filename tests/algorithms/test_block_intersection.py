@@ -298,8 +298,6 @@ def test_theory_and_checks_say_that_nothing_is_promised(tmp_path: Path) -> None:
             function(scenario)
     with pytest.raises(netkf.TheoryError, match="some blocks of the state"):
         netkf.theory.error_covariance(scenario, run)
-    with pytest.raises(netkf.EngineError, match="different states under clocks"):
-        netkf.simulate(load(CLOCKED, tmp_path), engine="compiled")
 
 
 PLANAR = """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import netkf
-from tests.algorithms.test_block_intersection import ROBOTS, load
+from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
 from tests.engines.agreement import assert_agree
 
 POSES = """
@@ -79,17 +79,44 @@ def poses(folder: Path, more: str, **changes: object) -> netkf.Scenario:
     return load(POSES.replace("[network]", more + "[network]"), folder, **changes)
 
 
+def clocked(text: str) -> str:
+    """The same blocks in continuous time: one node reads increments, the others samples."""
+    text = text.replace("F = [[0.9, 0.1], [0.0, 0.8]]\nQ =", "A = [[-0.1, 0.1], [0.0, -0.2]]\nB =")
+    text = text.replace("F = [[0.95, 0.0, 0.1], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]]\nQ =", FLOW)
+    text = text.replace("F = [[0.7, 0.0], [0.2, 0.9]]", "A = [[-0.3, 0.0], [0.2, -0.1]]")
+    text = text.replace("\nperiod = 1.0", "").replace('"broadcast"', '"nodes", rate = 2.0')
+    return text.replace("0.3]]\n[[sen", "0.3]]\nsampling = { kind = 'poisson', rate = 2.0 }\n[[sen")
+
+
+FLOW = "A = [[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, -0.1]]\nB ="
+
+
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours", ["pose"]])
-@pytest.mark.parametrize("more", ["", RANGES])
+@pytest.mark.parametrize("more", ["", RANGES, "clocks"])
 def test_local_filters_of_own_states(tmp_path: Path, estimates: object, more: str) -> None:
-    run = assert_agree(poses(tmp_path, more, filter__estimates=estimates))
+    scenario = poses(tmp_path, "", filter__estimates=estimates)
+    if more == "clocks":
+        scenario = load(clocked(POSES), tmp_path, filter__estimates=estimates)
+    elif more:
+        scenario = poses(tmp_path, more, filter__estimates=estimates)
+    run = assert_agree(scenario)
     assert np.isnan(run.xhat).any()
 
 
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours", "all"])
 @pytest.mark.parametrize("rule", ["split", "ci", "naive"])
-def test_block_intersection(tmp_path: Path, rule: str, estimates: object) -> None:
-    assert_agree(load(ROBOTS, tmp_path, filter__rule=rule, filter__estimates=estimates))
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
+def test_block_intersection(tmp_path: Path, text: str, rule: str, estimates: object) -> None:
+    assert_agree(load(text, tmp_path, filter__rule=rule, filter__estimates=estimates))
+
+
+def test_recorded_pairs_under_clocks(tmp_path: Path) -> None:
+    (tmp_path / "seen.csv").write_text(
+        "t,node,to,y0\n0.5,1,2,0.3\n1.25,1,3,0.1\n1.25,1,2,0.2\n2.0,2,1,-0.3\n2.0,3,2,\n"
+    )
+    text = CLOCKED.replace('kind = "relative"', 'kind = "relative"\npath = "seen.csv"')
+    text = text.replace("sampling = { kind = 'periodic', period = 0.5 }\n", "")
+    assert_agree(load(text, tmp_path))
 
 
 @pytest.mark.parametrize("linearise", ["ekf", "ukf"])

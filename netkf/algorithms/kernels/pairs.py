@@ -34,9 +34,9 @@ class Pairs(Struct):
     and then those of the other block.
 
     first : (R + 1,), those of reading number r are ``first[r]`` to ``first[r + 1]`` - 1
-    row, length : (K,), the first row of each in ``run.y`` of its reading, and how many it has
+    row, length : (K,), the first row of each in ``run.y`` of its reading, and how many it has; of
+                  those that are linear ``run.H`` (p, n) has n columns, and rows are white
     block : (S or 1, K), number of the other block in each slot of a plan, -1: nothing is read
-    H : (S or 1, K, p, n), of those that are linear
     rows, places : NonlinearRows of K filters, and from where they read, (K, p, n, 1)
     slot : number of the slot in the plan
     """
@@ -45,7 +45,6 @@ class Pairs(Struct):
     row: IntArray
     length: IntArray
     block: IntArray
-    H: FloatArray
     rows: NonlinearRows
     places: FloatArray
     own: int
@@ -60,7 +59,6 @@ def pairs_of(rows: NonlinearRows, own: int, first: IntArray) -> Pairs:
         row=np.zeros(K, dtype=np.int64),
         length=np.zeros(K, dtype=np.int64),
         block=np.full((1, K), -1),
-        H=np.zeros((1, K, p, len(rows.x))),
         rows=rows,
         places=np.zeros((K, p, len(rows.x), 1)),
         own=own,
@@ -86,14 +84,15 @@ def linearise_pair(pairs: Pairs, run: Any, r: int, k: int, q: int) -> None:
     ``q`` into ``rows.value`` (p,), ``rows.J`` (p, n) and ``rows.C`` (p, p), at the estimates
     ``rows.x`` (n,).
     """
-    rows, first, slot = pairs.rows, run.first_y + r, min(pairs.slot, len(pairs.H) - 1)
+    rows, first, matrix = pairs.rows, run.first_y + r, run.first_H + run.matrix[r]
     count, n, noise = pairs.length[k], len(rows.x), min(pairs.slot, len(rows.R) - 1)
     for i in range(count):
-        rows.y[i] = rows.value[i] = run.y[first, pairs.row[k] + i, q]
+        row = pairs.row[k] + i
+        rows.y[i] = rows.value[i] = run.y[first, row, q]
         for j in range(count):
             rows.C[i, j] = rows.R[noise, k, i, j]
-        for j in range(n):
-            rows.J[i, j] = pairs.H[slot, k, i, j]
+        for j in range(n if rows.kind[k, 0] == LINEAR else 0):
+            rows.J[i, j] = run.H[matrix, row, j, q]
     if rows.kind[k, 0] == IN_PYTHON:
         call_function(rows.functions[k, 0, 0], rows.x, rows.y, float(k), 0.0, rows.matrix)
         for i in range(count):
@@ -106,10 +105,8 @@ def linearise_pair(pairs: Pairs, run: Any, r: int, k: int, q: int) -> None:
         # A value that is missing says nothing.
         if math.isnan(rows.value[i]):
             rows.value[i] = 0.0
-            for j in range(n):
-                rows.J[i, j] = 0.0
-            for j in range(count):
-                rows.C[i, j] = rows.C[j, i] = 0.0
+            rows.J[i, :] = 0.0
+            rows.C[i, :] = rows.C[:, i] = 0.0
             rows.C[i, i] = 1.0
 
 

@@ -282,7 +282,7 @@ def _transition_of_slot(
 @transition.register(ClockTables)
 @kernel
 def _transition_of_gap(
-    model: ClockTables, run: Any, _x: FloatArray, _k: int, out: FloatArray
+    model: ClockTables, run: Any, _x: FloatArray, k: int, out: FloatArray
 ) -> None:
     n = len(run.size)
     for c in range(n):
@@ -290,7 +290,8 @@ def _transition_of_gap(
             model.mean[0, i] = 1.0 if i == c else 0.0
             for j in range(i + 1):
                 model.mean_root[0, i, j] = 0.0
-        move(model, run, model.stride - 1, model.mean_root, model.mean, 0, run.gap)
+        m = model.models[k] - model.piece * model.stride
+        move(model, run, m, model.mean_root, model.mean, 0, run.gap)
         for i in range(n):
             out[i, c, 0] = model.mean[0, i]
 

@@ -92,6 +92,7 @@ def is_immediate(scenario: Scenario) -> bool:
         kernels is not None
         and kernels.is_convex
         and node_filter.timing.talks
+        and scenario.views is None
         and not scenario.sampled_sensors
         and not len(scenario.followed_changes)
         and ticks_apart(network.activation)

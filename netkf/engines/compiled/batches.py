@@ -159,8 +159,11 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
 
 
 def drawn_together(scenario: Scenario) -> bool:
-    """Return True if runs are drawn together: on the sensing grid, without samples or changes."""
-    return uses_grid(scenario) and not scenario.sampled_sensors and not len(scenario.plant.changes)
+    """Return True if runs are drawn together: on the sensing grid, without samples or changes, for
+    filters of one state.
+    """
+    alike = scenario.views is None and not len(scenario.plant.changes)
+    return uses_grid(scenario) and not scenario.sampled_sensors and alike
 
 
 @once_per_scenario

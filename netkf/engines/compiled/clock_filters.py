@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.pairs import no_pairs
+from netkf.algorithms.kernels.nonlinear_rows import linear_rows
+from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
 from netkf.algorithms.kernels.run import (
     ALL,
     ClockRun,
@@ -19,7 +20,15 @@ from netkf.algorithms.kernels.run import (
 from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
-from netkf.engines.compiled.state import Filters, Instants, Simulation, add_messages
+from netkf.engines.compiled.samples import entries_of
+from netkf.engines.compiled.slot_pairs import BlockColumns
+from netkf.engines.compiled.state import (
+    Filters,
+    Instants,
+    Simulation,
+    add_messages,
+    wide_models,
+)
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.generic import copy_arrays
 from netkf.linalg.lanes import ONE
@@ -37,10 +46,12 @@ class ClockFilters:
         messages: int,
     ) -> None:
         self.kernels, self._loop = kernels, clock_loop(kernels)
-        self._p = 1
+        self._p = self._samples = 1
+        columns = BlockColumns(scenario, entries_of(scenario))
+        self._columns = columns.width, columns.entries.shape[1]
         pooled = scenario.node_filter.timing.pooled
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
-        models = scenario.model_pieces[0]
+        models = wide_models(scenario)[0]
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
         count = len(links["sender"])
@@ -48,7 +59,8 @@ class ClockFilters:
             scenario.node_filter, starts, infos, models, links=count, messages=messages
         )
         self.record, self.start = self.records.struct, self.records.copied()
-        n, size = start.xhat.shape[1], size_of(start.xhat.shape[1], kernels.unrolled)
+        n, unrolled = start.xhat.shape[1], kernels.unrolled and scenario.views is None
+        size = size_of(n, unrolled)
         cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
         self._first_models = np.ascontiguousarray(start.nodes["model"])
         self.run = cls(
@@ -62,10 +74,9 @@ class ClockFilters:
                 np.array(scenario.followed_changes),
             ),
             **links,
-            **self._inbox(messages, n),
+            **self._inbox(messages),
             sends=np.ones(1, dtype=np.uint8),
             uniform=np.zeros(1),
-            pairs=no_pairs(),
             reading=0,
             first_y=0,
             first_H=0,
@@ -94,9 +105,9 @@ class ClockFilters:
         # Rows of the reading of each sample, then the largest sum over one instant.
         rows = np.concatenate([instants.rows, [0]])[instants.sensor]
         totals = np.concatenate([[0], np.cumsum(rows)])[instants.first]
-        p = int(np.diff(totals).max(initial=0))
-        if p > self._p:
-            self._p = p
+        p, samples = (int(np.diff(part).max(initial=1)) for part in (totals, instants.first))
+        if p > self._p or samples > self._samples:
+            self._p, self._samples = max(p, self._p), max(samples, self._samples)
             self.grow(len(self.run.message))
 
     def begin_piece(self, piece: int) -> None:
@@ -127,11 +138,19 @@ class ClockFilters:
         columns = range(len(self._conserved))
         return [math.fsum(self.record.conserved[:, k, 0].tolist()) for k in columns]
 
-    def _inbox(self, messages: int, n: int) -> dict[str, np.ndarray]:
+    def _inbox(self, messages: int) -> dict[str, Any]:
         readings = 1 + messages if self.kernels.sends_readings else 1
+        columns, own = self._columns
+        pairs = no_pairs()
+        if columns > own:
+            entries = np.full((1, columns), -1)
+            rows = linear_rows(messages * self._samples, self._p, entries)
+            rows.R[0] = np.eye(self._p)
+            pairs = pairs_of(rows, own, np.zeros(1 + readings, dtype=np.int64))
         return {
+            "pairs": pairs,
             "y": np.zeros((readings, self._p, 1)),
-            "H": np.zeros((readings, self._p, n, 1)),
+            "H": np.zeros((readings, self._p, columns, 1)),
             "rows": np.zeros(readings, dtype=np.int64),
             "matrix": np.arange(readings),
             "message": np.zeros(messages, dtype=np.int64),
@@ -164,7 +183,7 @@ class ClockFilters:
         """Make room for so many messages; those that are there stay."""
         messages = max(messages, len(self.run.message))
         self.record.payload = resized(self.record.payload, messages)
-        for name, array in self._inbox(messages, len(self.run.size)).items():
+        for name, array in self._inbox(messages).items():
             setattr(self.run, name, array)
 
     def grow_past(self) -> None:

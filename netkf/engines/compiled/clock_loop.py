@@ -52,7 +52,7 @@ from netkf.engines.compiled.events import (
 )
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.message_queue import push, release, sort_indices, take
-from netkf.engines.compiled.state import AFTER_READINGS, NODES, Simulation
+from netkf.engines.compiled.state import AFTER_READINGS, NODES, Instants, Simulation
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import copy_arrays, copy_row
 from netkf.linalg.structs import struct_at
@@ -295,6 +295,9 @@ def absorption_of(kernels: Kernels) -> Any:
             run.message_weight[count], run.age[count] = state.directions[w].weight, age
             if sends_readings:
                 run.heard[count] = -1
+                if len(run.pairs.row) > 0:
+                    # Where the pairs of a message end begin those of the next one.
+                    run.pairs.first[count + 2] = run.pairs.first[count + 1]
                 if message.tag >= 0:
                     whiten_instant(state, run, count + 1, message.tag)
                     run.heard[count] = count + 1
@@ -331,22 +334,43 @@ def whiten_instant(state: Simulation, run: ClockRun, r: int, instant: int) -> No
     """Write all samples of an ``instant`` (index in ``state.instants``) as reading ``r`` of the
     run, multiplied by the inverse of the root of R, so that the noise of each row has variance 1.
     """
-    instants, row, n = state.instants, 0, len(run.size)
+    instants, pairs, row, last = state.instants, run.pairs, 0, 0
     for s in range(instants.first[instant], instants.first[instant + 1]):
-        sensor, matrix = instants.sensor[s], instants.matrix[s]
-        for i in range(instants.rows[sensor]):
-            scale = 1.0 / instants.root[sensor, i, i]
-            y = instants.y[s, i]
-            for k in range(i):
-                y -= instants.root[sensor, i, k] * run.y[r, row + k, 0]
-            run.y[r, row + i, 0] = y * scale
-            for j in range(n):
-                entry = instants.H[matrix, i, j]
-                for k in range(i):
-                    entry -= instants.root[sensor, i, k] * run.H[r, row + k, j, 0]
-                run.H[r, row + i, j, 0] = entry * scale
-        row += instants.rows[sensor]
+        if instants.block[s] == -1:
+            whiten_sample(instants, run, r, s, row, len(run.size))
+            row += instants.rows[instants.sensor[s]]
     run.rows[r] = row
+    # Behind them readings of pairs, in the messages that bring them.
+    if r == OWN or len(pairs.row) == 0:
+        return
+    # Readings of an inbox are written in order.
+    last = pairs.first[r]
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        if instants.block[s] >= 0:
+            whiten_sample(instants, run, r, s, row, instants.H.shape[2])
+            rows = instants.rows[instants.sensor[s]]
+            pairs.block[0, last], pairs.row[last], pairs.length[last] = instants.block[s], row, rows
+            row, last = row + rows, last + 1
+    pairs.first[r + 1] = last
+
+
+@kernel(inlined=True)
+def whiten_sample(
+    instants: Instants, run: ClockRun, r: int, s: int, row: int, columns: int
+) -> None:
+    """Write sample ``s``, whitened, as the rows of reading ``r`` from ``row`` on."""
+    sensor, matrix = instants.sensor[s], instants.matrix[s]
+    for i in range(instants.rows[sensor]):
+        scale = 1.0 / instants.root[sensor, i, i]
+        y = instants.y[s, i]
+        for k in range(i):
+            y -= instants.root[sensor, i, k] * run.y[r, row + k, 0]
+        run.y[r, row + i, 0] = y * scale
+        for j in range(columns):
+            entry = instants.H[matrix, i, j]
+            for k in range(i):
+                entry -= instants.root[sensor, i, k] * run.H[r, row + k, j, 0]
+            run.H[r, row + i, j, 0] = entry * scale
 
 
 @kernel

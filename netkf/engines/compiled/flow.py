@@ -30,7 +30,7 @@ from netkf.engines.compiled.events import (
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
 from netkf.engines.compiled.sample_tables import samples_of
-from netkf.engines.compiled.samples import record_samples
+from netkf.engines.compiled.samples import by_node, entries_of, record_samples
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import (
     CLOCKS,
@@ -151,7 +151,7 @@ class Workspace:
         self._scratch: tuple[Scratch, FlowScratch] | None = None
         kernels = compiled_kernels(scenario.node_filter, clocked=True)
         assert kernels is not None
-        self._unrolled = kernels.unrolled
+        self._unrolled = kernels.unrolled and scenario.views is None
         self.clocked: ClockFilters | None = None
         if not is_immediate(scenario):
             self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)
@@ -185,7 +185,9 @@ class Workspace:
         pool["next"] = np.arange(1, len(pool) + 1)
         path = draws.path(together)
         if self._scratch is None:
-            self._scratch = scratch_arrays(start.table, start.gains, self._unrolled)
+            self._scratch = scratch_arrays(
+                start.table, start.gains, self._unrolled, self._scenario.plant.n
+            )
         scratch, flow_arrays = self._scratch
         nodes, n = start.xhat.shape
         if self.clocked is not None:
@@ -195,6 +197,7 @@ class Workspace:
             xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
             xhat[:] = np.tile(start.xhat, (together, 1))
             root[:] = np.tile(start.root, (together, 1, 1))
+        n = self._scenario.plant.n
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
             nodes=start.nodes.copy(),
@@ -280,6 +283,7 @@ class FlowRun:
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
         self._visits = workspace.visits() if is_immediate(scenario) else None
         self._clocked = workspace.clocked
+        self._entries = np.maximum(entries_of(scenario), 0)
 
     def to_the_end(self) -> str:
         """Simulate and record up to the horizon, or to an estimate that is not finite; return the
@@ -386,9 +390,11 @@ class FlowRun:
         # Copies: the loop writes the next samples into the same space.
         xhat, P = buffer.xhat[0, :count].copy(), buffer.P[0, :count].copy()
         # Relative to the moving origin: a difference of large absolute states would lose digits.
-        error = local[:, None] - xhat
+        entries = self._entries
+        error = local[:, entries] - xhat
         if local is not x:
-            xhat += self._scenario.origins(times, local, x)[:, None]
+            xhat += self._scenario.origins(times, local, x)[:, entries]
+        xhat, P, error = by_node(self._scenario, xhat, P, error)
         samples = StateSamples(times, x, xhat, P, error)
         run = self._scenario, self._recorder, self._progress
         finite = record_samples(*run, samples, pass_rows_on)

@@ -13,7 +13,9 @@ import numpy as np
 
 from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
-from netkf.engines.compiled.state import Instants
+from netkf.engines.compiled.samples import entries_of
+from netkf.engines.compiled.slot_pairs import BlockColumns
+from netkf.engines.compiled.state import NOBODY, Instants
 from netkf.engines.compiled.ticks import clocks_of, draw_instants, is_kernel_clock
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -32,13 +34,14 @@ from netkf.scenario.scenario import Scenario
 
 class SampledSensor(NamedTuple):
     """One sensor: the ``times`` (K,) in seconds of its ``samples``, their ``indices`` (K,) among
-    all samples of the run, and whether each has an H of its own.
+    all samples of the run, whether each has an H of its own, and the index of its filter.
     """
 
     times: FloatArray
     samples: sampling.Samples
     indices: np.ndarray
     varying: bool
+    filter: int
 
 
 class Samples(Protocol):
@@ -204,11 +207,17 @@ class SampleTables:
                 scenario.sample_path(streams, node, placed_sensor),
                 indices,
                 bool(varies),
+                int(h),
             )
-            for (node, placed_sensor), indices, varies in zip(
-                placed, parts, _sensor_tables(scenario).varying, strict=True
+            for (node, placed_sensor), indices, varies, h in zip(
+                placed,
+                parts,
+                _sensor_tables(scenario).varying,
+                _sensor_tables(scenario).filter,
+                strict=True,
             )
         ]
+        self._columns = None if scenario.views is None else _sensor_tables(scenario).columns
         self.instants = _make_instants(scenario, t[order], sensor[order])
         for (_, placed_sensor), sampled in zip(placed, self._sensors, strict=True):
             if sampled.varying and hasattr(sampled.samples, "covariance"):
@@ -230,7 +239,25 @@ class SampleTables:
             indices, p = sensor.indices[first:last], y.shape[1]
             instants.y[indices, :p] = y
             if sensor.varying:
-                instants.H[instants.matrix[indices], :p] = H
+                if self._columns is None:
+                    instants.H[instants.matrix[indices], :p] = H
+                else:
+                    self._set_matrices(self._columns, sensor, indices, H)
+
+    def _set_matrices(
+        self, columns: BlockColumns, sensor: SampledSensor, indices: np.ndarray, H: FloatArray
+    ) -> None:
+        """Write the H (K, p, N) of samples, and of which block beside their filter's they are."""
+        instants, p = self.instants, H.shape[1]
+        for k, matrix in zip(indices.tolist(), H, strict=True):
+            place = columns.other(sensor.filter, np.flatnonzero(matrix.any(axis=0)))
+            instants.H[instants.matrix[k], :p] = columns.of(sensor.filter, matrix, place)
+            instants.block[k] = _block_of(columns, place)
+
+
+def _block_of(columns: BlockColumns, place: Any) -> int:
+    number = columns.number(place)
+    return number if place is None or number >= 0 else NOBODY
 
 
 def _add_noises(instants: Instants, samples: Any, indices: np.ndarray, R: FloatArray) -> None:
@@ -256,7 +283,8 @@ def no_instants(scenario: Scenario) -> Instants:
 class SensorTables(NamedTuple):
     """What a scenario says of its S sampling sensors, of up to p rows: ``node`` (id) and ``filter``
     (index) of each (S,), ``rows`` (S,), whether its H varies, the Cholesky factor ``root``
-    (S, p, p) of the R that filters believe, and H (S, p, n).
+    (S, p, p) of the R that filters believe, and H (S, p, n); ``columns`` are those of filters, and
+    ``own`` and ``block`` H in them (S, p, w) and ``Instants.block`` (S,).
     """
 
     node: np.ndarray
@@ -265,6 +293,9 @@ class SensorTables(NamedTuple):
     varying: np.ndarray
     root: FloatArray
     H: FloatArray
+    columns: BlockColumns
+    own: FloatArray
+    block: np.ndarray
 
 
 @once_per_scenario
@@ -288,13 +319,23 @@ def _sensor_tables(scenario: Scenario) -> SensorTables:
     root, H = np.zeros((len(parts), max_rows, max_rows)), np.zeros((len(parts), max_rows, n))
     for k, (part, R) in enumerate(parts):
         root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.matrix_of(n)
+    filters = [0 if pooled else index[node] for node, _ in placed]
+    columns = BlockColumns(scenario, entries_of(scenario))
+    places = [
+        columns.other(h, np.flatnonzero(matrix.any(axis=0)))
+        for h, matrix in zip(filters, H, strict=True)
+    ]
+    own = [columns.of(*parts) for parts in zip(filters, H, places, strict=True)]
     return SensorTables(
         node=np.array([node for node, _ in placed], dtype=np.int64),
-        filter=np.array([0 if pooled else index[node] for node, _ in placed], dtype=np.int64),
+        filter=np.array(filters, dtype=np.int64),
         rows=rows,
         varying=np.array([part.varying or is_own(part) for part, _ in parts], dtype=bool),
         root=root,
         H=H,
+        columns=columns,
+        own=np.reshape(own, (len(parts), max_rows, columns.width)),
+        block=np.array([_block_of(columns, place) for place in places], dtype=np.int64),
     )
 
 
@@ -304,7 +345,7 @@ def _make_instants(scenario: Scenario, t: FloatArray, sensor: np.ndarray) -> Ins
     # Sensors whose H varies get a matrix for each sample, behind the fixed ones.
     varying, count = tables.varying[sensor], len(tables.rows)
     own = int(varying.sum())
-    matrix, H = sensor.copy(), tables.H
+    matrix, H = sensor.copy(), tables.own
     if own:
         matrix[varying] = count + np.arange(own)
         H = np.concatenate([H, np.zeros((own, *H.shape[1:]))])
@@ -321,6 +362,7 @@ def _make_instants(scenario: Scenario, t: FloatArray, sensor: np.ndarray) -> Ins
         y=np.zeros((len(t), tables.H.shape[1])),
         sensor=sensor,
         matrix=matrix,
+        block=tables.block[sensor],
         rows=tables.rows,
         root=tables.root,
         H=H,

@@ -8,12 +8,42 @@ import numpy as np
 
 from netkf.engines.base import Progress
 from netkf.engines.soundness import sound_mask
+from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.run import StateSamples
 from netkf.trace.schema import CODES
 
 DIVERGED = CODES["diverged"]
+
+
+def entries_of(scenario: Scenario) -> np.ndarray:
+    """Return the entries (F, w) of the state that each filter estimates, -1 beyond the last."""
+    pooled, count = scenario.node_filter.timing.pooled, len(scenario.nodes)
+    if scenario.views is None or pooled:
+        return np.tile(np.arange(scenario.plant.n), (1 if pooled else count, 1))
+    entries = np.full((count, scenario.width), -1)
+    for h, view in enumerate(scenario.views):
+        entries[h, : len(view)] = view
+    return entries
+
+
+def by_node(
+    scenario: Scenario, xhat: FloatArray, P: FloatArray, error: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return samples (..., F, w) and (..., F, w, w) of filters as those of nodes, which are nan
+    beyond the states that a node estimates; one for all nodes estimates all states.
+    """
+    if scenario.views is None:
+        return xhat, P, error
+    shape = *xhat.shape[:-2], len(scenario.nodes), scenario.width
+    made = [np.full(s, np.nan) for s in (shape, (*shape, scenario.width), shape)]
+    for k, view in enumerate(scenario.views):
+        n, pooled = len(view), scenario.node_filter.timing.pooled
+        h, own = (0, view) if pooled else (k, np.arange(n))
+        made[0][..., k, :n], made[2][..., k, :n] = xhat[..., h, own], error[..., h, own]
+        made[1][..., k, :n, :n] = P[..., h, own[:, None], own]
+    return made[0], made[1], made[2]
 
 
 def record_samples(

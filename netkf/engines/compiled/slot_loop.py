@@ -6,7 +6,6 @@ call; what is drawn for them is in a :class:`SlotPlan`.
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -90,8 +89,7 @@ class SlotSamples(NamedTuple):
     total : (B, L), sum of all samples of xhat and P so far: finite if all of them are
     sampled_xhat, sampled_error, sampled_P : (>= H w, L), (>= H w, L) and (>= H w w, L), a sample
     runs : (L,), the run of each lane, -1 if it is idle
-    entries : (H, w), the entries of the state that each filter estimates, -1 beyond, where samples
-              are nan
+    entries : (H, w), the entries of the state that each filter estimates, and any beyond
     """
 
     x: FloatArray
@@ -278,9 +276,6 @@ def store_sample(
     for h in range(len(xhat)):
         for i in range(n):
             entry = samples.entries[h, i]
-            if entry < 0:
-                clear_sample(samples, lanes, h, i, n)
-                continue
             x = load(lanes, xhat, h, i)
             # Relative to the moving origin: a difference of large absolute states loses digits.
             local = load(lanes, samples.local, b, s, entry)
@@ -307,17 +302,6 @@ def store_sample(
     scatter_sample(lanes, samples.sampled_xhat, samples.xhat[:, k], samples.runs)
     scatter_sample(lanes, samples.sampled_error, samples.error[:, k], samples.runs)
     scatter_sample(lanes, samples.sampled_P, samples.P[:, k], samples.runs)
-
-
-@kernel
-def clear_sample(samples: SlotSamples, lanes: Lanes, h: int, i: int, n: int) -> None:
-    """Write nan as component ``i`` of ``n`` of a sample of filter ``h``, which has fewer."""
-    nothing = spread(lanes, math.nan)
-    store(lanes, samples.sampled_error, h * n + i, nothing)
-    store(lanes, samples.sampled_xhat, h * n + i, nothing)
-    for j in range(i + 1):
-        store(lanes, samples.sampled_P, (h * n + i) * n + j, nothing)
-        store(lanes, samples.sampled_P, (h * n + j) * n + i, nothing)
 
 
 @kernel

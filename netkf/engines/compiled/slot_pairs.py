@@ -17,6 +17,35 @@ from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
 
+class BlockColumns:
+    """The columns of a reading in the states of its filter and one block more."""
+
+    def __init__(self, scenario: Scenario, entries: np.ndarray) -> None:
+        """``entries`` (H, w) are those of the state that each filter estimates, -1 beyond."""
+        self.entries, self.places = entries, scenario.layout.places
+        self.numbers = block_numbers(scenario.node_infos)
+        needs = scenario.node_filter.needs.blocks and scenario.views is not None
+        self.width = entries.shape[1] + (max(p.n for p in self.places) if needs else 0)
+
+    def other(self, h: int, support: np.ndarray) -> Place | None:
+        """Return the block of the ``support`` (k,) of a reading that filter ``h`` has not."""
+        outside = np.setdiff1d(support, self.entries[h])
+        return next((p for p in self.places if len(outside) and outside[0] < p.first + p.n), None)
+
+    def of(self, h: int, H: FloatArray, place: Place | None = None) -> FloatArray:
+        """Return the columns (..., n) of H (..., N) of filter ``h``, and of a block behind them."""
+        w, own = self.entries.shape[1], self.entries[h][self.entries[h] >= 0]
+        made = np.zeros((*H.shape[:-1], self.width))
+        made[..., : len(own)] = H[..., own]
+        if place is not None:
+            made[..., w : w + place.n] = H[..., place.entries]
+        return made
+
+    def number(self, place: Place | None) -> int:
+        """Return the number of a block, -1 if no node estimates it."""
+        return -1 if place is None else self.numbers.get((place.name, place.node), -1)
+
+
 class SlotPair(NamedTuple):
     """One of at most so many readings of a slot: of filter ``h``, from ``row`` on of its reading,
     with the noise covariance ``R`` (p, p), of a ``sensor``. The other block is ``place``; of a
@@ -34,20 +63,15 @@ class SlotPair(NamedTuple):
 class SlotPairs:
     """The readings of pairs of a scenario, in the order of their filters."""
 
-    def __init__(self, scenario: Scenario, entries: np.ndarray) -> None:
-        """``entries`` (H, w) are those of the state that each filter estimates."""
-        self._scenario, self._entries = scenario, entries
-        self._places = scenario.layout.places
-        self.numbers = block_numbers(scenario.node_infos)
+    def __init__(self, scenario: Scenario, columns: BlockColumns) -> None:
+        self._scenario, self.columns = scenario, columns
         self.all: list[SlotPair] = []
 
-    def others(self, h: int, placed: PlacedSensor) -> dict[int, Place]:
-        """Return by anchor the blocks beside those of filter ``h`` that a sensor reads; -1 is the
-        anchor of one that names none.
-        """
-        sensor: Any = self._scenario.located_sensors[placed.entry]
-        anchors = anchors_of(sensor, self._scenario.nodes[h])
-        found = {anchor: self.other(h, sensor, anchor) for anchor in anchors}
+    def others(self, s: Any) -> dict[int, Place]:
+        """Return by anchor the blocks beside those of its filter that an AssignedSensor reads."""
+        sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
+        anchors = anchors_of(sensor, s.node)
+        found = {anchor: self.other(s.estimator, sensor, anchor) for anchor in anchors}
         return {anchor: place for anchor, place in found.items() if place is not None}
 
     def other(self, h: int, sensor: Any, anchor: int) -> Place | None:
@@ -57,69 +81,50 @@ class SlotPairs:
             support = np.flatnonzero(matrix_of(sensor, anchor, n).any(axis=0))
         else:
             support = sensor.support(n, sensor.nodes[0] if anchor < 0 else anchor)
-        outside = np.setdiff1d(support, self._entries[h])
-        return next((p for p in self._places if len(outside) and outside[0] < p.first + p.n), None)
+        return self.columns.other(h, support)
 
     def add(self, s: Any, row: int, others: dict[int, Place]) -> int:
         """Add an AssignedSensor, with its first value in ``row``; return the number of its first
         pair.
         """
         sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
-        p, first = len(s.R), len(self.all)
         anchor, place = next(iter(others.items()))
-        for k in range(row, row + s.rows, p):
+        first = len(self.all)
+        for k in range(row, row + s.rows, len(s.R)):
             self.all.append(SlotPair(s.estimator, k, s.R, sensor, anchor, place))
         return first
-
-    def columns(self, k: int, H: FloatArray, place: Place) -> FloatArray:
-        """Return the columns (p, n) of H (p, N) of the states of pair ``k``, with this block."""
-        own, w = self._entries[self.all[k].h], self._entries.shape[1]
-        made, count = np.zeros((len(H), self._width)), int((own >= 0).sum())
-        made[:, :count] = H[:, own[:count]]
-        made[:, w : w + place.n] = H[:, place.entries]
-        return made
-
-    @property
-    def _width(self) -> int:
-        return int(self._entries.shape[1] + max(place.n for place in self._places))
 
     @cached_property
     def nonlinear(self) -> NonlinearSetup:
         """What kernels know of those that are not linear."""
-        w, count = self._entries.shape[1], len(self.all)
-        entries = np.full((count, self._width), -1)
+        columns, w = self.columns, self.columns.entries.shape[1]
+        entries = np.full((len(self.all), columns.width), -1)
         for k, pair in enumerate(self.all):
-            entries[k, :w] = self._entries[pair.h]
+            entries[k, :w] = columns.entries[pair.h]
             entries[k, w : w + pair.place.n] = np.arange(pair.place.n) + pair.place.first
         p = max((len(pair.R) for pair in self.all), default=1)
-        setup = NonlinearSetup(count, p, entries)
+        setup = NonlinearSetup(len(entries), p, entries)
         for k, pair in enumerate(self.all):
             if not pair.sensor.linear:
                 setup.add(pair.sensor, k, 0, pair.R)
         return setup
 
-    def tables(self, method: str, active: int, whitened: dict[int, FloatArray]) -> Pairs:
-        """Return the pairs as kernels take them; ``whitened`` has the H (p, N) of linear sensors
-        whose readings are drawn, with white noise, by number of the pair.
-        """
-        first = np.searchsorted([pair.h for pair in self.all], np.arange(len(self._entries) + 1))
+    def tables(self, method: str, active: int) -> Pairs:
+        """Return the pairs as kernels take them."""
+        entries = self.columns.entries
+        first = np.searchsorted([pair.h for pair in self.all], np.arange(len(entries) + 1))
         rows = self.nonlinear.tables(method, active)
-        pairs = pairs_of(rows, self._entries.shape[1], first.astype(np.int64))
+        pairs = pairs_of(rows, entries.shape[1], first.astype(np.int64))
         for k, pair in enumerate(self.all):
             pairs.row[k], pairs.length[k] = pair.row, len(pair.R)
             if pair.sensor.record is None:
-                pairs.block[0, k] = self.number(pair.place)
+                pairs.block[0, k] = self.columns.number(pair.place)
             if not pair.sensor.linear:
                 node = pair.sensor.nodes[0] if pair.anchor < 0 else pair.anchor
                 pairs.places[k, :, :, 0] = self.nonlinear.reference(pair.sensor, node, k)
-            elif k in whitened:
-                pairs.H[0, k, : len(pair.R)] = self.columns(k, whitened[k], pair.place)
-                pairs.rows.R[0, k] = np.eye(rows.kind.shape[1])
+            else:
+                rows.R[0, k] = np.eye(rows.kind.shape[1])
         return pairs
-
-    def number(self, place: Place) -> int:
-        """Return the number of a block, -1 if no node estimates it."""
-        return self.numbers.get((place.name, place.node), -1)
 
 
 def anchors_of(sensor: Any, node: int) -> tuple[int, ...]:
@@ -137,8 +142,6 @@ def matrix_of(sensor: Any, anchor: int, n: int) -> FloatArray:
 
 def blocks_refusal(scenario: Scenario) -> str | None:
     """Return what the compiled engine cannot do where nodes estimate different states."""
-    if not scenario.slotted:
-        return "nodes of different states under clocks"
     if scenario.common_entries:
         return "filters whose messages other nodes must translate"
     if any(hasattr(sensor, "C") for sensor in scenario.sensors):

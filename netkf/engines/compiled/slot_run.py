@@ -23,7 +23,7 @@ from netkf.core.memory import ReusableMemory, keep_freed_memory
 from netkf.engines.base import Progress
 from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
-from netkf.engines.compiled.samples import record_samples
+from netkf.engines.compiled.samples import by_node, record_samples
 from netkf.engines.compiled.slot_events import SlotEvents
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
@@ -126,7 +126,7 @@ class SlotRuns:
         self._pairs: Pairs | None = None
         if setup.pairs is not None:
             method = scenario.filter.linearise
-            self._pairs = setup.pairs.tables(method, min(runs, LANES), setup.whitened)
+            self._pairs = setup.pairs.tables(method, min(runs, LANES))
         active = min(runs, LANES)
         self._filters = SlotFilters(setup, kernels, blocks, active=active, pairs=self._pairs)
         arrays, never = self._filters.records.arrays, (blocks, setup.estimators, LANES)
@@ -241,13 +241,13 @@ class SlotRuns:
         )
         kernel_samples = SlotSamples(
             x, xhat, P, error, absolute, local, drawn and absolute is not local, self._total,
-            *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64), self.setup.entries,
+            *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
+            np.maximum(self.setup.entries, 0),
         )  # fmt: skip
         slots = times.first + sampled
         self._simulate(times, messages, (y, H, rebased), kernel_samples)
         if not drawn and responses is not None and responses.believed is not None:
             # Recorded states may be unknown, where coordinates begin is not.
-            # Beyond the last state of a filter there is nan.
             moved = responses.believed.states(slots)[:, self.setup.entries]
             samples.xhat[:, times.sample[sampled]] += moved
         return SlotBlock(sampled, samples, times, messages)
@@ -512,7 +512,7 @@ class SlotRuns:
         y: FloatArray = unset((*shape, LANES))
         H: FloatArray = setup.H
         if setup.varies:
-            H = unset((*shape, setup.width, LANES))
+            H = unset((*shape, setup.columns.width, LANES))
             H[:] = setup.H
         x = local
         if rebased.any() and setup.algorithm.timing.predicts:
@@ -559,7 +559,7 @@ class SlotRuns:
             for run, path in enumerate(paths):
                 b, lane = divmod(run, LANES)
                 read, of_all = read_whitened(path, slots, x[b, times.sensed, :, lane], s.R, s.root)
-                own = read, setup.seen(of_all, s.estimator)
+                own = read, setup.columns.of(s.estimator, of_all)
                 for out, values in zip((y, H), own, strict=True):
                     out[b, times.sensed, s.estimator, rows, ..., lane] = values
         for s, path in self._recorded:
@@ -573,7 +573,7 @@ class SlotRuns:
             # L^-1 y and L^-1 H, with the R = L L' that filters believe; all runs read the same.
             whitened_y, whitened_H = path.whitened(slots, s.R, s.rows)
             y[:, times.sensed, s.estimator, rows] = whitened_y[..., None]
-            own_H = setup.seen(whitened_H, s.estimator)
+            own_H = setup.columns.of(s.estimator, whitened_H)
             H[:, times.sensed, s.estimator, rows] = own_H[..., None]
 
     def _clear_pairs(self, count: int) -> None:
@@ -581,9 +581,7 @@ class SlotRuns:
         pairs = self._pairs
         if pairs is None or all(s.pair < 0 for s, _ in self._recorded):
             return
-        pairs.block, pairs.H = (
-            np.repeat(part[:1], count, axis=0) for part in (pairs.block, pairs.H)
-        )
+        pairs.block = np.repeat(pairs.block[:1], count, axis=0)
         pairs.rows.R = np.repeat(pairs.rows.R[:1], count, axis=0)
         for s, _ in self._recorded:
             pairs.block[:, s.pair : s.pair + s.rows // len(s.R) if s.pair >= 0 else s.pair] = -1
@@ -601,28 +599,29 @@ class SlotRuns:
         y[:, sensed, h, rows] = 0.0 if sensor.linear else np.nan
         for k in np.flatnonzero(sensed).tolist():
             for m, (values, anchor, R) in enumerate(path.readings_at(self._slot + k, s.R)):
-                place, pair = setup.pairs.other(h, sensor, anchor), s.pair + m
-                if place is None and not sensor.linear:
-                    self._write_nonlinear((s, sensor), (k, m), (values, anchor, R), y, H)
-                    continue
-                z = values
+                place, pair, first = setup.pairs.other(h, sensor, anchor), s.pair + m, s.row + m * p
+                if place is not None:
+                    first = int(pairs.row[pair])
+                    pairs.block[k, pair] = setup.columns.number(place)
                 if sensor.linear:
-                    matrix = matrix_of(sensor, anchor, setup.n)
-                    if believed is not None:
-                        z = values - matrix @ believed.states(np.array([self._slot + k]))[0]
-                if place is None:
                     there = np.isfinite(values)
-                    own = np.column_stack([z, setup.seen(matrix, h)])[there]
-                    whitened = solve_lower(cholesky(R[there][:, there]), own)
-                    some = slice(s.row + m * p, s.row + m * p + len(whitened))
-                    y[:, k, h, some] = whitened[:, :1]
-                    H[:, k, h, some] = whitened[:, 1:, None]
-                    continue
-                first = int(pairs.row[pair])
-                y[:, k, h, first : first + p] = z[:, None]
-                pairs.block[k, pair], pairs.rows.R[k, pair, :p, :p] = setup.pairs.number(place), R
-                if sensor.linear:
-                    pairs.H[k, pair, :p] = setup.pairs.columns(pair, matrix, place)
+                    matrix = matrix_of(sensor, anchor, setup.n)
+                    z = (
+                        values
+                        if believed is None
+                        else values - matrix @ believed.states(np.array([self._slot + k]))[0]
+                    )
+                    both = np.column_stack([z, matrix])[there]
+                    white = solve_lower(cholesky(R[there][:, there]), both)
+                    y[:, k, h, first : first + p], H[:, k, h, first : first + p] = 0.0, 0.0
+                    rows = slice(first, first + len(white))
+                    y[:, k, h, rows] = white[:, :1]
+                    H[:, k, h, rows] = setup.columns.of(h, white[:, 1:], place)[..., None]
+                elif place is None:
+                    self._write_nonlinear((s, sensor), (k, m), (values, anchor, R), y, H)
+                else:
+                    y[:, k, h, first : first + p] = values[:, None]
+                    pairs.rows.R[k, pair, :p, :p] = R
 
     def _read_nonlinear(
         self, s: AssignedSensor, path: Any, sensed: np.ndarray, y: FloatArray, H: FloatArray
@@ -652,7 +651,7 @@ class SlotRuns:
         rows = slice(s.row + m * p, s.row + (m + 1) * p)
         place = setup.reference(sensor, s.node if anchor < 0 else anchor, s.estimator)
         y[:, k, s.estimator, rows] = values[:, None]
-        H[:, k, s.estimator, rows] = place[:, None]
+        H[:, k, s.estimator, rows, : len(place)] = place[:, None]
         nonlinear.R[k, s.estimator, rows, rows] = R
 
     def events(self, block: SlotBlock) -> tuple[np.ndarray, np.ndarray]:
@@ -760,23 +759,6 @@ def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress
     return COMPLETE
 
 
-def by_node(scenario: Scenario, samples: SampledStates) -> SampledStates:
-    """Return samples of a filter that all nodes share as those of nodes that estimate parts of the
-    state, where a scenario says so.
-    """
-    if scenario.views is None or not scenario.node_filter.timing.pooled:
-        return samples
-    views, width = scenario.views, scenario.width
-    shape = *samples.xhat.shape[:2], len(views), width
-    xhat, P, error = (np.full(s, np.nan) for s in (shape, (*shape, width), shape))
-    for k, view in enumerate(views):
-        n = len(view)
-        xhat[:, :, k, :n] = samples.xhat[:, :, 0, view]
-        error[:, :, k, :n] = samples.error[:, :, 0, view]
-        P[:, :, k, :n, :n] = samples.P[:, :, 0][..., view[:, None], view]
-    return SampledStates(samples.x, xhat, P, error)
-
-
 def _record_block(
     scenario: Scenario, runs: SlotRuns, recorder: Recorder, progress: Progress
 ) -> bool:
@@ -788,7 +770,8 @@ def _record_block(
         sums = runs.conserved()
         recorder.sums = {name: (float(v[0, 0]), float(v[0, 1])) for name, v in sums.items()}
     # One run: index 0 of all arrays.
-    x, xhat, P, error = (values[0] for values in by_node(scenario, block.samples))
+    x, xhat, P, error = (values[0] for values in block.samples)
+    xhat, P, error = by_node(scenario, xhat, P, error)
     times = block.times.start[block.sampled]
 
     def pass_rows_on(k: int) -> None:
@@ -837,14 +820,12 @@ def slot_batch(
         runs.count_events(block)
         for rows in runs.first_events(block) if fingerprint else ():
             events_hash.update(rows.data)
-    broken, error = runs.broken, runs.samples.error
+    x, xhat, P, error = runs.samples
+    broken = runs.broken
     if scenario.plant.truth_known:
-        known = error
-        if runs.setup.views is not None:
-            known = np.where(runs.setup.entries < 0, 0.0, error)
         with np.errstate(over="ignore", invalid="ignore"):
-            broken |= ~np.isfinite(np.einsum("rtfn,rtfn->r", known, known))
-    x, xhat, P, error = by_node(scenario, runs.samples)
+            broken |= ~np.isfinite(np.einsum("rtfn,rtfn->r", error, error))
+    xhat, P, error = by_node(scenario, xhat, P, error)
     return RunBatch(
         replicas=replicas,
         times=runs.setup.sample_times,

@@ -16,6 +16,7 @@ from netkf.engines.compiled.nonlinear_rows import NonlinearSetup
 from netkf.engines.compiled.outcomes import delivery_table
 from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
+from netkf.engines.compiled.samples import entries_of
 from netkf.engines.compiled.senders import link_senders
 from netkf.engines.compiled.slot_messages import (
     INDEPENDENT,
@@ -25,7 +26,7 @@ from netkf.engines.compiled.slot_messages import (
     SlotLinks,
     Stages,
 )
-from netkf.engines.compiled.slot_pairs import SlotPairs
+from netkf.engines.compiled.slot_pairs import BlockColumns, SlotPairs
 from netkf.linalg.arrays import FloatArray, block_diagonal, enlarged
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
@@ -134,11 +135,8 @@ class SlotSetup:
         pooled = self.algorithm.timing.pooled
         self.estimators, self.p = 1 if pooled else len(scenario.nodes), 1
         rows = np.zeros(self.estimators, dtype=np.int64)
-        views = [np.arange(self.n)] * self.estimators if self.views is None else self.views
-        # The entries of the state that each filter estimates, -1 beyond the last.
-        self.entries = np.full((self.estimators, self.width), -1)
-        for h, view in enumerate(views):
-            self.entries[h, : len(view)] = view
+        self.entries = entries_of(scenario)
+        self.columns = BlockColumns(scenario, self.entries)
         self.sensing = np.array(scenario.sensing_nodes, dtype=np.int64)
         self.assigned: list[AssignedSensor] = []
         for node in scenario.sensing_nodes:
@@ -154,7 +152,7 @@ class SlotSetup:
                 rows[estimator] += count
         self.pairs: SlotPairs | None = None
         if self.views is not None and self.algorithm.needs.blocks:
-            self.pairs = SlotPairs(scenario, self.entries)
+            self.pairs = SlotPairs(scenario, self.columns)
             rows = self._set_pairs(self.pairs, scenario)
         self.rows, self.p = rows, max(self.p, int(rows.max(initial=1)))
         # Python reads recorded sensors and those of users, kernels read the others; some of these
@@ -181,14 +179,14 @@ class SlotSetup:
         linear = not self.regressor_sensors and not self.nonlinear_sensors
         self.varies = len(self.kernel_sensors) < len(self.assigned) or not linear
         # The same in all blocks of runs and all slots, hence 1, 1.
-        self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.width, LANES))
+        self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.columns.width, LANES))
         self._set_nonlinear_rows(scenario)
         self._set_kernel_sensors(scenario)
 
     def _set_pairs(self, pairs: SlotPairs, scenario: Scenario) -> np.ndarray:
         """Put readings of pairs behind those of own states; return how many rows these have."""
         rows, assigned = np.zeros(self.estimators, dtype=np.int64), list[AssignedSensor]()
-        others = [pairs.others(s.estimator, s.placed_sensor) for s in self.assigned]
+        others = [pairs.others(s) for s in self.assigned]
         for s, other in zip(self.assigned, others, strict=True):
             assigned.append(s._replace(row=int(rows[s.estimator])))
             # In a record each row may be about another block.
@@ -228,11 +226,10 @@ class SlotSetup:
                     setup.add(sensor, h, first, s.R)
                     if sensor.record is None:
                         place = setup.reference(sensor, s.node, h)
-                        places[h, first : first + rows] = place[:, None]
+                        places[h, first : first + rows, : len(place)] = place[:, None]
 
     def _set_kernel_sensors(self, scenario: Scenario) -> None:
         count, p, n = len(self.kernel_sensors), self.p, self.n
-        self.whitened: dict[int, FloatArray] = {}
         H, noise = np.zeros((count, p, n)), np.zeros((count, p, p))
         regressor_index = np.full(count, -1, dtype=np.int64)
         for m, s in enumerate(self.kernel_sensors):
@@ -251,10 +248,8 @@ class SlotSetup:
                 regressor_index[m], H[m, 0, 0] = self.regressor_sensors.index(s), 1.0 / s.root[0, 0]
                 continue
             H[m, :rows] = solve_lower(s.root, sensor.H)
-            if s.pair >= 0:
-                self.whitened[s.pair] = H[m, :rows]
-                continue
-            own = self.seen(H[m, :rows], s.estimator)
+            place = self.pairs.all[s.pair].place if self.pairs and s.pair >= 0 else None
+            own = self.columns.of(s.estimator, H[m, :rows], place)
             self.H[0, 0, s.estimator, s.row : s.row + rows] = own[..., None]
         regressors: list[Any] = [
             scenario.sensors[s.placed_sensor.entry] for s in self.regressor_sensors
@@ -281,12 +276,6 @@ class SlotSetup:
             regressor_index,
             C,
         )
-
-    def seen(self, H: FloatArray, h: int) -> FloatArray:
-        """Return the columns (..., w) of H (..., n) of what filter ``h`` estimates, then zeros."""
-        if self.views is None:
-            return H
-        return enlarged(H[..., self.views[h]], *H.shape[:-1], self.width)
 
     def _set_states(self, scenario: Scenario) -> None:
         infos: Sequence[NodeInfo] = scenario.node_infos
@@ -432,7 +421,7 @@ class SlotSetup:
     def bytes_of_slot(self) -> int:
         """Return the bytes of states, readings and messages of one slot of one run."""
         # Readings, their H if it varies, and states.
-        floats = self.estimators * self.p * (1 + self.varies * self.width) + 3 * self.n
+        floats = self.estimators * self.p * (1 + self.varies * self.columns.width) + 3 * self.n
         messages = len(self.fresh) * (len(self.directions) + 8 * self.max_pairs + 8)
         mask = self.decides or self.may_miss
         asked = len(self.nodes) * (mask + 8 * self.algorithm.timing.randomised)

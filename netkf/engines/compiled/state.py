@@ -6,7 +6,9 @@ names in compiled code too. No type depends on the size of a scenario: one compi
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from netkf.algorithms.kernels.root_flow import (
 from netkf.algorithms.models import FlowModel, first_roots
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.senders import senders_of
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import FloatArray, IntArray, enlarged
 from netkf.linalg.structs import Size, Struct
 from netkf.plants.laws import course_width
 from netkf.scenario.scenario import Scenario
@@ -63,6 +65,7 @@ tag : instant of the reading that is sent
 sent, arrival : seconds
 """
 
+NOBODY = -2  # the number of a block that nobody estimates
 LINKS, DIRECTIONS, NODES, AFTER_READINGS = range(4)
 CLOCKS = ("links", "directions", "nodes", "readings")
 """The values of ``Senders.at`` in the order of these constants. From NODES on nodes broadcast: one
@@ -122,8 +125,10 @@ class Instants(Struct):
     first : (K + 1,), samples of instant k begin at ``first[k]``
     node, y : (S,) and (S, p), of each sample
     sensor, matrix : (S,), index of its noise and of its H
+    block : (S,), number of the block that it is also about and that its node does not estimate, -1:
+            none, NOBODY: one that nobody estimates
     rows, root : (L,) and the root of R (L, p, p), by sensor
-    H : (M, p, n), by matrix
+    H : (M, p, n), by matrix, of the states of a filter, then of such a block
     """
 
     t: FloatArray
@@ -133,6 +138,7 @@ class Instants(Struct):
     y: FloatArray
     sensor: IntArray
     matrix: IntArray
+    block: IntArray
     rows: IntArray
     root: FloatArray
     H: FloatArray
@@ -326,9 +332,10 @@ def filters_at_start(scenario: Scenario) -> Filters:
     """Return all N filters at time 0, or the one that reads all sensors if they are pooled."""
     # A pooled filter is one node with the id -1, which belongs to no node of the network.
     ids, pooled = scenario.nodes, scenario.node_filter.timing.pooled
-    models = scenario.model_pieces[0]
+    all_pieces = wide_models(scenario)
+    models = all_pieces[0]
     # Nodes that share a model share its table, in each piece of the plant.
-    pieces = [list({id(m): m for m in piece}.values()) for piece in scenario.model_pieces]
+    pieces = [list({id(m): m for m in piece}.values()) for piece in all_pieces]
     index = {id(model): k for k, model in enumerate(pieces[0])}
     filtering_nodes = ids[:1] if pooled else ids
     starts = [scenario.initial_estimate(node) for node in filtering_nodes]
@@ -343,8 +350,33 @@ def filters_at_start(scenario: Scenario) -> Filters:
     nodes["inbox"] = nodes["reading"] = -1
     # One table for each distinct model.
     table, gains = _stack_model_tables(pieces)
-    xhat = np.stack([mean for mean, _ in starts]).astype(np.float64)
+    n = len(models[0].information)
+    starts = [(enlarged(mean, n), enlarged(cov, n, n)) for mean, cov in starts]
+    xhat = np.stack([mean for mean, _ in starts])
     return Filters(nodes, xhat, first_roots([cov for _, cov in starts]), table, gains)
+
+
+@once_per_scenario
+def wide_models(scenario: Scenario) -> list[Sequence[FlowModel]]:
+    """Return the models of all filters, of each piece of the plant: all with as many states as the
+    widest estimates, of which nothing drives those that are added. Equal ones are one object.
+    """
+    if scenario.views is None or scenario.node_filter.timing.pooled:
+        return list(scenario.model_pieces)
+    known: dict[Any, list[FlowModel]] = {}
+    w, columns = scenario.width, []
+    for models in zip(*scenario.model_pieces, strict=True):
+        parts = [(m.A, m.Q, m.H, m.R) for m in models]
+        key = tuple((M.shape, M.tobytes()) for part in parts for M in part)
+        if key not in known:
+            known[key] = [
+                dataclasses.replace(
+                    m, A=enlarged(m.A, w, w), Q=enlarged(m.Q, w, w), H=enlarged(m.H, len(m.H), w)
+                )
+                for m in models
+            ]
+        columns.append(known[key])
+    return list(zip(*columns, strict=True))
 
 
 def _stack_model_tables(pieces: list[list[FlowModel]]) -> tuple[FlowTable, Gains]:
@@ -380,9 +412,13 @@ def entity_records(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     return entities, directions
 
 
-def scratch_arrays(table: FlowTable, gains: Gains, unrolled: bool) -> tuple[Scratch, FlowScratch]:
-    """Return scratch arrays for models with these tables; ``unrolled``: of types that know n."""
-    n, max_moments, width = table.levels.shape[3], int(gains.moments.max()), gains.series.shape[2]
+def scratch_arrays(
+    table: FlowTable, gains: Gains, unrolled: bool, n: int
+) -> tuple[Scratch, FlowScratch]:
+    """Return scratch arrays for models with these tables of a plant of ``n`` states; ``unrolled``:
+    of types that know n.
+    """
+    max_moments, width = int(gains.moments.max()), gains.series.shape[2]
     scratch = Scratch(
         moments=np.zeros(max_moments),
         # Two moments for each row.
