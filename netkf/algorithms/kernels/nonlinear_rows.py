@@ -81,10 +81,11 @@ def linear_rows(filters: int, p: int, entries: np.ndarray) -> NonlinearRows:
         **dict.fromkeys(("G", "J", "matrix"), (p, n)),
         **{"x": (n,), "points": (2 * n + 1, p), "C": (p, p), "nothing": (0,)},
     }
+    made: dict[str, Any] = {name: np.zeros(size) for name, size in scratch.items()}
+    made |= {name: np.zeros(shape, dtype=np.int64) for name in integers}
+    made |= {name: np.zeros((*shape, 3), dtype=np.int64) for name in ("states", "functions")}
     return NonlinearRows(
-        **{name: np.zeros(shape, dtype=np.int64) for name in integers},
-        **{name: np.zeros((*shape, 3), dtype=np.int64) for name in ("states", "functions")},
-        **{name: np.zeros(size) for name, size in scratch.items()},
+        **made,
         heading=np.full(shape, -1),
         R=np.zeros((1, *shape, p)),
         origin=np.zeros((1, 1 + int(entries.max(initial=0)))),

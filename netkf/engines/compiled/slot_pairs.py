@@ -25,7 +25,7 @@ class BlockColumns:
         self.entries, self.places = entries, scenario.layout.places
         self.numbers = block_numbers(scenario.node_infos)
         needs = scenario.node_filter.needs.blocks and scenario.views is not None
-        self.width = entries.shape[1] + (max(p.n for p in self.places) if needs else 0)
+        self.width: int = entries.shape[1] + (max(p.n for p in self.places) if needs else 0)
 
     def other(self, h: int, support: np.ndarray) -> Place | None:
         """Return the block of the ``support`` (k,) of a reading that filter ``h`` has not."""

@@ -22,6 +22,7 @@ from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns
 from netkf.theory.common.forms import MEAN, NOISE
+from netkf.theory.common.kernel_columns import KernelColumns
 from netkf.theory.common.observations import Observation, slot_observations, timed_observations
 from netkf.trace.nees import without_padding
 from netkf.trace.run import Run
@@ -71,7 +72,8 @@ class BlockColumns(ErrorColumns):
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
         super().__init__()
-        self._scenario, self._run, self._filter = scenario, run, scenario.node_filter
+        self._scenario, self._run, algorithm = scenario, run, scenario.node_filter
+        self._filter: Any = algorithm if algorithm.kernels is None else KernelColumns(algorithm)
         self.estimators, self.n = len(scenario.nodes), scenario.width
         plant = cast(Any, scenario.plant)
         rank = plant.start_root.shape[1]
