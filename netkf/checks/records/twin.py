@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from netkf.checks.rounding import EPS, OPERATIONS, allowed_deviation, largest_terms
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, enlarged
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
 
@@ -38,20 +38,30 @@ def twin_fault(scenario: Scenario, run: Run, twin: Run) -> str:
 
 def _gaps(scenario: Scenario, run: Run, twin: Run) -> list[tuple[str, FloatArray, FloatArray]]:
     """Return names of values, the differences (T, N) of two runs, and what rounding explains."""
-    starts = np.array([scenario.initial_estimate(node)[1] for node in scenario.nodes])
+    covs = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
+    starts = np.stack([enlarged(cov, *np.max([c.shape for c in covs], axis=0)) for cov in covs])
+    # States that a node does not estimate are nan in both, and differ by nothing.
+    missing = np.isnan(twin.xhat)
+    outside = missing & np.isnan(run.xhat) & ~missing.all(axis=2, keepdims=True)
+    of_P = outside[..., :, None] | outside[..., None, :]
     information = float(np.linalg.norm(scenario.node_infos[0].information, 2))
-    given = np.asarray(np.isfinite(twin.P).all(axis=(2, 3)))
-    P = np.where(given[..., None, None], twin.P, 0.0)
+    twin_P = np.where(of_P, 0.0, twin.P)
+    given = np.asarray(np.isfinite(twin_P).all(axis=(2, 3)))
+    P = np.where(given[..., None, None], twin_P, 0.0)
     size = np.abs(P).max(axis=(2, 3), initial=0.0)
     terms = largest_terms(P[None], starts, information)[0]
     with np.errstate(over="ignore", invalid="ignore"):
-        covariance = np.where(given, np.abs(run.P - twin.P).max(axis=(2, 3), initial=0.0), 0.0)
-        estimate = np.abs(run.error - twin.error).max(axis=2, initial=0.0)
-        state = np.abs(run.xhat - twin.xhat).max(axis=2, initial=0.0)
+        gaps = np.where(of_P, 0.0, np.abs(run.P - twin.P))
+        covariance = np.where(given, gaps.max(axis=(2, 3), initial=0.0), 0.0)
+        estimate, state = (
+            np.where(outside, 0.0, np.abs(one - other)).max(axis=2, initial=0.0)
+            for one, other in ((run.error, twin.error), (run.xhat, twin.xhat))
+        )
     # An estimate inherits the relative rounding of the largest covariance so far, by which its
     # gains were computed, and those of the errors and states that it comes from.
     deviation = np.sqrt(np.trace(P, axis1=2, axis2=3))
-    errors = np.maximum.accumulate(np.abs(twin.error).max(axis=(1, 2), initial=0.0))[:, None]
+    own = np.where(outside, 0.0, np.abs(twin.error))
+    errors = np.maximum.accumulate(own.max(axis=(1, 2), initial=0.0))[:, None]
     states = np.maximum.accumulate(np.abs(twin.x).max(axis=1, initial=0.0))[:, None]
     spread = np.divide(terms, np.square(deviation), out=np.ones_like(size), where=deviation > 0.0)
     rounding = OPERATIONS * EPS * errors * np.maximum.accumulate(np.maximum(spread, 1.0))
