@@ -142,7 +142,7 @@ def matrix_of(sensor: Any, anchor: int, n: int) -> FloatArray:
 
 def blocks_refusal(scenario: Scenario) -> str | None:
     """Return what the compiled engine cannot do where nodes estimate different states."""
-    if scenario.common_entries:
+    if scenario.common_entries and scenario.node_filter.timing.talks:
         return "filters whose messages other nodes must translate"
     if any(hasattr(sensor, "C") for sensor in scenario.sensors):
         return "nodes of different states with regressors"
