@@ -302,7 +302,8 @@ class RecordedSamples:
         rows, p = self._rows, self._rows.y.shape[1]
         if self._is_uniform and rows.phi.shape[1]:
             return rows.y[list(ks)], rows.phi[list(ks), None]
-        if self._is_uniform:
+        # The H of all, unless rows are about others.
+        if self._is_uniform and len(set(rows.anchors.tolist())) < 2:
             H_of_all = self._matrix(0, np.ones(p, dtype=bool))
             return rows.y[list(ks)], np.broadcast_to(H_of_all, (len(ks), *H_of_all.shape))
         y, H = np.zeros((len(ks), p)), []

@@ -110,13 +110,14 @@ def test_block_intersection(tmp_path: Path, text: str, rule: str, estimates: obj
     assert_agree(load(text, tmp_path, filter__rule=rule, filter__estimates=estimates))
 
 
-def test_recorded_pairs_under_clocks(tmp_path: Path) -> None:
+@pytest.mark.parametrize("estimates", ["own", "all"])
+def test_recorded_pairs_under_clocks(tmp_path: Path, estimates: str) -> None:
     (tmp_path / "seen.csv").write_text(
         "t,node,to,y0\n0.5,1,2,0.3\n1.25,1,3,0.1\n1.25,1,2,0.2\n2.0,2,1,-0.3\n2.0,3,2,\n"
     )
     text = CLOCKED.replace('kind = "relative"', 'kind = "relative"\npath = "seen.csv"')
     text = text.replace("sampling = { kind = 'periodic', period = 0.5 }\n", "")
-    assert_agree(load(text, tmp_path))
+    assert_agree(load(text, tmp_path, filter__estimates=estimates))
 
 
 @pytest.mark.parametrize("linearise", ["ekf", "ukf"])
