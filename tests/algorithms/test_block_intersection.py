@@ -290,16 +290,6 @@ def test_mistakes_about_blocks_are_named(
     assert rule in str(caught.value)
 
 
-def test_theory_and_checks_say_that_nothing_is_promised(tmp_path: Path) -> None:
-    scenario = load(ROBOTS, tmp_path)
-    run = netkf.simulate(scenario)
-    for function in (netkf.theory.central_covariance, netkf.theory.assumptions, netkf.check):
-        with pytest.raises(netkf.TheoryError, match="some blocks of the state"):
-            function(scenario)
-    with pytest.raises(netkf.TheoryError, match="some blocks of the state"):
-        netkf.theory.error_covariance(scenario, run)
-
-
 PLANAR = """
 format = 1
 name = "planar"

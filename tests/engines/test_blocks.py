@@ -84,7 +84,9 @@ def clocked(text: str) -> str:
     text = text.replace("F = [[0.9, 0.1], [0.0, 0.8]]\nQ =", "A = [[-0.1, 0.1], [0.0, -0.2]]\nB =")
     text = text.replace("F = [[0.95, 0.0, 0.1], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]]\nQ =", FLOW)
     text = text.replace("F = [[0.7, 0.0], [0.2, 0.9]]", "A = [[-0.3, 0.0], [0.2, -0.1]]")
-    text = text.replace("\nperiod = 1.0", "").replace('"broadcast"', '"poisson", at = "nodes", rate = 2.0')
+    text = text.replace("\nperiod = 1.0", "").replace(
+        '"broadcast"', '"poisson", at = "nodes", rate = 2.0'
+    )
     return text.replace("0.3]]\n[[sen", "0.3]]\nsampling = { kind = 'poisson', rate = 2.0 }\n[[sen")
 
 
