@@ -130,8 +130,8 @@ def test_readings_of_pairs(tmp_path: Path, estimates: str, linearise: str) -> No
 
 
 def test_unicycles() -> None:
-    scenario = netkf.load("scenarios/blocks/cooperative_localisation.toml", {"horizon": 6.0})
-    assert_agree(scenario)
+    changes = {"horizon": 6.0, "network.channel.loss": {"kind": "bernoulli", "delivery": 0.8}}
+    assert_agree(netkf.load("scenarios/blocks/cooperative_localisation.toml", changes))
 
 
 @pytest.mark.parametrize("kind", ["local", "central"])
