@@ -93,7 +93,7 @@ class CompiledEngine(Engine):
         assert kernels is not None
         if scenario.slotted:
             linear = all(sensor.linear for sensor in scenario.sensors)
-            compiling.announce(slot_loop(kernels, linear))
+            compiling.announce(slot_loop(kernels, linear, slot_setup(scenario).own_models))
         else:
             compiling.announce(simulate_agenda if is_immediate(scenario) else clock_loop(kernels))
 

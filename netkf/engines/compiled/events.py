@@ -250,7 +250,7 @@ def store_sample(state: Simulation, run: int, first: int, k: int) -> None:
     """Store the estimates and covariances ``P = S S'`` of the nodes in the rows from ``first`` on
     as sample ``k`` of run number ``run``.
     """
-    xhat, P, root, n = state.buffer.xhat, state.buffer.P, state.root, state.xhat.shape[1]
+    xhat, P, root, n = state.buffer.xhat, state.buffer.P, state.root, len(state.size)
     for h in range(len(state.nodes)):
         entry = first + h
         for i in range(n):

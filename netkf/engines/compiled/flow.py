@@ -197,9 +197,9 @@ class Workspace:
             xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
             xhat[:] = np.tile(start.xhat, (together, 1))
             root[:] = np.tile(start.root, (together, 1, 1))
-        n = self._scenario.plant.n
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
+            plant=sized(n) if self._unrolled else np.zeros(self._scenario.plant.n),
             nodes=start.nodes.copy(),
             xhat=xhat,
             root=root,

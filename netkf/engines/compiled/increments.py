@@ -35,7 +35,7 @@ def read_increments(
             left = last - now
             divide(ONE, early, noise, state.scratch.cut, (end - now) / left, left)
             noise = early
-        fill_reading(ONE, state.size, out, row, sensing.rows[s], x, H, noise, root, s)
+        fill_reading(ONE, state.plant, out, row, sensing.rows[s], x, H, noise, root, s)
         row += sensing.rows[s]
 
 
@@ -67,7 +67,7 @@ def find_course(state: Simulation, run: int, piece: int) -> int:
         path.known[k, entry] = piece
         length, course = path.stop[piece] - path.start[piece], path.course[k, entry]
         x_start, cubic = path.x_start[run], path.cubic[run]
-        fill_course(state.size, course, path.table, length, x_start, cubic, piece)
+        fill_course(state.plant, course, path.table, length, x_start, cubic, piece)
     return entry
 
 
@@ -85,7 +85,7 @@ def fill_moments_of_piece(state: Simulation, run: int, piece: int, now: float, e
     # A part of it: integrate the polynomial of x in this piece.
     course = path.course[run - state.first_run, find_course(state, run, piece)]
     moments, values = scratch.state_moments, scratch.values
-    fill_state_moments(state.size, moments, course, now - start, end - now, stop - start, values)
+    fill_state_moments(state.plant, moments, course, now - start, end - now, stop - start, values)
 
 
 @kernel(inlined=True)

@@ -162,7 +162,7 @@ class SlotFilters:
         )
         setup, record, count = self._setup, self.records.struct, len(plan.sensed)
         rows: Any = 0 if self._rows is None else self._rows
-        loop = slot_loop(self._kernels, self._rows is None)
+        loop = slot_loop(self._kernels, self._rows is None, len(self._memories) > 0)
         step = 1 if self._kernels.slotwise else max(1, count)
         assert setup.algorithm.kernels is not None
         prepare = setup.algorithm.kernels.prepare

@@ -89,7 +89,8 @@ class SlotSamples(NamedTuple):
     total : (B, L), sum of all samples of xhat and P so far: finite if all of them are
     sampled_xhat, sampled_error, sampled_P : (>= H w, L), (>= H w, L) and (>= H w w, L), a sample
     runs : (L,), the run of each lane, -1 if it is idle
-    entries : (H, w), the entries of the state that each filter estimates, and any beyond
+    entries : (H, w), the entries of the state that each filter estimates, and any beyond; (0, 0)
+              if all estimate all
     """
 
     x: FloatArray
@@ -107,7 +108,7 @@ class SlotSamples(NamedTuple):
     entries: np.ndarray
 
 
-def exchange_of(kernels: Kernels) -> Any:
+def exchange_of(kernels: Kernels, choose: Any) -> Any:
     """Return the kernel of one step of an exchange, composed of ``emit`` and ``absorb``."""
     emit, absorb, decides = kernels.emit, kernels.absorb, kernels.decides
     addressed = kernels.addressed
@@ -123,7 +124,7 @@ def exchange_of(kernels: Kernels) -> Any:
                     if plan.uniform.shape[0] > 0:
                         store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
                 run.reading = h
-                choose_model(run, plan, h)
+                choose(run, plan, h)
                 emit(record, h, h + run.first[h] if addressed else h, run)
                 if decides:
                     store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
@@ -132,7 +133,7 @@ def exchange_of(kernels: Kernels) -> Any:
         if e != plan.stop:
             for h in range(nodes):
                 run.reading = h
-                choose_model(run, plan, h)
+                choose(run, plan, h)
                 fill_inbox(run, plan, b, s, e, h, addressed)
                 absorb(record, h, run)
 
@@ -140,15 +141,16 @@ def exchange_of(kernels: Kernels) -> Any:
 
 
 @cache
-def slot_loop(kernels: Kernels, linear: bool = True) -> Any:
+def slot_loop(kernels: Kernels, linear: bool = True, own_models: bool = False) -> Any:
     """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan, samples,
     rows)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first; unless
-    sensors are all ``linear``, ``rows`` are NonlinearRows.
+    sensors are all ``linear``, ``rows`` are NonlinearRows. ``own_models``: each filter has its own.
     """
+    choose = choose_model if own_models else keep_model
     linearise = no_rows if linear else linearise_rows
     predict, update = kernels.predict, kernels.update
     shift, observe = kernels.shift, kernels.observe
-    exchange = exchange_of(kernels)
+    exchange = exchange_of(kernels, choose)
 
     @kernel
     def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, rows: Any, b: int, s: int) -> None:
@@ -167,7 +169,7 @@ def slot_loop(kernels: Kernels, linear: bool = True) -> Any:
                     e += 1
             elif plan.sensed[s] and begun:
                 for h in range(nodes):
-                    choose_model(run, plan, h)
+                    choose(run, plan, h)
                     if stage == PREDICT:
                         predict(record, h, run)
                     else:
@@ -215,9 +217,13 @@ def slot_loop(kernels: Kernels, linear: bool = True) -> Any:
 
 @kernel(inlined=True)
 def choose_model(run: SlotRun, plan: SlotPlan, h: int) -> None:
-    """Make the model of filter ``h`` that of the run, where filters have models of their own."""
-    if len(plan.models) > 0:
-        run.model = struct_like(run.model, plan.models[h])
+    """Make the model of filter ``h`` that of the run."""
+    run.model = struct_like(run.model, plan.models[h])
+
+
+@kernel(inlined=True)
+def keep_model(run: SlotRun, plan: SlotPlan, h: int) -> None:
+    """Do nothing: all filters have the model of the run."""
 
 
 @kernel
@@ -275,7 +281,7 @@ def store_sample(
     sum_of_all, states = load(lanes, samples.total, b), samples.absolute.shape[2]
     for h in range(len(xhat)):
         for i in range(n):
-            entry = samples.entries[h, i]
+            entry = samples.entries[h, i] if len(samples.entries) > 0 else i
             x = load(lanes, xhat, h, i)
             # Relative to the moving origin: a difference of large absolute states loses digits.
             local = load(lanes, samples.local, b, s, entry)

@@ -73,7 +73,7 @@ from netkf.trace.recorder import LONG, Recorder
 from netkf.trace.run import StateSamples
 from netkf.trace.schema import EVENT, KINDS
 
-NEVER = np.iinfo(np.int64).max
+NEVER, _ALL = np.iinfo(np.int64).max, np.zeros((0, 0), dtype=np.int64)
 _samples = ReusableMemory(BATCH_BYTES)
 
 
@@ -242,7 +242,7 @@ class SlotRuns:
         kernel_samples = SlotSamples(
             x, xhat, P, error, absolute, local, drawn and absolute is not local, self._total,
             *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
-            np.maximum(self.setup.entries, 0),
+            np.maximum(self.setup.entries, 0) if self.setup.views is not None else _ALL,
         )  # fmt: skip
         slots = times.first + sampled
         self._simulate(times, messages, (y, H, rebased), kernel_samples)

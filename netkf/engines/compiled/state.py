@@ -216,6 +216,7 @@ class Simulation(Struct):
     Filters
 
     size, nodes : n as a type (linalg.structs), and NODE records (N,)
+    plant : likewise the number of states of the plant, of which filters may estimate a part
     xhat, root : (G N, n) and (G N, n, n)
     now : time (G N,) in seconds that each estimate refers to
     table, gains : tables of all models, the last without sensors, for messages under way
@@ -261,6 +262,7 @@ class Simulation(Struct):
     """
 
     size: Size
+    plant: Size
     nodes: np.ndarray
     xhat: FloatArray
     root: FloatArray
