@@ -295,12 +295,11 @@ def absorption_of(kernels: Kernels) -> Any:
             run.message_weight[count], run.age[count] = state.directions[w].weight, age
             if sends_readings:
                 run.heard[count] = -1
-                if len(run.pairs.row) > 0:
-                    # Where the pairs of a message end begin those of the next one.
-                    run.pairs.first[count + 2] = run.pairs.first[count + 1]
                 if message.tag >= 0:
                     whiten_instant(state, run, count + 1, message.tag)
                     run.heard[count] = count + 1
+                if len(run.pairs.row) > 0:
+                    whiten_pairs(state, run, count + 1, message.tag)
             count, m = count + 1, message.next
         run.count = count
         absorb(record, h, run)
@@ -334,24 +333,13 @@ def whiten_instant(state: Simulation, run: ClockRun, r: int, instant: int) -> No
     """Write all samples of an ``instant`` (index in ``state.instants``) as reading ``r`` of the
     run, multiplied by the inverse of the root of R, so that the noise of each row has variance 1.
     """
-    instants, pairs, row, last = state.instants, run.pairs, 0, 0
+    instants, row = state.instants, 0
     for s in range(instants.first[instant], instants.first[instant + 1]):
+        # Readings of pairs are for others.
         if instants.block[s] == -1:
             whiten_sample(instants, run, r, s, row, len(run.size))
             row += instants.rows[instants.sensor[s]]
     run.rows[r] = row
-    # Behind them readings of pairs, in the messages that bring them.
-    if r == OWN or len(pairs.row) == 0:
-        return
-    # Readings of an inbox are written in order.
-    last = pairs.first[r]
-    for s in range(instants.first[instant], instants.first[instant + 1]):
-        if instants.block[s] >= 0:
-            whiten_sample(instants, run, r, s, row, instants.H.shape[2])
-            rows = instants.rows[instants.sensor[s]]
-            pairs.block[0, last], pairs.row[last], pairs.length[last] = instants.block[s], row, rows
-            row, last = row + rows, last + 1
-    pairs.first[r + 1] = last
 
 
 @kernel(inlined=True)
@@ -371,6 +359,24 @@ def whiten_sample(
             for k in range(i):
                 entry -= instants.root[sensor, i, k] * run.H[r, row + k, j, 0]
             run.H[r, row + i, j, 0] = entry * scale
+
+
+@kernel
+def whiten_pairs(state: Simulation, run: ClockRun, r: int, instant: int) -> None:
+    """Write the readings of pairs of an ``instant`` behind the rows of reading ``r``; those of an
+    inbox are written in order, and an ``instant`` of -1 has none.
+    """
+    instants, pairs, row, last = state.instants, run.pairs, run.rows[r], run.pairs.first[r]
+    pairs.first[r + 1] = last
+    if instant < 0:
+        return
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        if instants.block[s] >= 0:
+            whiten_sample(instants, run, r, s, row, instants.H.shape[2])
+            rows = instants.rows[instants.sensor[s]]
+            pairs.block[0, last], pairs.row[last], pairs.length[last] = instants.block[s], row, rows
+            row, last = row + rows, last + 1
+    pairs.first[r + 1] = last
 
 
 @kernel
