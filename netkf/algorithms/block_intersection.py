@@ -247,6 +247,9 @@ def use_pair(record: Any, h: int, run: Any, which: tuple[int, int, int], q: int)
                     P += rows.J[a, i] * record.heard_P[i, j] * rows.J[b, j]
                     D += rows.J[a, i] * record.heard_D[i, j] * rows.J[b, j]
             f.heard[a, b], f.told[a, b], f.noise[a, b] = D, P - D, rows.C[a, b]
+            # Others that estimate this block may use the same reading.
+            if record.alone[h] == 0:
+                f.told[a, b], f.noise[a, b] = P - D + rows.C[a, b], 0.0
 
 
 def block_record(

@@ -196,6 +196,23 @@ def test_blocks_that_change_and_whose_input_is_not_known(tmp_path: Path, text: s
     assert np.abs(added).max() > 0.1
 
 
+@pytest.mark.parametrize("rule", ["split", "ci"])
+def test_a_reading_that_several_nodes_use_makes_their_errors_dependent(
+    tmp_path: Path, rule: str
+) -> None:
+    text = ROBOTS.replace("nodes = [1, 2, 3]", "nodes = [1, 2, 3, 4]")
+    text = text.replace("[[1, 2], [2, 3]]", "[[1, 2], [1, 3], [2, 3], [2, 4], [3, 4]]")
+    text = text.replace('kind = "relative"', 'kind = "relative"\nto = [[1, 4]]')
+    text = text.replace("Q = [[0.2]]", "Q = [[0.001]]").replace("cov = [[1.0]]", "cov = [[9.0]]")
+    changes = {"filter__estimates": "own+neighbours", "filter__rule": rule}
+    scenario = load(text, tmp_path, horizon=6.0, **changes)
+    run = netkf.simulate(scenario)
+    Sigma = error_covariance(scenario, run)
+    for k, n in enumerate(scenario.sizes.tolist()):
+        gap = run.P[:, k, :n, :n] - Sigma[:, k, :n, :n]
+        assert np.linalg.eigvalsh(gap).min() > -1e-9
+
+
 def test_no_filter_of_blocks_is_better_than_the_central_one(tmp_path: Path) -> None:
     scenario = load(ROBOTS, tmp_path, filter__estimates="own+neighbours")
     promises = compute_promises(scenario)
