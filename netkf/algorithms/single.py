@@ -37,6 +37,7 @@ from netkf.algorithms.models import (
 )
 from netkf.algorithms.python_pairs import PythonPairs
 from netkf.algorithms.records import Kernels, Records, double_past, make_records
+from netkf.linalg.addresses import call_kernel
 from netkf.linalg.arrays import FloatArray, address_of
 from netkf.linalg.lanes import ONE
 from netkf.linalg.structs import Size
@@ -343,7 +344,7 @@ def predict(state: NodeState, gap: float) -> NodeState:
     for k in range(1 if state.run.clocked else round(gap / state.run.period)):
         if isinstance(model, MapModel):
             run.slot = model.slot + k
-        state.kernels.predict(new.record, 0, run)
+        call_kernel(state.kernels.predict, new.record, 0, run=run)
     if isinstance(model, MapModel | RateModel):
         model.raise_error()
     return new
@@ -357,7 +358,7 @@ def update(state: NodeState, reading: Any) -> NodeState:
     if hasattr(reading, "moments"):
         run.model.moments = np.array(reading.moments)
         run.model.increments, run.gap = 1, reading.gap
-        state.kernels.update(new.record, 0, run)
+        call_kernel(state.kernels.update, new.record, 0, run=run)
         run.model.increments = 0
         return new
     whitened = _NO_READING
@@ -366,7 +367,7 @@ def update(state: NodeState, reading: Any) -> NodeState:
     whitened = whitened._replace(pairs=reading.pairs)
     # In slots a node without a sensor gets readings without rows.
     surroundings.set_readings([whitened])
-    state.kernels.update(new.record, 0, run)
+    call_kernel(state.kernels.update, new.record, 0, run=run)
     new.reading = whitened if len(whitened.y) or whitened.pairs else None
     return new
 
@@ -385,7 +386,7 @@ def emit(state: NodeState, exchange: Any) -> tuple[NodeState, Payload | None]:
     former = {name: getattr(record.payload, name) for name in cls.struct_fields}
     payload = cls(**{k: np.zeros((count, *a.shape[1:]), a.dtype) for k, a in former.items()})
     record.payload = payload
-    state.kernels.emit(record, 0, 0, run)
+    call_kernel(state.kernels.emit, record, 0, 0, run=run)
     has_reading = new.reading is not None
     silent = exchange.slot >= 0 and not surroundings.sends(exchange.phase, has_reading)
     if silent or not run.sends[0]:
@@ -409,7 +410,7 @@ def absorb(state: NodeState, messages: Sequence[Any], exchange: Any) -> NodeStat
             parts = [_field(message.payload, name, surroundings.info.node) for message in messages]
             fields[name] = np.concatenate([_fitted(part, shape) for part in parts])
         record.payload = type(record.payload)(**fields)
-    state.kernels.absorb(record, 0, run)
+    call_kernel(state.kernels.absorb, record, 0, run=run)
     surroundings.raise_error()
     return new
 
@@ -418,7 +419,8 @@ def interval(state: NodeState) -> float:
     """Return the seconds of increments that ``update`` may use at once; inf in slots."""
     if not state.run.clocked:
         return math.inf
-    return float(state.kernels.interval(state.record, 0, state.run.struct))
+    run, interval = state.run.struct, state.kernels.interval
+    return float(call_kernel(interval, state.record, 0, run=run, number=True))
 
 
 def shift(state: Any, offset: FloatArray) -> Any:
@@ -430,12 +432,12 @@ def shift(state: Any, offset: FloatArray) -> Any:
     record, run = new.record, new.run.struct
     run.offset[:, 0] = offset
     if not of_payload:
-        new.kernels.shift(record, 0, run)
+        call_kernel(new.kernels.shift, record, 0, run=run)
         return new
     fields = {name: array.copy() for name, array in state.fields.items()}
     record.payload = type(record.payload)(**fields)
     for m in range(len(next(iter(fields.values())))):
-        new.kernels.shift_payload(record, m, run)
+        call_kernel(new.kernels.shift_payload, record, m, run=run)
     # A reading keeps the coordinates of its time.
     return Payload(fields, state.reading, state.sender)
 

@@ -159,6 +159,7 @@ class Kernel:
     def __init__(self, loops: Callable[..., Any], options: dict[str, Any]) -> None:
         """Wrap the Python function ``loops``; ``options`` are those of numba's njit."""
         self._loops, self._options = loops, options
+        self._entries: list[Any] = []
         update_wrapper(self, loops)
 
     @property
@@ -185,14 +186,35 @@ class Kernel:
     def _python_dispatcher(self) -> Callable[..., Any]:
         """The numba dispatcher for calls by Python; cached on disk with all its callees."""
         dispatcher = self._new_dispatcher()
-        _if_numba_can(_compile_well, dispatcher, self._loops)
+        _if_numba_can(_compile_well, dispatcher, "_compile_for_args", self._loops)
         return cast(Callable[..., Any], dispatcher)
+
+    def compile_entry(self, arguments: tuple[Any, ...], returns_number: bool) -> int:
+        """Return the address of a C function for ``arguments`` of these types, which returns a
+        float or nothing (``addresses``); compile it, or load it from disk.
+        """
+        numba = require_numba()
+        returned = numba.types.float64 if returns_number else numba.types.void
+        kinds = tuple(map(numba.typeof, arguments))
+        options = {k: v for k, v in self._known_options().items() if k != "no_cfunc_wrapper"}
+        try:
+            from numba.core.ccallback import CFunc
+
+            entry: Any = CFunc(self._loops, (kinds, returned), {}, options)
+            _if_numba_can(_compile_well, entry, "compile", self._loops)
+            entry.compile()
+        except (ImportError, AttributeError, TypeError):  # a private name of numba is missing
+            entry = numba.cfunc(returned(*kinds), **options)(self._loops)
+        self._entries.append(entry)
+        return int(entry.address)
 
     def _new_dispatcher(self) -> Any:
         """Return a numba dispatcher of the function."""
-        numba = require_numba()
-        options = {name: self._options[name] for name in self._options.keys() - _unknown_options()}
-        return numba.njit(**options)(self._loops)
+        return require_numba().njit(**self._known_options())(self._loops)
+
+    def _known_options(self) -> dict[str, Any]:
+        """Return the options that this numba has."""
+        return {name: self._options[name] for name in self._options.keys() - _unknown_options()}
 
 
 def _make_kernel(
@@ -228,17 +250,19 @@ def _widen_arguments(function: Any) -> None:
     function.get_call_template = template_of_widened
 
 
-def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
-    """Keep a dispatcher's code on disk, and compile with LLVM's level 2, one link step."""
+def _compile_well(function: Any, method: str, loops: Callable[..., Any]) -> None:
+    """Keep the code of a function of numba on disk, and let the ``method`` by which it is compiled
+    use LLVM's level 2, and link once.
+    """
     # Level 3 takes a quarter longer and gains nothing here.
     from llvmlite.binding import set_option
 
     config: Any = import_module("numba.core.config")
-    compile_for, level = dispatcher._compile_for_args, type(config.OPT)
+    compile_for, level = getattr(function, method), type(config.OPT)
     # Not numba's own cache, which executes what it finds, and whose files are known by the file of
     # the function alone, while callees may change. Of several processes one compiles.
     files = CodeFiles(loops, _cache_folder(config.CACHE_DIR))
-    shared = dispatcher._cache = SharedCache(files, loops.__name__)
+    shared = function._cache = SharedCache(files, loops.__name__)
 
     def compile_linked(*args: Any, **kwargs: Any) -> Any:
         try:
@@ -271,7 +295,7 @@ def _compile_well(dispatcher: Any, loops: Callable[..., Any]) -> None:
             shared.release()
             _compile_times.append(time.perf_counter() - started)
 
-    dispatcher._compile_for_args = compile_with_settings
+    setattr(function, method, compile_with_settings)
 
 
 def seconds_spent() -> float:

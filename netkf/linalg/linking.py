@@ -73,15 +73,18 @@ def _patched_numba() -> Iterator[None]:
 
 
 def _patches() -> list[tuple[Any, str, Callable[..., Any]]]:
+    from numba.core import ccallback
     from numba.core.codegen import CPUCodeLibrary
     from numba.core.cpu import CPUContext
     from numba.core.dispatcher import Dispatcher
     from numba.np import arrayobj
 
     library: Any = CPUCodeLibrary
+    c_function: Any = ccallback.CFunc
     return [
         # Depths tell the outermost function from the inner ones compiled on the way.
         (Dispatcher, "compile", _count_depth("compile", Dispatcher.compile)),
+        (c_function, "_compile_uncached", _with_code(c_function._compile_uncached)),
         (library, "finalize", _count_depth("finalize", _link_once(library.finalize))),
         (
             CPUContext,
@@ -144,6 +147,17 @@ def _count_depth(stage: str, original: Callable[..., Any]) -> Callable[..., Any]
             setattr(_DEPTH, stage, getattr(_DEPTH, stage) - 1)
 
     return count_and_call
+
+
+def _with_code(compile_uncached: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap the compilation of a C function, which is an outermost one, so that it has its code."""
+
+    def compile_and_finalize(function: Any) -> Any:
+        result = _count_depth("compile", compile_uncached)(function)
+        _count_depth("load", result.library._ensure_finalized)()
+        return result
+
+    return compile_and_finalize
 
 
 def _only_outermost(

@@ -150,6 +150,13 @@ class Struct(metaclass=StructClass):
         return made
 
     @classmethod
+    def at(cls, struct: Any) -> Any:
+        """Return a struct of this class for kernels, at the memory of another ``struct``."""
+        made = object.__new__(cls)
+        made.__dict__.update(memory=struct.memory, address=struct.address)
+        return made
+
+    @classmethod
     def struct_size(cls) -> int:
         """Return the number of int64 words of ``memory``: the end of the last field, which is one
         word for a number or the address of a struct, and one word for the address of an array plus
@@ -157,11 +164,7 @@ class Struct(metaclass=StructClass):
         """
         last = cls.struct_fields[-1]
         kind = cls.struct_kinds[last]
-        # An int is the length of a sized tuple. It takes no word, so this one is spare.
-        if isinstance(kind, int):
-            return cls.struct_offsets[last] + 1
-        # kind[1] is the number of dimensions of an array (dtype, dimensions).
-        return cls.struct_offsets[last] + 1 + (kind[1] if isinstance(kind, tuple) else 0)
+        return cls.struct_offsets[last] + 1 + _dimensions(kind)
 
     @classmethod
     def _lay_out(cls, values: dict[str, Any]) -> None:
@@ -177,13 +180,11 @@ class Struct(metaclass=StructClass):
             elif isinstance(value, Struct):
                 kinds[name] = type(value)
             elif isinstance(value, tuple):
-                # A tuple takes no words: undo the one that is added below.
-                kinds[name], word = len(value), word - 1
+                kinds[name] = len(value)
             else:
                 kinds[name] = (value.dtype, value.ndim)
-                # A pointer, and one word for each dimension.
-                word += value.ndim
-            word += 1
+            # A number or a pointer, and one word for each dimension.
+            word += 1 + _dimensions(kinds[name])
         cls.struct_kinds, cls.struct_offsets = kinds, offsets
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -212,7 +213,13 @@ class Struct(metaclass=StructClass):
         if not isinstance(kind, int) and type(value) is not kind:
             raise TypeError(f"{type(self).__name__}.{name} is a {kind.__name__}")
         self.__dict__[name] = value
-        return () if isinstance(kind, int) else (value.address,)
+        return (0, kind) if isinstance(kind, int) else (value.address,)
+
+    @property
+    def general(self) -> Any:
+        """The same memory as a struct of the class for any size, which has the same layout."""
+        cls = _general_class(type(self))
+        return self if is_plain() or cls is type(self) else cls.at(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what pickle needs to make the struct again: its class, n and fields."""
@@ -239,6 +246,27 @@ Derived = TypeVar("Derived", bound=Struct)
 _sized_classes: dict[tuple[type[Struct], int], Any] = {}
 _structs: WeakValueDictionary[int, Struct] = WeakValueDictionary()
 """All structs by address, for ``struct_at`` in plain Python."""
+
+
+def _dimensions(kind: Any) -> int:
+    """Return the number of words of a shape; that of a sized tuple is that of an array."""
+    return kind[1] if isinstance(kind, tuple) else int(isinstance(kind, int))
+
+
+def _general_class(cls: Any) -> Any:
+    """Return the class that ``cls`` was made of by ``of_size``, else ``cls``, laid out alike."""
+    base = cls.__base__
+    if base is Struct:
+        return cls
+    if not base.struct_kinds:
+        kinds = dict(cls.struct_kinds)
+        for name, kind in kinds.items():
+            if base.__annotations__[name] == "Size":
+                kinds[name] = (np.dtype(np.float64), 1)
+            elif isinstance(kind, StructClass):
+                kinds[name] = _general_class(kind)
+        base.struct_kinds, base.struct_offsets = kinds, cls.struct_offsets
+    return base
 
 
 def _array_at(address: int, dtype: np.dtype, shape: Any) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Filters under clocks as records: what the composed event loop needs, made once for each run."""
+"""Filters under clocks as records: what the event loop needs, made once for each run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from netkf.algorithms.kernels.run import (
 )
 from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_arrays import BatchArrays
-from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, shift_loop
+from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, clock_verbs
 from netkf.engines.compiled.samples import entries_of
 from netkf.engines.compiled.slot_pairs import BlockColumns
 from netkf.engines.compiled.state import (
@@ -29,6 +29,7 @@ from netkf.engines.compiled.state import (
     add_messages,
     wide_models,
 )
+from netkf.linalg.addresses import any_struct, call_kernel
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.generic import copy_arrays
 from netkf.linalg.lanes import ONE
@@ -45,7 +46,7 @@ class ClockFilters:
         start: Filters,
         messages: int,
     ) -> None:
-        self.kernels, self._loop = kernels, clock_loop(kernels)
+        self.kernels = kernels
         self._p = self._samples = 1
         columns = BlockColumns(scenario, entries_of(scenario))
         self._columns = columns.width, columns.entries.shape[1]
@@ -89,13 +90,16 @@ class ClockFilters:
             now=0.0,
             **scratch_of(n, 1),
         )
+        self._run = self.run.general
+        reads = bool((start.nodes["sensors"] > start.nodes["sensor"]).any())
+        self._verbs = clock_verbs(kernels, self.record, self.run, reads)
         self._conserved: tuple[str, ...] = ()
         if "conserved" in self.records.arrays:
             first = scenario.initial_estimate(infos[0].node)
             state = scenario.node_filter.init(models[0], *first, infos[0])
             self._conserved = tuple(scenario.node_filter.analysis.conserved(state))
             for h in range(len(infos)):
-                kernels.observe(self.record, h, self.run)
+                call_kernel(kernels.observe, self.record, h, run=self.run)
         self._at_start = self._sums()
 
     def begin(self, instants: Instants) -> None:
@@ -163,16 +167,17 @@ class ClockFilters:
 
     def advance(self, state: Simulation) -> int:
         """Run the event loop until it needs something from Python; return its request."""
-        return int(self._loop(state, self.record, self.run))
+        return int(clock_loop(state, any_struct(self.record), self._run, self._verbs))
 
     def simulate(self, state: Simulation, batch: BatchArrays) -> None:
         """Simulate all runs of a batch; the results are in ``batch``, samples in
         ``state.buffer``.
         """
-        simulate, run, resumed = batch_loop(self.kernels), 0, False
+        run, resumed = 0, False
+        records = any_struct(self.record), any_struct(self.start)
         while run < len(batch.lengths):
-            arguments = self.record, self.start, self.run, batch.memory, run, resumed
-            run = int(simulate(state, *arguments))
+            arguments = *records, self._run, self._verbs, batch.memory, run, resumed
+            run = int(batch_loop(state, *arguments))
             # A run stops only if the pool of messages is too small.
             if run < len(batch.lengths):
                 add_messages(state, state.most_messages)
@@ -190,6 +195,7 @@ class ClockFilters:
         """Make room for twice as many past events of each node."""
         for record in (self.record, self.start):
             double_past(record, self.records.past)
+        self._verbs.room = self.record.room
 
     def shift(self, scenario: Scenario, state: Simulation, offset: FloatArray) -> None:
         """Move all nodes and messages under way by ``offset`` (n,), as the origin has moved."""
@@ -197,11 +203,12 @@ class ClockFilters:
             self.grow_past()
         run, now = self.run, float(state.frames[state.frame_at])
         run.offset[:, 0] = offset
-        shift_loop(self.kernels)(self.record, run)
+        for h in range(len(self.record.xhat)):
+            call_kernel(self.kernels.shift, self.record, h, run=run)
         for m in state.heap[: state.in_flight].tolist():
             # A payload refers to the time of sending: predict the offset back to it.
             run.offset[:, 0] = scenario.move_back(offset, now - state.pool["sent"][m])
-            self.kernels.shift_payload(self.record, m, run)
+            call_kernel(self.kernels.shift_payload, self.record, m, run=run)
 
 
 def _links_by_receiver(scenario: Scenario) -> dict[str, Any]:

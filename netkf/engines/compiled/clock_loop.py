@@ -1,15 +1,17 @@
-"""The one event loop of all filters under clocks, composed of the verbs of a filter.
+"""The one event loop of all filters under clocks, which calls the verbs of a filter by address.
 
-``clock_loop`` makes it for a filter's kernels. It finds the next event, predicts the nodes that
-take part in it, and calls its handler; events are ordered by (time, rank, entity) as in
-``engines.base``. It returns a request when Python has something to do (``events``).
+It finds the next event, predicts the nodes that take part in it, and calls its handler; events are
+ordered by (time, rank, entity) as in ``engines.base``. It returns a request when Python has
+something to do (``events``).
 """
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
+import numpy as np
+
+from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.run import ClockRun, interval_end
 from netkf.algorithms.records import Kernels
 from netkf.core.instants import snapped
@@ -53,279 +55,310 @@ from netkf.engines.compiled.events import (
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.message_queue import push, release, sort_indices, take
 from netkf.engines.compiled.state import AFTER_READINGS, NODES, Instants, Simulation
+from netkf.linalg.addresses import NOTHING, address_of, call_at, call_at_two, number_at
+from netkf.linalg.arrays import IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import copy_arrays, copy_row
-from netkf.linalg.structs import struct_at
+from netkf.linalg.structs import Struct, struct_at
 
+FLAGS = ("decides", "sends_readings", "remembers", "counts_sends", "addressed")
+"""Names of properties of kernels that the loop asks for."""
 OWN = 0
 """The reading of ``update`` in the tables of a run; those of messages follow."""
 
 
-@cache
-def clock_loop(kernels: Kernels) -> Any:
-    """Return the event loop for a filter's kernels, ``loop(state, record, run)``, which returns a
-    request (``events``).
+class ClockVerbs(Struct):
+    """Addresses of a filter's verbs, and what ``records.Kernels`` says of them as 0 or 1.
+
+    copy : copies a payload to another one
+    restart : copies all arrays of a record that is given in place of a run
+    kept, room : of a filter that remembers, see ``records.Record``
     """
-    predict_node = prediction_of(kernels)
-    on_tick = ticking_of(kernels)
-    on_absorb = absorption_of(kernels)
-    on_sample = sampling_of(kernels)
-    counts_sends, remembers = kernels.counts_sends, kernels.remembers
-    observe = kernels.observe
 
-    @kernel
-    def predict_participants(
-        state: Simulation, record: Any, run: ClockRun, event: int, now: float
-    ) -> None:
-        """Predict the nodes that take part in an event to ``now`` (seconds)."""
-        # The sender of a message that is lost needs no prediction, unless it reads increments.
-        lost = event == ON_TICK and not counts_sends and is_lost(state)
-        for k in range(count_participants(state, event)):
-            h = participant(state, event, k)
-            if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
-                predict_node(state, record, run, h, now)
-
-    @kernel
-    def on_probe(state: Simulation, record: Any, run: ClockRun) -> bool:
-        """Store a sample of all nodes; return False if there is no space for another one."""
-        for h in range(len(state.nodes)):
-            observe(record, h, run)
-        store_sample(state, state.run, 0, state.samples)
-        return count_sample(state)
-
-    @kernel
-    def shortage(state: Simulation, record: Any, event: int, now: float) -> int:
-        """Return the request for what an event lacks, as ``find_shortage``."""
-        request = int(find_shortage(state, now))
-        if remembers and request == GO_ON and lacks_past(state, record, event):
-            return WANT_PAST
-        return request
-
-    @kernel
-    def loop(state: Simulation, record: Any, run: ClockRun) -> int:
-        """Simulate the run ``state`` until the loop needs something from Python."""
-        while True:
-            # Check first that the event has everything it needs: if not, nothing has changed, and
-            # the next call finds the same event again.
-            event, now = next_event(state)
-            request = shortage(state, record, event, now)
-            if request != GO_ON:
-                return request
-            seek_piece(state, now)
-            run.now = now
-            predict_participants(state, record, run, event, now)
-            if event == ON_TICK:
-                on_tick(state, record, run, now)
-                # Absorptions come next, unless there are other events at this instant.
-                if not remembers and state.receivers > 0 and ends_instant(state, now):
-                    sort_indices(state.waiting, state.receivers)
-                    while state.receivers > 0:
-                        predict_node(state, record, run, state.waiting[state.absorbing], now)
-                        on_absorb(state, record, run, now)
-            elif event == ON_ABSORB:
-                on_absorb(state, record, run, now)
-            elif event == ON_SENSE:
-                on_sense(state, now)
-            elif event == ON_SAMPLE:
-                on_sample(state, record, run, now)
-            elif event == ON_DELIVER:
-                on_deliver(state, now)
-            elif event == ON_REBASE:
-                # Python moves the origin and goes to the next frame.
-                return WANT_REBASE
-            elif not on_probe(state, record, run):
-                return WANT_SAMPLES
-
-    return loop
-
-
-def prediction_of(kernels: Kernels) -> Any:
-    """Return the kernel that predicts a node to a time, using its increments."""
-    predict, update, interval = kernels.predict, kernels.update, kernels.interval
-
-    @kernel
-    def predict_node(state: Simulation, record: Any, run: ClockRun, h: int, time: float) -> None:
-        """Predict node ``h`` to ``time`` (seconds) unless it is there already."""
-        node, now, model, least = state.nodes[h], state.now[h], run.model, 0.0
-        # ``not <`` also returns for a time that is nan.
-        if not now < time:
-            return
-        state.now[h] = time
-        if node.sensors == node.sensor:
-            run.gap = time - now
-            predict(record, h, run)
-            return
-        moments = model.moments[: model.gains.moments[node.model]]
-        while now < time:
-            end, length = time, interval(record, h, run)
-            if length < time - now:
-                # A lower bound that is set once per gap: a diverging P would make intervals ever
-                # shorter.
-                if least == 0.0:
-                    least = MIN_GAP_SHARE * (time - now)
-                end = interval_end(now, time, max(length, least))
-            least *= LONGER
-            # The increments of a gap are an observation at its end.
-            run.gap = end - now
-            predict(record, h, run)
-            fill_readings(state, state.run, h, state.piece, now, end, moments)
-            model.increments = 1
-            update(record, h, run)
-            model.increments = 0
-            now = end
-
-    return predict_node
-
-
-def sampling_of(kernels: Kernels) -> Any:
-    """Return the kernel that updates a node with all its samples of an instant."""
-    update = kernels.update
-
-    @kernel
-    def on_sample(state: Simulation, record: Any, run: ClockRun, now: float) -> None:
-        """Update a node with its samples of the next instant, ``now`` (seconds)."""
-        instants, instant = state.instants, state.instant_at
-        h, last_node = instants.index[instant], -1
-        for s in range(instants.first[instant], instants.first[instant + 1]):
-            # A pooled filter reads several nodes at an instant: one row for each.
-            if instants.node[s] != last_node:
-                last_node = instants.node[s]
-                record_event(state, now, SENSE, last_node, -1, -1)
-        whiten_instant(state, run, OWN, instant)
-        run.reading = OWN
-        update(record, h, run)
-        state.nodes[h].reading = instant
-        state.instant_at += 1
-
-    return on_sample
-
-
-def ticking_of(kernels: Kernels) -> Any:
-    """Return the kernel of the ticks of clocks, and of transmissions after samples."""
-    emit, decides, addressed = kernels.emit, kernels.decides, kernels.addressed
-    sends_readings, counts_sends = kernels.sends_readings, kernels.counts_sends
-
-    @kernel
-    def send_all(
-        state: Simulation, record: Any, run: ClockRun, h: int, links: tuple[int, int, int],
-        now: float,
-    ) -> None:  # fmt: skip
-        """Let node ``h`` send one payload on the directed links ``outgoing[first:after]``, whose
-        outcomes begin at ``delay[outcome]``; ``links`` = (first, after, outcome).
-        """
-        first, after, outcome = links
-        ticks, broadcast, m = state.ticks, state.clock_kind >= NODES, take(state)
-        arrives = counts_sends or decides
-        for k in range(after - first):
-            arrives = arrives or ticks.delay[outcome + k] >= 0.0
-        run.sends[0] = 1
-        if arrives and not addressed:
-            emit(record, h, m, run)
-        if decides and run.sends[0] == 0:
-            release(state, m)
-            return
-        if broadcast:
-            record_event(state, now, TRANSMIT, state.nodes[h].id, -1, state.nodes[h].sent)
-            state.nodes[h].sent += 1
-        # The reading of this instant goes with the message.
-        tag, used = -1, False
-        if sends_readings:
-            reading = state.nodes[h].reading
-            if reading >= 0 and state.instants.t[reading] == now:
-                tag = reading
-        for k in range(first, after):
-            w = state.outgoing[k]
-            delay = snapped(ticks.delay[outcome + k - first], state.per_second)
-            if is_sent(state, w, delay, now):
-                copy = m
-                if used:
-                    copy = take(state)
-                    if not addressed:
-                        copy_row(record.payload, copy, m)
-                used = True
-                if addressed:
-                    run.receiver = run.opposite[state.incoming[w]]
-                    emit(record, h, copy, run)
-                dispatch(state, w, copy, tag, delay, now)
-        if not used:
-            release(state, m)
-
-    @kernel
-    def on_tick(state: Simulation, record: Any, run: ClockRun, now: float) -> None:
-        """Handle the next tick of a clock at ``now`` (seconds), or a transmission after a sample:
-        send on each directed link of its entity.
-        """
-        ticks, nodes, k = state.ticks, state.nodes, state.tick_at
-        entity = state.entities[ticks.entity[k]]
-        i, j = entity.sender, entity.other
-        # A transmission after a sample has no tick of its own.
-        if state.clock_kind != AFTER_READINGS:
-            record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
-        state.tick_at += 1
-        outcome = state.first_delay + ticks.first_outcome[k]
-        if state.clock_kind >= NODES:
-            send_all(state, record, run, i, (entity.first, entity.after, outcome), now)
-            return
-        # Each end of a link sends a payload of its own.
-        for w in range(entity.first, entity.after):
-            h = state.directions[state.outgoing[w]].sender
-            send_all(state, record, run, h, (w, w + 1, outcome + w - entity.first), now)
-
-    return on_tick
-
-
-def absorption_of(kernels: Kernels) -> Any:
-    """Return the kernel by which a node absorbs the messages of an instant."""
-    absorb, sends_readings = kernels.absorb, kernels.sends_readings
-
-    @kernel
-    def on_absorb(state: Simulation, record: Any, run: ClockRun, now: float) -> None:
-        """Let the next node absorb all messages of this instant ``now`` (seconds), in the order of
-        senders.
-        """
-        pool, h = state.pool, state.waiting[state.absorbing]
-        node, oldest, count = state.nodes[h], 0.0, 0
-        m = node.inbox
-        while m != -1:
-            message = pool[m]
-            age = snapped(now - message.sent, state.per_second)
-            oldest = max(oldest, age)
-            w = message.direction
-            run.message[count], run.link[count] = m, state.incoming[w]
-            run.message_weight[count], run.age[count] = state.directions[w].weight, age
-            if sends_readings:
-                run.heard[count] = -1
-                if message.tag >= 0:
-                    whiten_instant(state, run, count + 1, message.tag)
-                    run.heard[count] = count + 1
-                if len(run.pairs.row) > 0:
-                    whiten_pairs(state, run, count + 1, message.tag)
-            count, m = count + 1, message.next
-        run.count = count
-        absorb(record, h, run)
-        # Messages return to the pool only now, since their payloads were read.
-        m = node.inbox
-        while m != -1:
-            following = pool[m].next
-            release(state, m)
-            m = following
-        node.inbox = -1
-        record_event_with_age(state, now, ABSORB, node.id, -1, -1, oldest)
-        state.absorbing += 1
-        # All messages of this instant are absorbed.
-        if state.absorbing == state.receivers:
-            state.absorbing = state.receivers = 0
-
-    return on_absorb
+    predict: int
+    update: int
+    emit: int
+    absorb: int
+    observe: int
+    interval: int
+    copy: int
+    restart: int
+    decides: int
+    sends_readings: int
+    remembers: int
+    counts_sends: int
+    addressed: int
+    room: int
+    kept: IntArray
 
 
 @kernel
-def lacks_past(state: Simulation, record: Any, event: int) -> bool:
+def copy_payload(record: Any, to: int, m: int, _run: Any) -> None:
+    """Copy payload ``m`` of a record."""
+    copy_row(record.payload, to, m)
+
+
+@kernel
+def restart(record: Any, _h: int, start: Any) -> None:
+    """Make all arrays of a record those of ``start``."""
+    copy_arrays(record, start)
+
+
+def clock_verbs(kernels: Kernels, record: Any, run: ClockRun, increments: bool) -> ClockVerbs:
+    """Return the verbs of a filter for its record and its run; ``increments``: some nodes read."""
+    key = kernels, type(record), type(run), increments
+    # Those of a filter that remembers are of one record.
+    if key not in _verbs or kernels.remembers:
+        _verbs[key] = _compiled_verbs(kernels, record, run, increments)
+    return _verbs[key]
+
+
+_verbs: dict[tuple[Any, ...], ClockVerbs] = {}
+
+
+def _compiled_verbs(kernels: Kernels, record: Any, run: ClockRun, increments: bool) -> ClockVerbs:
+    observes = kernels.observe is not standard.observe
+    return ClockVerbs(
+        predict=address_of(kernels.predict, record, run),
+        update=address_of(kernels.update, record, run),
+        emit=address_of(kernels.emit, record, run, 2),
+        absorb=address_of(kernels.absorb, record, run),
+        observe=address_of(kernels.observe, record, run) if observes else NOTHING,
+        interval=address_of(kernels.interval, record, run, number=True) if increments else NOTHING,
+        copy=address_of(copy_payload, record, run, 2),
+        restart=address_of(restart, record, record),
+        **{name: getattr(kernels, name) for name in FLAGS},
+        room=record.room if kernels.remembers else 0,
+        kept=record.kept if kernels.remembers else np.zeros((0, 1), dtype=np.int64),
+    )
+
+
+@kernel
+def clock_loop(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs) -> int:
+    """Simulate the run ``state`` until the loop needs something from Python."""
+    while True:
+        # Check first that the event has everything it needs: if not, nothing has changed, and
+        # the next call finds the same event again.
+        event, now = next_event(state)
+        request = find_shortage(state, now)
+        if request == GO_ON and verbs.remembers == 1 and lacks_past(state, verbs, event):
+            request = WANT_PAST
+        if request != GO_ON:
+            return request
+        seek_piece(state, now)
+        run.now = now
+        predict_participants(state, record, run, verbs, event, now)
+        if event == ON_TICK:
+            on_tick(state, record, run, verbs, now)
+            # Absorptions come next, unless there are other events at this instant.
+            if verbs.remembers == 0 and state.receivers > 0 and ends_instant(state, now):
+                sort_indices(state.waiting, state.receivers)
+                while state.receivers > 0:
+                    h = state.waiting[state.absorbing]
+                    predict_node(state, record, run, verbs, h, now)
+                    on_absorb(state, record, run, verbs, now)
+        elif event == ON_ABSORB:
+            on_absorb(state, record, run, verbs, now)
+        elif event == ON_SENSE:
+            on_sense(state, now)
+        elif event == ON_SAMPLE:
+            on_sample(state, record, run, verbs, now)
+        elif event == ON_DELIVER:
+            on_deliver(state, now)
+        elif event == ON_REBASE:
+            # Python moves the origin and goes to the next frame.
+            return WANT_REBASE
+        elif not on_probe(state, record, run, verbs):
+            return WANT_SAMPLES
+
+
+@kernel
+def predict_participants(
+    state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, event: int, now: float
+) -> None:
+    """Predict the nodes that take part in an event to ``now`` (seconds)."""
+    # The sender of a message that is lost needs no prediction, unless it reads increments.
+    lost = event == ON_TICK and verbs.counts_sends == 0 and is_lost(state)
+    for k in range(count_participants(state, event)):
+        h = participant(state, event, k)
+        if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
+            predict_node(state, record, run, verbs, h, now)
+
+
+@kernel
+def on_probe(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs) -> bool:
+    """Store a sample of all nodes; return False if there is no space for another one."""
+    for h in range(len(state.nodes) if verbs.observe != NOTHING else 0):
+        call_at(verbs.observe, record, h, run)
+    store_sample(state, state.run, 0, state.samples)
+    return count_sample(state)
+
+
+@kernel
+def predict_node(
+    state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, h: int, time: float
+) -> None:
+    """Predict node ``h`` to ``time`` (seconds) unless it is there already, using its increments."""
+    node, now, model, least = state.nodes[h], state.now[h], run.model, 0.0
+    # ``not <`` also returns for a time that is nan.
+    if not now < time:
+        return
+    state.now[h] = time
+    if node.sensors == node.sensor:
+        run.gap = time - now
+        call_at(verbs.predict, record, h, run)
+        return
+    moments = model.moments[: model.gains.moments[node.model]]
+    while now < time:
+        end, length = time, number_at(verbs.interval, record, h, run)
+        if length < time - now:
+            # A lower bound that is set once per gap: a diverging P would make intervals ever
+            # shorter.
+            if least == 0.0:
+                least = MIN_GAP_SHARE * (time - now)
+            end = interval_end(now, time, max(length, least))
+        least *= LONGER
+        # The increments of a gap are an observation at its end.
+        run.gap = end - now
+        call_at(verbs.predict, record, h, run)
+        fill_readings(state, state.run, h, state.piece, now, end, moments)
+        model.increments = 1
+        call_at(verbs.update, record, h, run)
+        model.increments = 0
+        now = end
+
+
+@kernel
+def on_sample(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, now: float) -> None:
+    """Update a node with its samples of the next instant, ``now`` (seconds)."""
+    instants, instant = state.instants, state.instant_at
+    h, last_node = instants.index[instant], -1
+    for s in range(instants.first[instant], instants.first[instant + 1]):
+        # A pooled filter reads several nodes at an instant: one row for each.
+        if instants.node[s] != last_node:
+            last_node = instants.node[s]
+            record_event(state, now, SENSE, last_node, -1, -1)
+    whiten_instant(state, run, OWN, instant)
+    run.reading = OWN
+    call_at(verbs.update, record, h, run)
+    state.nodes[h].reading = instant
+    state.instant_at += 1
+
+
+@kernel
+def on_tick(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, now: float) -> None:
+    """Handle the next tick of a clock at ``now`` (seconds), or a transmission after a sample:
+    send on each directed link of its entity.
+    """
+    ticks, nodes, k = state.ticks, state.nodes, state.tick_at
+    entity = state.entities[ticks.entity[k]]
+    i, j = entity.sender, entity.other
+    # A transmission after a sample has no tick of its own.
+    if state.clock_kind != AFTER_READINGS:
+        record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
+    state.tick_at += 1
+    outcome = state.first_delay + ticks.first_outcome[k]
+    if state.clock_kind >= NODES:
+        send_all(state, record, run, verbs, i, (entity.first, entity.after, outcome), now)
+        return
+    # Each end of a link sends a payload of its own.
+    for w in range(entity.first, entity.after):
+        h = state.directions[state.outgoing[w]].sender
+        send_all(state, record, run, verbs, h, (w, w + 1, outcome + w - entity.first), now)
+
+
+@kernel
+def send_all(
+    state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, h: int,
+    links: tuple[int, int, int], now: float,
+) -> None:  # fmt: skip
+    """Let node ``h`` send one payload on the directed links ``outgoing[first:after]``, whose
+    outcomes begin at ``delay[outcome]``; ``links`` = (first, after, outcome).
+    """
+    first, after, outcome = links
+    ticks, broadcast, m = state.ticks, state.clock_kind >= NODES, take(state)
+    arrives = verbs.counts_sends == 1 or verbs.decides == 1
+    for k in range(after - first):
+        arrives = arrives or ticks.delay[outcome + k] >= 0.0
+    run.sends[0] = 1
+    if arrives and verbs.addressed == 0:
+        call_at_two(verbs.emit, record, h, m, run)
+    if verbs.decides == 1 and run.sends[0] == 0:
+        release(state, m)
+        return
+    if broadcast:
+        record_event(state, now, TRANSMIT, state.nodes[h].id, -1, state.nodes[h].sent)
+        state.nodes[h].sent += 1
+    # The reading of this instant goes with the message.
+    tag, used = -1, False
+    if verbs.sends_readings == 1:
+        reading = state.nodes[h].reading
+        if reading >= 0 and state.instants.t[reading] == now:
+            tag = reading
+    for k in range(first, after):
+        w = state.outgoing[k]
+        delay = snapped(ticks.delay[outcome + k - first], state.per_second)
+        if is_sent(state, w, delay, now):
+            copy = m
+            if used:
+                copy = take(state)
+                if verbs.addressed == 0:
+                    call_at_two(verbs.copy, record, copy, m, run)
+            used = True
+            if verbs.addressed == 1:
+                run.receiver = run.opposite[state.incoming[w]]
+                call_at_two(verbs.emit, record, h, copy, run)
+            dispatch(state, w, copy, tag, delay, now)
+    if not used:
+        release(state, m)
+
+
+@kernel
+def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, now: float) -> None:
+    """Let the next node absorb all messages of this instant ``now`` (seconds), in the order of
+    senders.
+    """
+    pool, h = state.pool, state.waiting[state.absorbing]
+    node, oldest, count = state.nodes[h], 0.0, 0
+    m = node.inbox
+    while m != -1:
+        message = pool[m]
+        age = snapped(now - message.sent, state.per_second)
+        oldest = max(oldest, age)
+        w = message.direction
+        run.message[count], run.link[count] = m, state.incoming[w]
+        run.message_weight[count], run.age[count] = state.directions[w].weight, age
+        if verbs.sends_readings == 1:
+            run.heard[count] = -1
+            if message.tag >= 0:
+                whiten_instant(state, run, count + 1, message.tag)
+                run.heard[count] = count + 1
+            if len(run.pairs.row) > 0:
+                whiten_pairs(state, run, count + 1, message.tag)
+        count, m = count + 1, message.next
+    run.count = count
+    call_at(verbs.absorb, record, h, run)
+    # Messages return to the pool only now, since their payloads were read.
+    m = node.inbox
+    while m != -1:
+        following = pool[m].next
+        release(state, m)
+        m = following
+    node.inbox = -1
+    record_event_with_age(state, now, ABSORB, node.id, -1, -1, oldest)
+    state.absorbing += 1
+    # All messages of this instant are absorbed.
+    if state.absorbing == state.receivers:
+        state.absorbing = state.receivers = 0
+
+
+@kernel
+def lacks_past(state: Simulation, verbs: ClockVerbs, event: int) -> bool:
     """Return True if an event may add more past events to a node than there is room for."""
     if event not in (ON_SAMPLE, ON_ABSORB):
         return False
     h = participant(state, event, 0)
-    return bool(record.kept[h, 0] + max_readings(state, event) > record.room)
+    return bool(verbs.kept[h, 0] + max_readings(state, event) > verbs.room)
 
 
 @kernel
@@ -419,51 +452,30 @@ def dispatch(state: Simulation, w: int, m: int, tag: int, delay: float, now: flo
     state.in_flight += 1
 
 
-@cache
-def batch_loop(kernels: Kernels) -> Any:
-    """Return the kernel of a batch of runs, ``simulate(state, record, start, run, batch_memory,
-    first, resumed)``: it simulates them from number ``first`` on, each from the record ``start``,
-    and returns the number of the run that needs a larger pool of messages, or the number of runs.
+@kernel
+def batch_loop(
+    state: Simulation, record: Any, start: Any, run: ClockRun, verbs: ClockVerbs,
+    batch_memory: Any, first: int, resumed: bool,
+) -> int:  # fmt: skip
+    """Simulate the runs of a batch from number ``first`` on, each from the record ``start``; return
+    the number of the run that needs a larger pool of messages, or the number of runs.
+    ``resumed``: the first goes on where it stopped.
     """
-    loop = clock_loop(kernels)
-
-    @kernel
-    def simulate(
-        state: Simulation, record: Any, start: Any, run: ClockRun, batch_memory: Any,
-        first: int, resumed: bool,
-    ) -> int:  # fmt: skip
-        """Simulate the runs of a batch; ``resumed``: the first goes on where it stopped."""
-        batch, r = struct_at(batch_memory, BatchArrays), first
-        while r < len(batch.lengths):
-            if not resumed:
-                state.first_run = r
-                copy_arrays(record, start)
-                for h in range(len(batch.nodes)):
-                    state.nodes[h] = batch.nodes[h]
-                    state.now[h] = 0.0
-                reset_messages(state)
-                begin(state, batch, r)
-            resumed, request = False, -1
-            while request != DONE:
-                request = loop(state, record, run)
-                if request == WANT_MESSAGES:
-                    return r
-            finish(state, batch, r)
-            r += 1
-        return r
-
-    return simulate
-
-
-@cache
-def shift_loop(kernels: Kernels) -> Any:
-    """Return the kernel that moves the origin of all nodes of a run by ``-run.offset``."""
-    shift = kernels.shift
-
-    @kernel
-    def shift_all(record: Any, run: ClockRun) -> None:
-        """Shift every node."""
-        for h in range(len(record.xhat)):
-            shift(record, h, run)
-
-    return shift_all
+    batch, r = struct_at(batch_memory, BatchArrays), first
+    while r < len(batch.lengths):
+        if not resumed:
+            state.first_run = r
+            call_at(verbs.restart, record, 0, start)
+            for h in range(len(batch.nodes)):
+                state.nodes[h] = batch.nodes[h]
+                state.now[h] = 0.0
+            reset_messages(state)
+            begin(state, batch, r)
+        resumed, request = False, -1
+        while request != DONE:
+            request = clock_loop(state, record, run, verbs)
+            if request == WANT_MESSAGES:
+                return r
+        finish(state, batch, r)
+        r += 1
+    return r

@@ -95,7 +95,7 @@ class CompiledEngine(Engine):
             linear = all(sensor.linear for sensor in scenario.sensors)
             compiling.announce(slot_loop(kernels, linear, slot_setup(scenario).own_models))
         else:
-            compiling.announce(simulate_agenda if is_immediate(scenario) else clock_loop(kernels))
+            compiling.announce(simulate_agenda if is_immediate(scenario) else clock_loop)
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

@@ -10,24 +10,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
+from netkf.algorithms.kernels.run import ClockRun
 from netkf.algorithms.records import Kernels, make_records, record_class
 from netkf.core.errors import TheoryError
 from netkf.engines.compiled.clock_filters import ClockFilters
 from netkf.engines.compiled.state import filters_at_start
+from netkf.linalg.addresses import NOTHING, address_of, any_struct, call_at, call_at_two
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import struct_like
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.forms import MEAN, Forms
 
-PREDICT, UPDATE, EMIT, ABSORB, SHIFT, SHIFT_PAYLOAD = range(6)
-"""Verbs; PREDICT is nothing else but the prediction, with which all begin."""
 PAYLOAD = "payload "
 """Prefix of names of arrays of messages."""
 NO_PLACES, NO_FORMS = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))
@@ -126,68 +125,45 @@ def move_forms(
             table[target, c] = moved[i, c]
 
 
-@cache
-def prober(kernels: Kernels, moves: bool) -> Any:
-    """Return a kernel that predicts node ``h`` over ``gap`` seconds, if that is not 0, and runs
-    ``verb``, one of the numbers below, or, if it ``moves``, SHIFT or SHIFT_PAYLOAD. It does so on
-    the numbers ``words`` (w,) of the ``stored`` filters (W,), and applies their linear map to the
-    forms, rows ``row`` (W,) of ``table``. The first ``keep`` words are what may change; the last
-    ``written`` are only written.
+@kernel
+def probe(
+    record: Any, memories: np.ndarray, run: ClockRun, blocks: FloatArray, stored: FloatArray,
+    is_float: np.ndarray, words: IntArray, row: IntArray, keep: int, written: int,
+    places: IntArray, others: FloatArray, count: int, table: FloatArray, used: int,
+    predict: int, act: int, h: int, m: int, gap: float, inputs: IntArray, out: FloatArray,
+    moved: FloatArray, found: IntArray,
+) -> int:  # fmt: skip
+    """Predict node ``h`` over ``gap`` seconds, if that is not 0, and run a verb, by their addresses
+    ``predict`` and ``act``, on the numbers ``words`` (w,) of the ``stored`` filters (W,), and apply
+    their linear map to the forms, rows ``row`` (W,) of ``table``. The first ``keep`` words are what
+    may change; the last ``written`` are only written. With a message ``m`` >= 0 the verb is
+    ``emit``.
 
     The verb depends on further numbers, whose forms are ``others`` (k, C): ``places`` (k, 2) say
     row i of reading r, or entry i of the offset for r = -1; there are ``count`` readings. They run
     in ``blocks`` (B, W). Columns of the linear map are written into ``out``; ``moved`` is scratch.
 
-    The kernel returns 0; a negative number if it needs so many blocks; or how many words depend on
-    noise now that did not: their places are written into ``found``, and no form has changed.
+    Return 0; a negative number if it needs so many blocks; or how many words depend on noise now
+    that did not: their places are written into ``found``, and no form has changed.
     """
-    # One kernel for all verbs is compiled faster than one for each; few runs move the origin.
-    predict, update, emit, absorb = kernels.predict, kernels.update, kernels.emit, kernels.absorb
-    shift, shift_payload = kernels.shift, kernels.shift_payload
-
-    @kernel
-    def run_verb(record: Any, run: Any, verb: int, h: int, m: int) -> None:
-        if verb == UPDATE:
-            update(record, h, run)
-        elif verb == EMIT:
-            emit(record, h, m, run)
-        elif verb == ABSORB:
-            absorb(record, h, run)
-
-    @kernel
-    def move(record: Any, run: Any, verb: int, h: int, m: int) -> None:
-        if verb == SHIFT:
-            shift(record, h, run)
-        else:
-            shift_payload(record, m, run)
-
-    act = move if moves else run_verb
-
-    @kernel
-    def probe(
-        record: Any, memories: np.ndarray, run: Any, blocks: FloatArray, stored: FloatArray,
-        is_float: np.ndarray, words: IntArray, row: IntArray, keep: int, written: int,
-        places: IntArray, others: FloatArray, count: int, table: FloatArray, used: int,
-        verb: int, h: int, m: int, gap: float, inputs: IntArray, out: FloatArray,
-        moved: FloatArray, found: IntArray,
-    ) -> int:  # fmt: skip
-        number = find_inputs(words, written, row, inputs)
-        changes = number + len(places)
-        if changes + 1 > len(blocks) or (changes + 1) * count > len(run.y):
-            return -(changes + 1)
-        fill_blocks(run, blocks, stored, words, count, changes)
-        for b in range(changes + 1):
-            change(run, blocks[b], words, inputs, number, places, count, b)
-            if gap > 0.0:
-                run.gap = gap
-                predict(struct_like(record, memories[b]), h, run)
-            act(struct_like(record, memories[b]), run, verb, h, m)
-        new = read_map(blocks, stored, is_float, words, row, keep, changes, out, found)
-        if new == 0:
-            move_forms(table, used, words, row, keep, inputs, number, others, out, moved)
-        return int(new)
-
-    return probe
+    number = find_inputs(words, written, row, inputs)
+    changes = number + len(places)
+    if changes + 1 > len(blocks) or (changes + 1) * count > len(run.y):
+        return -(changes + 1)
+    fill_blocks(run, blocks, stored, words, count, changes)
+    for b in range(changes + 1):
+        change(run, blocks[b], words, inputs, number, places, count, b)
+        if gap > 0.0:
+            run.gap = gap
+            call_at(predict, struct_like(record, memories[b]), h, run)
+        if m >= 0:
+            call_at_two(act, struct_like(record, memories[b]), h, m, run)
+        elif act != NOTHING:
+            call_at(act, struct_like(record, memories[b]), h, run)
+    new = read_map(blocks, stored, is_float, words, row, keep, changes, out, found)
+    if new == 0:
+        move_forms(table, used, words, row, keep, inputs, number, others, out, moved)
+    return int(new)
 
 
 class LinearVerbs:
@@ -370,20 +346,20 @@ class LinearVerbs:
 
     def predict(self, h: int, gap: float) -> None:
         """Predict node ``h`` by ``gap`` seconds."""
-        self._apply(PREDICT, self.node_words(h), h, gap)
+        self._apply(None, self.node_words(h), h, gap)
 
     def update(self, h: int, gap: float, H: FloatArray, y: FloatArray) -> None:
         """Predict node ``h`` and update it with a reading ``y`` (p, C), whitened with ``H``."""
         self.run.reading = 0
         words, places = self.node_words(h, 1), self._own_places[: len(H)]
-        self._apply(UPDATE, words, h, gap, places=places, others=y, readings=[H])
+        self._apply(self.kernels.update, words, h, gap, places=places, others=y, readings=[H])
 
     def emit(self, h: int, gap: float, m: int) -> None:
         """Predict node ``h`` and write its payload into message ``m``."""
         self.run.sends[0] = 1
         words, sent = self.node_words(h), self.message_words(m)
         words, written = np.concatenate([words, sent]), len(sent)
-        self._apply(EMIT, words, h, gap, m=m, written=written)
+        self._apply(self.kernels.emit, words, h, gap, m=m, written=written)
 
     def absorb(self, h: int, gap: float, messages: Sequence[int], readings: Sequence[Any]) -> None:
         """Predict node ``h`` and let it absorb ``messages``, with their ``readings``, pairs of H
@@ -399,45 +375,48 @@ class LinearVerbs:
             others = self.forms.table[np.concatenate([rows for _, rows in readings])]
         keep, words = len(words), np.concatenate([words, *heard])
         self._apply(
-            ABSORB, words, h, gap, keep=keep, places=places, others=others,
+            self.kernels.absorb, words, h, gap, keep=keep, places=places, others=others,
             readings=matrices,
         )  # fmt: skip
 
     def shift(self, h: int, gap: float, offset: FloatArray) -> None:
         """Predict node ``h`` and move it with the origin, by ``offset`` (n, C)."""
         words, places = self.node_words(h, 1), self._offset_places
-        self._apply(SHIFT, words, h, gap, places=places, others=offset)
+        self._apply(self.kernels.shift, words, h, gap, places=places, others=offset)
 
     def shift_message(self, m: int, offset: FloatArray) -> None:
         """Move message ``m`` with the origin, by ``offset`` (n, C) at the time of sending."""
         words, places = self.message_words(m), self._offset_places
-        self._apply(SHIFT_PAYLOAD, words, 0, 0.0, m=m, places=places, others=offset)
+        self._apply(self.kernels.shift_payload, words, m, 0.0, places=places, others=offset)
 
     def _apply(
         self,
-        verb: int,
+        verb: Any,
         words: IntArray,
         h: int,
         gap: float,
-        m: int = 0,
+        m: int = -1,
         keep: int | None = None,
         written: int = 0,
         places: IntArray = NO_PLACES,
         others: FloatArray = NO_FORMS,
         readings: Sequence[FloatArray] = (),
     ) -> None:
-        """Predict, and run a verb on ``words``, see ``prober``."""
-        probe = prober(self.kernels, verb >= SHIFT)
+        """Predict, and run a ``verb``, if there is one, on ``words``, see ``probe``."""
+        predict, act = address_of(self.kernels.predict, self._record, self.run), NOTHING
+        if verb is not None:
+            act = address_of(verb, self._record, self.run, 1 if m < 0 else 2)
         keep, forms = len(words) if keep is None else keep, self.forms
         self._fit(len(words), keep)
-        needed, found = 1, -1
+        needed, found, record = 1, -1, any_struct(self._record)
         while found < 0:
             if readings:
                 self._set_readings(readings, needed)
             found = probe(
-                self._record, self._memories, self.run, self._blocks, self._stored, self._is_float,
-                words, self._row, keep, written, places, others, len(readings), forms.table,
-                forms.used, verb, h, m, gap, self._inputs, self._out, self._moved, self._found,
+                record, self._memories, self.run.general, self._blocks, self._stored,
+                self._is_float, words, self._row, keep, written, places, others, len(readings),
+                forms.table, forms.used, predict, act, h, m, gap, self._inputs, self._out,
+                self._moved, self._found,
             )  # fmt: skip
             if found < 0:
                 needed = -found
