@@ -341,7 +341,7 @@ def test_where_the_bound_says_no_it_is_simulated(short):
     """The bound on worst_rms asks for far more than simulation says is needed."""
     target = "worst_rms<=1.7"
     bound = size(short, RATE, 0.5, 50.0, target, by="theory")
-    found = size(short, RATE, 0.5, 50.0, target, runs=256, workers=1)
+    found = size(short, RATE, 0.5, 50.0, target, runs=64, workers=1)
     assert found.by == "both"
     assert found.value < bound.value
     for probe in found.probes:
@@ -358,24 +358,24 @@ def test_where_the_bound_says_no_it_is_simulated(short):
 
 
 def test_a_target_under_burst_losses_takes_a_handful_of_runs(ring):
-    """Twelve nodes of a grid: 1000 runs with squared errors left this undecided."""
+    """Eight nodes of a grid: 600 runs with squared errors leave this undecided."""
     made = ring.replace(
         {
-            "network.graph": {"kind": "grid", "rows": 3, "columns": 4},
-            "sensors.0.nodes": [0, 11],
+            "network.graph": {"kind": "grid", "rows": 2, "columns": 4},
+            "sensors.0.nodes": [0, 7],
             "network.channel.loss": {"kind": "gilbert-elliott", "to_bad": 0.1, "to_good": 0.3},
             "filter.epsilon": 0.25,
-            "horizon": 5.0,
+            "horizon": 3.0,
         }
     )
-    found = size(made, RATE, 1.0, 20.0, "worst_rms<=2.0", runs=64, workers=1)
+    found = size(made, RATE, 2.0, 12.0, "worst_rms<=1.8", runs=64, workers=1)
     assert found
     assert found.by == "simulation"
     assert sum(probe.runs for probe in found.probes if probe.target != "undecided") < 300
     own = netkf.monte_carlo(made.replace({RATE: found.value}), runs=600, seed=4, workers=1)
     square, error = own.average[:-1, 0], own.se_average[:-1, 0]
     worst = int(np.argmax(square))
-    assert square[worst] - 4.0 * error[worst] <= 2.0**2
+    assert square[worst] - 4.0 * error[worst] <= 1.8**2 < square[worst] + 4.0 * error[worst]
 
 
 def test_a_range_that_is_too_small_gets_another(short):
