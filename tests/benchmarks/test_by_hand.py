@@ -109,8 +109,9 @@ def running_sums():
 
 
 MAKE = [
-    *(hybrid, bursts, swaps, intersecting_pairs, intersection, running_sums),
+    *(hybrid, bursts, swaps, intersecting_pairs),
     *(gossip, push_sum, diffusion, intermittent),
+    *(pytest.param(make, marks=pytest.mark.slow) for make in (intersection, running_sums)),
 ]
 
 
