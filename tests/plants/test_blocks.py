@@ -160,7 +160,8 @@ def test_blocks_are_the_plant_of_all_states_to_the_bit(tmp_path: Path, filtering
     ]
     # Of three states the others would be compiled for this test alone.
     engine = "compiled" if "hybrid" in filtering else "simpy"
-    runs = [netkf.simulate(load(text, tmp_path), engine=engine) for text in (blocks, to_toml(whole))]
+    scenarios = (load(text, tmp_path) for text in (blocks, to_toml(whole)))
+    runs = [netkf.simulate(scenario, engine=engine) for scenario in scenarios]
     assert runs[0].fingerprint == runs[1].fingerprint
     for name in ("x", "xhat", "P", "error"):
         np.testing.assert_array_equal(getattr(runs[0], name), getattr(runs[1], name))
