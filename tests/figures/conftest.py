@@ -44,7 +44,7 @@ def make(kind, folder):
     if kind == "ensemble":
         return netkf.monte_carlo(netkf.load(RING, {"horizon": 5.0}), 12, workers=1)
     if kind == "one node":
-        return netkf.simulate(one_node())
+        return netkf.simulate(one_node(), engine="simpy")  # no loop compiled for this alone
     if kind == "no truth":
         return netkf.simulate(netkf.load(SCENARIOS / "ulb_library.toml", {"horizon": 1200.0}))
     if kind == "no samples":
