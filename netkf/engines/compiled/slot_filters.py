@@ -64,20 +64,40 @@ class SlotFilters:
             blocks=blocks,
             lanes=LANES,
         )
-        size = size_of(n, kernels.unrolled)
-        cls: Any = SlotRun
-        self._models: list[Any] = [
-            SlotTables(F=F.copy(), root_Q=root_Q.copy()) for F, root_Q in setup.tables[0]
-        ]
-        if isinstance(setup.models[0], MapModel):
-            delay = 0 if setup.algorithm.timing.predicts else 1
-            models = setup.models[: len(self._models)]
-            self._models = [m.tables(LANES, active, delay, n) for m in models]
-            cls = MapRun
+        self._models = self._models_of(active)
+        self._run = self._run_of(no_pairs() if pairs is None else pairs)
+        words = len(self._models[0].memory)
+        memories = [model.memory for model in self._models] if setup.own_models else []
+        # None where the model of the run is that of all filters.
+        self._memories = np.array(memories, dtype=np.int64).reshape(-1, words)
+        # L entries are copied at a time, so that the last copy may go beyond the last entry.
+        for_means, for_roots = H * n + LANES, H * n * n + LANES
+        self.sample_scratch: tuple[FloatArray, FloatArray, FloatArray] = (
+            aligned((for_means, LANES)),
+            aligned((for_means, LANES)),
+            aligned((for_roots, LANES)),
+        )
+        self._lay_out_stages()
+
+    def _models_of(self, active: int) -> list[Any]:
+        """Return the models of all nodes, or the one that they share."""
+        setup = self._setup
+        if not isinstance(setup.models[0], MapModel):
+            tables = setup.tables[0]
+            return [SlotTables(F=F.copy(), root_Q=root_Q.copy()) for F, root_Q in tables]
+        delay = 0 if setup.algorithm.timing.predicts else 1
+        models = setup.models[: len(setup.tables[0])]
+        return [m.tables(LANES, active, delay, setup.width) for m in models]
+
+    def _run_of(self, pairs: Pairs) -> Any:
+        """Return what surrounds the nodes, before any slot."""
+        setup, n = self._setup, self._setup.width
+        size = size_of(n, self._kernels.unrolled)
+        cls: Any = MapRun if isinstance(setup.models[0], MapModel) else SlotRun
         cls = cls.of_size(n) if isinstance(size, tuple) else cls
         # Inbox: a node hears at most all of its links.
         most = max(1, int(np.diff(setup.links.first).max(initial=0)))
-        self._run = cls(
+        return cls(
             size=size,
             lanes=MANY,
             model=self._models[0],
@@ -88,7 +108,7 @@ class SlotFilters:
             y=np.zeros((1, 1, LANES)),
             H=np.zeros((1, 1, 1, LANES)),
             rows=setup.rows,
-            matrix=np.arange(H),
+            matrix=np.arange(setup.estimators),
             message=np.zeros(most, dtype=np.int64),
             link=np.zeros(most, dtype=np.int64),
             message_weight=np.zeros(most),
@@ -97,7 +117,7 @@ class SlotFilters:
             arrived=aligned((most, LANES), np.uint8),
             sends=aligned((LANES,), np.uint8),
             uniform=aligned((LANES,)),
-            pairs=no_pairs() if pairs is None else pairs,
+            pairs=pairs,
             reading=0,
             first_y=0,
             first_H=0,
@@ -110,28 +130,17 @@ class SlotFilters:
             now=0.0,
             **scratch_of(n, LANES),
         )
-        words = len(self._models[0].memory)
-        memories = [model.memory for model in self._models] if setup.own_models else []
-        # None where the model of the run is that of all filters.
-        self._memories = np.array(memories, dtype=np.int64).reshape(-1, words)
-        # L entries are copied at a time, so that the last copy may go beyond the last entry.
-        for_means, for_roots = H * n + LANES, H * n * n + LANES
-        self.sample_scratch: tuple[FloatArray, FloatArray, FloatArray] = (
-            aligned((for_means, LANES)),
-            aligned((for_means, LANES)),
-            aligned((for_roots, LANES)),
-        )
-        algorithm = setup.algorithm
-        stages = [
-            kind
-            for kind in algorithm.timing.schedule or ()
-            if algorithm.timing.talks or kind != "exchange"
-        ]
+
+    def _lay_out_stages(self) -> None:
+        """Set the stages of a slot, with the phase and the number of steps of each."""
+        timing = self._setup.algorithm.timing
+        kinds = timing.schedule or ()
+        stages = [kind for kind in kinds if timing.talks or kind != "exchange"]
         self._stages = np.array([_KINDS[kind] for kind in stages], dtype=np.int64)
         exchange = np.cumsum(self._stages == EXCHANGE) - 1
         self._phases = np.where(self._stages == EXCHANGE, exchange, -1)
         self._steps = np.array(
-            [algorithm.timing.steps(phase) if phase >= 0 else 0 for phase in self._phases.tolist()],
+            [timing.steps(phase) if phase >= 0 else 0 for phase in self._phases.tolist()],
             dtype=np.int64,
         )
 
