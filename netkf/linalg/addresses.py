@@ -12,7 +12,6 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from netkf.linalg.compiling import Kernel
 from netkf.linalg.functions import plain_functions
 from netkf.linalg.plain import is_plain
 from netkf.linalg.structs import Struct
@@ -58,7 +57,6 @@ def address_of(
             _addresses[key] = address = len(_addresses) + 1
             plain_functions[-address] = kernel
             return -address
-        assert isinstance(kernel, Kernel)
         _addresses[key] = kernel.compile_entry((record, *[0] * count, run), number)
     return -_addresses[key] if is_plain() else _addresses[key]
 
