@@ -28,6 +28,7 @@ _CALLS: dict[tuple[bool, int], Any] = {
 }
 _addresses: dict[tuple[Any, ...], int] = {}
 _entries: dict[tuple[Any, ...], Any] = {}
+_classes_read: dict[Any, type[Struct]] = {}
 
 
 class AnyStruct(Struct):
@@ -45,19 +46,38 @@ def any_struct(struct: Struct) -> Any:
     return AnyStruct.at(struct)
 
 
+def reads_only(cls: type[Struct], *kernels: Any) -> None:
+    """Declare that ``kernels`` read the fields of ``cls``, if these are the first of their record:
+    they are compiled once for all such records.
+    """
+    _classes_read.update(dict.fromkeys(kernels, cls))
+
+
+def _first_fields(kernel: Any, record: Struct) -> Any:
+    cls = _classes_read.get(kernel)
+    if cls is None:
+        return record
+    if not cls.struct_kinds:
+        cls(**{name: getattr(record, name) for name in cls.struct_fields})
+    offsets = record.struct_offsets
+    alike = all(offsets.get(name) == word for name, word in cls.struct_offsets.items())
+    return cls.at(record) if alike else record
+
+
 def address_of(
     kernel: Any, record: Struct, run: Struct, count: int = 1, number: bool = False
 ) -> int:
     """Return the address of ``kernel(record, *integers, run)`` with ``count`` integers, compiled
     for structs of these classes; it returns a float if it is of a ``number``, else nothing.
     """
-    key = kernel, type(record), type(run)
+    known = record if is_plain() else _first_fields(kernel, record)
+    key = kernel, type(known), type(run)
     if key not in _addresses:
         if is_plain():
             _addresses[key] = address = len(_addresses) + 1
             plain_functions[-address] = kernel
             return -address
-        _addresses[key] = kernel.compile_entry((record, *[0] * count, run), number)
+        _addresses[key] = kernel.compile_entry((known, *[0] * count, run), number)
     return -_addresses[key] if is_plain() else _addresses[key]
 
 

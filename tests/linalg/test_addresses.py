@@ -15,6 +15,7 @@ from netkf.linalg.addresses import (
     call_at_two,
     call_kernel,
     number_at,
+    reads_only,
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
@@ -99,6 +100,29 @@ def test_one_loop_serves_records_of_all_kinds():
         assert record.level.tolist() == [0.0, 0.0, 1.0]
     assert address_of(fill, tank, flow) != address_of(fill, other, flow)
     assert address_of(fill, tank, flow) == address_of(fill, Tank(level=np.zeros(1)), flow)
+
+
+def test_what_reads_the_first_fields_is_compiled_once_for_all_records():
+    class More(Struct):
+        level: FloatArray
+        spare: FloatArray
+
+    class Elsewhere(Struct):
+        spare: FloatArray
+        level: FloatArray
+
+    @kernel
+    def drain(tank, h, flow):
+        tank.level[h] -= flow.rate
+
+    reads_only(Tank, drain)
+    flow, x = flow_of(2), np.zeros
+    tanks = Tank(level=x(3)), More(level=x(3), spare=x(1)), Elsewhere(spare=x(1), level=x(3))
+    for tank in tanks:
+        call_kernel(drain, tank, 1, run=flow)
+        assert tank.level.tolist() == [0.0, -0.5, 0.0]
+    first, second, third = (address_of(drain, tank, flow) for tank in tanks)
+    assert first == second != third
 
 
 SCRIPT = """

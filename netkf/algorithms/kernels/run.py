@@ -39,6 +39,7 @@ from netkf.algorithms.kernels.root_flow import (
     information_rate,
     propagate_root,
 )
+from netkf.linalg.addresses import reads_only
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane, generic
@@ -554,3 +555,13 @@ def interval_end(now: float, time: float, length: float) -> float:
     """
     end = now + length
     return end if now < end < time else time
+
+
+class Estimates(Struct):
+    """The first fields of all records, all that the standard verbs of a node read."""
+
+    xhat: FloatArray
+    root: FloatArray
+
+
+reads_only(Estimates, predict, update, shift, interval)
