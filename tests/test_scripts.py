@@ -238,6 +238,7 @@ DRAWINGS = {
     "gallery": ["--runs", "2", "--points", "3"],
     "gossip": ["--samples", "100"],
     "hybrid": ["--runs", "2", "--rates", "8"],
+    "ieee14": ["--runs", "1"],
     "intermittent": [],
     "push_sum": ["--gains", "2"],
 }
