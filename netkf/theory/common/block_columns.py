@@ -20,7 +20,7 @@ from netkf.linalg.arrays import FloatArray, block_diagonal, square_root
 from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.columns import ErrorColumns, LoggedColumns
 from netkf.theory.common.forms import MEAN, NOISE
 from netkf.theory.common.kernel_columns import KernelColumns
 from netkf.theory.common.observations import Observation, slot_observations, timed_observations
@@ -230,7 +230,7 @@ class SlotBlocks(BlockColumns):
                 self._absorb(h, sorted(heard.get(node, [])), exchange)
 
 
-class ClockBlocks(BlockColumns):
+class ClockBlocks(BlockColumns, LoggedColumns):
     """The errors of such a filter under clocks, along the log of a run."""
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
@@ -241,9 +241,9 @@ class ClockBlocks(BlockColumns):
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
         self._begin_piece(0)
         names = ("t", "kind", "node", "peer", "message", "age")
-        self._rows = list(zip(*(run.log[name].tolist() for name in names), strict=True))
+        self._log = list(zip(*(run.log[name].tolist() for name in names), strict=True))
         self._receivers: dict[tuple[float, int], tuple[int, ...]] = {}
-        for t, kind, node, peer, *_ in self._rows:
+        for t, kind, node, peer, *_ in self._log:
             if kind == CODES["send"]:
                 self._receivers[t, node] = (*self._receivers.get((t, node), ()), peer)
         self._inboxes: dict[int, list[tuple[int, Link, float]]] = {}
@@ -258,23 +258,8 @@ class ClockBlocks(BlockColumns):
             if isinstance(model.moving, ChangingFlowModel) and piece < len(model.moving.pieces):
                 model.moving.begin(piece)
 
-    def replay(self) -> Iterator[None]:
-        """Follow the log; yield at each of ``run.times``."""
-        rows = iter(self._rows)
-        row = next(rows, None)
-        for until in self._run.times.tolist():
-            while row is not None and row[0] <= until:
-                self._pass_changes(row[0])
-                self._apply(*row)
-                row = next(rows, None)
-            self._pass_changes(until)
-            self._move_all(until)
-            yield
-
-    def _pass_changes(self, time: float) -> None:
-        while self._piece < len(self._changes) and self._changes[self._piece] <= time:
-            self._move_all(self._changes[self._piece])
-            self._begin_piece(self._piece + 1)
+    def _rows(self) -> Iterator[tuple[Any, ...]]:
+        return iter(self._log)
 
     def _move_all(self, time: float) -> None:
         self._move_truth(time)

@@ -17,7 +17,7 @@ from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.columns import ErrorColumns
+from netkf.theory.common.columns import LoggedColumns
 from netkf.theory.common.forms import MEAN, Forms
 from netkf.theory.common.increments import IncrementFlows, increment_flows
 from netkf.theory.common.linear_verbs import LinearVerbs
@@ -47,7 +47,7 @@ class Sent(NamedTuple):
     reading: tuple[FloatArray, IntArray] | None
 
 
-class ClockColumns(ErrorColumns):
+class ClockColumns(LoggedColumns):
     """The errors of M estimators under clocks; the first n rows of the forms are the true state."""
 
     def __init__(self, scenario: Scenario, run: Run) -> None:
@@ -111,12 +111,6 @@ class ClockColumns(ErrorColumns):
         self._flows: IncrementFlows | None = increment_flows(scenario, self.estimators, piece)
         self._piece = piece
 
-    def _pass_changes(self, time: float) -> None:
-        """Move all to each change of the plant up to ``time``, where its next piece begins."""
-        for change in [c for c in self._changes[self._piece :] if c <= time]:
-            self._move_all(change)
-            self._begin_piece(self._piece + 1)
-
     def _move_all(self, time: float) -> None:
         self._move_truth(time)
         self._move_increments(time)
@@ -125,18 +119,8 @@ class ClockColumns(ErrorColumns):
             if gap > 0.0:
                 self._filters.predict(h, gap)
 
-    def replay(self) -> Iterator[None]:
-        """Repeat the log of the run; yield at each of ``run.times``."""
-        rows = iter(zip(*self._log, strict=True))
-        row = next(rows, None)
-        for until in self._run.times.tolist():
-            while row is not None and row[0] <= until:
-                self._pass_changes(row[0])
-                self._apply(*row)
-                row = next(rows, None)
-            self._pass_changes(until)
-            self._move_all(until)
-            yield
+    def _rows(self) -> Iterator[tuple[Any, ...]]:
+        return zip(*self._log, strict=True)
 
     def _apply(self, time: float, kind: int, node: int, peer: int, message: int) -> None:
         if kind == SENSE:

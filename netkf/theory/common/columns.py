@@ -7,6 +7,7 @@ The covariance of all errors is the sum of the products of the columns.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from netkf.algorithms.filter import commutes, compiled_kernels
 from netkf.linalg.arrays import FloatArray
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.observations import Observation
+from netkf.trace.run import Run
 
 
 def has_columns(scenario: Scenario) -> bool:
@@ -77,6 +79,51 @@ class ErrorColumns:
         forms = np.concatenate([padded(form, width - form.shape[1]) for form in self._kept])
         noises = forms[:, 1:]
         return forms[:, 0], np.asarray(noises @ noises.T)
+
+
+class LoggedColumns(ErrorColumns):
+    """Errors under clocks, along the log of a run, whose plant may change: derived classes apply a
+    row, move everything to a time, and begin a piece of the plant, which sets ``_piece``.
+    """
+
+    _run: Run
+    _changes: list[float]
+    _piece: int
+
+    def _rows(self) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of the log, which begin with their times."""
+        raise NotImplementedError
+
+    def _apply(self, *row: Any) -> None:
+        """Do what a row says."""
+        raise NotImplementedError
+
+    def _move_all(self, time: float) -> None:
+        """Move the true state and all estimates to ``time``."""
+        raise NotImplementedError
+
+    def _begin_piece(self, piece: int) -> None:
+        """Take the laws of a piece of the plant, from its first instant on."""
+        raise NotImplementedError
+
+    def replay(self) -> Iterator[None]:
+        """Repeat the log of the run; yield at each of ``run.times``."""
+        rows = self._rows()
+        row = next(rows, None)
+        for until in self._run.times.tolist():
+            while row is not None and row[0] <= until:
+                self._pass_changes(row[0])
+                self._apply(*row)
+                row = next(rows, None)
+            self._pass_changes(until)
+            self._move_all(until)
+            yield
+
+    def _pass_changes(self, time: float) -> None:
+        """Move all to each change of the plant up to ``time``, where its next piece begins."""
+        for change in [c for c in self._changes[self._piece :] if c <= time]:
+            self._move_all(change)
+            self._begin_piece(self._piece + 1)
 
 
 def padded(form: FloatArray, after: int, before: int = 0) -> FloatArray:
