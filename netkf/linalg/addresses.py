@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from netkf.linalg.functions import plain_functions
+from netkf.linalg.functions import plain_address, plain_functions
 from netkf.linalg.plain import is_plain
 from netkf.linalg.structs import Struct
 
@@ -73,12 +73,10 @@ def address_of(
     known = record if is_plain() else _first_fields(kernel, record)
     key = kernel, type(known), type(run)
     if key not in _addresses:
-        if is_plain():
-            _addresses[key] = address = len(_addresses) + 1
-            plain_functions[-address] = kernel
-            return -address
-        _addresses[key] = kernel.compile_entry((known, *[0] * count, run), number)
-    return -_addresses[key] if is_plain() else _addresses[key]
+        arguments = known, *[0] * count, run
+        entry = plain_address(kernel) if is_plain() else kernel.compile_entry(arguments, number)
+        _addresses[key] = entry
+    return _addresses[key]
 
 
 def call_kernel(

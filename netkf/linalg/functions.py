@@ -7,12 +7,21 @@ kernels and plain Python alike.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 from netkf.linalg.arrays import FloatArray
 
 plain_functions: dict[int, Callable[..., None]] = {}
 """Functions by address where kernels are plain Python; addresses are mere numbers then."""
+_numbers = itertools.count(1)
+
+
+def plain_address(function: Callable[..., None]) -> int:
+    """Return an address of a function where kernels are plain Python."""
+    number = next(_numbers)
+    plain_functions[number] = function
+    return number
 
 
 def call_function(

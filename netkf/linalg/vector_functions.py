@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import itertools
 import math
 from collections.abc import Callable
 from functools import cached_property
@@ -13,14 +12,13 @@ import numpy as np
 
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import require_numba
-from netkf.linalg.functions import plain_functions
+from netkf.linalg.functions import plain_address
 from netkf.linalg.plain import is_plain
 
 Shape = tuple[int, ...]
 _CALL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_void_p
 )
-_numbers = itertools.count(1)
 
 
 class VectorFunction:
@@ -47,9 +45,7 @@ class VectorFunction:
     def address(self) -> int:
         """The address, at which a kernel is compiled when it is first asked for."""
         if is_plain():
-            number = next(_numbers)
-            plain_functions[number] = self._call_with_arrays
-            return number
+            return plain_address(self._call_with_arrays)
         self._code: Any
         if not self._is_kernel:
             self._code = _CALL(self._call_with_addresses)
