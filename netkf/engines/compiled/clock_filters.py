@@ -60,11 +60,28 @@ class ClockFilters:
             scenario.node_filter, starts, infos, models, links=count, messages=messages
         )
         self.record, self.start = self.records.struct, self.records.copied()
-        n, unrolled = start.xhat.shape[1], kernels.unrolled and scenario.views is None
+        self._first_models = np.ascontiguousarray(start.nodes["model"])
+        self.run = self._run_of(scenario, start, links, messages)
+        self._run = self.run.general
+        reads = bool((start.nodes["sensors"] > start.nodes["sensor"]).any())
+        self._verbs = clock_verbs(kernels, self.record, self.run, reads)
+        self._conserved: tuple[str, ...] = ()
+        if "conserved" in self.records.arrays:
+            first = scenario.initial_estimate(infos[0].node)
+            state = scenario.node_filter.init(models[0], *first, infos[0])
+            self._conserved = tuple(scenario.node_filter.analysis.conserved(state))
+            for h in range(len(infos)):
+                call_kernel(kernels.observe, self.record, h, run=self.run)
+        self._at_start = self._sums()
+
+    def _run_of(
+        self, scenario: Scenario, start: Filters, links: dict[str, Any], messages: int
+    ) -> Any:
+        """Return what surrounds the nodes at time 0."""
+        n, unrolled = start.xhat.shape[1], self.kernels.unrolled and scenario.views is None
         size = size_of(n, unrolled)
         cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
-        self._first_models = np.ascontiguousarray(start.nodes["model"])
-        self.run = cls(
+        return cls(
             size=size,
             lanes=ONE,
             model=clock_tables(
@@ -90,17 +107,6 @@ class ClockFilters:
             now=0.0,
             **scratch_of(n, 1),
         )
-        self._run = self.run.general
-        reads = bool((start.nodes["sensors"] > start.nodes["sensor"]).any())
-        self._verbs = clock_verbs(kernels, self.record, self.run, reads)
-        self._conserved: tuple[str, ...] = ()
-        if "conserved" in self.records.arrays:
-            first = scenario.initial_estimate(infos[0].node)
-            state = scenario.node_filter.init(models[0], *first, infos[0])
-            self._conserved = tuple(scenario.node_filter.analysis.conserved(state))
-            for h in range(len(infos)):
-                call_kernel(kernels.observe, self.record, h, run=self.run)
-        self._at_start = self._sums()
 
     def begin(self, instants: Instants) -> None:
         """Go back to time 0, for a run whose sensors take samples at these ``instants``."""
