@@ -23,9 +23,9 @@ import numpy as np
 import scipy.linalg
 
 from netkf.algorithms.belief_propagation import MAX_STEPS, is_forest
-from netkf.algorithms.block_cross_covariances import Rows, pair_rows, stacked, updated
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.rows import Rows, pair_rows, stacked, updated
 from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.fields import field, integer
 from netkf.core.places import Place
@@ -215,7 +215,7 @@ class BlockBeliefPropagation(Filter):
         the one that the node has was sent later.
         """
         time = _time(state, exchange)
-        own = {(place.name, -1 if place.node is None else place.node) for place in state.blocks}
+        own = {place.key for place in state.blocks}
         told = {message.sender: message.payload for message in messages}
         if any(t == time and pair.other in own for one in told.values() for t, pair in one.seen):
             state = state.marked(time, self.window)

@@ -16,7 +16,7 @@ know their cross-covariance whatever is lost.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,11 +25,12 @@ import numpy as np
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
 from netkf.algorithms.models import first_root
 from netkf.algorithms.registry import built_in
+from netkf.algorithms.rows import Rows, pair_rows, stacked, updated
 from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer
 from netkf.core.places import Place
-from netkf.linalg.arrays import FloatArray, block_diagonal, symmetric
+from netkf.linalg.arrays import FloatArray, symmetric
 
 MAX_STEPS = 1000
 """More than any network needs: a larger value is a mistake."""
@@ -64,14 +65,6 @@ class Tie(NamedTuple):
             return self
         nothing = np.zeros((len(self.base), n))
         return self._replace(core=nothing, seen=nothing)
-
-
-class Rows(NamedTuple):
-    """Readings ``z = H x + v``, cov(v) = R, of a state x (n,)."""
-
-    z: FloatArray
-    H: FloatArray
-    R: FloatArray
 
 
 class PairMessage(NamedTuple):
@@ -293,16 +286,6 @@ def can_invert(A: FloatArray) -> bool:
     return bool(sizes.all() and np.linalg.cond(A / sizes) < MAX_CONDITION)
 
 
-def updated(x: FloatArray, P: FloatArray, seen: Rows) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return estimate (n,), covariance (n, n) and ``I - K H`` (n, n) of the Kalman filter after
-    readings, from x (n,) and P (n, n).
-    """
-    H = seen.H
-    K = np.linalg.solve(symmetric(H @ P @ H.T + seen.R), H @ P).T
-    stays = np.eye(len(x)) - K @ H
-    return x + K @ (seen.z - H @ x), symmetric(stays @ P @ stays.T + K @ seen.R @ K.T), stays
-
-
 def ratio(after: FloatArray, before: FloatArray) -> FloatArray:
     """Return ``after before^-1`` (n, n) of two covariances (n, n), the factor by which an own
     reading would have multiplied the error.
@@ -312,26 +295,3 @@ def ratio(after: FloatArray, before: FloatArray) -> FloatArray:
     # Singular where something is known for certain.
     scaled = (after / scale) @ np.linalg.pinv(before / scale, hermitian=True)
     return np.asarray(units[:, None] * scaled / units)
-
-
-def pair_rows(
-    pairs: Sequence[PairReading], x: FloatArray, others: Sequence[Place], x_other: FloatArray
-) -> Iterator[Rows]:
-    """Yield those ``pairs``, read by a node with the estimate x (n,), that are about blocks of
-    ``others`` in the estimate x_other (n',) of another node, as readings of (x, x_other)
-    linearised there.
-    """
-    places = {(place.name, -1 if place.node is None else place.node): place for place in others}
-    for pair in pairs:
-        if (place := places.get(pair.other)) is not None:
-            z, H, part = pair.H(x, x_other[place.entries])
-            G = np.zeros((len(z), len(x_other)))
-            G[:, place.entries] = part
-            yield Rows(z, np.hstack([H, G]), pair.R)
-
-
-def stacked(seen: Sequence[Rows], x: FloatArray) -> Rows:
-    """Return all readings of a state like x (n,) as one."""
-    z = np.concatenate([x[:0], *(z for z, _, _ in seen)])
-    H = np.concatenate([np.zeros((0, len(x))), *(H for _, H, _ in seen)])
-    return Rows(z, H, block_diagonal([R for _, _, R in seen]))

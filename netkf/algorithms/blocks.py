@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from netkf.core.places import Place
+from netkf.core.places import Key, Place
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.structs import Struct
-
-Key = tuple[str, int | None]
-"""Name and owner of a block."""
 
 
 class BlockTables(Struct):
@@ -32,12 +29,12 @@ class BlockTables(Struct):
 def places_of(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
     """Return the blocks of a node of n states by name and owner; one of all states without any."""
     places = blocks or (Place("", None, 0, n),)
-    return {(place.name, place.node): place for place in places}
+    return {place.key: place for place in places}
 
 
 def block_numbers(infos: Sequence[Any]) -> dict[Key, int]:
     """Return a number for each block that nodes with these ``NodeInfo`` estimate."""
-    keys = [(place.name, place.node) for info in infos for place in info.blocks]
+    keys = [place.key for info in infos for place in info.blocks]
     return {key: number for number, key in enumerate(dict.fromkeys(keys))}
 
 
@@ -51,7 +48,7 @@ def block_tables(infos: Sequence[Any], models: Sequence[Any]) -> BlockTables:
     for h, (info, model) in enumerate(zip(infos, models, strict=True)):
         own = places_of(info.blocks, len(model.information))
         for place in info.blocks:
-            number = numbers[place.name, place.node]
+            number = numbers[place.key]
             first[h, number], size[number] = place.first, place.n
         for k in range(max(len(info.senders), 1 if len(infos) == 1 else 0)):
             row = np.full(max(widths), -1)

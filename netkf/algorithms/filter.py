@@ -23,6 +23,7 @@ from netkf.algorithms.models import first_root, sample_update
 from netkf.algorithms.records import Kernels
 from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.fields import Component
+from netkf.core.places import Key
 from netkf.linalg.arrays import FloatArray
 
 
@@ -148,14 +149,14 @@ class Message(NamedTuple):
 class PairReading(NamedTuple):
     """A reading of a block that the node estimates and of one that it does not.
 
-    other : name and owner (id) of the latter
+    other : name and owner (id) of the latter, -1 if all share it
     y, R : values (p,), and their noise covariance (p, p)
     H : ``H(x, x_other)`` returns y linearised at the estimates x (n,) of the node and x_other (n',)
         of the other block: z (p,), and H (p, n) and H_other (p, n') with ``z = H x + H_other
         x_other + v``
     """
 
-    other: tuple[str, int]
+    other: Key
     y: FloatArray
     R: FloatArray
     H: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]

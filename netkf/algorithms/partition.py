@@ -28,7 +28,7 @@ from scipy.optimize import minimize_scalar
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
 from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Analysis, Needs
-from netkf.core.places import Place
+from netkf.core.places import Key, Place
 from netkf.linalg.arrays import FloatArray, symmetric
 
 MARGIN = 1e-6
@@ -71,8 +71,8 @@ class PartitionState(NamedTuple):
     start: Start
     groups: tuple[np.ndarray, ...]
     model: Any
-    places: dict[tuple[str, int | None], np.ndarray]
-    blocks: tuple[tuple[str, int | None], ...]
+    places: dict[Key, np.ndarray]
+    blocks: tuple[Key, ...]
     waits: bool
 
 
@@ -84,7 +84,7 @@ class Told(NamedTuple):
 
     xhat: FloatArray
     P: FloatArray
-    blocks: tuple[tuple[str, int | None], ...]
+    blocks: tuple[Key, ...]
     whole: tuple[FloatArray, FloatArray, tuple[np.ndarray, ...]] | None
 
 
@@ -109,15 +109,15 @@ class Partition(Filter):
         """Return the state at time 0; mean and cov are of the whole state."""
         n = len(mean)
         places = {
-            (place.name, place.node): np.arange(n)[place.entries]
+            place.key: np.arange(n)[place.entries]
             for place in node.whole or (Place("plant", None, 0, n),)
         }
-        blocks = tuple((place.name, place.node) for place in node.blocks) or tuple(places)
+        blocks = tuple(place.key for place in node.blocks) or tuple(places)
         own = np.concatenate([places[block] for block in blocks])
         others: dict[Any, list[np.ndarray]] = {}
         for key, entries in places.items():
             if key not in blocks:
-                others.setdefault(key if key[1] is None else key[1], []).append(entries)
+                others.setdefault(key if key[1] < 0 else key[1], []).append(entries)
         groups = (own, *(np.concatenate(parts) for parts in others.values()))
         P = np.array(cov, dtype=np.float64)
         bounds = np.zeros((n, n))
@@ -187,8 +187,8 @@ class Partition(Filter):
         known: tuple[PartitionState, FloatArray, FloatArray],
     ) -> tuple[FloatArray, FloatArray]:
         """Return estimate and bound after a reading of another block, of which all is ``known``."""
-        (state, x, bounds), (name, owner) = known, pair.other
-        other = state.places[name, owner if owner >= 0 else None]
+        state, x, bounds = known
+        other = state.places[pair.other]
         z, H, H_other = pair.H(xhat, x[other])
         C = H_other @ bounds[np.ix_(other, other)] @ H_other.T
         return _intersected(xhat, P, z - H_other @ x[other], H, (C, pair.R))

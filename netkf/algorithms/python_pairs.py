@@ -53,22 +53,20 @@ class PythonPairs:
         p = max((len(pair.y) for pair, _ in self._found), default=1)
         pairs = self._room(len(rows), p, first)
         for k, (pair, _) in enumerate(self._found):
-            pairs.row[k], pairs.length[k], pairs.block[0, k] = rows[k], len(pair.y), self._of(pair)
+            pairs.row[k], pairs.length[k] = rows[k], len(pair.y)
+            pairs.block[0, k] = self._numbers.get(pair.other, -1)
             pairs.rows.kind[k, 0] = IN_PYTHON
             pairs.rows.functions[k, 0, 0] = self._function(p).address
             pairs.rows.R[0, k] = enlarged(pair.R, p, p)
         return pairs, extended
-
-    def _of(self, pair: Any) -> int:
-        name, owner = pair.other
-        return self._numbers.get((name, owner if owner >= 0 else None), -1)
 
     def _function(self, p: int) -> VectorFunction:
         """Return the function of both estimates and a number of ``_found`` that gives z and J."""
 
         def linearised(x: FloatArray, _: FloatArray, number: float) -> FloatArray:
             (pair, states), own = self._found[int(number)], self._own
-            z, H, H_other = pair.H(x[:states], x[own : own + self._sizes[self._of(pair)]])
+            size = self._sizes[self._numbers.get(pair.other, -1)]
+            z, H, H_other = pair.H(x[:states], x[own : own + size])
             made = np.zeros((p, 1 + self._n))
             made[: len(z), 0], made[: len(z), 1 : 1 + states] = z, H
             made[: len(z), 1 + own : 1 + own + H_other.shape[1]] = H_other

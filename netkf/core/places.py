@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+Key = tuple[str, int]
+"""Name and owner (id) of a block, -1 if all share it."""
+
 
 class Place(NamedTuple):
     """A block of the stacked state: ``name``, the ``node`` (id) that owns it, None if all share it,
@@ -14,6 +17,11 @@ class Place(NamedTuple):
     node: int | None
     first: int
     n: int
+
+    @property
+    def key(self) -> Key:
+        """Its name and owner (id), -1 if all share it."""
+        return self.name, -1 if self.node is None else self.node
 
     @property
     def label(self) -> str:

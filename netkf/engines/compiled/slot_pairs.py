@@ -43,7 +43,7 @@ class BlockColumns:
 
     def number(self, place: Place | None) -> int:
         """Return the number of a block, -1 if no node estimates it."""
-        return -1 if place is None else self.numbers.get((place.name, place.node), -1)
+        return -1 if place is None else self.numbers.get(place.key, -1)
 
 
 class SlotPair(NamedTuple):

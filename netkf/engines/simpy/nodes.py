@@ -83,9 +83,8 @@ class View:
             z, C = y[rows], R[rows][:, rows]
             if others.size:
                 place = next(p for p in self._places if p.first <= others[0] < p.first + p.n)
-                owner = -1 if place.node is None else place.node
                 of_pair: Any = PairFunction(z, part, (self.entries, place.entries), self._n)
-                yield PairReading((place.name, owner), z, C, of_pair)
+                yield PairReading(place.key, z, C, of_pair)
             elif isinstance(part, np.ndarray):
                 yield z, np.ascontiguousarray(part[:, self.entries]), C
             else:
