@@ -58,24 +58,17 @@ from netkf.core.fields import (
     vector,
 )
 from netkf.core.laws import Chain, Lattice, WaitingLaw
-from netkf.network.channels import (
-    Bernoulli,
-    Channel,
-    ConstantDelay,
-    Delay,
-    DistanceLoss,
-    ExponentialDelay,
-    GilbertElliott,
-    Logistic,
-    LognormalDelay,
-    Loss,
-    NoDelay,
-    NoLoss,
-    PerLink,
-    UniformDelay,
-)
+from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock, OnReadings, Periodic, Poisson, RecordedClock, Renewal
 from netkf.network.contacts import Contacts
+from netkf.network.delays import (
+    ConstantDelay,
+    Delay,
+    ExponentialDelay,
+    LognormalDelay,
+    NoDelay,
+    UniformDelay,
+)
 from netkf.network.graph_files import EdgelistGraph, GmlGraph, GraphFile, GraphmlGraph
 from netkf.network.graphs import (
     Complete,
@@ -91,6 +84,15 @@ from netkf.network.graphs import (
     Regular,
     Star,
     Topology,
+)
+from netkf.network.losses import (
+    Bernoulli,
+    DistanceLoss,
+    GilbertElliott,
+    Logistic,
+    Loss,
+    NoLoss,
+    PerLink,
 )
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.recorded import RecordedDelay, RecordedLoss

@@ -29,7 +29,7 @@ from netkf.figures.style import (
     new_figure,
 )
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import Bernoulli
+from netkf.network.losses import Bernoulli
 from netkf.runs.summary import NORMAL_QUANTILE
 from netkf.scenario.scenario import Scenario
 from netkf.theory import invariant_samples

@@ -11,7 +11,8 @@ from typing import Any
 
 from netkf.core.clock import Clock
 from netkf.core.fields import Component, as_class
-from netkf.network.channels import Delay, Loss
+from netkf.network.delays import Delay
+from netkf.network.losses import Loss
 from netkf.scenario.registry import KINDS
 
 _CLOCK = ("mean_rate", "memoryless", "gaps")

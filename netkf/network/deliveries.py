@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from netkf.core.fields import field, instance_of
-from netkf.network.channels import Delay, Loss
+from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology
+from netkf.network.losses import Loss
 
 
 class MessageKey(NamedTuple):

@@ -13,8 +13,9 @@ from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
-from netkf.network.channels import Delay, Loss
+from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology, demand_links
+from netkf.network.losses import Loss
 
 AFTER = ("deliver", "lose", "repeat", "refuse")
 """The treatments of a message that the table does not list."""

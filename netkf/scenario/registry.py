@@ -12,7 +12,16 @@ from netkf.core.clock import Clock
 from netkf.core.contracts import ContractError, is_netkf_class, require_known_members
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.fields import Component
-from netkf.network import channels, clocks, contacts, graph_files, graphs, matchings, recorded
+from netkf.network import (
+    clocks,
+    contacts,
+    delays,
+    graph_files,
+    graphs,
+    losses,
+    matchings,
+    recorded,
+)
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
@@ -46,8 +55,8 @@ FAMILIES: dict[str, type[Component]] = {
     "sampling": Clock,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
-    "loss": channels.Loss,
-    "delay": channels.Delay,
+    "loss": losses.Loss,
+    "delay": delays.Delay,
     "filter": Filter,
     "slot activation": matchings.SlotActivation,
     "slot filter": Filter,
@@ -111,19 +120,19 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "readings": clocks.OnReadings,
     },
     "loss": {
-        "none": channels.NoLoss,
-        "bernoulli": channels.Bernoulli,
-        "per-link": channels.PerLink,
-        "distance": channels.DistanceLoss,
-        "gilbert-elliott": channels.GilbertElliott,
+        "none": losses.NoLoss,
+        "bernoulli": losses.Bernoulli,
+        "per-link": losses.PerLink,
+        "distance": losses.DistanceLoss,
+        "gilbert-elliott": losses.GilbertElliott,
         "recorded": recorded.RecordedLoss,
     },
     "delay": {
-        "none": channels.NoDelay,
-        "constant": channels.ConstantDelay,
-        "exponential": channels.ExponentialDelay,
-        "uniform": channels.UniformDelay,
-        "lognormal": channels.LognormalDelay,
+        "none": delays.NoDelay,
+        "constant": delays.ConstantDelay,
+        "exponential": delays.ExponentialDelay,
+        "uniform": delays.UniformDelay,
+        "lognormal": delays.LognormalDelay,
         "recorded": recorded.RecordedDelay,
     },
     "filter": {**built_in_filters()},

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import Channel, NoDelay
+from netkf.network.channels import Channel
+from netkf.network.delays import NoDelay
 from netkf.network.deliveries import (
     Chosen,
     DelayUnlessWaived,

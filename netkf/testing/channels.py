@@ -18,9 +18,11 @@ from netkf.laws.losses import (
 )
 from netkf.laws.noise import compare_with
 from netkf.laws.stating import stated_law, stated_part
-from netkf.network.channels import Channel, ChannelSampler, Delay, Loss
-from netkf.network.channels import delay_depends_on_message as overrides_message_delay
+from netkf.network.channels import Channel, ChannelSampler
+from netkf.network.delays import Delay
+from netkf.network.delays import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
+from netkf.network.losses import Loss
 from netkf.rng.streams import Streams
 from netkf.testing.generators import RecordingGenerator, describe_calls
 from netkf.testing.noise import demand_agreement, family_level

@@ -12,8 +12,9 @@ import numpy as np
 from netkf.algorithms.traits import Timing
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.linalg.arrays import FloatArray, square_root
-from netkf.network.channels import Channel, Delay
+from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock, OnReadings, Periodic
+from netkf.network.delays import Delay
 from netkf.network.graphs import Complete, Link
 from netkf.network.matchings import Broadcast, Matching, SlotActivation
 from netkf.plants.diffusion import Diffusion

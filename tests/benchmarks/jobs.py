@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from netkf.network.channels import ExponentialDelay, GilbertElliott
 from netkf.network.clocks import Poisson, Renewal
+from netkf.network.delays import ExponentialDelay
+from netkf.network.losses import GilbertElliott
 from tests.benchmarks import by_hand
 from tests.benchmarks.by_hand import (
     BINS,

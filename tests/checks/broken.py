@@ -13,7 +13,7 @@ from netkf.algorithms.intermittent import Intermittent
 from netkf.algorithms.push_sum import AVERAGE, PushSum
 from netkf.algorithms.traits import Timing, Weights
 from netkf.core.fields import positive, setting
-from netkf.network.channels import Bernoulli
+from netkf.network.losses import Bernoulli
 from netkf.network.matchings import Matching
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from netkf.algorithms.baselines import Central
 from netkf.checks.check import judge_replicas, run_replica, with_check_times
 from netkf.checks.evidence import BROKEN
-from netkf.network.channels import Bernoulli
 from netkf.network.clocks import Poisson
+from netkf.network.losses import Bernoulli
 from netkf.plants.linear import LinearPlant
 from netkf.plants.sensors import LinearSensor
 from netkf.scenario.reading import from_table

@@ -16,8 +16,9 @@ from netkf.core.errors import EngineError, ScenarioError
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.linalg import compiling
-from netkf.network.channels import Bernoulli, ChannelSampler
+from netkf.network.channels import ChannelSampler
 from netkf.network.clocks import Poisson
+from netkf.network.losses import Bernoulli
 from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
 from netkf.trace.recorder import MemorySink, Recorder

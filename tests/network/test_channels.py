@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from netkf.network import channels
+from netkf.network import channels, delays, losses
 from netkf.rng.streams import Streams
 from netkf.trace.schema import CODES
 
@@ -23,17 +23,17 @@ def sampled_outcomes(count, **settings):
 
 
 def test_bernoulli():
-    arrived, _ = sampled_outcomes(20000, loss=channels.Bernoulli(0.7))
+    arrived, _ = sampled_outcomes(20000, loss=losses.Bernoulli(0.7))
     assert scipy.stats.binomtest(int(arrived.sum()), arrived.size, 0.7).pvalue > 1e-4
     assert sampled_outcomes(50)[0].all()
-    assert not sampled_outcomes(50, loss=channels.Bernoulli(0.0))[0].any()
+    assert not sampled_outcomes(50, loss=losses.Bernoulli(0.0))[0].any()
 
 
 @pytest.mark.parametrize(
     "loss",
     [
-        channels.GilbertElliott(mean_loss=0.3, mean_burst=5.0),
-        channels.GilbertElliott(to_bad=0.2 * 0.3 / 0.7, to_good=0.2),
+        losses.GilbertElliott(mean_loss=0.3, mean_burst=5.0),
+        losses.GilbertElliott(to_bad=0.2 * 0.3 / 0.7, to_good=0.2),
     ],
 )
 def test_gilbert_elliott_has_its_mean_loss_and_burst(loss):
@@ -47,7 +47,7 @@ def test_gilbert_elliott_has_its_mean_loss_and_burst(loss):
 
 
 def test_gilbert_elliott_with_two_kinds_of_luck():
-    loss = channels.GilbertElliott(to_bad=0.1, to_good=0.3, deliver_good=0.9, deliver_bad=0.4)
+    loss = losses.GilbertElliott(to_bad=0.1, to_good=0.3, deliver_good=0.9, deliver_bad=0.4)
     arrived, _ = sampled_outcomes(100_000, loss=loss)
     expected = 0.75 * 0.9 + 0.25 * 0.4
     assert loss.mean_delivery((0, 1), 1.0) == pytest.approx(expected)
@@ -57,9 +57,9 @@ def test_gilbert_elliott_with_two_kinds_of_luck():
 @pytest.mark.parametrize(
     ("delay", "law"),
     [
-        (channels.ExponentialDelay(0.4), scipy.stats.expon(scale=0.4)),
-        (channels.UniformDelay(0.1, 0.5), scipy.stats.uniform(0.1, 0.4)),
-        (channels.LognormalDelay(0.3, 0.8), scipy.stats.lognorm(0.8, scale=0.3 * np.exp(-0.32))),
+        (delays.ExponentialDelay(0.4), scipy.stats.expon(scale=0.4)),
+        (delays.UniformDelay(0.1, 0.5), scipy.stats.uniform(0.1, 0.4)),
+        (delays.LognormalDelay(0.3, 0.8), scipy.stats.lognorm(0.8, scale=0.3 * np.exp(-0.32))),
     ],
 )
 def test_delays_have_their_law(delay, law):

@@ -11,7 +11,7 @@ import scipy.stats
 
 import netkf
 from netkf.core.errors import EngineError, NetkfError, TheoryError
-from netkf.network.channels import DistanceLoss
+from netkf.network.losses import DistanceLoss
 from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table, parse_toml
 from netkf.scenario.usage import record_usage

@@ -6,16 +6,8 @@ import pytest
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
-from netkf.network.channels import (
-    Channel,
-    ChannelDraw,
-    ChannelSampler,
-    ExponentialDelay,
-    NoDelay,
-    UniformDelay,
-    delay_depends_on_message,
-    transit_time,
-)
+from netkf.network.channels import Channel, ChannelDraw, ChannelSampler, transit_time
+from netkf.network.delays import ExponentialDelay, NoDelay, UniformDelay, delay_depends_on_message
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 
 WAY, BACK = (0, 1), (1, 0)

@@ -708,7 +708,7 @@ CLASSES = [
         "subclass of netkf's Filter",
     ),
     ("class-number", custom("refusal_things:number"), "filter.kind", "subclass of netkf's Filter"),
-    ("class-family", custom("netkf.network.channels:NoLoss"), "filter.kind", "subclass of netkf's"),
+    ("class-family", custom("netkf.network.losses:NoLoss"), "filter.kind", "subclass of netkf's"),
     ("class-graph", graph("refusal_things:Plain"), f"{G}.kind", "subclass of netkf's Graph"),
     ("class-clock", clock("refusal_things:Plain"), f"{C}.kind", "subclass of netkf's LinkClock"),
     ("class-loss", loss("refusal_things:Plain"), f"{L}.kind", "subclass of netkf's Loss"),
@@ -716,8 +716,8 @@ CLASSES = [
     ("abstract-filter", custom("netkf.algorithms.filter:Filter"), "filter.kind", "filter:Filter'"),
     ("abstract-graph", graph("netkf.network.graphs:Graph"), f"{G}.kind", "graphs:Graph'"),
     ("abstract-clock", clock("netkf.network.clocks:LinkClock"), f"{C}.kind", "clocks:LinkClock'"),
-    ("abstract-loss", loss("netkf.network.channels:Loss"), f"{L}.kind", "channels:Loss'"),
-    ("abstract-delay", delay("netkf.network.channels:Delay"), f"{D}.kind", "channels:Delay'"),
+    ("abstract-loss", loss("netkf.network.losses:Loss"), f"{L}.kind", "losses:Loss'"),
+    ("abstract-delay", delay("netkf.network.delays:Delay"), f"{D}.kind", "delays:Delay'"),
 ]
 
 INVALID = "is not valid TOML"

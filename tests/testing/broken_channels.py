@@ -6,15 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from netkf.network.channels import (
-    Bernoulli,
-    ConstantDelay,
-    Delay,
-    ExponentialDelay,
-    GilbertElliott,
-    Loss,
-)
 from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
+from netkf.network.delays import ConstantDelay, Delay, ExponentialDelay
+from netkf.network.losses import Bernoulli, GilbertElliott, Loss
 
 CHANNELS, CLOCKS = {}, {}
 

@@ -21,8 +21,8 @@ from netkf.laws.intervals import Comparison, deviation_interval, with_drawn
 from netkf.laws.stating import stated_part
 from netkf.laws.ticks import ClockGroup
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import delay_depends_on_message
 from netkf.network.contacts import Contacts
+from netkf.network.delays import delay_depends_on_message
 from netkf.network.matchings import Matching
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.random_links import has_recorded_broadcasts

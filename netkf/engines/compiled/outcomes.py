@@ -15,25 +15,26 @@ import numpy as np
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.network.channels import (
-    Bernoulli,
-    Channel,
-    ChannelSampler,
+from netkf.network.channels import Channel, ChannelSampler
+from netkf.network.delays import (
     ConstantDelay,
-    DistanceLoss,
     ExponentialDelay,
-    GilbertElliott,
     LognormalDelay,
-    Loss,
     NoDelay,
-    NoLoss,
-    PerLink,
     UniformDelay,
     checked_delay,
     delay_depends_on_message,
-    delivery_probabilities,
 )
 from netkf.network.graphs import Link
+from netkf.network.losses import (
+    Bernoulli,
+    DistanceLoss,
+    GilbertElliott,
+    Loss,
+    NoLoss,
+    PerLink,
+    delivery_probabilities,
+)
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import WIDTH, ReplicaStreams, Streams

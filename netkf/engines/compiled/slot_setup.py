@@ -30,9 +30,9 @@ from netkf.engines.compiled.slot_pairs import BlockColumns, SlotPairs
 from netkf.linalg.arrays import FloatArray, block_diagonal, enlarged
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
-from netkf.network.channels import GilbertElliott, identical_per_link
 from netkf.network.deliveries import Deliveries, DeliveringLoss
 from netkf.network.graphs import Link
+from netkf.network.losses import GilbertElliott, identical_per_link
 from netkf.network.matchings import PROTOCOLS, Broadcast, Matching, maximal_matchings
 from netkf.plants.recorded import RecordedSensor
 from netkf.plants.regressors import RegressorSensor

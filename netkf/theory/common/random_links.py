@@ -16,8 +16,8 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
-from netkf.network.channels import GilbertElliott, identical_per_link
 from netkf.network.clocks import LinkClock
+from netkf.network.losses import GilbertElliott, identical_per_link
 from netkf.network.matchings import RecordedSlots
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import NO_CHANNEL_LAW, lacks_channel_law

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import NoLoss
+from netkf.network.losses import NoLoss
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import AssumptionRow
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows

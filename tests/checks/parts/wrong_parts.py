@@ -5,8 +5,9 @@ from functools import cached_property
 
 import numpy as np
 
-from netkf.network.channels import Bernoulli, ConstantDelay, ExponentialDelay, GilbertElliott
 from netkf.network.clocks import Periodic, Poisson, Renewal
+from netkf.network.delays import ConstantDelay, ExponentialDelay
+from netkf.network.losses import Bernoulli, GilbertElliott
 from netkf.network.matchings import Matching
 from netkf.plants.linear import LinearPlant, SlotReadings
 from netkf.plants.sensors import LinearSensor
