@@ -1,5 +1,6 @@
 """Messages in slots, made one by one in Python, for channels and activations that kernels cannot
-draw: a user's own losses and delays, messages that take time, and recorded exchanges.
+draw: a user's own losses and delays, messages that take time, recorded exchanges, and nodes that
+move.
 
 Messages do not depend on estimates, unless nodes may be silent: then a block is one slot long, and
 the filters' kernel decides who sends.
@@ -28,6 +29,7 @@ from netkf.engines.compiled.slot_messages import (
     TICK,
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.engines.reach import Reach
 from netkf.network.channels import ChannelDraw, ChannelSampler, transit_time
 from netkf.network.graphs import Link
 from netkf.network.matchings import used_links
@@ -76,6 +78,10 @@ class SlotEvents:
     def __init__(self, scenario: Scenario, streams: Streams, setup: SlotSetup) -> None:
         self._scenario, self._setup, self._timing = scenario, setup, scenario.node_filter.timing
         self._instant = scenario.time_grid.instant
+        self._reach: Reach | None = None
+        if scenario.links_move:
+            self._reach = Reach(scenario, scenario.slot_truth(streams), self._append_row)
+        self._follows_distance = scenario.network.channel.loss.follows_distance
         self._random = streams.generator("matching")
         self._directions = [Direction(scenario, ends, k) for k, ends in enumerate(setup.directions)]
         each, channel = setup.directions_per_link, scenario.network.channel
@@ -116,7 +122,9 @@ class SlotEvents:
         for step in self._iterate_steps(self._slot):
             self._chosen_pairs.append(self._choose_pairs(step))
             # Links of the matching just drawn; broadcasts use all links.
-            links = self._chosen_pairs[-1][0] if self._timing.pairwise else self._by_link
+            links = list(self._by_link)
+            if self._timing.pairwise:
+                links = [k for k in self._chosen_pairs[-1][0] if self._is_up(k, step)]
             asked[step.step, [index[node] for link in links for node in link]] = 1
         return asked
 
@@ -150,17 +158,23 @@ class SlotEvents:
         # Filters that predict are sampled at the beginning of the slot, the others at its end.
         # None among the rows marks the sample.
         if sampled and timing.predicts:
-            self._rows.append(None)
+            self._sample(start)
         # At the horizon only the sample matters: no events.
         self._recording = slot < setup.last
         if self._recording or not timing.predicts:
-            self._make_stage_events(slot, up)
+            start = self._make_stage_events(slot, up)
         self._recording = True
         if sampled and not timing.predicts:
-            self._rows.append(None)
+            self._sample(start)
         return up
 
-    def _make_stage_events(self, slot: int, up: np.ndarray) -> None:
+    def _sample(self, now: float) -> None:
+        if self._reach is not None and now < self._scenario.horizon:
+            self._reach.look_at_all(self._slot, now)
+        self._rows.append(None)
+
+    def _make_stage_events(self, slot: int, up: np.ndarray) -> float:
+        """Make the events of a slot; return when its last stage happens, in seconds."""
         steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
@@ -180,6 +194,7 @@ class SlotEvents:
                 self._send_all(exchange_step)
                 self._deliver(exchange_step.end)
                 self._end_step(exchange_step, up[step])
+        return now
 
     def _iterate_steps(self, slot: int) -> Iterator[Step]:
         setup, timing, repeats = self._setup, self._timing, [0, 0]
@@ -233,6 +248,10 @@ class SlotEvents:
     def _send_all(self, step: Step) -> None:
         broadcast, now, phase = not self._timing.pairwise, step.begin, step.phase
         pairs, up = self._chosen_pairs.pop(0) if self._chosen_pairs else self._choose_pairs(step)
+        connected = set(pairs)
+        if self._reach is not None:
+            self._reach.slot = step.slot
+            connected = {pair for pair in pairs if self._reach.connects(*pair, now)}
         if broadcast:
             self._append_row((now, ROUND, -1, -1, -1, phase, NAN))
         for i, j in pairs:
@@ -247,11 +266,19 @@ class SlotEvents:
                 self._last[i, j] = drawn if len(drawn) == len(both) else drawn * 2
             # A recorded link that is down loses its messages, whatever was drawn.
             is_up = up is None or (i, j) in up
+            if (i, j) not in connected:
+                continue
             for direction, draw in zip(both, self._last[i, j], strict=True):
                 if self._setup.talks[step.step, direction.index] and not self._is_silent(
                     direction, step
                 ):
                     self._send(step, direction, draw if is_up else None)
+
+    def _is_up(self, link: Link, step: Step) -> bool:
+        if self._reach is None:
+            return True
+        self._reach.slot = step.slot
+        return self._reach.is_up(*link, step.begin)
 
     def _choose_pairs(self, step: Step) -> tuple[list[Link], set[Link] | None]:
         return used_links(
@@ -276,6 +303,8 @@ class SlotEvents:
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
             ends, table = direction.ends, direction.probability
+            if self._follows_distance and self._reach is not None:
+                table = self._reach.delivery(ends, now)
             delay = self._instant(transit_time(channel, ends, number, draw, table))
         if math.isnan(delay):
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))

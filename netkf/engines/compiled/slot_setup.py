@@ -398,6 +398,8 @@ class SlotSetup:
         # Which message has which number is known before the exchange, unless nodes may be silent.
         if self.deliveries is not None and (self.decides or self.may_miss):
             return False
+        if scenario.links_move:
+            return False
         # Kernels know broadcasts and matchings without delay, with the built-in losses.
         exchanges = (
             type(network.activation) in (Matching, Broadcast) or not self.algorithm.timing.talks

@@ -15,10 +15,10 @@ from netkf.algorithms.filter import Filter
 from netkf.algorithms.kernels.maps import spread_of
 from netkf.algorithms.models import MapModel, RateModel
 from netkf.engines.base import Engine, Progress, Rank, broken
+from netkf.engines.reach import Reach
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
-from netkf.engines.simpy.reach import Reach
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import (
     FIRST_RANK,
@@ -125,8 +125,11 @@ class _Simulation:
 
     def _begin_reach(self, truth: Any) -> None:
         if self._scenario.links_move:
-            shared = (self._scenario, self.timeline, self._recorder, truth)
-            self._transmitter.reach = Reach(*shared)
+            self._transmitter.reach = Reach(self._scenario, truth, self._append)
+
+    def _append(self, row: Any) -> None:
+        # A recorder that pauses has another ``append``.
+        self._recorder.append(row)
 
     def _sampling(self, truth: Any, nodes: dict[int, ClockedNode], sums: _Sums) -> Process:
         for time in self._scenario.times.tolist():
@@ -229,8 +232,9 @@ class _Simulation:
         scenario, recorder = self._scenario, self._recorder
         x, local = truth.absolute(when), truth.local(when)
         # Half open: links are not looked at at the horizon.
-        if self._transmitter.reach is not None and self.timeline.now < scenario.horizon:
-            self._transmitter.reach.look_at_all(int(when) if scenario.slotted else None)
+        now, reach = self.timeline.now, self._transmitter.reach
+        if reach is not None and now < scenario.horizon:
+            reach.look_at_all(int(when) if scenario.slotted else None, now)
         # By identity: a pooled filter is asked once, and its estimate serves all nodes.
         estimate_by_state = {id(n): n.algorithm.estimate(n.state) for n in distinct(nodes)}
         estimates = [estimate_by_state[id(nodes[node])] for node in scenario.nodes]

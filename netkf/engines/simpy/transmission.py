@@ -11,8 +11,8 @@ import simpy
 
 from netkf.algorithms.filter import Filter
 from netkf.engines.base import Rank
+from netkf.engines.reach import Reach
 from netkf.engines.simpy.nodes import Envelope
-from netkf.engines.simpy.reach import Reach
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import ChannelDraw, ChannelSampler, transit_time
@@ -84,7 +84,7 @@ class Transmitter:
 
     def connects(self, i: int, j: int) -> bool:
         """Return True if nodes ``i`` and ``j`` (ids) can hear each other now."""
-        return self.reach is None or self.reach.connects(i, j)
+        return self.reach is None or self.reach.connects(i, j, self._timeline.now)
 
     def send(
         self,
@@ -106,7 +106,7 @@ class Transmitter:
         append((now, SEND, sender, receiver, number, phase, NAN))
         table = direction.table_probability
         if self._follows_distance and self.reach is not None:
-            table = self.reach.delivery(direction.link)
+            table = self.reach.delivery(direction.link, now)
         # nan: the message is lost.
         delay = self._instant(transit_time(self._channel, direction.link, number, outcome, table))
         if math.isnan(delay):

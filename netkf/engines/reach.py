@@ -2,61 +2,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-from netkf.engines.simpy.timeline import Timeline
 from netkf.network.graphs import Link
 from netkf.scenario.scenario import Scenario
-from netkf.trace.recorder import NAN, Recorder
+from netkf.trace.recorder import NAN
 from netkf.trace.schema import CODES
 
 LINK = CODES["link"]
 
 
 class Reach:
-    """The distances of nodes in one run, whose true state is ``truth``, and the links that are up.
+    """The distances of nodes in one run, whose true state is ``truth``, and the links that are up,
+    at times ``now`` in seconds; ``append`` takes the rows of links that come up or go down.
 
     ``slot`` is the present one in slots, where nodes are where its state says; else None.
     """
 
-    def __init__(
-        self, scenario: Scenario, timeline: Timeline, recorder: Recorder, truth: Any
-    ) -> None:
-        self._timeline, self._recorder, self._truth = timeline, recorder, truth
+    def __init__(self, scenario: Scenario, truth: Any, append: Callable[[Any], None]) -> None:
+        self._truth, self._append = truth, append
         self._positions, self._loss = scenario.positions, scenario.network.channel.loss
         self._radius, self._links = scenario.topology.radius, scenario.topology.links
         self.slot: int | None = 0 if scenario.slotted else None
         # Links that are up, as far as anyone has looked.
         self._up: set[Link] = set()
 
-    def _distance(self, i: int, j: int) -> float:
-        now, x = self._timeline.now, None
+    def _distance(self, i: int, j: int, now: float) -> float:
+        x = None
         if self._positions.of_state:
             x = self._truth.absolute(now if self.slot is None else self.slot)
         return self._positions.distance((i, j), now, x)
 
-    def delivery(self, link: Link) -> float:
+    def delivery(self, link: Link, now: float) -> float:
         """Return the probability that a message that is sent now arrives, by the distance of its
         ends.
         """
-        return self._loss.at_distance(self._distance(*link))
+        return self._loss.at_distance(self._distance(*link, now))
 
-    def connects(self, i: int, j: int) -> bool:
+    def is_up(self, i: int, j: int, now: float) -> bool:
+        """Return True if the link of two nodes is up."""
+        return self._radius is None or self._distance(min(i, j), max(i, j), now) <= self._radius
+
+    def connects(self, i: int, j: int, now: float) -> bool:
         """Return True if the link of two nodes is up; record if it was not when looked at last."""
-        if self._radius is None:
-            return True
-        link = (min(i, j), max(i, j))
-        is_up = self._distance(*link) <= self._radius
-        if is_up != (link in self._up):
-            self._recorder.append((self._timeline.now, LINK, *link, int(is_up), -1, NAN))
+        link, is_up = (min(i, j), max(i, j)), self.is_up(i, j, now)
+        if self._radius is not None and is_up != (link in self._up):
+            self._append((now, LINK, *link, int(is_up), -1, NAN))
             self._up ^= {link}
         return is_up
 
-    def look_at_all(self, slot: int | None) -> None:
+    def look_at_all(self, slot: int | None, now: float) -> None:
         """Record all links that have changed since they were looked at last; ``slot`` is the
         present one, None under clocks.
         """
         self.slot = slot
         if self._radius is not None:
             for link in self._links:
-                self.connects(*link)
+                self.connects(*link, now)
