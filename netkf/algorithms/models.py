@@ -119,7 +119,9 @@ class FlowModel:
 
     def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
         """Return the derivative (n, n) of the predicted estimate with respect to ``xhat`` (n,)."""
-        return linear_transition(self, len(xhat), gap)
+        eye = np.eye(len(xhat))
+        columns = [self.predict(e, np.zeros_like(eye), gap)[0] for e in eye]
+        return np.stack(columns, axis=1)
 
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
@@ -187,7 +189,8 @@ class SlotModel:
 
     def transition(self, xhat: FloatArray, gap: float) -> FloatArray:
         """Return the derivative (n, n) of the predicted estimate with respect to ``xhat`` (n,)."""
-        return linear_transition(self, len(xhat), gap)
+        eye = np.eye(len(xhat))
+        return self.predict(eye, np.zeros_like(eye), gap)[0]
 
     def gain_update(
         self, xhat: FloatArray, root: FloatArray, moments: FloatArray, gap: float
@@ -455,14 +458,6 @@ class RateModel(FlowModel):
             after, before = (self.predict(xhat + d, still, gap)[0] for d in (e, -e))
             columns.append((after - before) / (2.0 * e.sum()))
         return np.stack(columns, axis=1)
-
-
-def linear_transition(model: Any, n: int, gap: float) -> FloatArray:
-    """Return the matrix (n, n) by which a model predicts estimates over ``gap`` seconds."""
-    nothing = np.zeros((n, n))
-    origin = model.predict(np.zeros(n), nothing, gap)[0]
-    columns = [model.predict(e, nothing, gap)[0] - origin for e in np.eye(n)]
-    return np.stack(columns, axis=1)
 
 
 def first_root(cov: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
 from netkf.algorithms.registry import built_in
@@ -33,6 +33,8 @@ from netkf.linalg.arrays import FloatArray, symmetric
 
 MARGIN = 1e-6
 """Weights of covariance intersection are at least this."""
+ROUNDING = 2.0**-52
+"""Spacing of floating-point numbers at 1: relative size of eigenvalues that are 0."""
 
 
 class Start(NamedTuple):
@@ -284,13 +286,6 @@ def _intersected(
     does not.
     """
     C, R = covariances
-
-    def fused(w: float) -> tuple[FloatArray, FloatArray]:
-        return _used_as_is(x, P / w, z, H, C / (1.0 - w) + R)
-
-    def trace(w: float) -> float:
-        return float(np.trace(fused(w)[1]))
-
     if not C.any():
         return _used_as_is(x, P, z, H, R)
     choices = [(x, P)]
@@ -300,7 +295,27 @@ def _intersected(
         differences = np.linalg.eigvalsh(P - choices[1][1])
         if differences[0] >= 0.0 or differences[-1] <= 0.0:
             return choices[int(differences[-1] > 0.0)]
-    bounds = (MARGIN, 1.0 - MARGIN)
-    found = minimize_scalar(trace, bounds=bounds, method="bounded", options={"xatol": 1e-9})
-    choices += [fused(w) for w in (found.x, *bounds)]
+    w = _best_weight(P, H, C, R)
+    choices.append(_used_as_is(x, P / w, z, H, C / (1.0 - w) + R))
     return min(choices, key=lambda choice: float(np.trace(choice[1])))
+
+
+def _best_weight(P: FloatArray, H: FloatArray, C: FloatArray, R: FloatArray) -> float:
+    """Return the weight w of P by which the trace, which is convex in w, becomes least."""
+    sizes, vectors = np.linalg.eigh(H @ P @ H.T + C + R)
+    # Of other directions nothing is known or learned; within these no sum below is singular.
+    V = vectors[:, sizes > len(sizes) * ROUNDING * sizes[-1]]
+    gain, size = V.T @ H @ P, float(np.trace(P))
+    A, C, R = gain @ H.T @ V, V.T @ C @ V, V.T @ R @ V
+
+    def slope(w: float) -> float:
+        left = 1.0 - w
+        X = np.linalg.solve(A + w / left * C + w * R, gain)
+        # The derivative, times w, of the trace (size - sum(gain X)) / w.
+        change = X * ((C / (left * left) + R) @ X)
+        return float(change.sum() - (size - (gain * X).sum()) / w)
+
+    least, largest = MARGIN, 1.0 - MARGIN
+    if slope(least) >= 0.0:
+        return least
+    return largest if slope(largest) <= 0.0 else float(brentq(slope, least, largest))
