@@ -93,6 +93,7 @@ from netkf.network.losses import (
     Loss,
     NoLoss,
     PerLink,
+    Transmission,
 )
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.recorded import RecordedDelay, RecordedLoss
@@ -259,6 +260,7 @@ __all__ = [
     "Time",
     "Timing",
     "Topology",
+    "Transmission",
     "UniformDelay",
     "UnknownDiffusion",
     "UnknownPlant",

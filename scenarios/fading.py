@@ -29,9 +29,9 @@ class Fading(Loss):
     reach: float = setting(positive)
     places: tuple = ()
 
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         """Return the probability for the distance of the link."""
-        (a, b), (c, d) = (self.places[node] for node in link)
+        (a, b), (c, d) = (self.places[node] for node in sent.link)
         return math.exp(-((math.hypot(a - c, b - d) / self.reach) ** 2))
 
 

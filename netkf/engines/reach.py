@@ -22,27 +22,22 @@ class Reach:
 
     def __init__(self, scenario: Scenario, truth: Any, append: Callable[[Any], None]) -> None:
         self._truth, self._append = truth, append
-        self._positions, self._loss = scenario.positions, scenario.network.channel.loss
+        self._positions = scenario.positions
         self._radius, self._links = scenario.topology.radius, scenario.topology.links
         self.slot: int | None = 0 if scenario.slotted else None
         # Links that are up, as far as anyone has looked.
         self._up: set[Link] = set()
 
-    def _distance(self, i: int, j: int, now: float) -> float:
+    def distance(self, i: int, j: int, now: float) -> float:
+        """Return the distance of two nodes now."""
         x = None
         if self._positions.of_state:
             x = self._truth.absolute(now if self.slot is None else self.slot)
         return self._positions.distance((i, j), now, x)
 
-    def delivery(self, link: Link, now: float) -> float:
-        """Return the probability that a message that is sent now arrives, by the distance of its
-        ends.
-        """
-        return self._loss.at_distance(self._distance(*link, now))
-
     def is_up(self, i: int, j: int, now: float) -> bool:
         """Return True if the link of two nodes is up."""
-        return self._radius is None or self._distance(min(i, j), max(i, j), now) <= self._radius
+        return self._radius is None or self.distance(min(i, j), max(i, j), now) <= self._radius
 
     def connects(self, i: int, j: int, now: float) -> bool:
         """Return True if the link of two nodes is up; record if it was not when looked at last."""

@@ -302,11 +302,9 @@ def _draw_shares(
     probabilities = np.full(len(directions), np.nan)
     for k, direction in enumerate(directions):
         link = direction.sender, direction.receiver
-        table = data.scenario.table_probability(link)
         # A user's class of losses may have no mean, or raise.
         with contextlib.suppress(ArithmeticError, LookupError, TypeError, ValueError):
-            loss = data.scenario.network.channel.loss
-            probabilities[k] = float(loss.mean_delivery(link, table))
+            probabilities[k] = float(data.scenario.mean_delivery(link))
     misses = None
     if np.isfinite(probabilities).any():
         style = {"ls": "", "marker": "_", "ms": 5, "color": SENSING}

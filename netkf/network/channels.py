@@ -5,15 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.core.fields import Component, boolean, field, instance_of
 from netkf.linalg.arrays import FloatArray
 from netkf.network.delays import Delay, NoDelay, checked_delay, draw_delays
-from netkf.network.graphs import Link
-from netkf.network.losses import Loss, NoLoss, checked_delivery_probability
+from netkf.network.losses import (
+    Loss,
+    NoLoss,
+    Transmission,
+    checked_delivery_probability,
+    has_conditions,
+)
+from netkf.rng.streams import Streams
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,17 +113,20 @@ def stream_purposes(channel: Channel) -> tuple[str, ...]:
     return tuple(purposes)
 
 
-def transit_time(
-    channel: Channel, link: Link, message: int, draw: ChannelDraw, table_probability: float
-) -> float:
-    """Return the seconds that message number ``message`` on ``link`` (sender, receiver) takes to
-    arrive, decided by the random numbers ``draw``; ``table_probability`` is the entry of the
-    graph's table.
+def conditions_of(loss: Loss, streams: Streams, horizon: float) -> Any:
+    """Return the conditions that the loss draws for the run of ``streams``, if it does."""
+    if not has_conditions(loss):
+        return None
+    return loss.conditions(streams.generator("conditions"), horizon)
+
+
+def transit_time(channel: Channel, sent: Transmission, draw: ChannelDraw) -> float:
+    """Return the seconds that the message ``sent`` takes to arrive, decided by the random numbers
+    ``draw``.
 
     The result is nan if the message is lost. Raises ScenarioError for a delivery probability
     outside [0, 1] and for a negative delay.
     """
-    loss, bad = channel.loss, draw.bad
-    if draw.uniform >= checked_delivery_probability(loss, link, message, bad, table_probability):
+    if draw.uniform >= checked_delivery_probability(channel.loss, sent):
         return math.nan
-    return checked_delay(channel.delay, link, message, draw.delay)
+    return checked_delay(channel.delay, sent, draw.delay)

@@ -13,7 +13,8 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import Component, field, number, of_time, positive
 from netkf.core.laws import WaitingLaw, exponential_law, lognormal_law, uniform_law
 from netkf.linalg.arrays import FloatArray
-from netkf.network.graphs import Link, Topology
+from netkf.network.graphs import Topology
+from netkf.network.losses import Transmission
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +49,8 @@ class Delay(Component):
         """
         return None
 
-    def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the seconds that message number ``message`` takes from link[0] to link[1].
+    def message_delay(self, sent: Transmission, drawn: float) -> float:
+        """Return the seconds that the message ``sent`` takes.
 
         The result is not negative, and nan if the message is lost. ``drawn`` is the result of
         ``draw`` if delays are random, else ``fixed`` or 0.
@@ -167,15 +168,15 @@ def delay_depends_on_message(delay: Delay) -> bool:
     return type(delay).message_delay is not Delay.message_delay
 
 
-def checked_delay(delay: Delay, link: Link, message: int, drawn: float) -> float:
-    """Return the seconds that message number ``message`` on ``link`` (sender, receiver) takes, nan
-    if it is lost, from the delay ``drawn`` for it; raises ScenarioError if the delay model gives a
-    negative one.
+def checked_delay(delay: Delay, sent: Transmission, drawn: float) -> float:
+    """Return the seconds that the message ``sent`` takes, nan if it is lost, from the delay
+    ``drawn`` for it; raises ScenarioError if the delay model gives a negative one.
     """
-    seconds = delay.message_delay(link, message, drawn)
+    seconds = delay.message_delay(sent, drawn)
     if seconds < 0.0:
         rule = (
-            f"{type(delay).__name__}: the delay of message {message} on link {list(link)} must "
+            f"{type(delay).__name__}: the delay of message {sent.number} on link "
+            f"{list(sent.link)} must "
             "not be negative"
         )
         remedy = "correct message_delay of the class"

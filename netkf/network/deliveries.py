@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.core.fields import field, instance_of
 from netkf.network.delays import Delay
-from netkf.network.graphs import Link, Topology
-from netkf.network.losses import Loss
+from netkf.network.graphs import Topology
+from netkf.network.losses import Loss, Transmission
 
 
 class MessageKey(NamedTuple):
@@ -65,24 +65,22 @@ class DeliveringLoss(Loss):
         """The value of the model ``given``."""
         return self.given.follows_distance
 
-    def at_distance(self, distance: float) -> float:
-        """Return the delivery probability at a ``distance`` by the model ``given``."""
-        return self.given.at_distance(distance)
+    def conditions(self, random: np.random.Generator, horizon: float) -> Any:
+        """Return the conditions of the run by the model ``given``."""
+        return self.given.conditions(random, horizon)
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Return the next state of the channel, True if it is bad, by the model ``given``."""
         return self.given.next_state(bad, random)
 
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
+    def delivery_probability(self, sent: Transmission) -> float:
         """Return 1 for messages that the replay delivers, else the given probability."""
         chosen = self.deliveries.chosen
-        if chosen is None or (*link, message) in chosen:
+        if chosen is None or (*sent.link, sent.number) in chosen:
             return 1.0
-        return self.given.delivery_probability(link, message, bad, table_probability)
+        return float(self.given.delivery_probability(sent))
 
-    def mean_delivery(self, link: Link, table_probability: float) -> float:
+    def mean_delivery(self, sent: Transmission) -> float:
         """Return nan: this is one outcome, not a law."""
         return math.nan
 
@@ -119,12 +117,12 @@ class DelayUnlessWaived(Delay):
         """The value of the model ``given``, so that the same numbers are drawn."""
         return self.given.is_random
 
-    def message_delay(self, link: Link, message: int, drawn: float) -> float:
+    def message_delay(self, sent: Transmission, drawn: float) -> float:
         """Return the delay in seconds: 0 for a message in ``deliveries.without_delay``."""
-        chosen, key = self.deliveries.chosen, (*link, message)
+        chosen, key = self.deliveries.chosen, (*sent.link, sent.number)
         if key in self.deliveries.without_delay:
             return 0.0
-        seconds = self.given.message_delay(link, message, drawn)
+        seconds = self.given.message_delay(sent, drawn)
         delivered = chosen is None or key in chosen
         return 0.0 if delivered and math.isnan(seconds) else seconds
 

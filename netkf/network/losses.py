@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,37 +28,79 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import Link, Topology
 
 
+class Transmission(NamedTuple):
+    """What a channel knows of a message when it is sent.
+
+    link : (sender, receiver), ids of nodes
+    number : number of the message on that directed link, from 0
+    time : seconds
+    bad : the link is in the bad one of its two states, in which losses come in bursts
+    table_probability : entry of the graph's table for that direction, 1 without one
+    distance : of the two nodes; nan unless the loss follows it
+    hearers : ids of all nodes that the sender reaches with this transmission
+    size : bytes of the payload, nan if they are not known beforehand
+    conditions : what ``Loss.conditions`` has drawn for this run
+
+    Of K messages on one link ``number``, ``time``, ``bad`` and ``distance`` are arrays (K,).
+    """
+
+    link: Link
+    number: Any = 0
+    time: Any = 0.0
+    bad: Any = False
+    table_probability: float = 1.0
+    distance: Any = math.nan
+    hearers: tuple[int, ...] = ()
+    size: float = math.nan
+    conditions: Any = None
+
+
 @dataclass(frozen=True, eq=False)
 class Loss(Component):
     """The contract of a loss model.
 
     For each activation the engine draws one uniform number; a message is delivered when that is
     below its ``delivery_probability``. Both directions share the number when the channel is
-    symmetric.
+    symmetric, and with probability ``share`` all hearers of a broadcast.
     """
 
-    _called_if = MappingProxyType({"next_state": "stateful", "at_distance": "follows_distance"})
+    _called_if = MappingProxyType({"next_state": "stateful"})
 
     @abstractmethod
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
-        """Return the probability that message number ``message`` from link[0] reaches link[1].
-
-        ``bad``: the link is in the bad one of its two states, in which losses come in bursts.
-        ``table_probability`` is the entry of the graph's table for that direction, 1 without one;
-        of a loss that follows the distance, what ``at_distance`` says when the message is sent.
+    def delivery_probability(self, sent: Transmission) -> Any:
+        """Return the probability that the message ``sent`` arrives; of K messages on one link (K,)
+        or a number, if the class is ``vectorised``. It may depend on nothing else.
         """
         raise NotImplementedError
 
-    def at_distance(self, distance: float) -> float:
-        """Return the delivery probability of a message between nodes at this ``distance``."""
-        return 1.0
+    def conditions(self, random: np.random.Generator, horizon: float) -> Any:
+        """Draw what many messages of a run share, from a stream of its own, before its first
+        message: the weather up to the ``horizon`` in seconds, when a jammer is on, or the quality
+        of each node. ``delivery_probability`` finds it as ``sent.conditions``.
+        """
+        return None
+
+    @property
+    def vectorised(self) -> bool:
+        """True if ``delivery_probability`` takes many messages of one link at once."""
+        return False
 
     @property
     def follows_distance(self) -> bool:
-        """True if ``at_distance`` gives the ``table_probability`` of each message."""
+        """True if ``delivery_probability`` reads the distance."""
         return False
+
+    @property
+    def share(self) -> float:
+        """The probability that all hearers of a broadcast have one uniform number."""
+        return 0.0
+
+    @property
+    def state_of(self) -> str:
+        """Whose the two states are: each "link" has its own, or each "sender", all of whose links
+        are in one state.
+        """
+        return "link"
 
     def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
         """Return True if the link is in its bad state at the next activation.
@@ -77,13 +119,15 @@ class Loss(Component):
         """True if ``next_state`` draws."""
         return False
 
-    def mean_delivery(self, link: Link, table_probability: float) -> float:
-        """Return the fraction of messages from link[0] to link[1] that arrive in the long run, for
-        theory and summaries; nan if it is unknown before a run. ``table_probability`` is the entry
-        of the graph's table for that direction. By default the delivery probability of message 0 in
-        the good state: override it if others differ.
+    def mean_delivery(self, sent: Transmission) -> float:
+        """Return the fraction of messages that arrive in the long run on the link of ``sent``, its
+        message 0 at time 0, for theory and summaries; nan if it is unknown before a run. By default
+        the delivery probability of that message in the good state, nan if the class draws
+        ``conditions``: override it if others differ.
         """
-        return self.delivery_probability(link, 0, False, table_probability)
+        if has_conditions(self):
+            return math.nan
+        return float(self.delivery_probability(sent))
 
     @property
     def independent(self) -> bool:
@@ -104,10 +148,9 @@ class NoLoss(Loss):
     """Every message arrives."""
 
     deterministic = True
+    vectorised = True
 
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
+    def delivery_probability(self, sent: Transmission) -> Any:
         """Return 1, for any message in any state of the link."""
         return 1.0
 
@@ -116,11 +159,11 @@ class NoLoss(Loss):
 class Bernoulli(Loss):
     """A message arrives with probability ``delivery``."""
 
+    vectorised = True
+
     delivery: float = field(probability)
 
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
+    def delivery_probability(self, sent: Transmission) -> Any:
         """Return ``delivery``, for any message in any state of the link."""
         return self.delivery
 
@@ -129,11 +172,11 @@ class Bernoulli(Loss):
 class PerLink(Loss):
     """A message arrives with the delivery probability that the graph's table gives its link."""
 
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
+    vectorised = True
+
+    def delivery_probability(self, sent: Transmission) -> Any:
         """Return ``table_probability``, for any message in any state of the link."""
-        return table_probability
+        return sent.table_probability
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless the graph has a table of probabilities."""
@@ -156,10 +199,10 @@ class Logistic(Component):
     half: float = field(number(low=0.0))
     width: float = field(positive)
 
-    def at(self, distance: float) -> float:
+    def at(self, distance: Any) -> Any:
         """Return the delivery probability at a ``distance``."""
         # At exp(700) the probability is below 1e-300.
-        return 1.0 / (1.0 + math.exp(min((distance - self.half) / self.width, 700.0)))
+        return 1.0 / (1.0 + np.exp(np.minimum((distance - self.half) / self.width, 700.0)))
 
 
 def _convert_delivery(value: Any) -> Logistic | FloatArray:
@@ -215,20 +258,15 @@ class DistanceLoss(Loss):
     """
 
     follows_distance = True
+    vectorised = True
 
     delivery: Logistic | FloatArray = field(_delivery)
 
-    def at_distance(self, distance: float) -> float:
-        """Return the delivery probability of a message between nodes at this ``distance``."""
+    def delivery_probability(self, sent: Transmission) -> Any:
+        """Return the delivery probability of a message at its distance."""
         if isinstance(self.delivery, Logistic):
-            return self.delivery.at(distance)
-        return float(np.interp(distance, *self.delivery.T))
-
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
-        """Return ``table_probability``, which is that of the distance."""
-        return table_probability
+            return self.delivery.at(sent.distance)
+        return np.interp(sent.distance, *self.delivery.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +279,7 @@ class GilbertElliott(Loss):
     """
 
     stateful = True
+    vectorised = True
 
     to_bad: float | None = field(probability, default=None)
     to_good: float | None = field(number(above=0.0, high=1.0), default=None)
@@ -300,22 +339,18 @@ class GilbertElliott(Loss):
             return bool(u < to_bad / (to_bad + to_good))
         return bool(u >= to_good if bad else u < to_bad)
 
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
+    def delivery_probability(self, sent: Transmission) -> Any:
         """Return the delivery probability of any message in the ``bad`` or good state."""
-        if bad:
-            return 0.0 if self.deliver_bad is None else self.deliver_bad
-        return 1.0 if self.deliver_good is None else self.deliver_good
+        bad = 0.0 if self.deliver_bad is None else self.deliver_bad
+        good = 1.0 if self.deliver_good is None else self.deliver_good
+        return np.where(sent.bad, bad, good)
 
-    def mean_delivery(self, link: Link, table_probability: float) -> float:
+    def mean_delivery(self, sent: Transmission) -> float:
         """Return the mean delivery probability under the stationary law of the two states."""
         to_bad, to_good = self.transitions
         bad = to_bad / (to_bad + to_good)
-        # Of both states, in proportion to their probabilities; message and table do not matter.
-        return bad * self.delivery_probability(link, 0, True, 1.0) + (
-            1.0 - bad
-        ) * self.delivery_probability(link, 0, False, 1.0)
+        good, both = (float(self.delivery_probability(sent._replace(bad=b))) for b in (False, True))
+        return bad * both + (1.0 - bad) * good
 
     @property
     def independent(self) -> bool:
@@ -326,7 +361,8 @@ class GilbertElliott(Loss):
     @property
     def chain(self) -> Chain:
         """The chain of the two states of a link."""
-        delivery = (self.delivery_probability((0, 1), 0, bad, 1.0) for bad in (False, True))
+        sent = Transmission((0, 1))
+        delivery = (float(self.delivery_probability(sent._replace(bad=b))) for b in (False, True))
         return Chain(*self.transitions, *delivery)
 
 
@@ -338,38 +374,56 @@ def identical_per_link(loss: Loss) -> bool:
     return type(loss) in (NoLoss, Bernoulli, PerLink, DistanceLoss)
 
 
-def delivery_probabilities(
-    loss: Loss, link: Link, first: int, bad: np.ndarray, table_probability: float
-) -> FloatArray:
-    """Return the delivery probabilities (K,) of the messages numbered ``first``, ``first + 1``, ...
-    of a directed ``link`` (sender, receiver), by the loss model, which may be a user's own.
+def has_conditions(loss: Loss) -> bool:
+    """Return True if the class draws conditions of a run."""
+    return type(loss).conditions is not Loss.conditions
 
-    ``bad`` (K,) holds the state of the link at each; ``table_probability`` is the entry of the
-    graph's table for that direction. Raises ScenarioError for a value outside [0, 1].
-    """
-    if identical_per_link(loss):
-        return np.full(len(bad), loss.delivery_probability(link, first, False, table_probability))
-    return np.array(
-        [
-            checked_delivery_probability(loss, link, first + k, b, table_probability)
-            for k, b in enumerate(bad.tolist())
-        ]
+
+def _is_vectorised(loss: Loss) -> bool:
+    """Return True if the class that defines the probability says that it takes many messages."""
+    ancestors = type(loss).__mro__
+    says, defines = (
+        next(k for k, cls in enumerate(ancestors) if name in vars(cls))
+        for name in ("vectorised", "delivery_probability")
     )
+    return bool(loss.vectorised) and says <= defines
 
 
-def checked_delivery_probability(
-    loss: Loss, link: Link, message: int, bad: bool, table_probability: float
-) -> float:
-    """Return the probability that message number ``message`` on ``link`` (sender, receiver) arrives
-    if the link is in the state ``bad``; raises ScenarioError if the loss model gives one outside
-    [0, 1]. ``table_probability`` is the entry of the graph's table.
+def delivery_probabilities(loss: Loss, sent: Transmission) -> FloatArray:
+    """Return the delivery probabilities (K,) of K messages ``sent`` on one link, by the loss model,
+    which may be a user's own. Raises ScenarioError for a value outside [0, 1].
     """
-    value = loss.delivery_probability(link, message, bad, table_probability)
+    if _is_vectorised(loss):
+        values = np.broadcast_to(loss.delivery_probability(sent), np.shape(sent.number))
+        _demand_probabilities(loss, sent, values)
+        return np.asarray(values)
+    columns = np.broadcast_arrays(sent.number, sent.time, sent.bad, sent.distance)[1:]
+    rows = zip(sent.number.tolist(), *(c.tolist() for c in columns), strict=True)
+    ones = (
+        sent._replace(number=number, time=time, bad=bad, distance=distance)
+        for number, time, bad, distance in rows
+    )
+    return np.array([checked_delivery_probability(loss, one) for one in ones])
+
+
+def checked_delivery_probability(loss: Loss, sent: Transmission) -> float:
+    """Return the probability that the message ``sent`` arrives; raises ScenarioError if the loss
+    model gives one outside [0, 1].
+    """
+    value: float = loss.delivery_probability(sent)
     if not 0.0 <= value <= 1.0:
-        rule = (
-            f"{type(loss).__name__}: the delivery probability of message {message} on link "
-            f"{list(link)} must be in [0, 1]"
-        )
-        remedy = "correct delivery_probability of the class"
-        raise ScenarioError("network.channel.loss", rule, value, remedy)
+        _demand_probabilities(loss, sent, np.array(value))
     return value
+
+
+def _demand_probabilities(loss: Loss, sent: Transmission, values: FloatArray) -> None:
+    wrong = np.flatnonzero(~((values >= 0.0) & (values <= 1.0)))
+    if not wrong.size:
+        return
+    number = np.ravel(sent.number)[wrong[0]]
+    rule = (
+        f"{type(loss).__name__}: the delivery probability of message {number} on link "
+        f"{list(sent.link)} must be in [0, 1]"
+    )
+    remedy = "correct delivery_probability of the class"
+    raise ScenarioError("network.channel.loss", rule, float(values.ravel()[wrong[0]]), remedy)

@@ -15,7 +15,7 @@ from netkf.core.fields import SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology, demand_links
-from netkf.network.losses import Loss
+from netkf.network.losses import Loss, Transmission
 
 AFTER = ("deliver", "lose", "repeat", "refuse")
 """The treatments of a message that the table does not list."""
@@ -128,16 +128,14 @@ class RecordedLoss(Loss):
         rule = "delivered must be 0 or 1, one value a message"
         return read_messages(self.path, "delivered", rule, lambda value: value in (0.0, 1.0))
 
-    def delivery_probability(
-        self, link: Link, message: int, bad: bool, table_probability: float
-    ) -> float:
-        """Return 1 if the table says that message number ``message`` on ``link`` arrives."""
-        value = _value_at("network.channel.loss", self.table, link, message, self.after)
+    def delivery_probability(self, sent: Transmission) -> float:
+        """Return 1 if the table says that the message ``sent`` arrives."""
+        value = _value_at("network.channel.loss", self.table, sent, self.after)
         if value is None:
             return 0.0 if self.after == "lose" else 1.0
         return value
 
-    def mean_delivery(self, link: Link, table_probability: float) -> float:
+    def mean_delivery(self, sent: Transmission) -> float:
         """Return nan: the fraction is unknown before a run."""
         return math.nan
 
@@ -180,9 +178,9 @@ class RecordedDelay(Delay):
         listed = [value for link in self.table.values.values() for value in link.values()]
         return max(listed, default=0.0)
 
-    def message_delay(self, link: Link, message: int, drawn: float) -> float:
-        """Return the recorded seconds that message number ``message`` on ``link`` takes."""
-        value = _value_at("network.channel.delay", self.table, link, message, self.after)
+    def message_delay(self, sent: Transmission, drawn: float) -> float:
+        """Return the recorded seconds that the message ``sent`` takes."""
+        value = _value_at("network.channel.delay", self.table, sent, self.after)
         if value is None:
             return math.nan if self.after == "lose" else 0.0
         return value
@@ -192,7 +190,7 @@ class RecordedDelay(Delay):
         demand_links(self.path, self.table.lines, topology)
 
 
-def _value_at(key: str, table: MessageTable, link: Link, message: int, after: str) -> float | None:
+def _value_at(key: str, table: MessageTable, sent: Transmission, after: str) -> float | None:
     # Asked for during a run, so the error must carry the whole path of its key.
     with errors_under(key):
-        return table.value(link, message, after)
+        return table.value(sent.link, sent.number, after)

@@ -42,6 +42,7 @@ from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, RangeGraph, Topology
+from netkf.network.losses import Transmission
 from netkf.network.matchings import SlotActivation
 from netkf.network.positions import Positions, PositionTable
 from netkf.plants.blocks import Block, Layout, stack
@@ -474,18 +475,15 @@ class ScenarioModel(Component):
             return believed_R[self.sensor_entries[entry]]
         return believed_R
 
-    def table_probability(self, link: Link) -> float:
-        """Return the delivery probability of a directed link in the graph's CSV table.
-
-        It is 1 if the graph has no such table, 0 if the table does not list the link. Of a loss
-        that follows the distance it is that of the distance, nan if nodes move.
+    def transmission(self, link: Link) -> Transmission:
+        """Return what is known beforehand of message 0 on a directed link: its entry in the graph's
+        table is 0 if the table does not list the link, its distance nan if nodes move.
         """
-        loss = self.network.channel.loss
-        if loss.follows_distance:
-            moving = self.positions.moving
-            return math.nan if moving else loss.at_distance(self.positions.distance(link))
-        delivery = self.topology.delivery
-        return 1.0 if delivery is None else delivery.get(link, 0.0)
+        delivery, distance = self.topology.delivery, math.nan
+        if self.network.channel.loss.follows_distance and not self.positions.moving:
+            distance = self.positions.distance(link)
+        table = 1.0 if delivery is None else delivery.get(link, 0.0)
+        return Transmission(link, table_probability=table, distance=distance)
 
     def mean_delivery(self, link: Link) -> float:
         """Return the fraction of messages of a directed link that arrive in the long run, nan if it
@@ -493,7 +491,7 @@ class ScenarioModel(Component):
         """
         if self.topology.radius is not None:
             return math.nan
-        return self.network.channel.loss.mean_delivery(link, self.table_probability(link))
+        return self.network.channel.loss.mean_delivery(self.transmission(link))
 
     @cached_property
     def increment_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:

@@ -18,11 +18,11 @@ from netkf.laws.losses import (
 )
 from netkf.laws.noise import compare_with
 from netkf.laws.stating import stated_law, stated_part
-from netkf.network.channels import Channel, ChannelSampler
+from netkf.network.channels import Channel, ChannelSampler, conditions_of
 from netkf.network.delays import Delay
 from netkf.network.delays import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
-from netkf.network.losses import Loss
+from netkf.network.losses import Loss, Transmission, delivery_probabilities, has_conditions
 from netkf.rng.streams import Streams
 from netkf.testing.generators import RecordingGenerator, describe_calls
 from netkf.testing.noise import demand_agreement, family_level
@@ -32,8 +32,10 @@ CHAINS, LENGTH = 400, 50
 """Simulated runs, and messages over each directed link in a run."""
 DRAWS, DELAYS = 200, 20_000
 """Draws that are checked one by one, and delays whose law is tested."""
-MESSAGES = (0, 1, 2, 7, 1000)
-"""Numbers of the messages whose probabilities and delays are checked."""
+MESSAGES, TIMES, HORIZON = (0, 1, 2, 7, 1000), (0.0, 0.3, 11.0, 55.5, 99.0), 100.0
+"""Numbers of the messages whose probabilities and delays are checked, when they are sent, and the
+end of these runs in seconds.
+"""
 TABLE = (1.0, 0.6, 0.85)
 """Delivery probabilities of a graph without a table of its own: directed links take them in turn.
 """
@@ -50,13 +52,13 @@ def check_channel(channel: Any, /, topology: Topology | None = None, **settings:
 
     It is checked on every directed link of a complete graph of 4 nodes, or of ``topology``.
 
-    Exact checks: delivery probabilities, also those ``at_distance`` of a loss that follows it, are
-    numbers from 0 to 1 (0 or 1 if ``deterministic``), use no randomness and do not depend on
-    earlier calls; links with equal entries in the graph's table have equal ones, unless the class
-    defines a ``mean_delivery`` of its own; ``next_state`` and
-    ``draw`` use only the generator they are given, and make the same draws in each call, none if
-    ``stateful`` is False or the delay is ``fixed``; delays are not negative, at most ``longest``,
-    and equal to ``fixed`` if it is not None.
+    Exact checks: delivery probabilities, at all times and distances, are numbers from 0 to 1 (0 or
+    1 if ``deterministic``), use no randomness and do not depend on earlier calls, and those of many
+    messages at once are those of each, if the class is ``vectorised``; links with equal entries in
+    the graph's table have equal ones, unless the class defines a ``mean_delivery`` of its own;
+    ``conditions``, ``next_state`` and ``draw`` use only the generator they are given, and the last
+    two make the same draws in each call, none if ``stateful`` is False or the delay is ``fixed``;
+    delays are not negative, at most ``longest``, and equal to ``fixed`` if it is not None.
 
     Statistical checks find these errors with probability 0.9. From 20,000 messages over each
     directed link: a delivered fraction p of one link that differs from ``mean_delivery`` by
@@ -97,14 +99,16 @@ def _check_channel(part: Any, topology: Topology | None, seed: int) -> None:
             _check_draws(watched)
         _check_delay_law(watched, tuple(links))
         return
-    for distance in DISTANCES if part.follows_distance else ():
-        value = watched.call("at_distance", distance)
-        rule = f"must be a number from 0 to 1 at the distance {distance:g}"
-        demand(0.0 <= value <= 1.0, f"{watched.name}.at_distance", rule, value)
-    for link, table_probability in links.items():
-        _check_delivery_probabilities(watched, link, table_probability)
-    _check_pure(watched, links)
-    _check_identical_links(watched, tuple(links))
+    conditions = _check_conditions(watched)
+    near = DISTANCES[0] if part.follows_distance else math.nan
+    sent = [
+        Transmission(link, table_probability=p, distance=near, conditions=conditions)
+        for link, p in links.items()
+    ]
+    for one in sent:
+        _check_delivery_probabilities(watched, one)
+    _check_pure(watched, sent)
+    _check_identical_links(watched, sent)
     _check_channel_state(watched)
     _check_fractions(watched, links, seed)
 
@@ -119,29 +123,54 @@ def table_entries(topology: Topology) -> dict[Link, float]:
     return {link: TABLE[k % len(TABLE)] for k, link in enumerate(topology.directions)}
 
 
-def _check_pure(watched: WatchedPart, links: dict[Link, float]) -> None:
-    calls = [
-        (link, message, bad, table_probability)
-        for link, table_probability in links.items()
-        for message in MESSAGES
+def _check_conditions(watched: WatchedPart) -> Any:
+    """Return the conditions of a run, which must depend on the generator alone."""
+    if not has_conditions(watched.part):
+        return None
+    where, drawn = f"{watched.name}.conditions", []
+    for _ in range(2):
+        random = np.random.default_rng(5)
+        drawn.append(watched.call("conditions", random, HORIZON, repeatable=False))
+    rule = "must use no generator but the one it is given"
+    demand(repr(drawn[0]) == repr(drawn[1]), where, rule, "others from an equal generator")
+    return drawn[0]
+
+
+def _messages(one: Transmission) -> list[Transmission]:
+    """Return messages of one link, at several times and in both states."""
+    return [
+        one._replace(number=number, time=time, bad=bad)
+        for number, time in zip(MESSAGES, TIMES, strict=True)
         for bad in (False, True)
     ]
-    probability = watched.part.delivery_probability
-    forwards = {call: probability(*call) for call in calls}
-    backwards = {call: probability(*call) for call in reversed(calls)}
-    for call in calls:
-        link, message = call[:2]
+
+
+def _check_pure(watched: WatchedPart, sent: list[Transmission]) -> None:
+    calls = [message for one in sent for message in _messages(one)]
+    probability, where = watched.part.delivery_probability, f"{watched.name}.delivery_probability"
+    forwards = [float(probability(call)) for call in calls]
+    backwards = [float(probability(call)) for call in reversed(calls)][::-1]
+    for call, first, second in zip(calls, forwards, backwards, strict=True):
         demand(
-            forwards[call] == backwards[call],
-            f"{watched.name}.delivery_probability",
+            first == second,
+            where,
             "must not depend on which links and messages were asked for before",
-            f"{forwards[call]:.4g} and {backwards[call]:.4g} for message {message} of link "
-            f"{list(link)}",
+            f"{first:.4g} and {second:.4g} for message {call.number} of link {list(call.link)}",
             "use nothing but the arguments",
         )
+    per_link = np.reshape(forwards, (len(sent), -1))
+    for one, expected in zip(sent, per_link, strict=True):
+        number, time, bad = np.transpose([(m.number, m.time, m.bad) for m in _messages(one)])
+        many = one._replace(number=number.astype(int), time=time, bad=bad.astype(bool))
+        with guard_user_code(where):
+            together = delivery_probabilities(watched.part, many)
+        rule = "must give many messages the probabilities of each, where the class is vectorised"
+        off = np.flatnonzero(together != expected)
+        got = [f"{together[k]:.4g} and {expected[k]:.4g}" for k in off[:1].tolist()]
+        demand(not off.size, where, rule, "".join(got), "use operations of numpy on whole arrays")
 
 
-def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> None:
+def _check_identical_links(watched: WatchedPart, sent: list[Transmission]) -> None:
     part = watched.part
     ancestors = type(part).__mro__
     mean_owner, probability_owner = (
@@ -152,9 +181,10 @@ def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> Non
         return
     for bad in (False, True):
         for message in MESSAGES:
-            probabilities = [part.delivery_probability(link, message, bad, 0.8) for link in links]
+            alike = [one._replace(number=message, bad=bad, table_probability=0.8) for one in sent]
+            probabilities = [float(part.delivery_probability(one)) for one in alike]
             median = float(np.median(probabilities))
-            for link, probability in zip(links, probabilities, strict=True):
+            for (link, *_), probability in zip(sent, probabilities, strict=True):
                 demand(
                     abs(probability - median) <= PROBABILITY_TOLERANCE,
                     f"{watched.name}.delivery_probability",
@@ -164,25 +194,24 @@ def _check_identical_links(watched: WatchedPart, links: tuple[Link, ...]) -> Non
                 )
 
 
-def _check_delivery_probabilities(
-    watched: WatchedPart, link: Link, table_probability: float
-) -> None:
+def _check_delivery_probabilities(watched: WatchedPart, one: Transmission) -> None:
     part, where = watched.part, f"{watched.name}.delivery_probability"
-    for bad in (False, True):
-        for message in (0, 1, 2, 1000):
-            probability = watched.call(
-                "delivery_probability", link, message, bad, table_probability
+    for distance in DISTANCES if part.follows_distance else (one.distance,):
+        for message in _messages(one._replace(distance=distance)):
+            probability = watched.call("delivery_probability", message)
+            is_number = isinstance(probability, (int, float, np.floating)) or (
+                isinstance(probability, np.ndarray) and probability.shape == ()
             )
-            is_probability = (
-                isinstance(probability, (int, float, np.floating)) and 0.0 <= probability <= 1.0
-            )
-            rule = f"must be a number from 0 to 1 for message {message}"
-            demand(is_probability, where, rule, probability)
+            subject = f"for message {message.number}"
+            if part.follows_distance:
+                subject = f"at the distance {distance:g}"
+            rule = f"must be a number from 0 to 1 {subject}"
+            demand(is_number and 0.0 <= probability <= 1.0, where, rule, probability)
             rule = "must be 0 or 1 where the loss is deterministic"
             got = probability
             remedy = "let deterministic be False"
             demand(not part.deterministic or probability in (0.0, 1.0), where, rule, got, remedy)
-    mean = watched.call("mean_delivery", link, table_probability)
+    mean = watched.call("mean_delivery", one)
     is_mean = math.isnan(mean) or 0.0 <= mean <= 1.0
     demand(is_mean, f"{watched.name}.mean_delivery", "must be a number from 0 to 1, or nan", mean)
 
@@ -215,7 +244,12 @@ def _check_channel_state(watched: WatchedPart) -> None:
 
 def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) -> None:
     part, where = watched.part, f"{watched.name}.mean_delivery"
-    stated = np.array([part.mean_delivery(link, p) for link, p in links.items()])
+    stated = np.array(
+        [
+            part.mean_delivery(Transmission(link, table_probability=p, distance=DISTANCES[0]))
+            for link, p in links.items()
+        ]
+    )
     if np.isnan(stated).all() and not part.independent:
         return
     with guard_user_code(watched.name):
@@ -249,16 +283,18 @@ def _check_fractions(watched: WatchedPart, links: dict[Link, float], seed: int) 
 def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndarray:
     """Return the mask (CHAINS, LENGTH, L) of messages that the engine would lose."""
     lost, channel = np.zeros((CHAINS, LENGTH, len(links)), dtype=bool), Channel(loss=part)
+    times = np.linspace(0.0, HORIZON, LENGTH, endpoint=False)
     for chain in range(CHAINS):
         streams = Streams(seed + 7, chain)
+        conditions = conditions_of(part, streams, HORIZON)
         for k, (link, table_probability) in enumerate(links.items()):
             sampler = ChannelSampler(channel, lambda purpose: streams.generator(purpose, *link))  # noqa: B023
             uniform, bad, _ = sampler.draws(LENGTH)
-            probabilities = [
-                part.delivery_probability(link, message, is_bad, table_probability)
-                for message, is_bad in enumerate(bad.tolist())
-            ]
-            lost[chain, :, k] = uniform >= probabilities
+            sent = Transmission(
+                link, np.arange(LENGTH), times, bad, table_probability, DISTANCES[0],
+                conditions=conditions,
+            )  # fmt: skip
+            lost[chain, :, k] = uniform >= delivery_probabilities(part, sent)
     return lost
 
 
@@ -273,7 +309,7 @@ def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
     )
     if stated.fixed is not None and derives:
         for link in links:
-            seconds = part.message_delay(link, 0, stated.fixed)
+            seconds = part.message_delay(Transmission(link), stated.fixed)
             is_equal = math.isnan(seconds) or seconds == stated.fixed
             got = f"{seconds:g} s for link {list(link)} instead of {stated.fixed:g}"
             demand(is_equal, where, rule, got, remedy)
@@ -284,7 +320,7 @@ def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:
     with guard_user_code(where):
         random = Streams(7, 0).generator("delay")
         delays = [
-            part.message_delay(links[index], k, part.draw(random))
+            part.message_delay(Transmission(links[index], k), part.draw(random))
             for k, index in enumerate(directions.tolist())
         ]
     sent = np.zeros(len(delays))
@@ -321,9 +357,9 @@ def _check_draws(watched: WatchedPart) -> None:
 def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None:
     part, where, longest = watched.part, f"{watched.name}.message_delay", watched.part.longest
     drawn_delay = part.fixed or 0.0
-    calls = [(link, message) for link in links for message in MESSAGES]
-    delays = {call: watched.call("message_delay", *call, drawn_delay) for call in calls}
-    for (link, message), seconds in delays.items():
+    calls = [Transmission(link, number) for link in links for number in MESSAGES]
+    delays = [watched.call("message_delay", call, drawn_delay) for call in calls]
+    for (link, message, *_), seconds in zip(calls, delays, strict=True):
         subject = f"message {message} of link {list(link)}"
         is_number = isinstance(seconds, (int, float, np.floating))
         demand(is_number, where, f"must be a number for {subject}", seconds)
@@ -333,8 +369,8 @@ def _check_message_delays(watched: WatchedPart, links: tuple[Link, ...]) -> None
         is_fixed = part.fixed is None or seconds == drawn_delay or overrides_message_delay(part)
         demand(is_fixed, where, "must be `fixed` where delays are", f"{seconds:g} for {subject}")
     # The same calls again, in reverse order.
-    for call in reversed(calls):
-        first, second = delays[call], part.message_delay(*call, drawn_delay)
+    for call, first in zip(reversed(calls), reversed(delays), strict=True):
+        second = part.message_delay(call, drawn_delay)
         is_equal = second == first or (math.isnan(second) and math.isnan(first))
         rule = "must not depend on which messages were asked for before"
         demand(is_equal, where, rule, f"{first:g} and {second:g}")

@@ -15,7 +15,8 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock, OnReadings, Periodic
 from netkf.network.delays import Delay
-from netkf.network.graphs import Complete, Link
+from netkf.network.graphs import Complete
+from netkf.network.losses import Transmission
 from netkf.network.matchings import Broadcast, Matching, SlotActivation
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -95,12 +96,12 @@ class Unreliable(Delay):
         """Return 0: nothing is drawn."""
         return 0.0
 
-    def message_delay(self, link: Link, message: int, drawn: float) -> float:
+    def message_delay(self, sent: Transmission, drawn: float) -> float:
         """Return the seconds that a message takes, nan if it is lost."""
-        if message < self.first:
+        if sent.number < self.first:
             return 0.0
         pattern = (self.late, self.late, math.nan, 0.0) if self.late else (math.nan,)
-        return pattern[(message - self.first) % len(pattern)]
+        return pattern[(sent.number - self.first) % len(pattern)]
 
 
 class Kind(NamedTuple):

@@ -213,7 +213,7 @@ def loss_of(case, links):
     table = np.array(
         [
             [
-                loss.delivery_probability(link, 0, bad, case.table_probability(link))
+                float(loss.delivery_probability(case.transmission(link)._replace(bad=bad)))
                 for link in links
             ]
             for bad in (False, True)

@@ -84,10 +84,10 @@ class Reluctant(Matching):
 class Lossier(Bernoulli):
     """Claims ``delivery``, delivers a tenth less."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return self.delivery - 0.1
 
-    def mean_delivery(self, link, measured):
+    def mean_delivery(self, sent):
         return self.delivery
 
 

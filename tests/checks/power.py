@@ -39,7 +39,7 @@ class LossierBy(Bernoulli):
 
     size: float = 0.0
 
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return self.delivery - self.size
 
 

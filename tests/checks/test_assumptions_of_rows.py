@@ -217,7 +217,7 @@ def test_a_class_with_weights_of_its_own_may_say_how_many_links_they_allow(tmp_p
 class Unknown(Bernoulli):
     """Does not say before a run how many messages arrive."""
 
-    def mean_delivery(self, link, table_probability):
+    def mean_delivery(self, sent):
         return math.nan
 
 
@@ -225,10 +225,10 @@ class Unknown(Bernoulli):
 class Alternating(Bernoulli):
     """Loses every other message, and says how many on average."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return float(message % 2)
+    def delivery_probability(self, sent):
+        return float(sent.number % 2)
 
-    def mean_delivery(self, link, table_probability):
+    def mean_delivery(self, sent):
         return 0.5
 
 

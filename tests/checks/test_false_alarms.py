@@ -315,11 +315,11 @@ def test_runs_without_an_exact_covariance_are_judged_too(tmp_path, monkeypatch):
 class Downhill(Bernoulli):
     """Loses more upwards, and says so."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return self.mean_delivery(link, table_probability)
+    def delivery_probability(self, sent):
+        return self.mean_delivery(sent)
 
-    def mean_delivery(self, link, table_probability):
-        return self.delivery if link[0] < link[1] else 0.8 * self.delivery
+    def mean_delivery(self, sent):
+        return self.delivery if sent.link[0] < sent.link[1] else 0.8 * self.delivery
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,7 +330,7 @@ class TimedOut(ExponentialDelay):
     def longest(self):
         return 2.0 * self.mean
 
-    def message_delay(self, link, message, drawn):
+    def message_delay(self, sent, drawn):
         return drawn if drawn <= self.longest else math.nan
 
 

@@ -456,8 +456,8 @@ class Cautious(Hybrid):
 class Halved(Bernoulli):
     """A user's loss: half of what it says."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return 0.5 * super().delivery_probability(link, message, bad, table_probability)
+    def delivery_probability(self, sent):
+        return 0.5 * super().delivery_probability(sent)
 
 
 def test_a_filter_of_ones_own_is_refused_by_name_and_auto_takes_the_other(ring):
@@ -479,8 +479,8 @@ def test_a_loss_of_ones_own_runs_in_both(ring):
 class Certain(Bernoulli):
     """A user's loss that is no probability."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return np.nan if message > 3 else 1.0
+    def delivery_probability(self, sent):
+        return np.nan if sent.number > 3 else 1.0
 
 
 class Stuck(Poisson):

@@ -86,10 +86,10 @@ class Fading(Loss):
             return bool(u < 0.25)
         return bool(u >= 0.3 / self.longer if bad else u < 0.1 / self.longer)
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return 0.05 if bad else 0.95
+    def delivery_probability(self, sent):
+        return 0.05 if sent.bad else 0.95
 
-    def mean_delivery(self, link, table_probability):
+    def mean_delivery(self, sent):
         return 0.75 * 0.95 + 0.25 * 0.05
 
     @property

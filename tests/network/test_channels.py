@@ -16,7 +16,7 @@ def sampled_outcomes(count, **settings):
     sampler = channels.ChannelSampler(channel, lambda purpose: Streams(1).generator(purpose, 0, 1))
     draws = [sampler.draw() for _ in range(count)]
     arrived = [
-        u < channel.loss.delivery_probability((0, 1), k, bad, 1.0)
+        u < channel.loss.delivery_probability(losses.Transmission((0, 1), k, bad=bad))
         for k, (u, bad, _) in enumerate(draws)
     ]
     return np.array(arrived), np.array([delay for _, _, delay in draws])
@@ -42,7 +42,7 @@ def test_gilbert_elliott_has_its_mean_loss_and_burst(loss):
     starts = lost & np.concatenate([[True], arrived[:-1]])
     assert lost.sum() / starts.sum() == pytest.approx(5.0, rel=0.05)
     assert lost.mean() == pytest.approx(0.3, abs=0.02)
-    assert loss.mean_delivery((0, 1), 1.0) == pytest.approx(0.7)
+    assert loss.mean_delivery(losses.Transmission((0, 1))) == pytest.approx(0.7)
     assert not loss.independent
 
 
@@ -50,7 +50,7 @@ def test_gilbert_elliott_with_two_kinds_of_luck():
     loss = losses.GilbertElliott(to_bad=0.1, to_good=0.3, deliver_good=0.9, deliver_bad=0.4)
     arrived, _ = sampled_outcomes(100_000, loss=loss)
     expected = 0.75 * 0.9 + 0.25 * 0.4
-    assert loss.mean_delivery((0, 1), 1.0) == pytest.approx(expected)
+    assert loss.mean_delivery(losses.Transmission((0, 1))) == pytest.approx(expected)
     assert arrived.mean() == pytest.approx(expected, abs=0.01)
 
 

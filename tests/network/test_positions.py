@@ -11,7 +11,7 @@ import scipy.stats
 
 import netkf
 from netkf.core.errors import EngineError, NetkfError, TheoryError
-from netkf.network.losses import DistanceLoss
+from netkf.network.losses import DistanceLoss, Transmission
 from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table, parse_toml
 from netkf.scenario.usage import record_usage
@@ -218,9 +218,10 @@ def test_filters_know_what_they_hear(tmp_path, clock, filtering):
 
 def test_table_of_delivery_is_linear_and_ends_are_constant():
     loss = DistanceLoss(delivery=[[1.0, 0.9], [3.0, 0.5], [4.0, 0.1]])
-    found = [loss.at_distance(d) for d in (0.0, 1.0, 2.0, 3.5, 4.0, 50.0)]
+    at = [Transmission((0, 1), distance=d) for d in (0.0, 1.0, 2.0, 3.5, 4.0, 50.0, 1e9)]
+    found = [loss.delivery_probability(one) for one in at[:-1]]
     assert found == pytest.approx([0.9, 0.9, 0.7, 0.3, 0.1, 0.1], abs=1e-15)
-    assert DistanceLoss(delivery=LOGISTIC).at_distance(1e9) < 1e-300
+    assert DistanceLoss(delivery=LOGISTIC).delivery_probability(at[-1]) < 1e-300
 
 
 @pytest.mark.parametrize("clock", CLOCKS)

@@ -8,6 +8,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile
 from netkf.network.channels import Channel, ChannelDraw, ChannelSampler, transit_time
 from netkf.network.delays import ExponentialDelay, NoDelay, UniformDelay, delay_depends_on_message
+from netkf.network.losses import Transmission
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 
 WAY, BACK = (0, 1), (1, 0)
@@ -26,11 +27,11 @@ def record(tmp_path):
 
 
 def chances(loss, count, link=WAY):
-    return [loss.delivery_probability(link, k, False, 1.0) for k in range(count)]
+    return [loss.delivery_probability(Transmission(link, k)) for k in range(count)]
 
 
 def seconds(delay, count, link=WAY):
-    return [delay.message_delay(link, k, 0.0) for k in range(count)]
+    return [delay.message_delay(Transmission(link, k), 0.0) for k in range(count)]
 
 
 @pytest.mark.parametrize(
@@ -60,9 +61,9 @@ def test_delays_after_the_record(record):
 def test_a_message_beyond_the_record_may_be_refused(record, cls, key):
     part = record(cls, ["0,1,0,1"], after="refuse")
     channel = Channel(**{key: part})
-    assert transit_time(channel, WAY, 0, FINE, 1.0) == (1.0 if key == "delay" else 0.0)
+    assert transit_time(channel, Transmission(WAY, 0), FINE) == (1.0 if key == "delay" else 0.0)
     with pytest.raises(ScenarioError) as caught:
-        transit_time(channel, WAY, 1, FINE, 1.0)
+        transit_time(channel, Transmission(WAY, 1), FINE)
     line = str(caught.value)
     assert line.startswith(f"network.channel.{key}.path: record.csv must list every message")
     assert "message 1 from node 0 to node 1" in line
@@ -102,8 +103,8 @@ def test_nothing_is_drawn_for_recorded_delays(record):
 
 def test_negative_delays_are_refused(record):
     class Early(NoDelay):
-        def message_delay(self, link, message, drawn):
+        def message_delay(self, sent, drawn):
             return -1.0
 
     with pytest.raises(ScenarioError, match=r"Early: the delay of message 3 .* not be negative"):
-        transit_time(Channel(delay=Early()), WAY, 3, FINE, 1.0)
+        transit_time(Channel(delay=Early()), Transmission(WAY, 3), FINE)

@@ -206,7 +206,7 @@ from dataclasses import dataclass
 class Rare(Loss):
     delivery: float = setting(probability)
 
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return self.delivery
 """
 

@@ -128,7 +128,7 @@ def test_rules_of_users_have_a_schema():
 
         decay: float = setting(number(above=0.0, high=2.0), default=1.0)
 
-        def delivery_probability(self, link, message, bad, table_probability):
+        def delivery_probability(self, sent):
             """Return it."""
             return 0.5
 

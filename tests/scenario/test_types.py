@@ -25,7 +25,7 @@ import netkf
 from netkf.parts import (
     Analysis, Bernoulli, Channel, Cycle, Diffusion, Estimate, Exchange, Filter, Increments,
     LinearSensor, LinkClock, Loss, Message, Needs, NodeInfo, Poisson, Reading, State, Timing,
-    Weights, positive, probability, setting,
+    Transmission, Weights, positive, probability, setting,
 )
 
 Array = NDArray[np.float64]
@@ -164,10 +164,8 @@ class Regular(LinkClock):
 class Fading(Loss):
     delivery: float = setting(probability)
 
-    def delivery_probability(
-        self, link: tuple[int, int], message: int, bad: bool, table_probability: float
-    ) -> float:
-        return self.delivery ** (1 + message)
+    def delivery_probability(self, sent: Transmission) -> float:
+        return float(self.delivery ** (1 + sent.number))
 
 
 def scenario() -> netkf.Scenario:

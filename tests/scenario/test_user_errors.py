@@ -116,7 +116,7 @@ MISTAKES = {
                                 r"F\.mean_rate \(FILE, line 6\) must take \(entity\), not \(\)"),
     "check of a loss fails": ("LOSS", "def check(self, topology): return 1 / 0",
                               r"F failed in check: ZeroDivisionError.*; FILE, line 6"),
-    "mean_delivery returns nothing": ("LOSS", "def mean_delivery(self, link, table): pass",
+    "mean_delivery returns nothing": ("LOSS", "def mean_delivery(self, sent): pass",
                                       rf"F\.mean_delivery \(FILE, line 6\) {NO_RESULT}"),
     "draw fails": ("DELAY", "def draw(self, random): return 1 / 0",
                    r"F failed in draw: ZeroDivisionError.*; FILE, line 6"),

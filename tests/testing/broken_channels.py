@@ -24,27 +24,26 @@ def says(table, words, **settings):
 
 @says(CHANNELS, "TooSure.delivery_probability: must be a number from 0 to 1 for message 0; got 1.2")
 class TooSure(Loss):
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return 1.2
 
 
-@says(CHANNELS, "Falling.at_distance: must be a number from 0 to 1 at the distance 10; got -9")
+@says(
+    CHANNELS, "Falling.delivery_probability: must be a number from 0 to 1 at the distance 10; got"
+)
 class Falling(Loss):
     follows_distance = True
 
-    def at_distance(self, distance):
-        return 1.0 - distance
-
-    def delivery_probability(self, link, message, bad, table_probability):
-        return table_probability
+    def delivery_probability(self, sent):
+        return 1.0 - sent.distance
 
 
 @says(CHANNELS, "Lossier.mean_delivery: must be the delivered fraction", delivery=0.5)
 class Lossier(Bernoulli):
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return self.delivery - 0.02
 
-    def mean_delivery(self, link, measured):
+    def mean_delivery(self, sent):
         return self.delivery
 
 
@@ -95,7 +94,7 @@ class Lazy(GilbertElliott):
 
 @says(CHANNELS, "OwnLuck.delivery_probability: must return the same for the same arguments")
 class OwnLuck(Loss):
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return float(np.random.default_rng().random())
 
 
@@ -215,18 +214,18 @@ NUMBERS = {}
 
 @says(CHANNELS, "OneWorse.delivery_probability: must be the same for links with eq", delivery=0.8)
 class OneWorse(Bernoulli):
-    def delivery_probability(self, link, message, bad, table_probability):
-        return 0.75 if link == (2, 3) else self.delivery
+    def delivery_probability(self, sent):
+        return 0.75 if sent.link == (2, 3) else self.delivery
 
 
 @says(CHANNELS, "BackWorse.mean_delivery: must be the delivered fraction", delivery=0.8)
 class BackWorse(Bernoulli):
     """One direction loses more than it says."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return 0.77 if link == (3, 1) else self.delivery
+    def delivery_probability(self, sent):
+        return 0.77 if sent.link == (3, 1) else self.delivery
 
-    def mean_delivery(self, link, table_probability):
+    def mean_delivery(self, sent):
         return self.delivery
 
 
@@ -234,10 +233,10 @@ class BackWorse(Bernoulli):
 class Slightly(Bernoulli):
     """All links lose one percent more than they say."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return self.delivery - 0.01
 
-    def mean_delivery(self, link, table_probability):
+    def mean_delivery(self, sent):
         return self.delivery
 
 
@@ -245,10 +244,10 @@ class Slightly(Bernoulli):
 class AllAtOnce(Bernoulli):
     """All links lose the same messages, by their numbers."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return 0.0 if (message * 2654435761) % 5 == 0 else 1.0
+    def delivery_probability(self, sent):
+        return 0.0 if (sent.number * 2654435761) % 5 == 0 else 1.0
 
-    def mean_delivery(self, link, table_probability):
+    def mean_delivery(self, sent):
         return 0.8
 
 
@@ -258,20 +257,20 @@ class AllAtOnce(Bernoulli):
     delivery=0.8,
 )
 class Coupled(Bernoulli):
-    def delivery_probability(self, link, message, bad, table_probability):
-        last, NUMBERS["last"] = NUMBERS.get("last"), (link, message)
-        return self.delivery if last in (None, (link, message)) else 0.9 * self.delivery
+    def delivery_probability(self, sent):
+        last, NUMBERS["last"] = NUMBERS.get("last"), (sent.link, sent.number)
+        return self.delivery if last in (None, (sent.link, sent.number)) else 0.9 * self.delivery
 
 
 @says(CHANNELS, "Ignores.mean_delivery: must be the delivered fraction")
 class Ignores(Loss):
     """The entry of the table counts for the mean only."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return 0.8
 
-    def mean_delivery(self, link, table_probability):
-        return table_probability
+    def mean_delivery(self, sent):
+        return sent.table_probability
 
 
 @says(CHANNELS, "Ordered.draw: ")
@@ -290,8 +289,8 @@ class OneSlow(Delay):
     def draw(self, random):
         return random.random()
 
-    def message_delay(self, link, message, drawn):
-        return 2.0 if link == (3, 2) else drawn
+    def message_delay(self, sent, drawn):
+        return 2.0 if sent.link == (3, 2) else drawn
 
 
 @says(CLOCKS, "OneSlower.mean_rate: must be the mean ticks per second", rate=2.0)
@@ -344,7 +343,7 @@ class Slower(ExponentialDelay):
 
 @says(CHANNELS, "Instant.message_delay: delays must have the law of ConstantDelay", seconds=0.3)
 class Instant(ConstantDelay):
-    def message_delay(self, link, message, drawn):
+    def message_delay(self, sent, drawn):
         return 0.0
 
 

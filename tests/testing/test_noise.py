@@ -95,10 +95,10 @@ def test_coincidences_are_those_of_independent_events():
 class OneLossier(parts.Bernoulli):
     """One direction loses .022 more than stated."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return 0.778 if link == (3, 1) else 0.8
+    def delivery_probability(self, sent):
+        return 0.778 if sent.link == (3, 1) else 0.8
 
-    def mean_delivery(self, link, table_probability):
+    def mean_delivery(self, sent):
         return 0.8
 
 

@@ -11,6 +11,7 @@ from scipy.integrate import quad
 import netkf
 from netkf import theory
 from netkf.engines.compiled.engine import CompiledEngine
+from netkf.network.losses import Transmission
 from netkf.theory import mean_square
 from netkf.theory.common import delayed_jumps
 from netkf.theory.promises import compute_promises, promises_text
@@ -67,7 +68,7 @@ def outcomes(scenario):
         p = (
             [(0.9, 0.1)[bad] for bad in after]
             if bursts
-            else [channel.loss.mean_delivery(way, 1.0) for way in ways]
+            else [channel.loss.mean_delivery(Transmission(way)) for way in ways]
         )
         for up in itertools.product((0, 1), repeat=len(ways)):
             chance = math.prod(q if u else 1.0 - q for q, u in zip(p, up, strict=True))

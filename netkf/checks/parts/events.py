@@ -167,7 +167,7 @@ def loss_law(scenario: Scenario) -> LossLaw:
     """Return what a scenario states of losses on its directions."""
     channel, clock = scenario.network.channel, scenario.network.activation
     loss, links = stated_part(channel.loss, "loss"), scenario.topology.directions
-    delivery = [loss.mean_delivery(link, scenario.table_probability(link)) for link in links]
+    delivery = [loss.mean_delivery(scenario.transmission(link)) for link in links]
     indices, at_once = direction_indices(scenario), getattr(clock, "at", "links") == "links"
     opposite = np.array([indices.get((j, i), -1) for i, j in links], dtype=np.int64)
     # Broadcasts of two nodes at different times would both step a chain that they share.

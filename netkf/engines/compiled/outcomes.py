@@ -15,7 +15,7 @@ import numpy as np
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.network.channels import Channel, ChannelSampler
+from netkf.network.channels import Channel, ChannelSampler, conditions_of
 from netkf.network.delays import (
     ConstantDelay,
     ExponentialDelay,
@@ -33,6 +33,7 @@ from netkf.network.losses import (
     Loss,
     NoLoss,
     PerLink,
+    Transmission,
     delivery_probabilities,
 )
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
@@ -154,23 +155,31 @@ def draw_delay(channels: ChannelStreams, k: int) -> float:
 
 
 def list_outcomes(
-    scenario: Scenario, streams: Streams | ReplicaStreams, senders: Senders, ticks: IntArray
+    scenario: Scenario,
+    streams: Streams | ReplicaStreams,
+    senders: Senders,
+    ticks: Sequence[FloatArray],
 ) -> list[FloatArray]:
     """Return the outcomes, seconds or LOST, of all messages of a user's channel on each direction
-    of each run (R W), whose entities (R, E) have so many ``ticks``.
+    of each run (R W), whose entities (R E) have these ``ticks`` in seconds.
     """
-    channel, outcomes = scenario.network.channel, []
+    channel, outcomes, entities = scenario.network.channel, [], len(senders.entities)
     for run, one in enumerate(streams.per_replica):
         of_run = [np.empty(0)] * len(senders.directions)
-        for e, count in enumerate(ticks[run].tolist()):
+        conditions = conditions_of(channel.loss, one, scenario.horizon)
+        for e in range(entities):
+            times = scenario.time_grid.before(scenario.horizon, ticks[run * entities + e])
             draws, last = (np.empty(0), np.empty(0), np.empty(0)), -1
             for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
                 # Directions that share a stream share its draws.
                 if senders.source[w] != last:
                     last = int(senders.source[w])
-                    draws = _sampler(channel, one, senders.sources[last]).draws(count)
-                link = senders.directions[w]
-                of_run[w] = _delays(channel, link, scenario.table_probability(link), *draws)
+                    draws = _sampler(channel, one, senders.sources[last]).draws(len(times))
+                first = scenario.transmission(senders.directions[w])
+                sent = first._replace(
+                    number=np.arange(len(times)), time=times, bad=draws[1], conditions=conditions
+                )
+                of_run[w] = _delays(channel, sent, draws[0], draws[2])
         outcomes += of_run
     return outcomes
 
@@ -180,20 +189,16 @@ def _sampler(channel: Channel, streams: Streams, ends: Link) -> ChannelSampler:
 
 
 def _delays(
-    channel: Channel,
-    link: Link,
-    table: float,
-    uniform: FloatArray,
-    bad: np.ndarray,
-    delay: FloatArray,
+    channel: Channel, sent: Transmission, uniform: FloatArray, delay: FloatArray
 ) -> FloatArray:
-    """Return the outcomes (K,) of the messages on ``link``."""
-    lost = uniform >= delivery_probabilities(channel.loss, link, 0, bad, table)
+    """Return the outcomes (K,) of the messages ``sent`` on one link."""
+    lost = uniform >= delivery_probabilities(channel.loss, sent)
     if delay_depends_on_message(channel.delay):
         delay = delay.copy()
         # A delay is asked only for messages that arrive.
         for k in np.flatnonzero(~lost).tolist():
-            delay[k] = checked_delay(channel.delay, link, k, float(delay[k]))
+            one = sent._replace(number=k, time=float(sent.time[k]), bad=bool(sent.bad[k]))
+            delay[k] = checked_delay(channel.delay, one, float(delay[k]))
     return np.where(lost, LOST, delay)
 
 
@@ -258,7 +263,7 @@ def delivery_table(scenario: Scenario, loss: Loss, directions: Sequence[Link]) -
     """Return the delivery probabilities (2, W) of each direction in a good and a bad state."""
     table = [
         [
-            loss.delivery_probability(direction, 0, bad, scenario.table_probability(direction))
+            float(loss.delivery_probability(scenario.transmission(direction)._replace(bad=bad)))
             for direction in directions
         ]
         for bad in (False, True)

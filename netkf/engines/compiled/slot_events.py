@@ -30,8 +30,9 @@ from netkf.engines.compiled.slot_messages import (
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
 from netkf.engines.reach import Reach
-from netkf.network.channels import ChannelDraw, ChannelSampler, transit_time
+from netkf.network.channels import ChannelDraw, ChannelSampler, conditions_of, transit_time
 from netkf.network.graphs import Link
+from netkf.network.losses import Transmission
 from netkf.network.matchings import used_links
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -44,11 +45,12 @@ Decide = Callable[[int, np.ndarray], np.ndarray]
 
 
 class Direction:
-    """A directed link: its ends and index, and its number of messages so far."""
+    """A directed link: its ends and index, its number of messages so far, and what is known of the
+    first.
+    """
 
-    def __init__(self, scenario: Scenario, ends: Link, index: int) -> None:
-        self.ends, self.index, self.messages = ends, index, 0
-        self.probability = scenario.table_probability(ends)
+    def __init__(self, first: Transmission, index: int) -> None:
+        self.ends, self.index, self.messages, self.first = first.link, index, 0, first
 
 
 class Step(NamedTuple):
@@ -83,8 +85,12 @@ class SlotEvents:
             self._reach = Reach(scenario, scenario.slot_truth(streams), self._append_row)
         self._follows_distance = scenario.network.channel.loss.follows_distance
         self._random = streams.generator("matching")
-        self._directions = [Direction(scenario, ends, k) for k, ends in enumerate(setup.directions)]
         each, channel = setup.directions_per_link, scenario.network.channel
+        conditions = conditions_of(channel.loss, streams, scenario.horizon)
+        self._directions = [
+            Direction(scenario.transmission(ends)._replace(conditions=conditions), k)
+            for k, ends in enumerate(setup.directions)
+        ]
         # Directions of a link are neighbours; a directed graph has one of them. With a symmetric
         # channel only the first has streams.
         self._by_link = {
@@ -302,10 +308,10 @@ class SlotEvents:
         self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
-            ends, table = direction.ends, direction.probability
+            sent = direction.first._replace(number=number, time=now, bad=draw.bad)
             if self._follows_distance and self._reach is not None:
-                table = self._reach.delivery(ends, now)
-            delay = self._instant(transit_time(channel, ends, number, draw, table))
+                sent = sent._replace(distance=self._reach.distance(*direction.ends, now))
+            delay = self._instant(transit_time(channel, sent, draw))
         if math.isnan(delay):
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:

@@ -490,8 +490,8 @@ class Schedule:
             rates = _rates(scenario)
         if senders.entities and is_kernel_channel(channel):
             delivery = _delivery(scenario)
-        elif senders.entities:
-            outcomes = list_outcomes(scenario, streams, senders, numbers)
+        elif listed is not None and senders.entities:
+            outcomes = list_outcomes(scenario, streams, senders, listed)
         # The laws of a user's clock are its own.
         clock = scenario.network.activation if listed is None else None
         purposes = "clock", "phase"

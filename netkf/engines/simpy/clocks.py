@@ -147,7 +147,9 @@ def _directed_links(
     scenario: Scenario, transmitter: Transmitter, nodes: dict[int, ClockedNode]
 ) -> list[DirectedLink]:
     return [
-        DirectedLink(scenario, link, k, nodes[link[1]], transmitter.sampler(link))
+        DirectedLink(
+            scenario, transmitter.first(link), k, nodes[link[1]], transmitter.sampler(link)
+        )
         for k, link in enumerate(scenario.topology.directions)
     ]
 

@@ -15,8 +15,9 @@ from netkf.engines.reach import Reach
 from netkf.engines.simpy.nodes import Envelope
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import ChannelDraw, ChannelSampler, transit_time
+from netkf.network.channels import ChannelDraw, ChannelSampler, conditions_of, transit_time
 from netkf.network.graphs import Link
+from netkf.network.losses import Transmission
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -40,20 +41,19 @@ class Receiver(Protocol):
 
 class DirectedLink:
     """One direction of a link, (sender, receiver): its receiver, its sampler and its count of
-    messages. ``entity`` orders simultaneous arrivals.
+    messages; ``first`` is what is known of the first one. ``entity`` orders simultaneous arrivals.
     """
 
     def __init__(
         self,
         scenario: Scenario,
-        link: Link,
+        first: Transmission,
         entity: int,
         receiver: Receiver,
         sampler: ChannelSampler,
     ) -> None:
-        self.link, self.entity, self.sampler, self.receiver = link, entity, sampler, receiver
-        # Probability in the table and weight do not change in a run.
-        self.table_probability = scenario.table_probability(link)
+        self.link, self.entity, self.sampler, self.receiver = first.link, entity, sampler, receiver
+        self.first, link = first, first.link
         self.weight = scenario.weight(link[1], link[0])
         common = scenario.common_entries.get(link)
         self.has_nothing_to_tell = common is not None and not len(common[0])
@@ -70,6 +70,7 @@ class Transmitter:
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
         self._follows_distance = self._channel.loss.follows_distance
+        self._conditions = conditions_of(self._channel.loss, streams, scenario.horizon)
         self._horizon, self._until = scenario.horizon, scenario.end_time
         self._instant = scenario.time_grid.instant
         # Of nodes that move: who hears whom. Set when the true state of the run is known.
@@ -81,6 +82,10 @@ class Transmitter:
         """Return the sampler of ``link``: of both directions if the channel is symmetric."""
         # The sampler makes its streams when it needs them, by purpose.
         return ChannelSampler(self._channel, partial(stream, self._streams, link))
+
+    def first(self, link: Link) -> Transmission:
+        """Return what is known of the first message on a directed link in this run."""
+        return self._scenario.transmission(link)._replace(conditions=self._conditions)
 
     def connects(self, i: int, j: int) -> bool:
         """Return True if nodes ``i`` and ``j`` (ids) can hear each other now."""
@@ -104,11 +109,11 @@ class Transmitter:
         append = self._recorder.append
         # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
-        table = direction.table_probability
+        sent = direction.first._replace(number=number, time=now, bad=outcome.bad)
         if self._follows_distance and self.reach is not None:
-            table = self.reach.delivery(direction.link, now)
+            sent = sent._replace(distance=self.reach.distance(*direction.link, now))
         # nan: the message is lost.
-        delay = self._instant(transit_time(self._channel, direction.link, number, outcome, table))
+        delay = self._instant(transit_time(self._channel, sent, outcome))
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
@@ -173,11 +178,14 @@ class LinkExchange:
         self._outcomes: list[ChannelDraw] = []
         forth = transmitter.sampler((i, j))
         # Entities 2 k and 2 k + 1: the order in which simultaneous messages arrive.
-        self._directions = [DirectedLink(scenario, (i, j), 2 * entity, receivers[j], forth)]
+        first = transmitter.first((i, j))
+        self._directions = [DirectedLink(scenario, first, 2 * entity, receivers[j], forth)]
         if not scenario.topology.directed:
             back = forth if self._shared else transmitter.sampler((j, i))
             self._directions.append(
-                DirectedLink(scenario, (j, i), 2 * entity + 1, receivers[i], back)
+                DirectedLink(
+                    scenario, transmitter.first((j, i)), 2 * entity + 1, receivers[i], back
+                )
             )
 
     def exchange(

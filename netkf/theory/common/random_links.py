@@ -17,7 +17,12 @@ import numpy as np
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock
-from netkf.network.losses import GilbertElliott, identical_per_link
+from netkf.network.losses import (
+    GilbertElliott,
+    delivery_probabilities,
+    has_conditions,
+    identical_per_link,
+)
 from netkf.network.matchings import RecordedSlots
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import NO_CHANNEL_LAW, lacks_channel_law
@@ -216,12 +221,14 @@ def has_constant_losses(scenario: Scenario) -> bool:
     loss = scenario.network.channel.loss
     if identical_per_link(loss) or isinstance(loss, GilbertElliott):
         return True
+    if has_conditions(loss):
+        return False
+    times = np.linspace(0.0, scenario.horizon, MESSAGES_ASKED, endpoint=False)
     for direction in scenario.topology.directions:
-        table = scenario.table_probability(direction)
-        first = loss.delivery_probability(direction, 0, False, table)
-        for message in range(1, MESSAGES_ASKED):
-            if loss.delivery_probability(direction, message, False, table) != first:
-                return False
+        one = scenario.transmission(direction)
+        sent = one._replace(number=np.arange(MESSAGES_ASKED), time=times)
+        if np.ptp(delivery_probabilities(loss, sent)) > 0.0:
+            return False
     return True
 
 
@@ -231,12 +238,12 @@ def _deliveries(
     """Return the delivery probabilities (S, K) of ``links`` by mode of the bursty channels."""
     loss = scenario.network.channel.loss
     if isinstance(loss, GilbertElliott) and loss.independent:
-        return np.array([[loss.mean_delivery(link, 1.0) for link in links]])
+        return np.array([[scenario.mean_delivery(link) for link in links]])
 
     def probabilities(bad: bool) -> FloatArray:
         """Return the probabilities (K,) if all channels are in their bad state, or good one."""
-        tables = ((link, scenario.table_probability(link)) for link in links)
-        return np.array([loss.delivery_probability(link, 0, bad, table) for link, table in tables])
+        sent = (scenario.transmission(link)._replace(bad=bad) for link in links)
+        return np.array([float(loss.delivery_probability(one)) for one in sent])
 
     if not isinstance(loss, GilbertElliott):
         return np.array([[delivery_of(scenario, link) for link in links]])

@@ -111,22 +111,22 @@ class Even(Poisson):
 
 @dataclass(frozen=True, eq=False)
 class Lossier(Bernoulli):
-    def delivery_probability(self, link, message, bad, table_probability):
+    def delivery_probability(self, sent):
         return self.delivery - 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class OneWay(Bernoulli):
-    def delivery_probability(self, link, message, bad, table_probability):
-        return self.delivery - (0.15 if link == (1, 0) else 0.0)
+    def delivery_probability(self, sent):
+        return self.delivery - (0.15 if sent.link == (1, 0) else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Sticky(Bernoulli):
     """Loses every second message more often, and those between less often."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return self.delivery + (0.25 if message % 2 else -0.25)
+    def delivery_probability(self, sent):
+        return self.delivery + (0.25 if sent.number % 2 else -0.25)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,8 +205,8 @@ class LongerBursts(GilbertElliott):
 class FirstLost(Bernoulli):
     """Loses the first two messages of every direction."""
 
-    def delivery_probability(self, link, message, bad, table_probability):
-        return self.delivery if message > 1 else 0.0
+    def delivery_probability(self, sent):
+        return self.delivery if sent.number > 1 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,15 +221,15 @@ class Slow(ExponentialDelay):
 class OneSlow(ExponentialDelay):
     """Takes longer on one link."""
 
-    def message_delay(self, link, message, drawn):
-        return drawn * (1.5 if link == (0, 1) else 1.0)
+    def message_delay(self, sent, drawn):
+        return drawn * (1.5 if sent.link == (0, 1) else 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Sooner(ConstantDelay):
     """Takes a little less time than it says."""
 
-    def message_delay(self, link, message, drawn):
+    def message_delay(self, sent, drawn):
         return 0.99 * drawn
 
 
