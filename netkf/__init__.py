@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from netkf import parts, testing, theory
     from netkf.checks.check import check
     from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
+    from netkf.logs.exporting import export_log
     from netkf.logs.importing import import_log
     from netkf.runs.run import save
     from netkf.runs.simulate import simulate
@@ -45,6 +46,7 @@ _MODULE_OF = {
     "compare": "netkf.studies.compare",
     "compare_filters": "netkf.studies.compare_filters",
     "consistency": "netkf.studies.consistency",
+    "export_log": "netkf.logs.exporting",
     "first_difference": "netkf.trace.run",
     "import_log": "netkf.logs.importing",
     "load": "netkf.scenario.reading",
@@ -80,6 +82,7 @@ __all__ = [
     "compare",
     "compare_filters",
     "consistency",
+    "export_log",
     "first_difference",
     "import_log",
     "load",

@@ -354,14 +354,49 @@ COMMANDS = (
             _option("log", "file or folder", type=Path, metavar="LOG"),
             _option(
                 "--kind",
-                "mrclam: folder of a UTIAS MR.CLAM set, with Robot1_Odometry.dat and the others",
+                "csv: a table of packets, or a folder of them; ulb: folder with readings.csv and "
+                "heard.csv; mercator: raw CSV of openwsn-berkeley/mercator; mrclam: folder of a "
+                "UTIAS MR.CLAM set, with Robot1_Odometry.dat and the others",
                 required=True,
-                choices=["mrclam"],
+                choices=["csv", "ulb", "mercator", "mrclam"],
+            ),
+            _option(
+                "--like",
+                "scenario whose plant, sensors and filter to use (default: one made of the log, or "
+                "LOG/scenario.toml)",
+                type=Path,
+                metavar="SCENARIO",
+            ),
+            _option(
+                "--unreported",
+                "what transmissions are that nobody reported (default: unknown)",
+                choices=["unknown", "lost"],
+                default="unknown",
+            ),
+            _option(
+                "--hole",
+                "packets that a receiver would usually have heard, after which its silence is a "
+                "hole in its log",
+                type=float,
+                default=30.0,
+                metavar="PACKETS",
             ),
             _option("--out", "folder of the scenario", type=Path, required=True, metavar="DIR"),
+            _trust("the folder of --like"),
         ),
         takes_scenario=False,
         module="import_log",
+    ),
+    Command(
+        "export",
+        "write a run as a packet log, which import replays to the bit",
+        (
+            _option("directory", "run directory", type=Path, metavar="DIR"),
+            _option("--to", "format: a packet log", required=True, choices=["log"]),
+            _option("--out", "folder of the log", type=Path, required=True, metavar="LOG"),
+            _trust("DIR"),
+        ),
+        takes_scenario=False,
     ),
     Command(
         "new",

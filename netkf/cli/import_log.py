@@ -9,9 +9,17 @@ def _run(options: argparse.Namespace) -> int:
     """Write the files, and print their paths and notes; return the exit status."""
     from netkf.logs.importing import import_log
 
-    files, notes = import_log(options.log, options.kind, options.out)
+    files, notes = import_log(
+        options.log,
+        options.kind,
+        options.out,
+        like=options.like,
+        unreported=options.unreported,
+        hole=options.hole,
+        trust=options.trust,
+    )
     print(f"written: {files[0]} with {', '.join(path.name for path in files[1:])}")
     for note in notes:
-        print(f"note: {note}")
+        print(note if ": " in note[:14] else f"note: {note}")
     print(f"next: netkf run {files[0]}")
     return 0

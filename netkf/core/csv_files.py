@@ -118,7 +118,7 @@ def read_columns(
     than the header, or an entry that is not a finite number, or no stamp in a column of STAMPS.
     """
     numbers, lines, half_digits = array("d"), array("q"), array("d")
-    with _open_table(source) as sheet:
+    with open_table(source) as sheet:
         _require_columns(source, sheet, required)
         names = [name for name in (*required, *optional) if name in sheet.header]
         for name in names:
@@ -152,7 +152,7 @@ def read_columns(
 
 def read_header(source: SourceFile) -> list[str]:
     """Return the names of the columns; raises ScenarioError if the file is not a table."""
-    with _open_table(source) as sheet:
+    with open_table(source) as sheet:
         return sheet.header
 
 
@@ -359,7 +359,10 @@ def read_content(source: SourceFile) -> bytes:
 
 
 @contextmanager
-def _open_table(source: SourceFile) -> Iterator[_Sheet]:
+def open_table(source: SourceFile) -> Iterator[_Sheet]:
+    """Yield the header and the rows, as texts, of an open table; raises ScenarioError if the file
+    is none.
+    """
     start = b""
     try:
         with source.full.open("rb") as packed:

@@ -2,42 +2,90 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path
+from netkf.logs.mercator import read_mercator
 from netkf.logs.mrclam import read_mrclam
-from netkf.runs.files import make_directory, write_text
+from netkf.logs.packet_tables import read_tables
+from netkf.logs.packets import HOLE, PacketLog
+from netkf.logs.recorded_network import Files, write_network
+from netkf.logs.ulb import read_ulb
+from netkf.runs.files import make_directory, write_text, writing_file
+from netkf.scenario.reading import load
 
-KINDS: Mapping[str, Callable[[Path], tuple[dict[str, str], tuple[str, ...]]]] = {
-    "mrclam": read_mrclam
+PACKETS: Mapping[str, Callable[[Path], PacketLog]] = {
+    "csv": read_tables,
+    "ulb": read_ulb,
+    "mercator": read_mercator,
 }
-"""By kind, the function from a log to the texts of files by name, scenario.toml among them, and
-notes.
-"""
+"""By kind of a packet log, the function that reads it."""
+KINDS = ("csv", "ulb", "mercator", "mrclam")
 
 
 def import_log(
-    log: str | Path, kind: str, out: str | Path
+    log: str | Path,
+    kind: str,
+    out: str | Path,
+    *,
+    like: str | Path | None = None,
+    unreported: str = "unknown",
+    hole: float = HOLE,
+    trust: bool = True,
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write the ``log`` of a ``kind``, a file or a folder, as a scenario with its tables into the
     folder ``out``; nothing is overwritten. Return the paths, the scenario first, and notes.
 
-    ``kind`` is "mrclam", the UTIAS multi-robot data sets. Raises ScenarioError with file and line
-    for a log that cannot be read, before anything is written, and WriteError.
+    ``kind`` is "csv", "ulb" or "mercator" for packet logs, which become a recorded network, or
+    "mrclam" for the UTIAS multi-robot data sets. Of packet logs: ``like`` is a scenario whose
+    plant, sensors and filter are used, by default the scenario.toml in the folder of the log, if
+    there is one; ``unreported`` says what becomes of transmissions that nobody reported, "unknown"
+    or "lost"; a receiver that reports nothing has a hole in its log, so that its outcomes are
+    unknown, after ``hole`` packets that it would usually have heard. With ``trust`` classes that
+    the scenario names are imported, as by ``netkf.load``.
+
+    Raises ScenarioError with file and line for a log that cannot be read, before anything is
+    written, and WriteError.
     """
-    folder = as_path("out", out)
-    if kind not in KINDS:
-        rule, remedy = f"must be one of {', '.join(KINDS)}", "choose one of them"
-        raise ScenarioError("kind", rule, kind, remedy)
-    texts, notes = KINDS[kind](as_path("log", log))
-    paths = [folder / name for name in sorted(texts, key="scenario.toml".__ne__)]
+    folder, log = as_path("out", out), as_path("log", log)
+    for key, value, known in (("kind", kind, KINDS), ("unreported", unreported, UNREPORTED)):
+        if value not in known:
+            rule = f"must be one of {', '.join(known)}"
+            raise ScenarioError(key, rule, value, "choose one of them")
+    if not log.exists():
+        raise ScenarioError(str(log), "does not exist", None, "check the path")
+    files: Files = {}
+    if kind == "mrclam":
+        texts, notes = read_mrclam(log)
+        files |= texts
+    else:
+        base = as_path("like", like) if like is not None else log / "scenario.toml"
+        name = re.sub(r"[^\w-]", "_", log.resolve().name.partition(".")[0]) or "log"
+        scenario = load(base, trust=trust) if like is not None or base.is_file() else None
+        files, notes = write_network(PACKETS[kind](log), name, hole, unreported, scenario)
+    paths = [folder / name for name in sorted(files, key="scenario.toml".__ne__)]
     for path in paths:
         if path.exists():
             rule = "is there already, and nothing is overwritten"
             raise ScenarioError(str(path), rule, None, "choose another folder or remove it")
-    make_directory(folder)
-    for path in paths:
-        write_text(path, texts[path.name])
+    write_files(folder, files)
     return tuple(paths), notes
+
+
+UNREPORTED = ("unknown", "lost")
+
+
+def write_files(folder: Path, files: Files) -> None:
+    """Write texts, and copy files, by name into a folder. Raises WriteError."""
+    make_directory(folder)
+    for name, content in files.items():
+        if isinstance(content, str):
+            write_text(folder / name, content)
+            continue
+        with writing_file(folder / name):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(content, folder / name)

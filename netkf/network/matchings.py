@@ -293,7 +293,7 @@ class RecordedSlots(SlotActivation):
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, int, int], list[Link]]:
-        """Pairs of node ids of the table by (slot, phase, step)."""
+        """Pairs of node ids by (slot, phase, step), in the order of the table."""
         pairs: dict[tuple[int, int, int], dict[Link, int]] = {}
         matching = self.matching
         for (slot, phase, step, link), line in zip(*self._rows, strict=True):
@@ -301,7 +301,7 @@ class RecordedSlots(SlotActivation):
             if matching and link not in listed:
                 self._demand_free(slot, link, line, listed)
             listed.setdefault(link, line)
-        return {key: sorted(listed) for key, listed in pairs.items()}
+        return {key: list(listed) for key, listed in pairs.items()}
 
     def _demand_free(self, slot: int, link: Link, line: int, listed: dict[Link, int]) -> None:
         other = next((line for pair, line in listed.items() if set(pair) & set(link)), None)
@@ -317,8 +317,8 @@ class RecordedSlots(SlotActivation):
         return tuple(self._pairs)
 
     def pairs(self, slot: int, phase: int, step: int = 0) -> list[Link]:
-        """Return the sorted pairs of node ids of one step of the exchange number ``phase`` of a
-        slot; for broadcasts the listed directions (sender, receiver).
+        """Return the pairs of node ids of one step of the exchange number ``phase`` of a slot, in
+        the order of the table; for broadcasts the listed directions (sender, receiver).
         """
         return self._pairs.get((slot, phase, step), [])
 

@@ -117,7 +117,7 @@ def test_nothing_is_overwritten_and_a_log_must_be_one(log, tmp_path, capsys):
     with pytest.raises(ScenarioError, match=r"truth.csv: is there already"):
         netkf.import_log(log, "mrclam", tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["truth.csv"]
-    with pytest.raises(ScenarioError, match="kind: must be one of mrclam"):
+    with pytest.raises(ScenarioError, match="kind: must be one of csv, ulb, mercator, mrclam"):
         netkf.import_log(log, "rosbag", tmp_path / "other")
     assert main(["import", str(tmp_path), "--kind", "mrclam", "--out", str(tmp_path / "x")]) == 2
     assert "must be a folder with Robot1_Odometry.dat" in capsys.readouterr().err

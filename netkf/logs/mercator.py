@@ -1,0 +1,152 @@
+"""``netkf import --kind mercator``: logs of openwsn-berkeley/mercator on the IoT-LAB testbeds.
+
+A row is one packet that one mote received; a transmission (``transctr``) is a burst of ``txnumpk``
+packets on one channel, ``txifdur`` ms apart, under stamps of whole seconds.
+"""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from netkf.core.errors import ScenarioError
+from netkf.logs.packets import (
+    PacketLog,
+    choose_origin,
+    count_phrase,
+    parse_numbers,
+    parse_stamps,
+    read_texts,
+    spread_equal,
+)
+
+NUMBERS = ("transctr", "pkctr", "txnumpk", "txifdur", "frequency")
+COLUMNS = ("timestamp", "mac", "srcmac", *NUMBERS, "crc", "expected")
+PAUSE = 5.0
+"""Seconds beyond its length after which rows of a burst's number belong to another one."""
+
+
+def read_mercator(log: Path) -> PacketLog:
+    """Return the packet log of a raw CSV file of mercator, or of all those in a folder.
+
+    Raises ScenarioError, with file and line, for a file that is none.
+    """
+    paths = sorted([*log.glob("*.csv"), *log.glob("*.csv.gz")]) if log.is_dir() else [log]
+    if not paths:
+        raise ScenarioError(str(log), "has no .csv file", None, "check the folder")
+    notes: list[str] = []
+    parts = [_read(path, notes) for path in paths]
+    stamps = [stamp for part in parts for stamp in part[1]]
+    origin = choose_origin(stamps, 1.0)
+    table = pd.concat([part[0] for part in parts], ignore_index=True)
+    table["t"] = [float(stamp - origin) for stamp in stamps]
+    repeated = table.duplicated([*NUMBERS, "mac", "srcmac", "t"])
+    if repeated.any():
+        notes.append(f"merged: {count_phrase(int(repeated.sum()), 'row')} that repeat a packet")
+    _count_from_zero(table, notes, str(log))
+    table["burst"] = _number_bursts(table, notes)
+    sends, off = _transmissions(table)
+    notes.append(
+        f"used: {count_phrase(table['burst'].nunique(), 'burst')} of "
+        f"{count_phrase(len(sends), 'packet')}; stamps are whole seconds, so that packets "
+        "stand at pkctr * txifdur from a beginning of their burst that fits its stamps"
+    )
+    if off:
+        notes.append(
+            f"moved: {count_phrase(off, 'burst')} whose stamps fit no beginning: the middle counts"
+        )
+    spread_equal(sends, 1e-3, notes)
+    sends = sends.sort_values("t", kind="stable").reset_index(drop=True)
+    place = pd.Series(sends.index, index=[sends["burst"], sends["number"]])
+    rows = table.drop_duplicates(["burst", "pkctr", "mac"])
+    keys = pd.MultiIndex.from_arrays([rows["burst"], rows["pkctr"]])
+    outcomes = pd.DataFrame({"send": place.reindex(keys).to_numpy()})
+    outcomes = outcomes.assign(receiver=rows["mac"].to_numpy(), heard=1.0, delay=np.nan)
+    outcomes["rssi"] = rows["rssi"].to_numpy()
+    sends = sends[["sender", "t", "channel", "to", "sent", "logged"]]
+    return PacketLog(sends, outcomes, origin, 1.0, "lost", notes)
+
+
+def _read(path: Path, notes: list[str]) -> tuple[pd.DataFrame, list[Decimal]]:
+    """Return the usable rows of a file, and their stamps."""
+    raw = read_texts(path)
+    missing = [name for name in COLUMNS if name not in raw.columns]
+    if missing:
+        rule = f"must have the columns of mercator; there is no {missing[0]}"
+        raise ScenarioError(str(path), rule, list(raw.columns), "check the file, or --kind")
+    foreign, broken = raw["expected"] != "1", (raw["crc"] != "1") & (raw["expected"] == "1")
+    good = raw[~foreign & ~broken]
+    notes.append(f"used: {path.name}: {len(good):,} of {count_phrase(len(raw), 'row')}")
+    for what, flags in (("of no packet of the experiment", foreign), ("with a wrong crc", broken)):
+        if flags.any():
+            notes.append(f"dropped: {count_phrase(int(flags.sum()), 'row')} {what}")
+    if good.empty:
+        raise ScenarioError(str(path), "has no packet of the experiment", None, "check the file")
+    numbers: dict[str, Any] = {name: parse_numbers(path, good, name) for name in NUMBERS}
+    numbers["rssi"] = parse_numbers(path, good, "rssi") if "rssi" in good.columns else np.nan
+    table = pd.DataFrame({"mac": good["mac"], "srcmac": good["srcmac"], **numbers})
+    wrong = (table["txnumpk"] < 1) | (table["pkctr"] < 0) | (table["pkctr"] > table["txnumpk"])
+    wrong |= (table["txifdur"] < 0) | (table["mac"] == table["srcmac"])
+    if wrong.any():
+        lines = ", ".join(map(str, table.index[wrong][:3]))
+        notes.append(
+            f"dropped: {count_phrase(int(wrong.sum()), 'row')} whose numbers make no sense "
+            f"({path.name} line {lines}{', ...' if wrong.sum() > 3 else ''})"
+        )
+    good, table = good[~wrong], table[~wrong]
+    return table, parse_stamps(path, good, "timestamp")
+
+
+def _count_from_zero(table: pd.DataFrame, notes: list[str], log: str) -> None:
+    """Make numbers of packets in their burst begin at 0: in some logs they begin at 1."""
+    first, last = table["pkctr"] == 0, table["pkctr"] == table["txnumpk"]
+    if first.any() and last.any():
+        rule = "numbers the packets of bursts from 0 in some rows and from 1 in others"
+        raise ScenarioError(log, rule, None, "import the two parts apart")
+    base = 0 if first.any() else 1
+    if not (first.any() or last.any()):
+        notes.append("not known: whether packets of bursts count from 0 or 1; taken as 1")
+    table["pkctr"] = (table["pkctr"] - base).astype(int)
+
+
+def _number_bursts(table: pd.DataFrame, notes: list[str]) -> np.ndarray:
+    """Return the number of the burst of each row: rows of one counter, sender and channel whose
+    stamps are no farther apart than a burst is long.
+    """
+    key = ["srcmac", "transctr", "frequency"]
+    order = table.sort_values([*key, "t"], kind="stable")
+    same = (order[key] == order[key].shift()).all(axis=1)
+    length = order["txnumpk"] * order["txifdur"] / 1000.0 + PAUSE
+    again = same & (order["t"].diff() > length)
+    if again.any():
+        notes.append(f"used: numbers of bursts begin again: {int(again.sum()):,} bursts")
+    numbers = sorted(set(table["transctr"].astype(int)))
+    silent = numbers[-1] - numbers[0] + 1 - len(numbers)
+    if silent:
+        notes.append(
+            f"not known: {count_phrase(silent, 'burst')} that numbers tell of and no mote "
+            "reported: who sent them, and when, is in no row, so that they are not in the replay"
+        )
+    return np.asarray((~same | again).cumsum().reindex(table.index))
+
+
+def _transmissions(table: pd.DataFrame) -> tuple[pd.DataFrame, int]:
+    """Return all packets of all bursts, and how many bursts have stamps that fit no beginning."""
+    parts, off = [], 0
+    for burst, rows in table.groupby("burst", sort=True):
+        step = float(rows["txifdur"].iloc[0]) / 1000.0
+        count = int(rows["txnumpk"].max())
+        begins = rows["t"] - rows["pkctr"] * step
+        # A stamp of whole seconds says that the packet came in this second.
+        low, high = float(begins.max()), float(begins.min()) + 1.0
+        off += low >= high
+        begin = round(0.5 * (low + high), 3)
+        numbers = np.arange(count)
+        part = {"burst": burst, "number": numbers, "t": np.round(begin + numbers * step, 6)}
+        part |= {"sender": rows["srcmac"].iloc[0], "channel": f"{rows['frequency'].iloc[0]:g}"}
+        parts.append(pd.DataFrame(part))
+    return pd.concat(parts, ignore_index=True).assign(to="", sent=True, logged=False), off

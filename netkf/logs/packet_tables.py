@@ -1,0 +1,385 @@
+"""``netkf import --kind csv``: packet logs in tables, whatever their columns are called."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from netkf.core.errors import ScenarioError
+from netkf.linalg.arrays import FloatArray
+from netkf.logs.packets import (
+    MAX_SKIP,
+    PacketLog,
+    choose_origin,
+    count_phrase,
+    find_resolution,
+    parse_numbers,
+    parse_stamps,
+    read_texts,
+    spread_equal,
+    unwrap,
+)
+
+SYNONYMS = {
+    "t": ("time", "timestamp", "ts", "seconds", "datetime", "date", "stamp", "when", "sent_at"),
+    "sender": ("src", "source", "from", "tx", "transmitter", "srcmac", "origin", "by"),
+    "receiver": ("dst", "dest", "destination", "rx", "to", "hearer", "listener", "mac", "heard_by"),
+    "number": ("seq", "seqno", "seqnum", "sequence", "n", "counter", "packet", "msg", "message"),
+    "channel": ("ch", "freq", "frequency"),
+    "heard": ("received", "delivered", "ok", "success", "outcome", "status"),
+    "t_heard": ("t_rx", "rx_time", "received_at", "arrival", "arrived", "t_received"),
+    "rssi": ("rssi_dbm", "lqi", "snr"),
+    "event": ("kind", "type", "what", "direction"),
+    "node": ("id", "mote"),
+    "peer": ("neighbour", "neighbor", "other"),
+}
+"""Names of each column, the first of which in a table counts; in any case, and with _id, _no, _s,
+_ms, _us or _ns at the end.
+"""
+ENDINGS = ("_id", "_no", "_number", "_s", "_ms", "_us", "_ns")
+SENT = ("tx", "send", "sent", "transmit", "broadcast", "out")
+HEARD = ("rx", "receive", "received", "recv", "heard", "hear", "deliver", "delivered", "in")
+LOST = ("lost", "loss", "drop", "dropped", "miss", "missed")
+YES = ("1", "1.0", "true", "yes", "y", "ok", *HEARD)
+NO = ("0", "0.0", "false", "no", "n", "fail", "failed", *LOST)
+UNKNOWN = ("", "nan", "na", "none", "unknown", "?", "-1")
+EXTRAS = ("positions", "readings")
+
+
+class _Rows(NamedTuple):
+    """Rows of all packet tables, in their order: ``where`` is file and line, ``what`` "tx", "rx" or
+    "outcome"; stamps are exact; heard is 1, 0 or nan.
+    """
+
+    table: pd.DataFrame
+    stamps: list[Decimal]
+    arrivals: list[Decimal | None]
+
+
+def read_tables(log: Path) -> PacketLog:
+    """Return the packet log of a table, or of a folder: of packets.csv, or else of all tables but
+    positions.csv and readings.csv, which may stand beside them.
+
+    Raises ScenarioError, with file and line, for a table that cannot be read.
+    """
+    paths = [log]
+    if log.is_dir():
+        found = [p for ending in ("csv", "csv.gz", "tsv", "txt") for p in log.glob(f"*.{ending}")]
+        named = [path for path in found if path.name.partition(".")[0] == "packets"]
+        rest = [path for path in found if path.name.partition(".")[0] not in EXTRAS]
+        paths = sorted(named or rest)
+    if not paths:
+        raise ScenarioError(str(log), "has no table of packets", None, "check the folder")
+    notes: list[str] = []
+    rows = _join([_read_rows(path, notes) for path in paths])
+    extras = {name: _find_extra(log, name) for name in EXTRAS}
+    resolution = find_resolution(rows.stamps)
+    # A run counts from 0.
+    is_run = (log / "scenario.toml").is_file()
+    origin = Decimal(0) if is_run else choose_origin(rows.stamps, resolution)
+    table = rows.table.assign(t=[float(stamp - origin) for stamp in rows.stamps])
+    delays = [
+        np.nan if b is None else float(b - a)
+        for a, b in zip(rows.stamps, rows.arrivals, strict=True)
+    ]
+    table = table.assign(delay=delays)
+    early = np.flatnonzero(np.array(delays) < 0.0)
+    if early.size:
+        where = table["where"].iloc[early[0]]
+        rule = f"{where}: is heard before it is sent"
+        raise ScenarioError(str(log), rule, None, "correct the stamps, or leave t_heard out")
+    sends, outcomes = _match(table, resolution, notes, str(log))
+    result = PacketLog(sends, outcomes, origin, resolution, "lost", notes)
+    if is_run and (log / "ticks.csv").is_file():
+        result.ticks = log / "ticks.csv"
+    if (table["what"] == "outcome").all() and (table["heard"] == 0.0).any():
+        result.absent = "unknown"  # the log says itself what was lost
+    if extras["positions"] is not None:
+        result.positions = read_positions(extras["positions"])
+    if extras["readings"] is not None:
+        result.readings = read_readings(extras["readings"], origin)
+    return result
+
+
+def _find_extra(log: Path, name: str) -> Path | None:
+    folder = log if log.is_dir() else log.parent
+    if (folder / "scenario.toml").is_file():
+        return None  # a run: its tables are those of its scenario
+    found = [folder / f"{name}.{ending}" for ending in ("csv", "csv.gz", "tsv", "txt")]
+    return next((path for path in found if path.is_file() and path != log), None)
+
+
+def find_column(table: pd.DataFrame, name: str) -> str:
+    """Return the column of ``table`` that has this name or a synonym of it; "" without one."""
+    for known in (name, *SYNONYMS.get(name, ())):
+        for column in table.columns:
+            if column == known or any(column == known + ending for ending in ENDINGS):
+                return str(column)
+    return ""
+
+
+def _read_rows(path: Path, notes: list[str]) -> _Rows:
+    """Return the packets of one table; notes say which columns were taken for what."""
+    raw = read_texts(path)
+    names = {name: find_column(raw, name) for name in SYNONYMS}
+    if names["event"] and not names["sender"] and names["node"]:
+        events = raw[names["event"]].str.lower()
+        is_tx = events.isin(SENT)
+        own, other = raw[names["node"]], raw[names["peer"]] if names["peer"] else ""
+        raw["sender"] = own.where(is_tx, other)
+        raw["receiver"] = pd.Series(other, index=raw.index).where(is_tx, own)
+        names |= {"sender": "sender", "receiver": "receiver"}
+    for name in ("t", "sender"):
+        if not names[name]:
+            rule = f"must have a column {name} ({', '.join(SYNONYMS[name])})"
+            raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
+    used = {name: column for name, column in names.items() if column}
+    listed = ", ".join(f"{a} from {b}" if a != b else a for a, b in used.items())
+    unused = [column for column in raw.columns if column not in used.values()]
+    notes.append(
+        f"used: {path.name}: {count_phrase(len(raw), 'row')}, columns {listed}"
+        + (f"; not used: {', '.join(unused)}" if unused else "")
+    )
+    empty = pd.Series("", index=raw.index)
+    table = pd.DataFrame(
+        {
+            "where": [f"{path.name} line {line}" for line in raw.index],
+            "sender": raw[names["sender"]],
+            "receiver": raw[names["receiver"]] if names["receiver"] else empty,
+            "channel": raw[names["channel"]] if names["channel"] else empty,
+        }
+    )
+    lost = np.flatnonzero(table["sender"] == "")
+    if lost.size:
+        rule = f"line {raw.index[lost[0]]}: must name a sender"
+        raise ScenarioError(str(path), rule, None, "correct the row")
+    missing = np.full(len(raw), np.nan)
+    for name in ("number", "rssi"):
+        column = names[name]
+        table[name] = parse_numbers(path, raw, column, gaps=True) if column else missing
+    wrong = np.flatnonzero((table["number"] % 1.0 > 0.0) | (table["number"] < 0.0))
+    if wrong.size:
+        rule = f"line {raw.index[wrong[0]]}: number must be an integer from 0"
+        raise ScenarioError(str(path), rule, table["number"].iloc[wrong[0]], "correct the entry")
+    table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
+    return _Rows(table, parse_stamps(path, raw, names["t"]), _read_arrivals(path, raw, names))
+
+
+def _read_arrivals(path: Path, raw: pd.DataFrame, names: dict[str, str]) -> list[Decimal | None]:
+    column = names["t_heard"]
+    arrivals: list[Decimal | None] = [None] * len(raw)
+    if not column:
+        return arrivals
+    is_open = raw[column].str.lower().isin(["inf", "infinity"])
+    has = (raw[column] != "") & ~is_open
+    stamps = iter(parse_stamps(path, raw[has], column))
+    return [
+        next(stamps) if a else Decimal("Infinity") if b else None
+        for a, b in zip(has, is_open, strict=True)
+    ]
+
+
+def _read_outcomes(
+    path: Path, raw: pd.DataFrame, names: dict[str, str], table: pd.DataFrame
+) -> tuple[np.ndarray, FloatArray]:
+    """Return what each row is, "tx", "rx" or "outcome", and whether it was heard."""
+    what = np.where(table["receiver"] == "", "tx", "rx").astype(object)
+    heard = np.where(table["receiver"] == "", np.nan, 1.0)
+    for name, words in (("event", (SENT, HEARD, LOST)), ("heard", ((), YES, NO))):
+        if not names[name]:
+            continue
+        column = raw[names[name]].str.lower()
+        groups = [column.isin(group).to_numpy() for group in words]
+        is_unknown = column.isin(UNKNOWN).to_numpy()
+        wrong = np.flatnonzero(~(groups[0] | groups[1] | groups[2] | is_unknown))
+        if wrong.size:
+            rule = f"line {raw.index[wrong[0]]}: {names[name]} must say "
+            rule += "what happened (tx, rx or lost)" if name == "event" else "1 or 0"
+            raise ScenarioError(str(path), rule, column.iloc[wrong[0]], "correct the entry")
+        heard = np.select([groups[1], groups[2]], [1.0, 0.0], np.nan)
+        if name == "event":
+            what[groups[0]] = "tx"
+        else:
+            what[(table["receiver"] != "").to_numpy()] = "outcome"
+    alone = np.flatnonzero((what != "tx") & (table["receiver"] == "").to_numpy())
+    if alone.size:
+        rule = f"line {raw.index[alone[0]]}: must name a receiver"
+        raise ScenarioError(str(path), rule, None, "correct the row")
+    same = np.flatnonzero((table["receiver"] == table["sender"]).to_numpy())
+    if same.size:
+        rule = f"line {raw.index[same[0]]}: sender and receiver must differ"
+        raise ScenarioError(str(path), rule, table["sender"].iloc[same[0]], "correct the row")
+    return what, heard
+
+
+def _join(parts: list[_Rows]) -> _Rows:
+    table = pd.concat([part.table for part in parts], ignore_index=True)
+    stamps = [stamp for part in parts for stamp in part.stamps]
+    return _Rows(table, stamps, [arrival for part in parts for arrival in part.arrivals])
+
+
+def _match(
+    table: pd.DataFrame, resolution: float, notes: list[str], log: str
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return transmissions and outcomes: rows that speak of one transmission are joined."""
+    table["to"] = ""
+    if _counts_directions(table):
+        table["to"] = table["receiver"]
+        notes.append("used: each row is a message of its own to one receiver, no broadcast")
+    table["key"] = _number_transmissions(table, notes)
+    # Of one transmission the sender's own stamp counts, else the first one.
+    table["order"] = (table["what"] != "tx").astype(int)
+    ordered = table.sort_values(["order", "t"], kind="stable")
+    groups = ordered.groupby("key", sort=False)
+    sends = groups[["sender", "t", "channel", "to", "counter"]].first()
+    sends["row"] = table.reset_index().groupby("key", sort=False)["index"].first()
+    sends["sent"], sends["logged"] = True, groups["order"].min() == 0
+    spread = (groups["t"].max() - groups["t"].min())[lambda s: s > 0.0]
+    if len(spread):
+        notes.append(
+            f"merged: stamps of {count_phrase(len(spread), 'transmission')} differ from row to "
+            f"row, by {spread.max():g} s at most; the sender's or the first counts"
+        )
+    sends = pd.concat([sends, _skipped(sends, notes)])
+    sends = sends.sort_values(["t", "counter"], kind="stable")
+    sends["key"] = sends.index
+    sends = sends.reset_index(drop=True)
+    spread_equal(sends, resolution, notes)
+    sends = sends.sort_values(["t", "row"], kind="stable").reset_index(drop=True)
+    place = pd.Series(sends.index, index=sends["key"])
+    rows = table[table["what"] != "tx"].assign(send=lambda rows: rows["key"].map(place))
+    outcomes = _merge_rows(rows, notes, log)
+    return sends[["sender", "t", "channel", "to", "sent", "logged"]], outcomes
+
+
+def _counts_directions(table: pd.DataFrame) -> bool:
+    """Return True if rows are single messages: of one sender to many, and never two at one time."""
+    if not (table["what"] == "outcome").all():
+        return False
+    many = table.groupby("sender")["receiver"].nunique().max() > 1
+    return bool(many and not table.duplicated(["sender", "t"]).any())
+
+
+def _number_transmissions(table: pd.DataFrame, notes: list[str]) -> pd.Series:
+    """Return a key of the transmission of each row, and add its ``counter`` to the table."""
+    keys = pd.Series(index=table.index, dtype=object)
+    table["counter"] = 0
+    wraps = restarts = missing = 0
+    moduli, intervals = set(), []
+    for (sender, to), rows in table.groupby(["sender", "to"], sort=True):
+        own = rows.sort_values(["t", "number"], kind="stable")
+        known = own[own["number"].notna()]
+        missing += len(own) - len(known)
+        found = unwrap(known["number"].to_numpy().astype(np.int64), known["t"].to_numpy())
+        wraps, restarts = wraps + found[1], restarts + found[3]
+        moduli |= {found[2]} if found[1] else set()
+        table.loc[known.index, "counter"] = found[0]
+        keys[known.index] = [_key(sender, to, counter) for counter in found[0].tolist()]
+        rest = own.index.difference(known.index)
+        keys[rest] = [_key(sender, to, f"at {t!r}") for t in table.loc[rest, "t"].tolist()]
+        intervals += np.diff(np.unique(own["t"])).tolist()
+    times = table["t"].groupby(keys)
+    spread = (times.max() - times.min()).quantile(0.9)
+    if (table["what"] == "outcome").all() and intervals and spread > np.median(intervals):
+        notes.append("used: numbers count the messages of each pair; equal stamps are one packet")
+        again = table.groupby(["sender", "t", "receiver"]).cumcount()
+        table["counter"] = again
+        told = zip(table["sender"], table["t"].tolist(), again.tolist(), strict=True)
+        return pd.Series([_key(i, t, k) for i, t, k in told], index=table.index)
+    if wraps:
+        lengths = " or ".join(map(str, sorted(moduli)))
+        notes.append(f"used: numbers wrap after {lengths}: {count_phrase(wraps, 'time')}")
+    if restarts:
+        notes.append(
+            f"used: numbers begin again {count_phrase(restarts, 'time')}; what was sent between is "
+            "not known"
+        )
+    if missing:
+        phrase = count_phrase(missing, "row")
+        notes.append(f"used: {phrase} without a number: equal stamps of a sender are one packet")
+    return keys
+
+
+def _key(sender: object, to: object, number: object) -> str:
+    return f"{sender}\n{to}\n{number}"
+
+
+def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
+    """Return transmissions of which only the numbers tell, at times between their neighbours."""
+    found: list[dict[str, object]] = []
+    for (sender, to), rows in sends.groupby(["sender", "to"], sort=True):
+        own = rows.sort_values("counter")
+        counters, times = own["counter"].to_numpy(), own["t"].to_numpy()
+        for k in np.flatnonzero(np.diff(counters) > 1).tolist():
+            count = int(counters[k + 1] - counters[k])
+            # A jump that the time does not explain is a counter that began again.
+            if count > MAX_SKIP or times[k + 1] <= times[k]:
+                continue
+            for j in range(1, count):
+                t = times[k] + (times[k + 1] - times[k]) * j / count
+                row = {"sender": sender, "t": round(t, 9), "channel": "", "to": to}
+                row |= {"counter": counters[k] + j, "sent": False, "logged": False}
+                found.append(row)
+    if found:
+        notes.append(
+            f"not known: {count_phrase(len(found), 'transmission')} that numbers tell of and no "
+            "row does; they stand between their neighbours in time"
+        )
+    columns = ["sender", "t", "channel", "to", "counter", "sent", "logged"]
+    keys = [_key(row["sender"], row["to"], row["counter"]) for row in found]
+    return pd.DataFrame(found, columns=columns, index=keys)
+
+
+def _merge_rows(rows: pd.DataFrame, notes: list[str], log: str) -> pd.DataFrame:
+    """Return one outcome for each transmission and receiver; raises ScenarioError if two rows
+    contradict each other.
+    """
+    key = ["send", "receiver"]
+    repeated = int(rows.duplicated(key).sum())
+    kinds = rows[rows["heard"].notna()].groupby(key)["heard"].nunique()
+    if (kinds > 1).any():
+        send, receiver = kinds[kinds > 1].index[0]
+        two = rows[(rows["send"] == send) & (rows["receiver"] == receiver)]
+        lines = " and ".join(two["where"].iloc[[0, -1]])
+        rule = f"{lines}: one says heard and one says lost"
+        raise ScenarioError(log, rule, [str(two["sender"].iloc[0]), receiver], "correct a row")
+    if repeated:
+        notes.append(f"merged: {count_phrase(repeated, 'row')} that repeat an outcome")
+    ordered = rows.sort_values(["send", "heard", "delay"], kind="stable", na_position="last")
+    columns = ["send", "receiver", "heard", "delay", "rssi"]
+    return ordered.drop_duplicates(key)[columns].reset_index(drop=True)
+
+
+def read_positions(path: Path) -> pd.DataFrame:
+    """Return a table node, x, y; raises ScenarioError."""
+    raw = read_texts(path)
+    name = find_column(raw, "node") or raw.columns[0]
+    columns = {}
+    for axis in ("x", "y"):
+        column = next((c for c in raw.columns if c in (axis, f"{axis}_m")), "")
+        if not column:
+            rule = f"must have a column {axis}"
+            raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
+        columns[axis] = parse_numbers(path, raw, column)
+    return pd.DataFrame({"node": raw[name].to_numpy(), **columns}).drop_duplicates("node")
+
+
+def read_readings(path: Path, origin: Decimal, column: str = "") -> pd.DataFrame:
+    """Return a table t (s from ``origin``), node, y0 of the first column of numbers, or of the one
+    with this name; raises ScenarioError.
+    """
+    raw = read_texts(path)
+    stamp, node = find_column(raw, "t"), find_column(raw, "node") or find_column(raw, "sender")
+    rest = [name for name in raw.columns if name not in (stamp, node)]
+    if not stamp or not node or not rest:
+        rule = "must have columns t, node and y0"
+        raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
+    stamps = parse_stamps(path, raw, stamp)
+    values = parse_numbers(path, raw, column or rest[0], gaps=True)
+    table = pd.DataFrame({"t": [float(s - origin) for s in stamps], "node": raw[node].to_numpy()})
+    table["y0"] = values
+    return table[table["y0"].notna() & (table["t"] >= 0.0)].reset_index(drop=True)

@@ -1,0 +1,281 @@
+"""Packet logs: who sent when, who could hear it, and what became of it; and their tables.
+
+An outcome is heard, lost, or unknown: a lost report is no lost packet. Every kind of log becomes
+two tables, of transmissions and of outcomes, which ``settle`` completes so that for each sender and
+hearer sent = heard + lost + unknown.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from netkf.core.csv_files import open_table
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import SourceFile
+from netkf.core.stamps import UNITS, TimeBase
+from netkf.linalg.arrays import FloatArray
+
+HOLE = 30.0
+"""A receiver that reports nothing has a hole in its log after so many packets that it would have
+heard by its usual deliveries.
+"""
+USUAL = 0.1
+"""The smallest delivery of a sender whose silence says something."""
+MODULI = (16, 100, 128, 256, 1000, 1024, 4096, 10_000, 65_536, 2**32)
+"""Lengths after which counters of packets begin again."""
+MAX_SKIP = 1000
+"""Numbers skipped at once beyond which a counter began again: nothing is known of what lies
+between.
+"""
+LATE = 2
+"""A number may be that much smaller than the one before because reports are out of order."""
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)_(\d\d)[.:](\d\d)[.:](\d\d)")
+
+
+@dataclass
+class PacketLog:
+    """A log as it was read; ``notes`` say what was used, merged, dropped and not known.
+
+    sends    : sender, t (seconds from ``origin``), channel, to (the one receiver of a message, or
+               empty for a broadcast), sent (False: inferred, not reported), logged (by the sender
+               itself); in the order of t
+    outcomes : send (row of ``sends``), receiver, heard (1, 0, nan for unknown), delay (s), rssi
+    absent   : what a transmission without a row at a hearer is: "lost" or "unknown"
+    resolution : seconds of the last digit of stamps
+    positions : node, x, y, and readings: t, node, y0; empty if there are none
+    ticks    : the table of the ticks of clocks, of a run
+    """
+
+    sends: pd.DataFrame
+    outcomes: pd.DataFrame
+    origin: Decimal
+    resolution: float
+    absent: str = "lost"
+    notes: list[str] = field(default_factory=list)
+    positions: pd.DataFrame = field(default_factory=pd.DataFrame)
+    readings: pd.DataFrame = field(default_factory=pd.DataFrame)
+    ticks: Path | None = None
+
+
+def count_phrase(count: int, what: str) -> str:
+    """Return a count with its noun, in the plural unless it is 1."""
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
+def read_texts(path: Path) -> pd.DataFrame:
+    """Return the rows of a table as texts, by the numbers of their lines; names of columns in lower
+    case. Raises ScenarioError, with the line, for a file that is none, or a row of another length.
+    """
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    source = SourceFile(path.name, path.parent)
+    try:
+        with open_table(source) as sheet:
+            header, separator = [name.lower() for name in sheet.header], sheet.separator
+            for line, row in sheet.rows:
+                if len(row) != len(header):
+                    rule = f"line {line} must have {len(header)} entries"
+                    raise ScenarioError(str(path), rule, row, "correct the row")
+                rows.append([entry.strip() for entry in row])
+                lines.append(line)
+    except ScenarioError as error:
+        if error.key != "path":
+            raise
+        raise ScenarioError(str(path), error.rule, error.value, error.remedy) from None
+    for name in header:
+        if header.count(name) > 1:
+            raise ScenarioError(str(path), "must not repeat a column", name, "rename one of them")
+    if not rows:
+        raise ScenarioError(str(path), "has no rows", None, "check the file")
+    table = pd.DataFrame(rows, columns=header, index=lines)
+    return table if separator == "," else table.apply(_with_points)
+
+
+def _with_points(column: pd.Series) -> pd.Series:
+    is_decimal = column.str.fullmatch(r"[+-]?\d+,\d+").fillna(False).all()
+    return column.str.replace(",", ".") if is_decimal else column
+
+
+def parse_numbers(path: Path, table: pd.DataFrame, name: str, gaps: bool = False) -> FloatArray:
+    """Return a column as finite numbers (K,), nan where ``gaps`` may be empty; raises
+    ScenarioError with the line of another entry.
+    """
+    texts = table[name]
+    values = np.asarray(pd.to_numeric(texts, errors="coerce"), dtype=float)
+    is_gap = np.asarray(texts.str.lower().isin(["", "nan", "none", "na"])) & gaps
+    wrong = np.flatnonzero(~np.isfinite(values) & ~is_gap)
+    if wrong.size:
+        rule = f"line {table.index[wrong[0]]}: {name} must be a number"
+        raise ScenarioError(str(path), rule, texts.iloc[wrong[0]], "correct the entry")
+    return values
+
+
+def parse_stamps(path: Path, table: pd.DataFrame, name: str) -> list[Decimal]:
+    """Return a column of stamps as exact seconds (K,): numbers in the unit that ends the name of
+    the column, as t_ms, ISO 8601 times, or 2014-09-07_22.41.23. Raises ScenarioError.
+    """
+    unit = name.rpartition("_")[2]
+    base = TimeBase(unit if unit in UNITS else "s")
+    stamps = []
+    for line, text in zip(table.index, table[name], strict=True):
+        try:
+            stamps.append(base.exact(_DATE.sub(r"\1T\2:\3:\4", text)))
+        except ValueError:
+            rule = f"line {line}: {name} must be a number or an ISO 8601 time"
+            raise ScenarioError(str(path), rule, text, "correct the entry") from None
+    return stamps
+
+
+def find_resolution(stamps: list[Decimal]) -> float:
+    """Return the seconds of the last digit that any of the stamps uses, at most 1."""
+    exponents = {stamp.normalize().as_tuple().exponent for stamp in stamps}
+    return 10.0 ** min([0, *(e for e in exponents if isinstance(e, int))])
+
+
+def choose_origin(stamps: list[Decimal], resolution: float) -> Decimal:
+    """Return the stamp of simulated 0: 0 for a log that begins soon after it, else the whole second
+    before the first stamp. Nothing can be sent at 0 itself.
+    """
+    first, last = min(stamps), max(stamps)
+    if 0 < first <= max((last - first) / 10, Decimal(1)):
+        return Decimal(0)
+    whole = Decimal(int(first // 1))
+    return whole if first - whole >= Decimal(resolution) else whole - 1
+
+
+def unwrap(numbers: np.ndarray, times: FloatArray) -> tuple[np.ndarray, int, int, int]:
+    """Return counters (K,) of one sender, in the order of ``times`` (K,), that grow on where the
+    ``numbers`` begin again; how often they wrapped, by which modulus, and how often they restarted.
+
+    A number that falls, and whose successors stay down, wrapped if the numbers skipped by then fit
+    the time that passed, and restarted otherwise; one that falls alone is out of order.
+    """
+    modulus = next((m for m in MODULI if m > numbers.max(initial=0)), 0)
+    steps, gaps = np.diff(numbers), np.diff(times)
+    forward = (steps > 0) & (steps < MAX_SKIP) & (gaps > 0)
+    interval = float(np.median(gaps[forward] / steps[forward])) if forward.any() else 0.0
+    counters = np.empty(len(numbers), dtype=np.int64)
+    offset = wraps = restarts = top = last = 0
+    top_time = 0.0
+    for k, (number, time) in enumerate(zip(numbers.tolist(), times.tolist(), strict=True)):
+        expected = (time - top_time) / interval if interval and k else 0.0
+        falls = k > 0 and number < last - LATE and np.median(numbers[k : k + 8]) < last - LATE
+        skipped = number + modulus - last
+        if falls and modulus and skipped <= 2.0 * expected + 3.0:
+            offset, wraps = offset + modulus, wraps + 1
+        elif falls or (k and MAX_SKIP < number - last > 10.0 * expected and not wraps):
+            offset, restarts = top + 1 - number, restarts + 1
+        # One of before the wrap may come late.
+        is_late = wraps and not falls and number > last + modulus / 2
+        counters[k] = number + offset - (modulus if is_late else 0)
+        if not k or counters[k] > top:
+            top, top_time, last = int(counters[k]), time, number
+    return counters, wraps, modulus, restarts
+
+
+def spread_equal(sends: pd.DataFrame, resolution: float, notes: list[str]) -> None:
+    """Move transmissions of one sender that have one stamp apart, evenly within the resolution of
+    stamps, in the order of rows: a node sends once at a time.
+    """
+    key = [sends["sender"], sends["to"], sends["t"]]
+    rank, size = sends.groupby(key).cumcount(), sends.groupby(key)["t"].transform("size")
+    moved = int((rank > 0).sum())
+    if moved:
+        sends["t"] += (rank / size * resolution).round(9)
+        notes.append(
+            f"moved: {count_phrase(moved, 'transmission')} that had the stamp of another one of "
+            f"the sender, by less than the resolution of {resolution:g} s, in their order"
+        )
+
+
+def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
+    """Return one outcome for each transmission and node that could hear it, as those of a log:
+    columns send, receiver, heard (1, 0, nan), delay, rssi, in the order of time.
+
+    A node could hear those that the log says it did, or did not, at least once. A transmission
+    without a row is lost, or unknown where ``log.absent`` says so, in a hole of the receiver's log
+    (after ``hole`` packets, see HOLE), and where nobody reported it and ``unreported`` is
+    "unknown".
+    """
+    sends, told = log.sends, log.outcomes
+    pairs = told.assign(sender=sends["sender"].to_numpy()[told["send"]])
+    pairs = pairs[["sender", "receiver"]].drop_duplicates()
+    base = sends[["sender", "to"]].rename_axis("send").reset_index()
+    whole = base.merge(pairs, on="sender")
+    whole = whole[(whole["to"] == "") | (whole["to"] == whole["receiver"])]
+    whole = whole.merge(told.assign(told=True), on=["send", "receiver"], how="left")
+    missing = whole["told"].isna().to_numpy()
+    send = whole["send"].to_numpy()
+    fill = np.full(len(whole), np.nan if log.absent == "unknown" else 0.0)
+    if log.absent == "lost":
+        silent = ~sends["sent"].to_numpy(dtype=bool)[send]
+        fill[silent & (unreported == "unknown")] = np.nan
+        fill[_in_holes(log, whole, hole)] = np.nan
+        count = int(silent[missing].sum())
+        if count:
+            log.notes.append(
+                f"not known: {count_phrase(count, 'outcome')} of transmissions that nobody "
+                f"reported, of which only their numbers tell; taken as {unreported}"
+            )
+    heard = np.where(missing, fill, whole["heard"].to_numpy(dtype=float))
+    whole["heard"] = heard
+    columns = ["send", "receiver", "heard", "delay", "rssi"]
+    return whole.sort_values(["send"], kind="stable")[columns].reset_index(drop=True)
+
+
+def _in_holes(log: PacketLog, whole: pd.DataFrame, hole: float) -> np.ndarray:
+    """Return flags of outcomes ``whole`` without a row that lie in a hole of the receiver's log: it
+    reports nothing of two senders or more, of whose packets it would have heard ``hole``, while
+    another receiver reports something.
+    """
+    sends = log.sends.iloc[whole["send"]]
+    rows = pd.DataFrame({"receiver": whole["receiver"], "missing": whole["told"].isna()})
+    rows["t"], rows["sender"] = sends["t"].to_numpy(), sends["sender"].to_numpy()
+    rows["heard"] = (whole["heard"] == 1.0).astype(float)
+    context = ["receiver", "sender", sends["channel"].to_numpy()]
+    rows["usual"] = rows.groupby(context)["heard"].transform("mean")
+    logged, flags = log.sends[log.sends["logged"].astype(bool)], np.zeros(len(rows), dtype=bool)
+    reported = rows[rows["heard"] == 1.0]
+    for receiver, own in rows.groupby("receiver"):
+        signs = own["t"][~own["missing"]].tolist()
+        signs += logged["t"][logged["sender"] == receiver].tolist()
+        missing = own[own["missing"] & (own["usual"] >= USUAL)]
+        stretch = np.searchsorted(np.sort(signs), missing["t"], side="right")
+        others = np.sort(reported["t"][reported["receiver"] != receiver])
+        for _, part in missing.groupby(stretch):
+            if part["usual"].sum() < hole or part["sender"].nunique() < 2:
+                continue
+            low, high = float(part["t"].min()), float(part["t"].max())
+            if np.diff(np.searchsorted(others, [low, high]))[0] == 0:
+                continue  # nobody hears anything: that is the network
+            inside = (own["missing"] & own["t"].between(low, high)).to_numpy()
+            flags[own.index[inside]] = True
+            log.notes.append(
+                f"not known: {receiver} reports nothing from {low:g} to {high:g} s, of which "
+                f"it would usually have heard {part['usual'].sum():.0f} packets: a hole in its "
+                f"log, or it was down; {count_phrase(int(inside.sum()), 'outcome')}"
+            )
+    return flags
+
+
+def accounts(sends: pd.DataFrame, outcomes: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each sender and receiver: sent = heard + lost + unknown."""
+    sender = sends["sender"].to_numpy()[outcomes["send"]]
+    heard = outcomes["heard"].to_numpy(dtype=float)
+    table = pd.DataFrame(
+        {
+            "sender": sender,
+            "receiver": outcomes["receiver"],
+            "sent": 1,
+            "heard": (heard == 1.0).astype(int),
+            "lost": (heard == 0.0).astype(int),
+            "unknown": np.isnan(heard).astype(int),
+        }
+    )
+    return table.groupby(["sender", "receiver"], as_index=False, sort=True).sum()

@@ -1,0 +1,320 @@
+"""A packet log as a recorded network: its tables, the scenario that replays it, and the report."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from netkf.core.errors import ScenarioError
+from netkf.logs.packets import PacketLog, accounts, count_phrase, settle
+from netkf.network.clocks import LinkClock, OnReadings
+from netkf.network.matchings import Matching
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.tables import source_files
+from netkf.scenario.writing import resolve_defaults, to_toml, toml_text
+
+LAG = 10
+"""Readings between the two of a pair whose differences tell how the state moves."""
+TABLES = ("outcomes.csv", "accounts.csv", "delays.csv")
+Files = dict[str, str | Path]
+"""Texts, or files to copy, by name."""
+
+HEAD = """\
+# Made by netkf import of {log}: {told}.
+# The network is the log's. Choose a plant, sensors and a filter of your own.
+format = 1
+name = "{name}"
+claim = "the packets of a log, replayed"
+horizon = {horizon}
+probe = {probe}
+seed = 1
+"""
+SIMULATED = """
+[plant]     # simulated: a random walk that moves by about 1 while a node sends ten times
+kind = "diffusion"
+A = [[0.0]]
+B = [[{B}]]
+mean = [0.0]
+cov = [[1.0]]
+
+[[sensors]]    # every node reads it with noise of variance 1, about as often as it sends
+nodes = {nodes}
+H = [[1.0]]
+R = [[1.0]]
+sampling = {{ kind = "periodic", period = {period}, phase = "random" }}
+"""
+READINGS = """
+[plant]     # a random walk, by how much readings change; no ground truth
+kind = "unknown"
+A = [[0.0]]
+B = [[{B}]]
+mean = [{mean}]
+cov = [[{cov}]]
+
+[[sensors]]    # R is what neighbouring readings differ by, and nodes from each other
+kind = "recorded"
+path = "readings.csv"
+nodes = {nodes}
+H = [[1.0]]
+R = [[{R}]]
+"""
+NETWORK = """
+[network]
+graph = {{ kind = "csv", path = "links.csv", directed = true }}
+activation = {{ kind = "recorded", at = "{at}", path = "transmissions.csv" }}
+"""
+
+FILTER = """
+[filter]
+kind = "diffusion"
+"""
+
+
+def write_network(
+    log: PacketLog, name: str, hole: float, unreported: str, like: Scenario | None
+) -> tuple[Files, tuple[str, ...]]:
+    """Return the scenario, the tables and the report of a log called ``name``, and notes.
+
+    ``hole`` and ``unreported`` say what an absent row means, see ``settle``; ``like`` is a scenario
+    whose plant, sensors and filter replace those made here. Raises ScenarioError.
+    """
+    rename_nodes(log)
+    outcomes = settle(log, hole, unreported)
+    if outcomes.empty:
+        raise ScenarioError(name, "has no packet that anybody could hear", None, "check the log")
+    account = accounts(log.sends, outcomes)
+    table = _outcome_table(log, outcomes)
+    files: Files = {
+        "outcomes.csv": table.to_csv(index=False),
+        "accounts.csv": account.to_csv(index=False),
+    }
+    channel: dict[str, Any] = {
+        "loss": {"kind": "recorded", "path": "outcomes.csv", "after": "lose"},
+        "symmetric": False,
+    }
+    delays = table[table["delay"] > 0.0][["sender", "receiver", "message", "delay"]]
+    if len(delays):
+        files["delays.csv"] = delays.rename(columns={"delay": "seconds"}).to_csv(index=False)
+        channel["delay"] = {"kind": "recorded", "path": "delays.csv"}
+    if like is None:
+        files["links.csv"] = account[["sender", "receiver"]].to_csv(index=False)
+        files |= _own_scenario(log, name, account, channel)
+    else:
+        files |= _scenario_like(like, log, table, channel)
+    total = account[["sent", "heard", "lost", "unknown"]].sum()
+    log.notes.append(
+        f"outcomes: {total['sent']:,} = {total['heard']:,} heard + {total['lost']:,} lost + "
+        f"{total['unknown']:,} unknown, on {count_phrase(len(account), 'link')}; accounts.csv has "
+        "each"
+    )
+    if total["unknown"]:
+        log.notes.append(
+            "replay: outcomes that are not known are in no table and count as lost; "
+            'network.channel.loss.after = "deliver" makes them heard'
+        )
+    log.notes.insert(0, f"origin: simulated 0 is {log.origin} in the log")
+    log.notes.insert(1, f"resolution: stamps are multiples of {log.resolution:g} s")
+    files["report.txt"] = "\n".join([*log.notes, "", account.to_string(index=False), ""])
+    return files, tuple(log.notes)
+
+
+def rename_nodes(log: PacketLog) -> None:
+    """Give nodes names that tables can hold: no blanks, quotes or signs of comments, and no numbers
+    but those of ids from 0.
+    """
+    nodes = sorted({*log.sends["sender"], *log.outcomes["receiver"]})
+    names = {node: re.sub(r"[^\w.:+-]", "_", node) for node in nodes}
+    if not all(re.fullmatch(r"\d{1,15}", node) for node in nodes):
+        names = {n: f"n{name}" if _is_number(name) else name for n, name in names.items()}
+    if len(set(names.values())) < len(nodes):
+        names = {node: f"n{k}" for k, node in enumerate(nodes)}
+    changed = {a: b for a, b in names.items() if a != b}
+    if not changed:
+        return
+    listed = ", ".join(f"{a} is {b}" for a, b in list(changed.items())[:5])
+    log.notes.append(f"used: nodes have other names here: {listed}{', ...' * (len(changed) > 5)}")
+    log.sends[["sender", "to"]] = log.sends[["sender", "to"]].replace(changed)
+    log.outcomes["receiver"] = log.outcomes["receiver"].replace(changed)
+    for table in (log.positions, log.readings):
+        if len(table):
+            table["node"] = table["node"].replace(changed)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _outcome_table(log: PacketLog, outcomes: pd.DataFrame) -> pd.DataFrame:
+    """Return the known outcomes, with the number of each message of its direction."""
+    sends = log.sends.iloc[outcomes["send"]].reset_index(drop=True)
+    table = pd.DataFrame({"sender": sends["sender"], "receiver": outcomes["receiver"]})
+    table["message"] = table.groupby(["sender", "receiver"]).cumcount()
+    table["delivered"] = outcomes["heard"]
+    table["t"], table["transmission"] = sends["t"], outcomes["send"]
+    table["channel"], table["rssi"] = sends["channel"], outcomes["rssi"]
+    # A message that is heard after the end of the log is never heard in a run.
+    delay = outcomes["delay"].replace(np.inf, 2.0 * float(log.sends["t"].max()) + 1.0)
+    table["delay"] = delay
+    table = table[table["delivered"].notna()].astype({"delivered": int})
+    return table.drop(columns=[c for c in ("rssi", "channel") if not _is_told(table[c])])
+
+
+def _is_told(column: pd.Series) -> bool:
+    return bool((column.notna() & (column != "")).any())
+
+
+def _own_scenario(
+    log: PacketLog, name: str, account: pd.DataFrame, channel: dict[str, Any]
+) -> Files:
+    """Return a scenario with a plant and a filter to begin with, and the tables that it names."""
+    sends, nodes = log.sends, sorted({*account["sender"], *account["receiver"]})
+    ids: list[Any] = [int(node) for node in nodes] if _is_number(nodes[0]) else nodes
+    ids = sorted(ids)
+    silent = set(sends["sender"]) - set(nodes)
+    if silent:
+        log.notes.append(
+            f"dropped: {count_phrase(int(sends['sender'].isin(silent).sum()), 'transmission')} of "
+            f"nodes that nobody ever heard: {', '.join(sorted(silent))}"
+        )
+        sends = sends[~sends["sender"].isin(silent)]
+    directed = bool((sends["to"] != "").any())
+    ticks = sends[["t", "sender", "to"]].set_axis(["t", "node", "peer"], axis=1)
+    files: Files = {"transmissions.csv": _ticks(ticks if directed else ticks[["t", "node"]])}
+    rate = len(sends) / sends["sender"].nunique() / max(float(sends["t"].max()), 1e-9)
+    last = max(float(sends["t"].max()), float(log.readings["t"].max()) if len(log.readings) else 0)
+    horizon = float(math.floor(last) + 1)
+    keys: dict[str, Any] = {"log": name, "name": name, "horizon": horizon}
+    keys["probe"] = _round_number(horizon / 200.0)
+    keys["nodes"] = toml_text(ids)
+    readings = log.readings
+    if len(readings):
+        readings = readings[readings["node"].isin(nodes)].sort_values("t", kind="stable")
+        if len(readings) < len(log.readings):
+            count = count_phrase(len(log.readings) - len(readings), "reading")
+            log.notes.append(f"dropped: {count} of nodes that are not in the network")
+    if len(readings):
+        files["readings.csv"] = readings.to_csv(index=False)
+        own = {*readings["node"]}
+        keys["nodes"] = toml_text([node for node in ids if str(node) in own])
+        plant = READINGS.format(**keys, **_fit_walk(readings))
+    else:
+        period = _round_number(1.0 / rate)
+        plant = SIMULATED.format(**keys, period=period, B=f"{math.sqrt(0.1 * rate):.3g}")
+    told = f"{len(sends):,} transmissions of {len(nodes)} nodes"
+    network = NETWORK.format(at="directions" if directed else "nodes")
+    network += f"channel = {toml_text(channel)}\n"
+    if len(log.positions):
+        placed = log.positions[log.positions["node"].isin(nodes)]
+        if len(placed) == len(nodes):
+            files["positions.csv"] = placed.to_csv(index=False)
+            network += 'positions = "positions.csv"\n'
+        else:
+            log.notes.append(f"dropped: positions, of {len(placed)} of {len(nodes)} nodes only")
+    files["scenario.toml"] = HEAD.format(**keys, told=told) + plant + network + FILTER
+    return files
+
+
+def _ticks(ticks: pd.DataFrame) -> str:
+    return ticks.sort_values("t", kind="stable").to_csv(index=False)
+
+
+def _round_number(value: float) -> float:
+    """Return the nearest of 1, 2 and 5 times a power of ten that is no larger."""
+    power = 10.0 ** math.floor(math.log10(value))
+    step = max(k for k in (1, 2, 5) if k * power <= value * (1.0 + 1e-9))
+    return float(f"{step * power:.1e}")
+
+
+def _fit_walk(readings: pd.DataFrame) -> dict[str, str]:
+    """Return B and R of a random walk by the moments of differences of readings, one and LAG apart,
+    and mean and cov of its start.
+    """
+    near: list[tuple[float, float]] = []
+    far: list[tuple[float, float]] = []
+    for _, rows in readings.groupby("node"):
+        t, y = rows["t"].to_numpy(), rows["y0"].to_numpy()
+        for lag, found in ((1, near), (LAG, far)):
+            found += list(zip(t[lag:] - t[:-lag], (y[lag:] - y[:-lag]) ** 2, strict=True))
+    moments = [np.array(found).mean(axis=0) if found else np.zeros(2) for found in (near, far)]
+    gap, change = moments[1] - moments[0]
+    rate = max(change / gap, 0.0) if gap > 0.0 else 0.0
+    noise = max(0.5 * (moments[0][1] - rate * moments[0][0]), 0.0)
+    means = readings.groupby("node")["y0"].mean()
+    between = float(means.var(ddof=0)) if len(means) > 1 else 0.0
+    first = readings.groupby("node")["y0"].first()
+    R = max(noise + between, 1e-9)
+    values = {"B": max(math.sqrt(rate), 1e-6), "R": R, "mean": first.mean()}
+    values["cov"] = max(float(first.var(ddof=0)), R)
+    return {key: repr(float(f"{value:.4g}")) for key, value in values.items()}
+
+
+def _scenario_like(
+    scenario: Scenario, log: PacketLog, table: pd.DataFrame, channel: dict[str, Any]
+) -> Files:
+    """Return a ``scenario`` over the network of the log, with the tables that it names.
+
+    Its graph stays, which must have the links of the log; so does what makes nodes send, if they
+    do so after their samples or all of them in every slot.
+    """
+    known = {(str(i), str(j)) for i, j in scenario.topology.directions}
+    for sender, receiver in table[["sender", "receiver"]].drop_duplicates().itertuples(index=False):
+        if (sender, receiver) not in known:
+            rule = "the scenario must have the links of the log"
+            remedy = "correct its graph, or import without --like"
+            raise ScenarioError("network.graph", rule, [sender, receiver], remedy)
+    resolved = resolve_defaults(scenario)
+    network = resolved["network"]
+    network["channel"] = {**channel, "symmetric": scenario.network.channel.symmetric}
+    activation, files = scenario.network.activation, Files()
+    sends = log.sends
+    if isinstance(activation, Matching):
+        slots = np.floor(sends["t"] / scenario.slot_plant.period + 1e-9).astype(int)
+        ids = {str(node): int(node) for node in scenario.nodes}
+        pairs = np.sort(sends[["sender", "to"]].replace(ids).to_numpy(dtype=int), axis=1)
+        rows = pd.DataFrame({"slot": slots, "node": pairs[:, 0], "peer": pairs[:, 1]})
+        files["transmissions.csv"] = rows.drop_duplicates().to_csv(index=False)
+        network["activation"] = {"kind": "recorded", "path": "transmissions.csv"}
+        if activation.phase is not None:
+            network["activation"]["phase"] = activation.phase
+    elif isinstance(activation, LinkClock) and not isinstance(activation, OnReadings):
+        at, is_broadcast = activation.at, bool((sends["to"] == "").any())
+        if log.ticks is None and is_broadcast != (at == "nodes"):
+            at = "nodes" if is_broadcast else "directions"
+            log.notes.append(f'used: clocks at = "{at}", by what the log says of packets')
+        files["transmissions.csv"] = log.ticks or _clock_rows(sends, at)
+        network["activation"] = {"kind": "recorded", "at": at, "path": "transmissions.csv"}
+    else:
+        log.notes.append(
+            f"used: nodes send when the scenario says ({network['activation']['kind']}); outcomes "
+            "are those of the log, message by message"
+        )
+    replaced = source_files(scenario.network.channel)
+    replaced += source_files(activation) if files else []
+    for source in source_files(scenario):
+        if source not in replaced:
+            if source.name in (*TABLES, *files):
+                rule = "the scenario names a table as import does"
+                raise ScenarioError("path", rule, source.name, "rename the table")
+            files[source.name] = source.full
+    files["scenario.toml"] = to_toml(resolved)
+    return files
+
+
+def _clock_rows(sends: pd.DataFrame, at: str) -> str:
+    """Return the ticks of clocks ``at`` nodes, directions or links that make nodes send so."""
+    rows = sends[["t", "sender", "to"]].set_axis(["t", "node", "peer"], axis=1)
+    if at == "nodes":
+        return _ticks(rows[["t", "node"]].drop_duplicates())
+    if at == "links":
+        pair = np.sort(rows[["node", "peer"]].to_numpy(), axis=1)
+        rows["node"], rows["peer"] = pair[:, 0], pair[:, 1]
+    return _ticks(rows.drop_duplicates())

@@ -1,0 +1,142 @@
+"""``netkf import --kind ulb``: the library deployments of the Universite Libre de Bruxelles.
+
+Once a minute a mote reads its sensors, broadcasts, and reports whom it has heard since its last
+report: readings.csv (t_s, node, values) and heard.csv (t_s, receiver, sender, lqi).
+"""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from netkf.core.errors import ScenarioError
+from netkf.logs.packet_tables import find_column, read_readings
+from netkf.logs.packets import (
+    PacketLog,
+    count_phrase,
+    find_resolution,
+    parse_numbers,
+    parse_stamps,
+    read_texts,
+    spread_equal,
+)
+
+MINUTE = 60.0
+EARLY = 10.0
+"""A minute's reports begin up to so many seconds before it."""
+
+
+def read_ulb(log: Path) -> PacketLog:
+    """Return the packet log of a folder with readings.csv and heard.csv, or heard.csv.gz.
+
+    Raises ScenarioError, with file and line, for a folder that has none.
+    """
+    paths = {}
+    for name in ("readings", "heard"):
+        found = [log / f"{name}.csv", log / f"{name}.csv.gz"]
+        path = next((p for p in found if p.is_file()), None)
+        if path is None:
+            rule = "must be a folder with readings.csv and heard.csv or heard.csv.gz"
+            raise ScenarioError(str(log), rule, None, "check the path")
+        paths[name] = path
+    notes: list[str] = []
+    raw = read_texts(paths["heard"])
+    for name in ("t", "sender", "receiver"):
+        if not find_column(raw, name):
+            rule = f"must have a column {name}"
+            raise ScenarioError(str(paths["heard"]), rule, list(raw.columns), "check the file")
+    stamps = parse_stamps(paths["heard"], raw, find_column(raw, "t"))
+    texts = read_texts(paths["readings"])
+    read_stamps = parse_stamps(paths["readings"], texts, find_column(texts, "t"))
+    first = min(*stamps, *read_stamps)
+    origin = Decimal(int(first // 60) * 60)  # minutes stay those of the stamps
+    readings = read_readings(paths["readings"], origin)
+    lqi = find_column(raw, "rssi")
+    reports = pd.DataFrame(
+        {
+            "t": [float(stamp - origin) for stamp in stamps],
+            "sender": raw[find_column(raw, "sender")],
+            "receiver": raw[find_column(raw, "receiver")],
+            "rssi": parse_numbers(paths["heard"], raw, lqi, gaps=True) if lqi else np.nan,
+        }
+    )
+    reports["minute"] = ((reports["t"] + EARLY) // MINUTE).astype(int) - 1
+    notes.append(
+        f"used: {count_phrase(len(readings), 'reading')} (each one broadcast) and "
+        f"{count_phrase(len(reports), 'row')} of reports, which tell of the minute before"
+    )
+    kept = reports.drop_duplicates(["sender", "receiver", "minute"])
+    kept = kept[kept["sender"] != kept["receiver"]]
+    if len(kept) < len(reports):
+        rows = count_phrase(len(reports) - len(kept), "row")
+        notes.append(f"merged: {rows} of reports that name a sender again, or the mote itself")
+    sends = _broadcasts(readings, kept, notes)
+    spread_equal(sends, find_resolution(read_stamps), notes)
+    sends = sends.sort_values("t", kind="stable").reset_index(drop=True)
+    outcomes = _outcomes(sends, kept, notes)
+    result = PacketLog(
+        sends[["sender", "t", "channel", "to", "sent", "logged"]],
+        outcomes,
+        origin,
+        find_resolution(stamps),
+        "unknown",
+        notes,
+    )
+    result.readings = readings
+    return result
+
+
+def _broadcasts(readings: pd.DataFrame, reports: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
+    """Return a broadcast for each reading, and for each minute in which a mote is named that has no
+    reading in it, at the usual second of the mote.
+    """
+    minute = (readings["t"] // MINUTE).astype(int)
+    sends = pd.DataFrame({"sender": readings["node"], "t": readings["t"], "minute": minute})
+    sends = sends.drop_duplicates(["sender", "minute"])
+    usual = (sends["t"] - MINUTE * sends["minute"]).groupby(sends["sender"]).median()
+    named = reports[["sender", "minute"]].drop_duplicates()
+    named = named[(named["minute"] >= 0) & named["sender"].isin(usual.index)]
+    named = named.merge(sends[["sender", "minute"]], how="left", indicator=True)
+    extra = named[named["_merge"] == "left_only"][["sender", "minute"]]
+    extra["t"] = (MINUTE * extra["minute"] + extra["sender"].map(usual).astype(float)).round(3)
+    if len(extra):
+        notes.append(
+            f"used: {count_phrase(len(extra), 'broadcast')} without a reading, which reports name, "
+            "at the usual second of the mote"
+        )
+    again = len(readings) - len(sends)
+    if again:
+        notes.append(f"merged: {count_phrase(again, 'reading')} in a minute that has one already")
+    both = pd.concat([sends, extra], ignore_index=True)
+    at_zero = both["t"] == 0.0
+    if at_zero.any():
+        both.loc[at_zero, "t"] = 1e-3
+        notes.append(f"moved: {int(at_zero.sum())} at the first instant, to 0.001 s after it")
+    return both.assign(channel="", to="", sent=True, logged=False)
+
+
+def _outcomes(sends: pd.DataFrame, reports: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
+    """Return the outcome of each broadcast at each mote whose report of that minute there is; it is
+    not known where there is none.
+    """
+    pairs = reports[["sender", "receiver"]].drop_duplicates()
+    whole = sends[["sender", "minute"]].rename_axis("send").reset_index().merge(pairs, on="sender")
+    heard = reports[["sender", "receiver", "minute", "rssi"]].assign(heard=1.0)
+    whole = whole.merge(heard, on=["sender", "receiver", "minute"], how="left")
+    told = pd.MultiIndex.from_frame(reports[["receiver", "minute"]].drop_duplicates())
+    is_told = pd.MultiIndex.from_frame(whole[["receiver", "minute"]]).isin(told)
+    whole["heard"] = np.where(is_told, whole["heard"].fillna(0.0), np.nan)
+    count = int(whole["heard"].isna().sum())
+    if count:
+        notes.append(
+            f"not known: {count_phrase(count, 'outcome')} in minutes of which the receiver's "
+            "report is missing"
+        )
+    unused = len(reports) - int((whole["heard"] == 1.0).sum())
+    if unused:
+        rows = count_phrase(unused, "row")
+        notes.append(f"dropped: {rows} of reports on motes or minutes without a broadcast")
+    return whole[["send", "receiver", "heard", "rssi"]].assign(delay=np.nan)

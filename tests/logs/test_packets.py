@@ -1,0 +1,287 @@
+"""Packet logs: what they say is in the tables, and nothing else; a run comes back to the bit."""
+
+from decimal import Decimal
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import netkf
+from netkf.cli.main import main
+from netkf.core.errors import ScenarioError
+from netkf.logs.packets import unwrap
+from tests.conftest import SCENARIOS
+
+MERCATOR = """\
+timestamp,mac,frequency,length,rssi,crc,expected,srcmac,transctr,pkctr,txnumpk,txpower,txifdur,txlength,txfillbyte
+2014-09-07_22.41.23,22-22,11,100,-75,1,1,11-11,1,1,3,0,100,100,0x0a
+2014-09-07_22.41.23,33-33,11,100,-85,1,1,11-11,1,3,3,0,100,100,0x0a
+2014-09-07_22.41.23,33-33,11,100,-85,1,1,11-11,1,3,3,0,100,100,0x0a
+2014-09-07_22.41.23,33-33,11,100,-85,0,1,11-11,1,2,3,0,100,100,0x0a
+2014-09-07_22.41.24,33-33,11,100,-85,1,0,99-99,7,9,3,0,100,100,0x0a
+2014-09-07_22.41.29,22-22,12,100,-65,1,1,11-11,4,2,3,0,100,100,0x0a
+"""
+
+
+def table(folder, name):
+    return pd.read_csv(folder / name)
+
+
+def write(path, rows):
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def made(tmp_path, count=300, modulus=256, step=0.7):
+    """Rows (stamp in whole seconds, sender, receiver, number) of three nodes that hear each other
+    with probability 0.7, and the numbers of packets heard.
+    """
+    random = np.random.default_rng(3)
+    heard = {(i, j): 0 for i in range(3) for j in range(3) if i != j}
+    rows = ["timestamp;SRC_ID;dst;seqno;rssi;battery"]
+    for k in range(count):
+        for i in range(3):
+            for j in range(3):
+                if i != j and random.random() < 0.7:
+                    heard[i, j] += 1
+                    rows.append(f"{int(5000 + step * k)};{i};{j};{k % modulus};-70,5;3")
+    return write(tmp_path / "packets.csv", rows), heard
+
+
+def test_a_log_of_receptions_with_short_numbers_and_coarse_stamps_balances(tmp_path, capsys):
+    log, heard = made(tmp_path, modulus=16)
+    out = tmp_path / "out"
+    assert main(["import", str(log), "--kind", "csv", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    accounts = table(out, "accounts.csv")
+    assert (accounts["sent"] == accounts[["heard", "lost", "unknown"]].sum(axis=1)).all()
+    pairs = zip(accounts["sender"], accounts["receiver"], strict=True)
+    assert dict(zip(pairs, accounts["heard"], strict=True)) == heard
+    assert "numbers wrap after 16: 54 times" in printed
+    assert "resolution: stamps are multiples of 1 s" in printed
+    assert "not used: battery" in printed
+    sent = table(out, "transmissions.csv")
+    assert not sent.duplicated().any()  # none is merged
+    assert set(sent.groupby("node").size()) <= {299, 300}  # the last may be heard by nobody
+    run = netkf.simulate(netkf.load(out / "scenario.toml"))
+    kinds = run.events["kind"].value_counts()
+    assert kinds["send"] == accounts["sent"].sum()
+    assert kinds["deliver"] == sum(heard.values())
+    assert kinds["lost"] == accounts[["lost", "unknown"]].to_numpy().sum()
+
+
+def test_what_the_sender_logs_is_lost_and_what_only_numbers_tell_is_not_known(tmp_path):
+    rx = ["t,src,dst,seq", "1,a,b,0", "2,a,b,1", "2,a,c,1", "5,a,b,4", "5,a,c,4"]
+    for name, rows, expected in (
+        ("rx", rx, [2, 2, 0, 1, 2]),
+        ("tx", [*rx, "3,a,,2", "4,a,,3"], [3, 2, 0, 3, 0]),
+    ):
+        log = write(tmp_path / f"{name}.csv", rows)
+        netkf.import_log(log, "csv", tmp_path / name)
+        accounts = table(tmp_path / name, "accounts.csv").set_index("receiver")
+        assert accounts.loc["b", ["sent", "heard", "lost", "unknown"]].tolist() == (
+            [5, 3, 0, 2] if name == "rx" else [5, 3, 2, 0]
+        )
+        assert accounts.loc["c", ["heard", "lost", "unknown"]].tolist() == (
+            expected[1:2] + ([1, 2] if name == "rx" else [3, 0])
+        )
+    netkf.import_log(tmp_path / "rx.csv", "csv", tmp_path / "lost", unreported="lost")
+    assert table(tmp_path / "lost", "accounts.csv")["unknown"].sum() == 0
+
+
+def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
+    told = ["t_ms,src,dst,seq,ok", "1000,1,2,0,yes", "1000,1,3,0,no", "2000,1,2,1,", "2000,1,3,1,1"]
+    log = write(tmp_path / "told.csv", [*told, "2000,1,3,1,1"])
+    netkf.import_log(log, "csv", tmp_path / "told")
+    outcomes = table(tmp_path / "told", "outcomes.csv")
+    columns = ["receiver", "message", "delivered"]
+    assert sorted(outcomes[columns].to_numpy().tolist()) == [[2, 0, 1], [3, 0, 0], [3, 1, 1]]
+    assert table(tmp_path / "told", "accounts.csv")["unknown"].tolist() == [1, 0]
+    assert "merged: 1 row that repeat" in (tmp_path / "told" / "report.txt").read_text()
+    events = ["t,node,event,peer,seq", "1,1,tx,,0", "1.5,2,rx,1,0", "2,1,tx,,1", "2.5,3,rx,1,1"]
+    netkf.import_log(write(tmp_path / "e.csv", events), "csv", tmp_path / "events")
+    accounts = table(tmp_path / "events", "accounts.csv")
+    assert accounts[["sent", "heard", "lost"]].to_numpy().tolist() == [[2, 1, 1], [2, 1, 1]]
+    assert table(tmp_path / "events", "transmissions.csv")["t"].tolist() == [1.0, 2.0]
+    two = write(tmp_path / "two.csv", [*told, "1000,1,2,0,0"])
+    assert main(["import", str(two), "--kind", "csv", "--out", str(tmp_path / "no")]) == 2
+    error = capsys.readouterr().err
+    assert "two.csv line 2 and two.csv line 6: one says heard and one says lost" in error
+    assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (["t,src,dst", "1,1,2", "1,2"], r"line 3 must have 3 entries"),
+        (["t,src,dst", "1,1,2", "x,1,2"], r"line 3: t must be a number or an ISO 8601 time"),
+        (["t,src,dst,seq", "1,1,2,1.5"], r"line 2: number must be an integer"),
+        (["t,src,dst,seq", "1,1,2,x"], r"line 2: seq must be a number"),
+        (["t,src,dst,ok", "1,1,2,maybe"], r"line 2: ok must say 1 or 0"),
+        (["t,dst", "1,2"], r"must have a column sender"),
+        (["t,src,dst", "1,2,2"], r"line 2: sender and receiver must differ"),
+        (["t,src,dst", "1,,2"], r"line 2: must name a sender"),
+        (["t,src,dst"], r"has no rows"),
+        (["t,src,dst,t_rx", "2,1,2,1"], r"line 2: is heard before it is sent"),
+    ],
+)
+def test_a_bad_log_is_refused_with_its_line(tmp_path, rows, message):
+    log = write(tmp_path / "log.csv", rows)
+    with pytest.raises(ScenarioError, match=message):
+        netkf.import_log(log, "csv", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_silent_receiver_has_a_hole_if_others_hear(tmp_path):
+    """Nodes 0, 1, 2 hear all of 400 packets of 3 and 4, but for a stretch of node 2, of all, and of
+    one sender at node 1.
+    """
+    rows = ["t,src,dst,seq"]
+    for k in range(200):
+        for sender in (3, 4):
+            rows += [f"{k},{sender},,{k}"]
+            for receiver in range(3):
+                silent = receiver == 2 and 50 <= k < 80
+                silent |= 100 <= k < 130 or (receiver == 1 and sender == 3 and 150 <= k < 190)
+                if not silent:
+                    rows.append(f"{k}.5,{sender},{receiver},{k}")
+    netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    accounts = table(tmp_path / "out", "accounts.csv").set_index(["sender", "receiver"])
+    assert accounts.loc[(3, 2)].tolist() == [200, 140, 30, 30]
+    assert accounts.loc[(3, 1)].tolist() == [200, 130, 70, 0]
+    assert "2 reports nothing from 51 to 80 s" in (tmp_path / "out" / "report.txt").read_text()
+
+
+@pytest.mark.parametrize("modulus", [16, 256, 65536])
+@pytest.mark.parametrize("delivery", [1.0, 0.5])
+def test_counters_grow_on_through_wraps_holes_and_late_rows(modulus, delivery):
+    random = np.random.default_rng(modulus)
+    true = 65_000 + np.flatnonzero(random.random(3000) < delivery)
+    true = true[(true < 65_900) | (true > 65_960)]
+    times = true + random.uniform(0.0, 0.4, len(true))
+    times[5], times[6] = times[6], times[5]
+    order = np.argsort(times)
+    counters, wraps, found, restarts = unwrap((true % modulus)[order], times[order])
+    assert (found, restarts) == (modulus, 0)
+    if modulus > 16 * 4:  # a hole of sixty hides whole turns of 16
+        assert (np.diff(counters) == np.diff(true[order])).all()
+        assert wraps == true[-1] // modulus - true[0] // modulus
+
+
+def test_counters_begin_again():
+    numbers = np.array([*range(40, 70), *range(30), *range(5)])
+    counters, wraps, _, restarts = unwrap(numbers, np.arange(len(numbers), dtype=float))
+    assert (wraps, restarts) == (0, 2)
+    assert (np.diff(counters) == 1).all()
+
+
+def test_mercator(tmp_path):
+    log = write(tmp_path / "raw.csv", MERCATOR.splitlines())
+    _, notes = netkf.import_log(log, "mercator", tmp_path / "out")
+    text = "\n".join(notes)
+    for note in (
+        "dropped: 1 row of no packet of the experiment",
+        "dropped: 1 row with a wrong crc",
+        "merged: 1 row that repeat a packet",
+        "not known: 2 bursts that numbers tell of",
+        "outcomes: 12 = 3 heard + 9 lost + 0 unknown",
+    ):
+        assert note in text
+    outcomes = table(tmp_path / "out", "outcomes.csv")
+    heard = outcomes[outcomes["delivered"] == 1]
+    columns = ["receiver", "message", "channel", "rssi"]
+    assert heard[columns].to_numpy().tolist() == [
+        *(["22-22", 0, 11, -75.0], ["33-33", 2, 11, -85.0], ["22-22", 4, 12, -65.0]),
+    ]
+    times = table(tmp_path / "out", "transmissions.csv")["t"].to_numpy()
+    np.testing.assert_allclose(np.diff(times), [0.1, 0.1, times[3] - times[2], 0.1, 0.1])
+    stamps = np.array([1, 1, 7]) - 0.0  # the log begins a second after the origin
+    received = times[[0, 2, 4]]
+    assert ((stamps <= received) & (received < stamps + 1)).all()
+
+
+def test_ulb_counts_missing_reports_as_unknown(tmp_path):
+    log = tmp_path / "log"
+    log.mkdir()
+    rows = [f"{60 * m + 10 + i},{i},20.5,50" for m in range(3) for i in (1, 2, 3)]
+    write(log / "readings.csv", ["t_s,node,temperature_c,humidity_pct", *rows])
+    # Reports of minutes 0, 1, 2 by 2; of 0 and 2 by 3, which hears 1 in minute 0 only.
+    reports = [*("60.5,2,1,99", "120.5,2,1,99", "180.5,2,1,90", "60.7,3,1,80"), "180.7,3,2,70"]
+    write(log / "heard.csv", ["t_s,receiver,sender,lqi", *reports, "180.9,3,2,70"])
+    netkf.import_log(log, "ulb", tmp_path / "out")
+    accounts = table(tmp_path / "out", "accounts.csv").set_index(["sender", "receiver"])
+    assert accounts.loc[(1, 2)].tolist() == [3, 3, 0, 0]
+    assert accounts.loc[(1, 3)].tolist() == [3, 1, 1, 1]
+    assert accounts.loc[(2, 3)].tolist() == [3, 1, 1, 1]
+    run = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"), engine="simpy")
+    assert not run.truth_known
+
+
+PROBES = 5  # samples of a run
+RUNS = {
+    "poisson_ring": {"horizon": 2.0},
+    "delayed_links": {"horizon": 4.0},
+    "gossip_ring": {"horizon": 20.0},
+    "diffusion_regression": {"horizon": 10.0},
+    "intermittent_random10": {"horizon": 10.0},
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_run_written_as_a_log_comes_back_to_the_bit(name, tmp_path):
+    """Events and states, in slots and under clocks of links, nodes, directions and readings, with
+    delays and messages under way at the end.
+    """
+    scenario = netkf.load(
+        SCENARIOS / f"{name}.toml", {**RUNS[name], "probe": RUNS[name]["horizon"] / PROBES}
+    )
+    run = netkf.simulate(scenario, replica=2, engine="simpy")
+    netkf.export_log(run, tmp_path / "log")
+    netkf.import_log(tmp_path / "log", "csv", tmp_path / "out")
+    again = netkf.load(tmp_path / "out" / "scenario.toml")
+    replay = netkf.simulate(again, replica=2, engine="simpy")
+    assert netkf.first_difference(run, replay) is None
+    last = -1 if name == "diffusion_regression" else None
+    np.testing.assert_array_equal(run.xhat[:last], replay.xhat[:last])
+    np.testing.assert_array_equal(run.P[:last], replay.P[:last])
+    accounts = table(tmp_path / "out", "accounts.csv")
+    assert (accounts["sent"] == accounts["heard"] + accounts["lost"]).all()
+
+
+SENSORS = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}]
+
+
+def test_a_log_may_take_the_plant_of_a_scenario(tmp_path):
+    log, _ = made(tmp_path, 50)
+    changes = {"network.graph": {"kind": "complete", "nodes": 3}, "sensors": SENSORS}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", changes)
+    run = netkf.simulate(scenario.replace({"horizon": 1.0}), engine="simpy")
+    netkf.save(run, scenario, tmp_path / "run")
+    like = tmp_path / "run" / "scenario.toml"
+    out = tmp_path / "out"
+    netkf.import_log(log, "csv", out, like=like)
+    scenario = netkf.load(out / "scenario.toml")
+    assert scenario.plant.n == 2
+    assert scenario.network.activation.at == "nodes"
+
+
+def test_the_origin_and_decimals_of_stamps_are_kept(tmp_path):
+    rows = ["time,src,dst,seq", "2020-01-01T00:00:00.250Z,x y,b,0", "2020-01-01T00:00:01.5,x y,b,1"]
+    _, notes = netkf.import_log(write(tmp_path / "a.csv", rows), "csv", tmp_path / "out")
+    assert f"origin: simulated 0 is {Decimal(1577836800)} in the log" in notes
+    assert "used: nodes have other names here: x y is x_y" in notes
+    sent = table(tmp_path / "out", "transmissions.csv")
+    assert sent.to_numpy().tolist() == [[0.25, "x_y"], [1.5, "x_y"]]
+
+
+def test_a_run_directory_is_exported(tmp_path, capsys):
+    scenario = SCENARIOS / "poisson_ring.toml"
+    arguments = ["run", str(scenario), "--no-plot", "--set", "horizon=1.0", "--engine", "simpy"]
+    assert main([*arguments, "--out", str(tmp_path / "run")]) == 0
+    export = ["export", str(tmp_path / "run"), "--to", "log", "--out", str(tmp_path / "log")]
+    assert main(export) == 0
+    assert {p.name for p in (tmp_path / "log").iterdir()} == {
+        *("packets.csv", "ticks.csv", "scenario.toml"),
+    }
+    assert main(export) == 2
+    assert "must be a new or empty folder" in capsys.readouterr().err
