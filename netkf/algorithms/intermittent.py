@@ -24,7 +24,13 @@ from netkf.algorithms.kernels.estimates import update_by_row
 from netkf.algorithms.kernels.information import clear_part
 from netkf.algorithms.kernels.intersection import merge_lanes
 from netkf.algorithms.kernels.neighbours import use_readings_heard
-from netkf.algorithms.kernels.run import copy_estimate, predict_estimate, shift_vector, use_reading
+from netkf.algorithms.kernels.run import (
+    copy_estimate,
+    emit_nothing,
+    predict_estimate,
+    shift_vector,
+    use_reading,
+)
 from netkf.algorithms.models import SlotModel
 from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
@@ -36,11 +42,6 @@ SLACK = 1.0 + 1e-6
 """Factor by which the past that is remembered is longer than needed, since ages are rounded."""
 MOVE = -1
 """In place of a number of rows: the event is a move of the origin."""
-
-
-@kernel
-def send_reading(record: Any, h: int, m: int, run: Any) -> None:
-    """Do nothing: the reading of this instant goes with the message."""
 
 
 @kernel
@@ -305,7 +306,7 @@ class Intermittent(Filter):
     )
     needs = Needs(one_way=True, samples=True)
     kernels = Kernels(
-        emit=send_reading,
+        emit=emit_nothing,
         absorb=use_readings_heard,
         shift_payload=keep_payload,
         sends_readings=True,

@@ -14,6 +14,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.gains import stack_gains
 from netkf.algorithms.kernels.maps import SingleMapRun
+from netkf.algorithms.kernels.nonlinear_rows import no_nonlinear
 from netkf.algorithms.kernels.pairs import no_pairs
 from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.root_flow import stack_tables
@@ -198,6 +199,7 @@ class Surroundings:
             sends=np.ones(1, dtype=np.uint8),
             uniform=np.zeros(1),
             pairs=no_pairs() if self._pairs is None else self._pairs.none(),
+            nonlinear=no_nonlinear(),
             reading=OWN,
             first_y=0,
             first_H=0,

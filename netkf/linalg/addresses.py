@@ -12,6 +12,8 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
+import numpy as np
+
 from netkf.linalg.functions import plain_address, plain_functions
 from netkf.linalg.plain import is_plain
 from netkf.linalg.structs import Struct
@@ -37,13 +39,25 @@ class AnyStruct(Struct):
     unknown: int
 
 
+AnyStruct.struct_kinds, AnyStruct.struct_offsets = {"unknown": np.int64}, {"unknown": 0}
+
+
 def any_struct(struct: Struct) -> Any:
     """Return a struct as an AnyStruct."""
+    return struct if is_plain() else AnyStruct.at(struct)
+
+
+def seen_as(cls: type[Struct], struct: Struct, **kinds: Any) -> Any:
+    """Return a struct as one of ``cls``, whose fields it has too, at the same places; some may have
+    other ``kinds`` than its own.
+    """
     if is_plain():
         return struct
-    if not AnyStruct.struct_kinds:
-        AnyStruct(unknown=0)
-    return AnyStruct.at(struct)
+    if not cls.struct_kinds:
+        own = {name: struct.struct_kinds[name] for name in cls.struct_fields}
+        cls.struct_offsets = {name: struct.struct_offsets[name] for name in cls.struct_fields}
+        cls.struct_kinds = own | kinds
+    return cls.at(struct)
 
 
 def reads_only(cls: type[Struct], *kernels: Any) -> None:
@@ -55,13 +69,11 @@ def reads_only(cls: type[Struct], *kernels: Any) -> None:
 
 def _first_fields(kernel: Any, record: Struct) -> Any:
     cls = _classes_read.get(kernel)
-    if cls is None:
+    if cls is None or is_plain():
         return record
-    if not cls.struct_kinds:
-        cls(**{name: getattr(record, name) for name in cls.struct_fields})
-    offsets = record.struct_offsets
+    seen, offsets = seen_as(cls, record), record.struct_offsets
     alike = all(offsets.get(name) == word for name, word in cls.struct_offsets.items())
-    return cls.at(record) if alike else record
+    return seen if alike else record
 
 
 def address_of(
@@ -70,7 +82,7 @@ def address_of(
     """Return the address of ``kernel(record, *integers, run)`` with ``count`` integers, compiled
     for structs of these classes; it returns a float if it is of a ``number``, else nothing.
     """
-    known = record if is_plain() else _first_fields(kernel, record)
+    known = _first_fields(kernel, record)
     key = kernel, type(known), type(run)
     if key not in _addresses:
         arguments = known, *[0] * count, run

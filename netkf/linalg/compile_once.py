@@ -10,7 +10,7 @@ import hashlib
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,13 @@ class SharedCache:
     of the cache that it wraps.
     """
 
-    def __init__(self, cache: Any, name: str) -> None:
-        """Wrap a ``cache`` of the function ``name``, which names its lock files."""
-        self._cache, self._name = cache, name
+    def __init__(
+        self, cache: Any, name: str, on_missing: Callable[[], None] = lambda: None
+    ) -> None:
+        """Wrap a ``cache`` of the function ``name``, which names its lock files; ``on_missing`` is
+        called before code that it lacks is compiled.
+        """
+        self._cache, self._name, self._on_missing = cache, name, on_missing
         self._waiting = ExitStack()
 
     def __getattr__(self, name: str) -> Any:
@@ -48,6 +52,7 @@ class SharedCache:
         code = self._cache.load_overload(sig, target_context)
         if code is not None:
             return code
+        self._on_missing()
         # A lock for each signature: processes that need another signature do not wait.
         signature = hashlib.sha256(str(sig).encode()).hexdigest()[:16]
         self._waiting.enter_context(self._locked(f"{self._name}-{signature}.lock"))

@@ -56,7 +56,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # Kernels are not called from C: the wrapper would be a seventh of the compiled code.
 PRIVATE_OPTIONS = ("no_cfunc_wrapper", "_nrt")
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-_announced: set[Callable[..., Any]] = set()
+_announcing = [False]
+"""Whether the next kernel that is compiled is announced."""
 _compile_times: list[float] = []
 _folders_of_process: set[Path] = set()
 
@@ -262,7 +263,7 @@ def _compile_well(function: Any, method: str, loops: Callable[..., Any]) -> None
     # Not numba's own cache, which executes what it finds, and whose files are known by the file of
     # the function alone, while callees may change. Of several processes one compiles.
     files = CodeFiles(loops, _cache_folder(config.CACHE_DIR))
-    shared = function._cache = SharedCache(files, loops.__name__)
+    shared = function._cache = SharedCache(files, loops.__name__, _say_that_it_compiles)
 
     def compile_linked(*args: Any, **kwargs: Any) -> Any:
         try:
@@ -303,19 +304,21 @@ def seconds_spent() -> float:
     return sum(_compile_times)
 
 
-def announce(function: Callable[..., Any]) -> None:
-    """Print a note to stderr, once per function and process, if the code of a function is not on
-    disk yet, before a call that takes seconds to compile it.
+def announce() -> None:
+    """Print a note to stderr before the next kernel whose code is not on disk yet is compiled: it,
+    and those that follow, take seconds.
     """
-    if function in _announced:
-        return
-    _announced.add(function)
-    folder = _cache_folder(os.environ.get("NUMBA_CACHE_DIR", ""))
-    if not any(folder.rglob(f"*.{function.__name__}-*.nbi")):
+    _announcing[0] = True
+
+
+def _say_that_it_compiles() -> None:
+    if _announcing[0]:
+        folder = _cache_folder(os.environ.get("NUMBA_CACHE_DIR", ""))
         when = "once for each kind of filter"
         if not _folders_of_process.isdisjoint((folder, folder.parent)):
             when = "in each process: NUMBA_CACHE_DIR names no folder that only you can write"
-        print(f"netkf: compiling (5 to 15 s), {when} ...", file=sys.stderr, flush=True)
+        print(f"netkf: compiling (up to 15 s), {when} ...", file=sys.stderr, flush=True)
+    _announcing[0] = False
 
 
 def source_digest(*rooms: str) -> str:

@@ -8,11 +8,14 @@ the node begins with ``linearise_rows``, which writes the whitened linear readin
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.kernels.maps import set_point
+from netkf.algorithms.kernels.run import Estimates
+from netkf.linalg.addresses import reads_only
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.functions import call_function
@@ -214,10 +217,11 @@ def move_state(rows: NonlinearRows, x: FloatArray, k: int, q: int, s: int, h: in
 
 
 @kernel
-def linearise_rows(rows: NonlinearRows, record: Any, h: int, run: Any, s: int) -> None:
+def linearise_rows(record: Any, h: int, s: int, run: Any) -> None:
     """Replace the nonlinear rows of the reading of filter ``h`` in slot number ``s`` of the plan by
     whitened linear ones.
     """
+    rows = run.nonlinear
     n, p, r = len(run.size), rows.kind.shape[1], run.first_y + h
     for q in range(rows.active):
         own = min(h, len(rows.count) - 1)
@@ -317,9 +321,13 @@ def _whiten(rows: NonlinearRows, h: int) -> None:
                 C[i, j] -= C[i, k] * C[j, k]
 
 
-@kernel
-def no_rows(rows: Any, record: Any, h: int, run: Any, s: int) -> None:
-    """Do nothing where all rows are linear."""
+reads_only(Estimates, linearise_rows)
+
+
+@cache
+def no_nonlinear() -> NonlinearRows:
+    """Return no rows, where all readings are linear."""
+    return linear_rows(0, 1, np.zeros((0, 1), dtype=np.int64))
 
 
 @kernel

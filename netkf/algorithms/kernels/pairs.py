@@ -16,7 +16,7 @@ from netkf.algorithms.kernels.nonlinear_rows import (
     LINEAR,
     NonlinearRows,
     differentiate_rows,
-    linear_rows,
+    no_nonlinear,
     read_rows,
     subtract_rows,
 )
@@ -69,7 +69,7 @@ def pairs_of(rows: NonlinearRows, own: int, first: IntArray) -> Pairs:
 @cache
 def no_pairs() -> Pairs:
     """Return no pairs, for filters that know no blocks."""
-    return pairs_of(linear_rows(0, 1, np.zeros((0, 1), dtype=np.int64)), 0, np.zeros(1, dtype=int))
+    return pairs_of(no_nonlinear(), 0, np.zeros(1, dtype=int))
 
 
 @kernel

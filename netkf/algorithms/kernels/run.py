@@ -81,6 +81,7 @@ class SlotRun(Struct):
     sends : (L,), 1 on entry of ``emit``; it writes 0 where the node sends nothing
     uniform : (L,), uniform numbers for ``emit`` of a randomised filter
     pairs : those of readings that are also about blocks which their node does not estimate
+    nonlinear : NonlinearRows of the readings, where they are not linear
     offset : (n, L), by which ``shift`` moves estimates
     gap, slot, phase, step : seconds of a prediction, numbers of slot, exchange and repetition
     now : under clocks the end of the prediction, or the time to which messages are predicted
@@ -116,6 +117,7 @@ class SlotRun(Struct):
     whitened: FloatArray
     total: FloatArray
     pairs: Any
+    nonlinear: Any
     reading: int
     first_y: int
     first_H: int
@@ -505,6 +507,11 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     """Write the estimate of node ``h`` into payload ``m``."""
     payload = record.payload
     copy_estimate(run, payload.xhat, payload.root, m, record.xhat, record.root, h, True)
+
+
+@kernel
+def emit_nothing(record: Any, h: int, m: int, run: Any) -> None:
+    """Do nothing: the message is empty, or the reading of this instant that goes with it."""
 
 
 @kernel

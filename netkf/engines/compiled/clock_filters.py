@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.nonlinear_rows import linear_rows
+from netkf.algorithms.kernels.nonlinear_rows import linear_rows, no_nonlinear
 from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
 from netkf.algorithms.kernels.run import (
     ALL,
@@ -95,6 +95,7 @@ class ClockFilters:
             **self._inbox(messages),
             sends=np.ones(1, dtype=np.uint8),
             uniform=np.zeros(1),
+            nonlinear=no_nonlinear(),
             reading=0,
             first_y=0,
             first_H=0,

@@ -13,12 +13,9 @@ import numpy as np
 from netkf.algorithms.filter import compiled_kernels
 from netkf.core.fields import Component
 from netkf.engines.base import Engine, Progress
-from netkf.engines.compiled.agenda import is_immediate, simulate_agenda
 from netkf.engines.compiled.batches import flow_batches, quick_runs
-from netkf.engines.compiled.clock_loop import clock_loop
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace
 from netkf.engines.compiled.own_sensors import is_own, reads_in_python
-from netkf.engines.compiled.slot_loop import slot_loop
 from netkf.engines.compiled.slot_pairs import blocks_refusal
 from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
@@ -88,14 +85,8 @@ class CompiledEngine(Engine):
         """Say on stderr that code is compiled, unless it is cached from an earlier run."""
         if is_plain():
             announce_plain()
-            return
-        kernels = compiled_kernels(scenario.node_filter, not scenario.slotted)
-        assert kernels is not None
-        if scenario.slotted:
-            linear = all(sensor.linear for sensor in scenario.sensors)
-            compiling.announce(slot_loop(kernels, linear, slot_setup(scenario).own_models))
         else:
-            compiling.announce(simulate_agenda if is_immediate(scenario) else clock_loop)
+            compiling.announce()
 
     def run(
         self, scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress

@@ -1,17 +1,20 @@
-"""Filters in slots as records: what the composed loop needs, made once for R runs."""
+"""Filters in slots as records: what the loop needs, made once for R runs."""
 
 from __future__ import annotations
 
 import bisect
 import itertools
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from netkf.algorithms.kernels.maps import MapRun
+from netkf.algorithms.kernels.nonlinear_rows import no_nonlinear
 from netkf.algorithms.kernels.pairs import Pairs, no_pairs
 from netkf.algorithms.kernels.run import (
     ALL,
+    Estimates,
     SlotRun,
     SlotTables,
     opposite_links,
@@ -26,9 +29,13 @@ from netkf.engines.compiled.slot_loop import (
     SENSE,
     SlotPlan,
     SlotSamples,
+    SlotVerbs,
+    any_slot_run,
     slot_loop,
+    slot_verbs,
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
+from netkf.linalg.addresses import NOTHING, address_of, call_kernel, seen_as
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import LANES, MANY, aligned
 
@@ -51,7 +58,6 @@ class SlotFilters:
         ``active`` lanes of a block have runs; ``pairs`` are readings of these, where there are any.
         """
         self._setup, self._kernels = setup, kernels
-        self._rows: Any = None
         H, W, n = setup.estimators, len(setup.links.sender), setup.width
         means = setup.xhat if with_means else np.zeros(setup.xhat.shape)
         self.records = make_records(
@@ -72,12 +78,19 @@ class SlotFilters:
         self._memories = np.array(memories, dtype=np.int64).reshape(-1, words)
         # L entries are copied at a time, so that the last copy may go beyond the last entry.
         for_means, for_roots = H * n + LANES, H * n * n + LANES
-        self.sample_scratch: tuple[FloatArray, FloatArray, FloatArray] = (
-            aligned((for_means, LANES)),
-            aligned((for_means, LANES)),
-            aligned((for_roots, LANES)),
-        )
+        self.sample_scratch = {
+            "sampled_xhat": aligned((for_means, LANES)),
+            "sampled_error": aligned((for_means, LANES)),
+            "sampled_P": aligned((for_roots, LANES)),
+            "runs": np.zeros(LANES, dtype=np.int64),
+        }
         self._lay_out_stages()
+
+    @cached_property
+    def _verbs(self) -> SlotVerbs:
+        """The verbs that a run needs."""
+        talks, linear = EXCHANGE in self._stages, len(self._run.nonlinear.kind) == 0
+        return slot_verbs(self._kernels, self.records.struct, self._run, talks, linear)
 
     def _models_of(self, active: int) -> list[Any]:
         """Return the models of all nodes, or the one that they share."""
@@ -118,6 +131,7 @@ class SlotFilters:
             sends=aligned((LANES,), np.uint8),
             uniform=aligned((LANES,)),
             pairs=pairs,
+            nonlinear=no_nonlinear(),
             reading=0,
             first_y=0,
             first_H=0,
@@ -147,11 +161,11 @@ class SlotFilters:
     def observe(self) -> None:
         """Write into the record of each node of the first block what exchanges conserve, now."""
         for h in range(self._setup.estimators):
-            self._kernels.observe(self.records.struct, h, self._run)
+            call_kernel(self._kernels.observe, self.records.struct, h, run=self._run)
 
     def set_rows(self, rows: Any) -> None:
         """Let readings have nonlinear rows, ``nonlinear_rows.NonlinearRows``."""
-        self._rows = rows
+        self._run.nonlinear = rows
 
     def simulate(self, y: FloatArray, H: FloatArray, samples: SlotSamples, **drawn: Any) -> None:
         """Simulate the slots of a plan, ``drawn`` by name, with whitened readings ``y`` and H."""
@@ -170,8 +184,9 @@ class SlotFilters:
             **drawn,
         )
         setup, record, count = self._setup, self.records.struct, len(plan.sensed)
-        rows: Any = 0 if self._rows is None else self._rows
-        loop = slot_loop(self._kernels, self._rows is None, len(self._memories) > 0)
+        verbs, run = self._verbs, any_slot_run(self._run)
+        if verbs.shift == NOTHING and plan.rebased.any():
+            verbs.shift = address_of(self._kernels.shift, record, self._run)
         step = 1 if self._kernels.slotwise else max(1, count)
         assert setup.algorithm.kernels is not None
         prepare = setup.algorithm.kernels.prepare
@@ -184,8 +199,9 @@ class SlotFilters:
                     model.F[:], model.root_Q[:] = tables
             models = setup.model_pieces[piece]
             prepare(setup.algorithm, record, setup.infos, models, first, end - start)
-            part = plan._replace(start=start, end=end)
-            loop(record, self.records.memories, self._run, part, samples, rows)
+            plan.start, plan.end = start, end
+            seen = seen_as(Estimates, record)
+            slot_loop(seen, self.records.memories, run, plan, samples, verbs)
         for believed in setup.models if isinstance(setup.models[0], MapModel) else ():
             believed.raise_error()
         if setup.nonlinear is not None:

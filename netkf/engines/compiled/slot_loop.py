@@ -1,20 +1,21 @@
-"""The one loop of all filters in slots: stages of a slot, composed of the verbs of a filter.
+"""The one loop of all filters in slots, which calls the verbs of a filter by address.
 
-``slot_loop`` makes it for a filter's kernels. It simulates S slots of B blocks of L runs in one
-call; what is drawn for them is in a :class:`SlotPlan`.
+It simulates S slots of B blocks of L runs in one call; what is drawn for them is in a
+:class:`SlotPlan`.
 """
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.kernels.nonlinear_rows import linearise_rows, no_rows
+from netkf.algorithms.kernels import run as standard
+from netkf.algorithms.kernels.nonlinear_rows import linearise_rows
 from netkf.algorithms.kernels.run import SlotRun
 from netkf.algorithms.records import Kernels
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.addresses import NOTHING, AnyStruct, address_of, call_at, call_at_two, seen_as
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import struct_like
 from netkf.linalg.lanes import (
@@ -27,13 +28,14 @@ from netkf.linalg.lanes import (
     store,
     store_flags,
 )
+from netkf.linalg.structs import Struct
 
 PREDICT, SENSE, EXCHANGE = range(3)
 WHOLE = -1
 """A call begins with a slot, and ends with one."""
 
 
-class SlotPlan(NamedTuple):
+class SlotPlan(Struct):
     """What happens in S slots of B blocks of L runs, with E steps of the exchanges in each slot, W
     directed links and H filters.
 
@@ -57,27 +59,27 @@ class SlotPlan(NamedTuple):
     """
 
     first: int
-    stages: np.ndarray
-    phases: np.ndarray
-    steps: np.ndarray
-    predicts: bool
+    stages: IntArray
+    phases: IntArray
+    steps: IntArray
+    predicts: int
     sensed: np.ndarray
     exchanged: np.ndarray
-    sample: np.ndarray
+    sample: IntArray
     rebased: np.ndarray
     up: np.ndarray
-    direction: np.ndarray
+    direction: IntArray
     sent: np.ndarray
     uniform: FloatArray
-    varies: bool
-    models: np.ndarray
+    varies: int
+    models: IntArray
     begin: int
     stop: int
     start: int
     end: int
 
 
-class SlotSamples(NamedTuple):
+class SlotSamples(Struct):
     """T samples of R runs that the loop writes, and the true states of S slots that they need.
 
     x, xhat, P : (R, T, n), (R, T, H w) and (R, T, H w w) in the coordinates of the plant, with all
@@ -99,7 +101,7 @@ class SlotSamples(NamedTuple):
     error: FloatArray
     absolute: FloatArray
     local: FloatArray
-    framed: bool
+    framed: int
     total: FloatArray
     sampled_xhat: FloatArray
     sampled_error: FloatArray
@@ -108,127 +110,168 @@ class SlotSamples(NamedTuple):
     entries: np.ndarray
 
 
-def exchange_of(kernels: Kernels, choose: Any) -> Any:
-    """Return the kernel of one step of an exchange, composed of ``emit`` and ``absorb``."""
-    emit, absorb, decides = kernels.emit, kernels.absorb, kernels.decides
-    addressed = kernels.addressed
+class SlotVerbs(Struct):
+    """Addresses of a filter's verbs, and what ``records.Kernels`` says of them as 0 or 1.
 
-    @kernel
-    def exchange(record: Any, run: SlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
-        nodes, lanes = len(record.xhat), run.lanes
-        if e != plan.begin:
-            # All messages are made before any arrives.
-            for h in range(nodes):
-                if decides:
-                    store_flags(lanes, run.sends, load_flags(lanes, plan.sent, b, s, e, h))
-                    if plan.uniform.shape[0] > 0:
-                        store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
-                run.reading = h
-                choose(run, plan, h)
-                emit(record, h, h + run.first[h] if addressed else h, run)
-                if decides:
-                    store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
-            if decides:
-                drop_silent(run, plan, b, s, e)
-        if e != plan.stop:
-            for h in range(nodes):
-                run.reading = h
-                choose(run, plan, h)
-                fill_inbox(run, plan, b, s, e, h, addressed)
-                absorb(record, h, run)
-
-    return exchange
-
-
-@cache
-def slot_loop(kernels: Kernels, linear: bool = True, own_models: bool = False) -> Any:
-    """Return the loop of slots for a filter's kernels, ``loop(record, memories, run, plan, samples,
-    rows)``: ``memories`` (B, words) hold the record of each block, ``record`` is the first; unless
-    sensors are all ``linear``, ``rows`` are NonlinearRows. ``own_models``: each filter has its own.
+    linearise : of ``linearise_rows``, where readings are not linear
     """
-    choose = choose_model if own_models else keep_model
-    linearise = no_rows if linear else linearise_rows
-    predict, update = kernels.predict, kernels.update
-    shift, observe = kernels.shift, kernels.observe
-    exchange = exchange_of(kernels, choose)
 
-    @kernel
-    def simulate_slot(record: Any, run: SlotRun, plan: SlotPlan, rows: Any, b: int, s: int) -> None:
-        nodes, e, begun = len(record.xhat), 0, plan.begin == WHOLE
-        for g in range(len(plan.stages)):
-            stage = plan.stages[g]
-            if stage == EXCHANGE:
-                run.phase = plan.phases[g]
-                for step in range(plan.steps[g]):
-                    begun |= e == plan.begin
-                    if plan.exchanged[s] and begun:
-                        run.step = step
-                        exchange(record, run, plan, b, s, e)
-                        if e == plan.stop:
-                            return
-                    e += 1
-            elif plan.sensed[s] and begun:
-                for h in range(nodes):
-                    choose(run, plan, h)
-                    if stage == PREDICT:
-                        predict(record, h, run)
-                    else:
-                        run.reading = h
-                        linearise(rows, record, h, run, s)
-                        update(record, h, run)
+    predict: int
+    update: int
+    emit: int
+    absorb: int
+    observe: int
+    shift: int
+    linearise: int
+    decides: int
+    addressed: int
 
-    @kernel
-    def sample_slot(
-        record: Any, run: SlotRun, plan: SlotPlan, samples: SlotSamples, b: int, s: int
-    ) -> None:
-        if plan.sample[s] >= 0:
+
+class AnySlotRun(Struct):
+    """A SlotRun, or what stands for one, whatever its size and its model."""
+
+    __annotations__ = SlotRun.__annotations__
+
+
+def any_slot_run(run: Struct) -> Any:
+    """Return a SlotRun, or what stands for one, as the loop takes it."""
+    return seen_as(AnySlotRun, run, size=(np.dtype(np.float64), 1), model=AnyStruct)
+
+
+def slot_verbs(kernels: Kernels, record: Any, run: Any, talks: bool, linear: bool) -> SlotVerbs:
+    """Return the verbs of a filter for its record and its run: whether nodes send messages, and all
+    readings are ``linear``. ``shift`` comes when the origin moves.
+    """
+    observes = kernels.observe is not standard.observe
+    writes = talks and kernels.emit is not standard.emit_nothing
+    return SlotVerbs(
+        predict=address_of(kernels.predict, record, run),
+        update=address_of(kernels.update, record, run),
+        emit=address_of(kernels.emit, record, run, 2) if writes else NOTHING,
+        absorb=address_of(kernels.absorb, record, run) if talks else NOTHING,
+        observe=address_of(kernels.observe, record, run) if observes else NOTHING,
+        shift=NOTHING,
+        linearise=NOTHING if linear else address_of(linearise_rows, record, any_slot_run(run), 2),
+        decides=kernels.decides,
+        addressed=kernels.addressed,
+    )
+
+
+@kernel
+def slot_loop(
+    record: Any,
+    memories: np.ndarray,
+    run: AnySlotRun,
+    plan: SlotPlan,
+    samples: SlotSamples,
+    verbs: SlotVerbs,
+) -> None:
+    """Simulate the slots of a ``plan``: ``memories`` (B, words) hold the record of each block, of
+    which ``record`` is the first.
+    """
+    nodes, slots = len(record.xhat), plan.up.shape[1]
+    for b in range(len(memories)):
+        block = struct_like(record, memories[b])
+        for s in range(plan.start, plan.end):
+            run.slot, run.pairs.slot = plan.first + s, s
+            run.first_y = (b * slots + s) * nodes
+            run.first_H = run.first_y if plan.varies == 1 else 0
+            if plan.predicts == 1 and plan.begin == WHOLE:
+                sample_slot(block, run, plan, samples, verbs, b, s)
+            simulate_slot(block, run, plan, verbs, b, s)
+            if plan.predicts == 0 and plan.stop == WHOLE:
+                sample_slot(block, run, plan, samples, verbs, b, s)
+
+
+@kernel
+def simulate_slot(
+    record: Any, run: AnySlotRun, plan: SlotPlan, verbs: SlotVerbs, b: int, s: int
+) -> None:
+    """Go through the stages of slot ``s`` of block ``b``."""
+    e, begun = 0, plan.begin == WHOLE
+    for g in range(len(plan.stages)):
+        if plan.stages[g] == EXCHANGE:
+            run.phase = plan.phases[g]
+            for step in range(plan.steps[g]):
+                begun |= e == plan.begin
+                if plan.exchanged[s] and begun:
+                    run.step = step
+                    exchange(record, run, plan, verbs, b, s, e)
+                    if e == plan.stop:
+                        return
+                e += 1
+        elif plan.sensed[s] and begun:
             for h in range(len(record.xhat)):
-                observe(record, h, run)
-            store_sample(record.xhat, record.root, run, plan, samples, b, s)
-        if plan.rebased[s]:
-            set_offset(run, samples, b, s)
-            for h in range(len(record.xhat)):
-                shift(record, h, run)
+                choose_model(run, plan, h)
+                if plan.stages[g] == PREDICT:
+                    call_at(verbs.predict, record, h, run)
+                else:
+                    run.reading = h
+                    if verbs.linearise != NOTHING:
+                        call_at_two(verbs.linearise, record, h, s, run)
+                    call_at(verbs.update, record, h, run)
 
-    @kernel
-    def loop(
-        record: Any,
-        memories: np.ndarray,
-        run: SlotRun,
-        plan: SlotPlan,
-        samples: SlotSamples,
-        rows: Any,
-    ) -> None:
-        nodes, slots = len(record.xhat), plan.up.shape[1]
-        for b in range(len(memories)):
-            block = struct_like(record, memories[b])
-            for s in range(plan.start, plan.end):
-                run.slot, run.pairs.slot = plan.first + s, s
-                run.first_y = (b * slots + s) * nodes
-                run.first_H = run.first_y if plan.varies else 0
-                if plan.predicts and plan.begin == WHOLE:
-                    sample_slot(block, run, plan, samples, b, s)
-                simulate_slot(block, run, plan, rows, b, s)
-                if not plan.predicts and plan.stop == WHOLE:
-                    sample_slot(block, run, plan, samples, b, s)
 
-    return loop
+@kernel
+def exchange(
+    record: Any, run: AnySlotRun, plan: SlotPlan, verbs: SlotVerbs, b: int, s: int, e: int
+) -> None:
+    """Let all nodes send and absorb in step ``e`` of the exchanges of slot ``s``."""
+    nodes, lanes, decides = len(record.xhat), run.lanes, verbs.decides == 1
+    if e != plan.begin and verbs.emit != NOTHING:
+        # All messages are made before any arrives.
+        for h in range(nodes):
+            if decides:
+                store_flags(lanes, run.sends, load_flags(lanes, plan.sent, b, s, e, h))
+                if plan.uniform.shape[0] > 0:
+                    store(lanes, run.uniform, load(lanes, plan.uniform, b, s, e, h))
+            run.reading = h
+            choose_model(run, plan, h)
+            m = h + run.first[h] if verbs.addressed == 1 else h
+            call_at_two(verbs.emit, record, h, m, run)
+            if decides:
+                store_flags(lanes, plan.sent, b, s, e, h, load_flags(lanes, run.sends))
+        if decides:
+            drop_silent(run, plan, b, s, e)
+    if e != plan.stop:
+        for h in range(nodes):
+            run.reading = h
+            choose_model(run, plan, h)
+            fill_inbox(run, plan, b, s, e, h, verbs.addressed == 1)
+            call_at(verbs.absorb, record, h, run)
+
+
+@kernel
+def sample_slot(
+    record: Any,
+    run: AnySlotRun,
+    plan: SlotPlan,
+    samples: SlotSamples,
+    verbs: SlotVerbs,
+    b: int,
+    s: int,
+) -> None:
+    """Take the sample of slot ``s``, if it has one, and move the origin, if it moves there."""
+    if plan.sample[s] >= 0:
+        for h in range(len(record.xhat) if verbs.observe != NOTHING else 0):
+            call_at(verbs.observe, record, h, run)
+        store_sample(record.xhat, record.root, run, plan, samples, b, s)
+    if plan.rebased[s]:
+        set_offset(run, samples, b, s)
+        for h in range(len(record.xhat)):
+            call_at(verbs.shift, record, h, run)
 
 
 @kernel(inlined=True)
-def choose_model(run: SlotRun, plan: SlotPlan, h: int) -> None:
-    """Make the model of filter ``h`` that of the run."""
-    run.model = struct_like(run.model, plan.models[h])
-
-
-@kernel(inlined=True)
-def keep_model(run: SlotRun, plan: SlotPlan, h: int) -> None:
-    """Do nothing: all filters have the model of the run."""
+def choose_model(run: AnySlotRun, plan: SlotPlan, h: int) -> None:
+    """Make the model of filter ``h`` that of the run, if it is not that of all."""
+    if len(plan.models) > 0:
+        run.model = struct_like(run.model, plan.models[h])
 
 
 @kernel
 def fill_inbox(
-    run: SlotRun, plan: SlotPlan, b: int, s: int, e: int, h: int, addressed: bool
+    run: AnySlotRun, plan: SlotPlan, b: int, s: int, e: int, h: int, addressed: bool
 ) -> None:
     """Write the messages that node ``h`` hears in step ``e`` of slot ``s`` into the inbox."""
     count, lanes = 0, run.lanes
@@ -250,7 +293,7 @@ def fill_inbox(
 
 
 @kernel
-def drop_silent(run: SlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
+def drop_silent(run: AnySlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
     """Set ``plan.up`` to 0 for the messages of nodes that send nothing in step ``e``."""
     for m in range(len(run.sender)):
         for q in range(plan.up.shape[4]):
@@ -259,7 +302,7 @@ def drop_silent(run: SlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None:
 
 
 @kernel
-def set_offset(run: SlotRun, samples: SlotSamples, b: int, s: int) -> None:
+def set_offset(run: AnySlotRun, samples: SlotSamples, b: int, s: int) -> None:
     """Make the true state of slot ``s`` the origin: write its negative into ``run.offset``."""
     for i in range(len(run.size)):
         store(run.lanes, run.offset, i, -load(run.lanes, samples.local, b, s, i))
@@ -269,45 +312,56 @@ def set_offset(run: SlotRun, samples: SlotSamples, b: int, s: int) -> None:
 def store_sample(
     xhat: FloatArray,
     root: FloatArray,
-    run: SlotRun,
+    run: AnySlotRun,
     plan: SlotPlan,
     samples: SlotSamples,
     b: int,
     s: int,
 ) -> None:
     """Write the sample of slot ``s`` of block ``b``: ``xhat`` (H, n, L), ``root`` (H, n, n, L)."""
-    k, lanes = plan.sample[s], run.lanes
-    n, first = len(run.size), b * len(lanes)
-    sum_of_all, states = load(lanes, samples.total, b), samples.absolute.shape[2]
+    k, lanes, entries = plan.sample[s], run.lanes, samples.entries
+    n, first, all_local, all_absolute = (
+        len(run.size),
+        b * len(lanes),
+        samples.local,
+        samples.absolute,
+    )
+    means, errors, covariances = samples.sampled_xhat, samples.sampled_error, samples.sampled_P
+    sum_of_all, states, framed = (
+        load(lanes, samples.total, b),
+        all_absolute.shape[2],
+        samples.framed,
+    )
     for h in range(len(xhat)):
         for i in range(n):
-            entry = samples.entries[h, i] if len(samples.entries) > 0 else i
+            entry = entries[h, i] if len(entries) > 0 else i
             x = load(lanes, xhat, h, i)
             # Relative to the moving origin: a difference of large absolute states loses digits.
-            local = load(lanes, samples.local, b, s, entry)
-            store(lanes, samples.sampled_error, h * n + i, local - x)
-            if samples.framed:
-                x += load(lanes, samples.absolute, b, s, entry) - local
-            store(lanes, samples.sampled_xhat, h * n + i, x)
+            local = load(lanes, all_local, b, s, entry)
+            store(lanes, errors, h * n + i, local - x)
+            if framed:
+                x += load(lanes, all_absolute, b, s, entry) - local
+            store(lanes, means, h * n + i, x)
             sum_of_all += x
             # P = S S' and its mirror image, because samples hold covariances.
             for j in range(i + 1):
                 total = spread(lanes, 0.0)
                 for m in range(j + 1):
                     total += load(lanes, root, h, i, m) * load(lanes, root, h, j, m)
-                store(lanes, samples.sampled_P, (h * n + i) * n + j, total)
-                store(lanes, samples.sampled_P, (h * n + j) * n + i, total)
+                store(lanes, covariances, (h * n + i) * n + j, total)
+                store(lanes, covariances, (h * n + j) * n + i, total)
                 sum_of_all += total
     store(lanes, samples.total, b, sum_of_all)
+    runs, x_of_runs = samples.runs, samples.x
     for q in range(len(lanes)):
         # The last block may have more lanes than there are runs left.
-        used = first + q < len(samples.x)
-        samples.runs[q] = first + q if used else -1
+        used = first + q < len(x_of_runs)
+        runs[q] = first + q if used else -1
         for i in range(states if used else 0):
-            samples.x[first + q, k, i] = samples.absolute[b, s, i, q]
-    scatter_sample(lanes, samples.sampled_xhat, samples.xhat[:, k], samples.runs)
-    scatter_sample(lanes, samples.sampled_error, samples.error[:, k], samples.runs)
-    scatter_sample(lanes, samples.sampled_P, samples.P[:, k], samples.runs)
+            x_of_runs[first + q, k, i] = all_absolute[b, s, i, q]
+    scatter_sample(lanes, means, samples.xhat[:, k], runs)
+    scatter_sample(lanes, errors, samples.error[:, k], runs)
+    scatter_sample(lanes, covariances, samples.P[:, k], runs)
 
 
 @kernel

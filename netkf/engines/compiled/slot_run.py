@@ -240,9 +240,10 @@ class SlotRuns:
             part.reshape(*part.shape[:2], math.prod(part.shape[2:])) for part in samples
         )
         kernel_samples = SlotSamples(
-            x, xhat, P, error, absolute, local, drawn and absolute is not local, self._total,
-            *self._filters.sample_scratch, np.zeros(LANES, dtype=np.int64),
-            np.maximum(self.setup.entries, 0) if self.setup.views is not None else _ALL,
+            x=x, xhat=xhat, P=P, error=error, absolute=absolute, local=local,
+            framed=drawn and absolute is not local, total=self._total,
+            **self._filters.sample_scratch,
+            entries=np.maximum(self.setup.entries, 0) if self.setup.views is not None else _ALL,
         )  # fmt: skip
         slots = times.first + sampled
         self._simulate(times, messages, (y, H, rebased), kernel_samples)
