@@ -41,6 +41,10 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import Lanes, load, spread, store
 
+NAIVE_NOTE = (
+    'rule = "naive" takes errors of different nodes for independent, which they are not once nodes '
+    "have told each other: P is overconfident"
+)
 RULES = {"naive": NAIVE, "ci": CI, "split": SPLIT}
 
 
@@ -299,7 +303,11 @@ class BlockIntersection(Filter):
     rule: str = field(one_of("split", "ci", "naive"), default="split")
 
     timing = Timing(clocks=("directions", "nodes", "readings"))
-    needs = Needs(one_way=True, samples=True, blocks=True)
+    @property
+    def needs(self) -> Needs:
+        """Samples; a note says what the naive rule does."""
+        notes = (NAIVE_NOTE,) if self.rule == "naive" else ()
+        return Needs(one_way=True, samples=True, blocks=True, notes=lambda _: notes)
 
     @property
     def analysis(self) -> Analysis:

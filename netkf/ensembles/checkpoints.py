@@ -205,7 +205,8 @@ class BlockCheckpoints:
         counts = [statistics.totals, *(quantity.size for quantity in moments)]
         # Of each node: P, squares of errors, and NEES, which a singular P leaves nan.
         columns = np.arange(statistics.samples.mean.shape[1]) % (n * (n + 1) + 1)
-        exact = self._scenario.plant.truth_known and math.isinf(statistics.rounding_from)
+        exact = self._scenario.plant.truth_known and self._scenario.unknown_samples is None
+        exact = exact and math.isinf(statistics.rounding_from)
         samples = columns < (2 * u if exact and not statistics.totals[1] else u)
         averages = np.arange(statistics.averages.mean.shape[1]) % 3 == 1  # traces of P
         # In slots transmissions are not counted.
@@ -227,7 +228,8 @@ class BlockCheckpoints:
         trace: Any = Trace(*(arrays[f"trace_{k}_{name}"] for name in Trace._fields))
         T, N, n = len(trace.times), len(self._scenario.nodes), self._scenario.width
         # replica, log, times, x, xhat, P, error
-        shapes = [(), (len(trace.log),), (T,), (T, n), (T, N, n), (T, N, n, n), (T, N, n)]
+        states = (T, self._scenario.plant.n)
+        shapes = [(), (len(trace.log),), (T,), states, (T, N, n), (T, N, n, n), (T, N, n)]
         types = [np.dtype(np.int64), EVENT, *[np.dtype(np.float64)] * 5]
         if [(field.dtype, field.shape) for field in trace] != list(zip(types, shapes, strict=True)):
             raise DamagedError("does not fit the scenario")

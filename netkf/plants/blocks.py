@@ -259,18 +259,13 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
         if isinstance(block.plant, SlotPlant) != slotted:
             rule = "must be in slots as the others are, or in continuous time"
             raise ScenarioError(f"[{k}]", rule, block.name, "give all F, Q, period, or all A, B")
-        if not block.plant.truth_known:
-            rule = "must be drawn or recorded: unknown states cannot be blocks"
-            raise ScenarioError(f"[{k}].kind", rule, None, "leave kind out")
-        if block.plant.is_random != blocks[0].plant.is_random:
-            rule = "must be recorded in all entries, or in none"
-            raise ScenarioError(f"[{k}].path", rule, None, "add the tables, or leave them out")
         _check_shapes(k, block)
         with errors_under(f"[{k}]"):
             block.check_means()
             for plant in block.copies:
                 plant.read()
     plants = _plants(blocks)
+    is_random = all(plant.is_random for plant in plants)
     if not all(plant.linear for plant in plants):
         return _stack_nonlinear(blocks)
     mean = np.concatenate([plant.start_mean for plant in plants])
@@ -280,13 +275,14 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
         **{"mean": mean, "cov": cov, "input": _stacked_input(blocks, layout)},
         "schedule": _stacked_schedule(blocks, layout),
     }
-    if not plants[0].is_random:
-        parts["path"] = StackedStates([plant.record for plant in plants])
+    if not is_random:
+        _check_what_drives(blocks, layout)
+        parts["path"] = StackedStates(plants)
     if slotted:
         parts["period"] = _one(blocks, "period")
-        return LinearPlant(**parts) if plants[0].is_random else RecordedPlant(**parts)
+        return LinearPlant(**parts) if is_random else RecordedPlant(**parts)
     parts["sensing_period"] = _one(blocks, "sensing_period")
-    return Diffusion(**parts) if plants[0].is_random else RecordedDiffusion(**parts)
+    return Diffusion(**parts) if is_random else RecordedDiffusion(**parts)
 
 
 def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
@@ -318,8 +314,8 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
         "cov": block_diagonal([plant.start_cov for plant in plants]),
         "input": StackedInput(inputs=tuple(inputs)) if inputs else None,
     }
-    if not plants[0].is_random:
-        shared["path"] = StackedStates([plant.record for plant in plants])
+    if not all(plant.is_random for plant in plants):
+        shared["path"] = StackedStates(plants)
     noise = block_diagonal([plant.Q if slotted else plant.B for plant in plants])
     if slotted:
         return NonlinearPlant(Q=noise, period=_one(blocks, "period"), **shared)
@@ -425,6 +421,19 @@ def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> No
                     rule = f"must be {place.n} x {origin.n}, from the block of {origin.n} states"
                     raise ScenarioError(f"{key}.A", rule, coupling.A, "correct the shape")
                 M[place.entries, origin.entries] += coupling.A
+
+
+def _check_what_drives(blocks: Sequence[Block], layout: Layout) -> None:
+    """Raise ScenarioError for a block that is drawn and driven by one that is not."""
+    is_random = dict(zip(layout.places, (p.is_random for p in _plants(blocks)), strict=True))
+    for place, (k, plant) in zip(layout.places, _copies(blocks), strict=True):
+        for c, coupling in enumerate(blocks[k].coupling if plant.is_random else ()):
+            key = f"[{k}].coupling[{c}].from"
+            for origin in _origins(key, coupling, place, layout):
+                if not is_random[origin]:
+                    rule = "must be drawn as this block is, not recorded or unknown"
+                    remedy = "record this block too, or draw the other"
+                    raise ScenarioError(key, rule, coupling.origin, remedy)
 
 
 def _origins(key: str, coupling: Coupling, place: Place, layout: Layout) -> list[Place]:

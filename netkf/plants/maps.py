@@ -77,7 +77,7 @@ class NonlinearPlant(RecordedStates, SlotPlant):
         """Return the true states of one run, drawn from ``random`` or recorded; ``frames`` are for
         linear plants only.
         """
-        if self.record is not None:
+        if not self.draws:
             return RecordedPath(self.recorded_truth, self.period)
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         return MapPath(self, start, random)

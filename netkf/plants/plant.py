@@ -70,6 +70,11 @@ class Plant(Component, OnGrid):
                 _ = self.input.exogenous
 
     @property
+    def draws(self) -> bool:
+        """True if runs draw states of it, as those of some of its blocks."""
+        return self.is_random
+
+    @property
     @abstractmethod
     def n(self) -> int:
         """Dimension of the state."""

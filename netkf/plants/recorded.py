@@ -69,8 +69,12 @@ class RecordedPlant(RecordedStates, LinearPlant):
 
     path: SourceFile = field(state_file)
 
-    def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return the states of the table, nan in slots without one; ``random`` is not used."""
+    def truth(self, random: np.random.Generator, frames: bool = False) -> Any:
+        """Return the states of the table, nan in slots without one; where blocks are drawn, those
+        of all drawn from ``random``.
+        """
+        if self.draws:
+            return super().truth(random)
         return RecordedPath(self.recorded_truth, self.period)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import SourceFile, field, one_of, source_file
+from netkf.core.fields import SourceFile, boolean, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.dynamics import MOTIONS
@@ -92,30 +92,75 @@ class StateTable:
 
 
 class StackedTruth(RecordedTruth):
-    """The states of several truths, one after the other; known where all of them are."""
+    """The states of several truths, one after the other; 0 where there is no row or no table."""
 
-    def __init__(self, parts: Sequence[RecordedTruth]) -> None:
-        self._parts = parts
-        times = np.unique(np.concatenate([part.times for part in parts]))
-        n = sum(part.n for part in parts)
-        super().__init__(times, np.empty((0, n)), n)
-
-    def rows_at(self, time: float) -> tuple[int, ...]:
-        """Return (0,) if all states are known at ``time`` (seconds), else nothing."""
-        return (0,) if all(part.rows_at(time) for part in self._parts) else ()
+    def __init__(self, parts: Sequence[RecordedTruth | None], sizes: Sequence[int]) -> None:
+        self._parts = [
+            RecordedTruth(np.empty(0), np.empty((0, n)), n) if part is None else part
+            for part, n in zip(parts, sizes, strict=True)
+        ]
+        times = np.unique(np.concatenate([part.times for part in self._parts]))
+        super().__init__(times, np.empty((0, sum(sizes))), sum(sizes))
 
     def local(self, time: float) -> FloatArray:
-        """Return x (n,) at ``time`` (seconds); nan where it is unknown."""
-        return np.concatenate([part.local(time) for part in self._parts])
+        """Return x (n,) at ``time`` (seconds)."""
+        # What lacks a row then is read by nobody.
+        return np.asarray(np.nan_to_num(np.concatenate([p.local(time) for p in self._parts])))
 
     absolute = local
 
 
 class StackedStates:
-    """The states of several blocks together, each from its own table."""
+    """The states of several blocks together, each by its plant: from its own table, drawn, or
+    unknown.
 
-    def __init__(self, tables: Sequence[StateTable]) -> None:
-        self.truth = StackedTruth([table.truth for table in tables])
+    drawn, unknown : masks (n,) of entries
+    """
+
+    def __init__(self, plants: Sequence[Any]) -> None:
+        sizes = [plant.n for plant in plants]
+        self.drawn = np.repeat([plant.is_random for plant in plants], sizes)
+        self.unknown = np.repeat([not plant.truth_known for plant in plants], sizes)
+        tables = [plant.record for plant in plants]
+        self.truth = StackedTruth([table and table.truth for table in tables], sizes)
+
+
+class PartlyDrawnTruth:
+    """The states of a plant whose blocks are drawn, recorded or unknown: those of a ``truth`` that
+    was drawn for all of it, with the others in place. Instants are seconds, or slots of ``period``
+    seconds; coordinates begin at the response ``believed``.
+    """
+
+    frame_times, frame_slots = np.empty(0), None
+
+    def __init__(
+        self, truth: Any, states: StackedStates, believed: Any, period: float | None
+    ) -> None:
+        self._truth, self._given, self._drawn = truth, states.truth, states.drawn
+        self._believed, self._period = believed, period
+
+    def absolute(self, time: Any) -> FloatArray:
+        """Return x (n,) at ``time``."""
+        given = self._given.local(time if self._period is None else time * self._period)
+        return np.where(self._drawn, self._truth.absolute(time), given)
+
+    state = absolute
+
+    def local(self, time: Any) -> FloatArray:
+        """Return x (n,) at ``time``, in the coordinates of the filters."""
+        given = self.absolute(time)
+        if self._believed is not None:
+            given = given - self._believed.states(np.array([time]))[0]
+        return np.where(self._drawn, self._truth.local(time), given)
+
+    def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""
+        shape = -1, len(self._drawn)
+        local, absolute = (
+            np.array([state(time) for time in times.tolist()]).reshape(shape)
+            for state in (self.local, self.absolute)
+        )
+        return local, absolute
 
 
 class RecordedPath:
@@ -149,17 +194,21 @@ class RecordedStates(Plant):
     """A plant whose states are drawn or, with a ``path``, those of a table ``t,x0,x1,...``, t in
     seconds: then the plant is what filters assume. With ``interpolate`` states are known between
     rows too, "linear" or "hold", that of the last row. Rows of a column ``node`` are those of the
-    blocks of nodes.
+    blocks of nodes. With ``unknown`` there are no states but those that filters assume.
     """
 
     path: SourceFile | StackedStates | None = field(state_file, default=None)
     interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
+    unknown: bool = field(boolean, default=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.path is None and self.interpolate is not None:
             rule = "means nothing without path"
             raise ScenarioError("interpolate", rule, self.interpolate, "leave it out")
+        if self.path is not None and self.unknown:
+            rule = "means nothing where the state is unknown"
+            raise ScenarioError("path", rule, None, 'leave it out, or write kind = "recorded"')
         if isinstance(self.path, SourceFile) and "node" not in self._columns:
             _ = self.recorded_truth  # a mistake in the file is found on construction
 
@@ -181,8 +230,21 @@ class RecordedStates(Plant):
 
     @property
     def is_random(self) -> bool:  # type: ignore[override]
-        """True if runs draw the states, False if they are recorded."""
-        return self.path is None
+        """True if runs draw all states, False if some are recorded or unknown."""
+        return self.path is None and not self.unknown
+
+    @property
+    def truth_known(self) -> bool:  # type: ignore[override]
+        """True if some states are known, so that errors can be computed."""
+        path = self.path
+        return not (path.unknown.all() if isinstance(path, StackedStates) else self.unknown)
+
+    @property
+    def draws(self) -> bool:
+        """True if runs draw states of it, as those of some of its blocks."""
+        return (
+            bool(self.path.drawn.any()) if isinstance(self.path, StackedStates) else self.is_random
+        )
 
     @cached_property
     def _columns(self) -> Columns:
@@ -192,13 +254,15 @@ class RecordedStates(Plant):
 
     @cached_property
     def record(self) -> Any:
-        """The states, a StateTable or StackedStates; None if they are drawn."""
+        """The states, a StateTable or StackedStates; None if they are drawn or unknown."""
         if not isinstance(self.path, SourceFile):
             return self.path
         return StateTable(self, self._columns.of_node(self.node))
 
     @property
     def recorded_truth(self) -> RecordedTruth:
-        """The recorded states as engines read them."""
+        """The recorded states as engines read them; nan where they are unknown."""
+        if self.record is None:
+            return RecordedTruth(np.empty(0), np.empty((0, self.n)), self.n)
         truth: RecordedTruth = self.record.truth
         return truth

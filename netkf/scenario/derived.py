@@ -46,6 +46,7 @@ from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
 from netkf.plants.response import Difference, FlowResponse, Response, SlotResponse
 from netkf.plants.sampling import Samples
 from netkf.plants.sensors import Sensor
+from netkf.plants.states import PartlyDrawnTruth, StackedStates
 from netkf.plants.transitions import frame_period, frame_slots
 from netkf.rng.streams import Streams
 from netkf.scenario.block_sensors import support_of
@@ -485,12 +486,14 @@ class DerivedScenario(ScenarioModel):
                 sampled = all_sample_times(sample_times(self, streams))
             if not self.plant.is_random:
                 require_states(self, sample_times(self, streams), streams)
+            if not self.plant.draws:
                 return self.plant.recorded_truth
             random, *inside = map(streams.generator, ("plant", "samples", "probe"))
             # Readings do not depend on when the network ticks.
             ticks = tick_times(self, streams) if self.links_follow_state else np.empty(0)
             shown = np.union1d(self.times, ticks)
-            return self.plant.curve(random, (sampled, inside[0]), (shown, inside[1]))
+            curve = self.plant.curve(random, (sampled, inside[0]), (shown, inside[1]))
+            return self._with_given_states(curve)
         plant, horizon = self.diffusion, self.horizon
         recorded, on_grid = not plant.is_random, uses_grid(self)
         if sampled is None or recorded:
@@ -503,7 +506,7 @@ class DerivedScenario(ScenarioModel):
         random, probes = streams.generator("plant"), self.times
         times, responses = np.union1d(sampled, probes), self.input_responses
         truth: Any
-        if isinstance(plant, RecordedDiffusion | UnknownDiffusion):
+        if isinstance(plant, RecordedDiffusion | UnknownDiffusion) and not plant.draws:
             truth = plant.recorded_truth
         elif not on_grid:
             truth = plant.sampled_truth(random, times, horizon, frames)
@@ -514,10 +517,10 @@ class DerivedScenario(ScenarioModel):
             truth = plant.path(
                 random, probe_random, probes, sample_random, sampled, horizon, frames, forcing
             )
-        if responses is None:
-            return truth
-        forced = on_grid and not self.tells_models
-        return driven(truth, responses, recorded, forced, (times, probes))
+        if responses is not None:
+            forced = on_grid and not self.tells_models
+            truth = driven(truth, responses, not plant.draws, forced, (times, probes))
+        return self._with_given_states(truth)
 
     def slot_truth(self, streams: Streams, frames: bool | None = None) -> Any:
         """Return the true state of one run in slots, a plants.linear.Truth; with ``frames``, by
@@ -526,7 +529,37 @@ class DerivedScenario(ScenarioModel):
         frames = self.exact_errors if frames is None else frames
         plant, responses = self.slot_plant, self.input_responses
         truth = plant.truth(streams.generator("plant"), frames)
-        return truth if responses is None else driven(truth, responses, not plant.is_random)
+        if responses is not None:
+            truth = driven(truth, responses, not plant.draws)
+        return self._with_given_states(truth, plant.period)
+
+    def _with_given_states(self, truth: Any, period: float | None = None) -> Any:
+        """Return a ``truth`` with the states of blocks that are recorded or unknown in it."""
+        if self.plant.is_random or not self.plant.draws:
+            return truth
+        believed = None if self.input_responses is None else self.input_responses.believed
+        return PartlyDrawnTruth(truth, self.plant.record, believed, period)
+
+    @cached_property
+    def unknown(self) -> np.ndarray:
+        """A mask (n,) of the states that nobody knows."""
+        states = self.plant.record
+        if isinstance(states, StackedStates):
+            return states.unknown
+        return np.full(self.plant.n, not self.plant.truth_known)
+
+    @cached_property
+    def unknown_samples(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """``unknown``, and a mask (N, n') of the errors of nodes that nobody knows; None if all
+        states are known.
+        """
+        if not self.unknown.any():
+            return None
+        of_nodes = np.zeros((len(self.nodes), self.width), dtype=bool)
+        for k in range(len(self.nodes)):
+            known = self.unknown[self.view(k)]
+            of_nodes[k, : len(known)] = known
+        return self.unknown, of_nodes
 
     @cached_property
     def knows_input(self) -> bool:
@@ -553,7 +586,7 @@ class DerivedScenario(ScenarioModel):
         if self.plant.input is None or not self.plant.linear:
             return None
         # Recorded states have the true response in them.
-        surprise = self.surprise if self.plant.is_random else None
+        surprise = self.surprise if self.plant.draws else None
         return InputResponses(self.believed_response if self._moves_along else None, surprise)
 
     @property

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.places import Place
 from netkf.core.repeated_rows import RowUse, add_uses, count_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.network.contacts import Contacts
@@ -15,8 +16,9 @@ from netkf.network.matchings import RecordedSlots
 from netkf.plants.inputs import RecordedInput
 from netkf.plants.sensors import Sensor
 from netkf.rng.streams import Streams
+from netkf.scenario.block_sensors import support_of
 from netkf.scenario.derived import DerivedScenario
-from netkf.scenario.sampling import all_sample_times, sample_times
+from netkf.scenario.sampling import all_sample_times, is_drawn_from, sample_times
 
 
 def check_records(scenario: DerivedScenario) -> None:
@@ -25,15 +27,21 @@ def check_records(scenario: DerivedScenario) -> None:
         key = scenario.sensor_key(k)
         if sensor.record is not None:
             _check_readings(scenario, key, sensor)
-        elif not scenario.plant.truth_known:
+        elif scenario.unknown[support_of(sensor, scenario.plant.n)].any() or (
+            not scenario.plant.truth_known
+        ):
             raise ScenarioError(
                 f"{key}.kind",
                 "must be recorded where the plant's state is unknown",
                 None,
                 'write kind = "recorded" and path = "readings.csv"',
             )
-    for key, plant in scenario.all_plants if scenario.slotted else ():
-        for slot in sorted(_state_slots(scenario)) if plant.record is not None else ():
+    for (key, plant), place in zip(scenario.all_plants, scenario.layout.places, strict=True):
+        if scenario.links_follow_state and scenario.unknown[place.entries].any():
+            rule = "must be drawn or recorded, since links follow positions"
+            raise ScenarioError(f"{key}.kind", rule, "unknown", "leave kind out, or add path")
+        slotted = scenario.slotted and plant.record is not None
+        for slot in sorted(_state_slots(scenario, place)) if slotted else ():
             with errors_under(key):
                 plant.record.require_times(np.array([slot * plant.period]), f"slot {slot}")
     if scenario.slotted and scenario.filter.algorithm.timing.talks:
@@ -109,8 +117,12 @@ def count_state_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
     """Return the use of the rows of recorded states by key path."""
     if scenario.plant.record is None:
         return {}
-    times = _state_times(scenario).tolist()
-    return _sum_by_key((key, plant.record.use(times)) for key, plant in scenario.all_plants)
+    places = zip(scenario.all_plants, scenario.layout.places, strict=True)
+    return _sum_by_key(
+        (key, plant.record.use(_state_times(scenario, place).tolist()))
+        for (key, plant), place in places
+        if plant.record is not None
+    )
 
 
 def count_input_rows(scenario: DerivedScenario) -> dict[str, RowUse]:
@@ -150,22 +162,22 @@ def _sum_by_key(uses: Iterable[tuple[str, RowUse]]) -> dict[str, RowUse]:
     return {key: add_uses(parts) for key, parts in by_key.items()}
 
 
-def _state_times(scenario: DerivedScenario) -> FloatArray:
-    """Return the times (K,) in seconds at which replica 0 needs recorded states."""
+def _state_times(scenario: DerivedScenario, place: Place) -> FloatArray:
+    """Return the times (K,) in seconds at which replica 0 needs recorded states of a block."""
     if scenario.slotted:
-        return scenario.slot_plant.period * np.array(sorted(_state_slots(scenario)))
+        return scenario.slot_plant.period * np.array(sorted(_state_slots(scenario, place)))
     times = [scenario.times]
-    if any(sensor.is_random for sensor in scenario.sensors):
+    if any(is_drawn_from(scenario, sensor, place) for sensor in scenario.sensors):
         times.append(all_sample_times(sample_times(scenario, Streams(scenario.seed))))
     return np.unique(np.concatenate(times))
 
 
-def _state_slots(scenario: DerivedScenario) -> set[int]:
-    """Return the slots whose states a run needs: the sampled ones, those with drawn readings, and
-    those with messages where links follow the state.
+def _state_slots(scenario: DerivedScenario, place: Place) -> set[int]:
+    """Return the slots whose states of a block a run needs: the sampled ones, those with drawn
+    readings of it, and those with messages where links follow the state.
     """
     slots = {*scenario.sampled_slots}
-    if any(sensor.is_random for sensor in scenario.sensors):
+    if any(is_drawn_from(scenario, sensor, place) for sensor in scenario.sensors):
         slots.update(sensed_slots(scenario))
     return slots.union(exchange_slots(scenario)) if scenario.links_follow_state else slots
 

@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.rng.streams import Streams
+from netkf.scenario.block_sensors import support_of
 from netkf.scenario.model import PlacedSensor, ScenarioModel, takes_samples
 from netkf.scenario.positions import tick_times
 
@@ -97,6 +100,14 @@ def uses_grid(scenario: ScenarioModel) -> bool:
     return is_drawn and (bool(scenario.increment_sensors) or not scenario.sampled_sensors)
 
 
+def is_drawn_from(scenario: ScenarioModel, sensor: Any, place: Place) -> bool:
+    """Return True if readings of a sensor are drawn that depend on the block at a ``place``."""
+    entries = support_of(sensor, scenario.plant.n)
+    return bool(
+        sensor.is_random and np.isin(np.arange(scenario.plant.n)[place.entries], entries).any()
+    )
+
+
 def require_states(
     scenario: ScenarioModel, times: dict[tuple[int, int], FloatArray], streams: Streams
 ) -> None:
@@ -106,12 +117,14 @@ def require_states(
     links follow the state. ``times`` are the sample times (K,) in seconds by (node, ordinal).
     """
     ticks = tick_times(scenario, streams) if scenario.links_follow_state else np.empty(0)
-    for key, plant in scenario.all_plants if scenario.plant.record is not None else ():
+    for (key, plant), place in zip(scenario.all_plants, scenario.layout.places, strict=True):
+        if plant.record is None:
+            continue
         with errors_under(key):
             plant.record.require_times(scenario.times, "the probe")
             plant.record.require_times(ticks, "a tick of the network")
             for node, placed_sensor in _iterate_sampled_sensors(scenario):
-                if scenario.sensors[placed_sensor.entry].is_random:
+                if is_drawn_from(scenario, scenario.sensors[placed_sensor.entry], place):
                     needed, use = times[node, placed_sensor.ordinal], f"a sample of node {node}"
                     plant.record.require_times(needed, use)
 

@@ -257,10 +257,12 @@ def _build_plant(origin: Origin, value: Any) -> Any:
         "input": partial(_build_part, "input", origin),
     }
     table = _build_inner(_as_dict(value), builders)
-    if table.get("kind") == "recorded" and "f" in table:
-        table["kind"] = "nonlinear"
-        if "path" not in table:
+    if table.get("kind") in ("recorded", "unknown") and "f" in table:
+        if table["kind"] == "unknown":
+            table["unknown"] = True
+        elif "path" not in table:
             raise ScenarioError("path", "is missing", None, "add path = ...")
+        table["kind"] = "nonlinear"
     # Some kinds exist for both models of time; the keys tell which one is meant.
     in_both_times = table.get("kind") in ("nonlinear", "recorded", "unknown")
     continuous = in_both_times and not {"A", "B", "step"}.isdisjoint(table)

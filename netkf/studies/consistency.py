@@ -19,7 +19,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import scipy.special
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
@@ -27,6 +26,7 @@ from netkf.core.notebook import NotebookTable
 from netkf.engines.base import Engine
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
+from netkf.laws.intervals import interval_of_squares
 from netkf.linalg.arrays import FloatArray, block_diagonal, is_definite
 from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias
@@ -309,7 +309,7 @@ class NodeConsistency:
     block        : the name of the block and whose it is, as pose@3; empty for the whole state
     n            : its number of states
     nees         : mean NEES over runs and samples
-    width        : half width of the interval of NEES minus its expected value (n if unknown)
+    width        : reach of the interval of NEES minus its expected value (n if unknown) towards 0
     expected     : expected value of NEES, nan if unknown
     inside       : share of samples whose mean NEES over the runs lies in the chi-square bounds
     nis, expected_nis : mean NIS and its expected value, nan if unknown
@@ -383,9 +383,9 @@ def consistency(
     of ``[[plants]]`` that a node estimates, or else for each node.
 
     The verdicts compare the NEES of each run with its exact expected value given the events of the
-    run (run by run, Student's interval; all rows together at ``confidence``), or with n if that is
-    unknown (push-sum with frozen or asymptotic gains, a user's own filter). ``seed`` and the
-    options from ``workers`` on are those of ``netkf.monte_carlo``.
+    run (run by run, see ``interval_of_squares``; all rows together at ``confidence``), or with n if
+    that is unknown (push-sum with frozen or asymptotic gains, a user's own filter). ``seed`` and
+    the options from ``workers`` on are those of ``netkf.monte_carlo``.
 
     Raises ScenarioError for bad arguments and if there is no truth.
     """
@@ -428,10 +428,9 @@ def judge_consistency(
     usable, inside = np.isfinite(means).sum(axis=0), ((means >= low) & (means <= high)).sum(axis=0)
     # Shares (K,) of samples whose mean NEES over the runs is in ``low`` .. ``high``.
     shares_inside = inside / np.where(usable, usable, np.nan)
-    # Bonferroni over the blocks, two-sided.
-    quantile = float(scipy.special.stdtrit(count - 1, 1.0 - 0.5 * level / len(blocks)))
+    # Bonferroni over the blocks.
     rows = [
-        _judge_block(scenario, runs, (k, block), float(shares_inside[k]), quantile)
+        _judge_block(scenario, runs, (k, block), float(shares_inside[k]), level / len(blocks))
         for k, block in enumerate(blocks)
     ]
     largest = int(np.argmax(sizes))
@@ -463,26 +462,27 @@ def _judge_block(
     runs: Sequence[RunConsistency],
     judged: tuple[int, JudgedBlock],
     share_inside: float,
-    quantile: float,
+    level: float,
 ) -> NodeConsistency:
-    """Return the row of a block and its number; intervals reach ``quantile`` standard errors to
-    each side.
-    """
+    """Return the row of a block and its number, whose interval misses by chance ``level``."""
     i, block = judged
     n = len(block.entries)
     nees = np.array([run.nees[i] for run in runs])
     expected = np.array([run.expected[i] for run in runs])
     is_known = bool(np.isfinite(expected).all())
     # NEES of an exact P has the mean n.
-    excesses = nees - (expected if is_known else n)
-    width = quantile * float(excesses.std(ddof=1)) / math.sqrt(len(runs))
+    right = np.where(expected > 0.0, expected, n) if is_known else np.full(len(runs), float(n))
+    low, high = (float(right.mean()) * (r - 1.0) for r in interval_of_squares(nees / right, level))
+    excess = float((nees - (expected if is_known else n)).mean())
+    # The reach to the side of what is expected.
+    width = excess - low if excess > 0.0 else high - excess
     if not any(run.covariance_given[0] for run in runs):
         verdict = NO_COVARIANCE
     elif np.isfinite(min(run.blurred_from[0] for run in runs)) and np.isnan(nees).any():
         verdict = UNDECIDED
     else:
         mean = float(expected.mean()) if is_known else None
-        verdict = _verdict(scenario, n, (float(excesses.mean()), width), mean)
+        verdict = _verdict(scenario, n, (excess, width), mean)
     return NodeConsistency(
         node=scenario.nodes[block.node],
         nees=float(nees.mean()),

@@ -10,6 +10,7 @@ import scipy.special
 
 from netkf.engines.base import Engine
 from netkf.ensembles.statistics import run_values
+from netkf.laws.intervals import interval_of_squares
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
@@ -170,9 +171,9 @@ def credibility(values: FilterValues, n: float, level: float) -> str:
     above, below or around 1; "-" where NEES is unknown or one run shows nothing.
     """
     ratios = values.nees / n
-    mean, width = float(ratios.mean()), _width(ratios, level)
-    if not math.isfinite(width) or not math.isfinite(mean):
+    if len(ratios) < 2 or not np.isfinite(ratios).all():
         return "-"
-    if mean - width > 1.0:
+    low, high = interval_of_squares(ratios, level)
+    if low > 1.0:
         return "overconfident"
-    return "conservative" if mean + width < 1.0 else "consistent"
+    return "conservative" if high < 1.0 else "consistent"

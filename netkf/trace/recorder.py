@@ -96,6 +96,8 @@ class Recorder:
         self.stats: dict[str, int] = {}
         """Counts that the engine keeps of its own work, such as SimPy processes and events."""
         self._exact_errors = False
+        self.unknown: tuple[np.ndarray, np.ndarray] | None = None
+        """Masks (n,) and (N, n) of states and of errors that nobody knows; an engine sets it."""
 
     @property
     def exact_errors(self) -> bool:
@@ -211,6 +213,10 @@ class Recorder:
         """Record T samples at times t (T,) in seconds: x (T, n), xhat and error (T, N, n), P
         (T, N, n, n); the caller must not write to the arrays afterwards.
         """
+        if self.unknown is not None:
+            # Engines count them as 0.
+            states, errors = self.unknown
+            x, error = np.where(states, NAN, x), np.where(errors, NAN, error)
         with defer_signals():  # a signal must not leave the sinks with different samples
             self._run_or_submit(self._pass_sample_on, t, x, xhat, P, error)
 

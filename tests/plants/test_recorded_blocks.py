@@ -148,7 +148,9 @@ def test_recorded_linear_blocks_are_one_recorded_plant(tmp_path):
     ("change", "message"),
     [
         ({"plants.1.nodes": [4]}, r"plants\[1\].input.path: odometry.csv has no row of node 4"),
-        ({"plants.1.path": "truth.csv"}, r"plants\[1\].path: must be recorded in all entries"),
+        ({"plants.1.path": "truth.csv"}, r"plants\[1\].path: truth.csv has no state for the probe"),
+        ({"plants.1.unknown": True}, r"sensors\[1\].kind: must be recorded where the plant's"),
+        ({"plants.1.unknown": True, "plants.1.path": "truth.csv"}, r"plants\[1\].path: means not"),
         ({"plants.1.interpolate": "hold"}, r"plants\[1\].interpolate: means nothing without path"),
         (
             {"plants": [{"name": "all", "A": [[0.0]], "B": [[1.0]], "input": RECORDED}]},
@@ -173,6 +175,88 @@ def test_a_plant_of_all_has_no_rows_by_node(tmp_path):
         from_table(table, tmp_path)
     plant["input"] = {"kind": "constant", "value": [1.0, 0.1]}
     with pytest.raises(ScenarioError, match=r"plant.path: truth.csv has a column node"):
+        from_table(table, tmp_path)
+
+
+def mixed(folder, slots):
+    """Three walks with a known input: the first drawn, the second recorded, of the third only
+    readings are known.
+    """
+    (folder / "walk.csv").write_text(
+        "t,node,x0\n" + "".join(f"{t},2,{5 + t * t}\n" for t in range(6))
+    )
+    (folder / "seen.csv").write_text("t,node,y0\n1,3,2.5\n3,3,1.0\n")
+    u = {"kind": "recorded", "path": "u.csv", "G": [[0.5]]}
+    (folder / "u.csv").write_text("t,u0\n0,1\n2,-1\n")
+    keys = {"F": [[0.9]], "Q": [[1.0]], "period": 1.0} if slots else {"A": [[-0.1]], "B": [[1.0]]}
+    block = {"name": "a", "cov": [[2.0]], "input": u, **keys}
+    clock = {} if slots else {"sampling": {"kind": "periodic", "period": 0.5}}
+    whole = {} if slots else {"sampling": {"kind": "periodic", "period": 1.0}}
+    H = {"of": "a", "H": [[1.0]], "R": [[0.1]]}
+    ticks = {"kind": "periodic", "period": 1.0, "at": "nodes"}
+    return {
+        "format": 1,
+        "name": "mixed",
+        "horizon": 5.0,
+        "probe": 1.0,
+        "plants": [
+            {**block, "nodes": [1]},
+            {**block, "nodes": [2], "kind": "recorded", "path": "walk.csv"},
+            {**block, "nodes": [3], "kind": "unknown"},
+        ],
+        "sensors": [
+            # Of the recorded one there are states at whole seconds only.
+            {**H, "nodes": [1], **clock},
+            {**H, "nodes": [2], **whole},
+            {**H, "kind": "recorded", "path": "seen.csv"},
+            {"kind": "relative", "of": "a", "to": [[1, 2]], "R": [[0.2]], **whole},
+        ],
+        "network": {
+            "graph": {"kind": "edges", "edges": [[1, 2], [2, 3]]},
+            "activation": {"kind": "broadcast"} if slots else ticks,
+        },
+        "filter": {"kind": "block-intersection", "estimates": "own"},
+    }
+
+
+@pytest.mark.parametrize("slots", [True, False])
+def test_each_block_is_drawn_recorded_or_unknown_by_itself(tmp_path, slots):
+    table = mixed(tmp_path, slots)
+    scenario = from_table(table, tmp_path)
+    simpy, compiled = (netkf.simulate(scenario, engine=one) for one in ("simpy", "compiled"))
+    drawn = mixed(tmp_path, slots)
+    drawn["plants"] = [{**p, "kind": "linear" if slots else "diffusion"} for p in drawn["plants"]]
+    del drawn["plants"][1]["path"], drawn["sensors"][2]
+    first = netkf.simulate(from_table(drawn, tmp_path), engine="simpy").x[:, 0]
+    for run in (simpy, compiled):
+        # What is drawn does not know of the others.
+        np.testing.assert_allclose(run.x[:, 0], first, rtol=0, atol=1e-12)
+        assert run.x[:, 1].tolist() == [5.0, 6.0, 9.0, 14.0, 21.0, 30.0]
+        assert np.isnan(run.x[:, 2]).all()
+        assert np.isnan(run.error[:, 2]).all()
+        assert np.isfinite(run.error[:, :2]).all()
+        assert abs(run.error[1:, 1]).max() < 1.5 if slots else run.status == "complete"
+        np.testing.assert_allclose(run.xhat, simpy.xhat, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(run.P, simpy.P, rtol=0, atol=1e-10)
+    # A plain Kalman filter of the readings of the third, which nobody else reads.
+    F, Q = (0.9, 1.0) if slots else (math.exp(-0.1), 5.0 * (1.0 - math.exp(-0.2)))
+    b = 0.5 if slots else 5.0 * (1.0 - F)
+    x, P, path = 0.0, 2.0, [0.0]
+    for t in range(1, 6):
+        x, P = F * x + b * (1.0 if t <= 2 else -1.0), F * P * F + Q
+        if (y := {1: 2.5, 3: 1.0}.get(t)) is not None and (slots or t < 5):
+            gain = P / (P + 0.1)
+            x, P = x + gain * (y - x), (1.0 - gain) * P
+        path.append(x)
+    np.testing.assert_allclose(simpy.block("a", 3).xhat[:, 0], path, rtol=0, atol=1e-9)
+    uses = record_usage(scenario, sent=None)
+    assert uses["plants[1]"]["unused"] == 0
+    # Several runs, in files too: averages of what is known.
+    ensemble = netkf.monte_carlo(scenario, runs=3, workers=1)
+    assert np.isnan(ensemble.mean_error[:, 2]).all()
+    assert np.isfinite(ensemble.mean_error[:, :2]).all()
+    table["plants"][0]["coupling"] = [{"from": [2], "A": [[0.1]]}]
+    with pytest.raises(ScenarioError, match="must be drawn as this block is"):
         from_table(table, tmp_path)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.special
 
+from netkf.laws.intervals import interval_of_squares, student_interval
 from netkf.studies import filter_values, targets
 from netkf.studies.filter_values import FilterValues, estimate_quantities
 from netkf.studies.metrics import RunMetrics
@@ -123,3 +124,29 @@ class Scipy:
 def test_a_wrong_quantile_is_found(module, name, special, monkeypatch):
     monkeypatch.setattr(module, "scipy", Scipy(special))
     assert {found.split()[0] for found, _ in wrong_sides(1500)} == {name}
+
+
+@pytest.mark.parametrize("freedom", [1, 3, 20])
+def test_few_runs_of_skewed_nees_accuse_nobody(freedom):
+    """NEES of ten runs, each a mean of so many squares, of eighteen blocks judged at 99 %."""
+    random, level, wrong = np.random.default_rng(4), 0.01 / 18, 0
+    values = random.chisquare(freedom, size=(36_000, 10)) / freedom
+    for one in values:
+        low, high = interval_of_squares(one, level)
+        wrong += not low <= 1.0 <= high
+    # A bound on the mean of 20 wrong rows, plus three deviations; Student's has up to 900.
+    assert wrong <= 1.5 * level * len(values) + 14
+    found = sum(
+        not low <= 1.0 <= high
+        for low, high in (interval_of_squares(3.0 * one, level) for one in values[:200])
+    )
+    assert found >= {1: 0, 3: 10, 20: 180}[freedom]
+
+
+def test_the_interval_of_squares_tends_to_students():
+    values = np.random.default_rng(1).chisquare(40, size=2000) / 40
+    low, high = interval_of_squares(values, 0.01)
+    deviation = float(values.std(ddof=1)) / np.sqrt(len(values))
+    other = student_interval(float(values.mean()), deviation, len(values), 0.01)
+    np.testing.assert_allclose([low, high], [other.low, other.high], atol=0.05 * deviation * 40)
+    assert interval_of_squares(np.zeros(10), 0.01) == (0.0, np.inf)

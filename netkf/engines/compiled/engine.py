@@ -30,6 +30,7 @@ from netkf.plants.recorded import (
     UnknownDiffusion,
     UnknownPlant,
 )
+from netkf.plants.states import StackedStates
 from netkf.rng.streams import Streams
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
@@ -109,10 +110,11 @@ class CompiledEngine(Engine):
     ) -> Iterator[RunBatch]:
         """Yield the runs of ``replicas``, many in each batch, see ``Engine.run_many``."""
         alone = partial(super().run_many, scenario, seed)
-        if not scenario.slotted:
+        is_mixed = isinstance(scenario.plant.record, StackedStates)
+        if not scenario.slotted and not is_mixed:
             yield from flow_batches(scenario, seed, replicas, fingerprint)
         # Messages made in Python come one run at a time.
-        elif not slot_setup(scenario).is_drawn:
+        elif is_mixed or not slot_setup(scenario).is_drawn:
             yield from alone(replicas, fingerprint)
         else:
             # A run that diverges is repeated alone, since a batch goes on to the end.

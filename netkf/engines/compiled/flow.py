@@ -279,7 +279,7 @@ class FlowRun:
         progress: Progress,
     ) -> None:
         self._scenario, self._recorder, self._progress = scenario, recorder, progress
-        recorder.exact_errors = scenario.exact_errors
+        recorder.exact_errors, recorder.unknown = scenario.exact_errors, scenario.unknown_samples
         self._draws, self._state = draws, workspace.begin(draws, not recorder.counts_only)
         self._visits = workspace.visits() if is_immediate(scenario) else None
         self._clocked = workspace.clocked

@@ -443,12 +443,12 @@ class SlotRuns:
         slots = range(self._slot, self._slot + count)
         rebased = np.zeros(count, dtype=bool)
         if self._path is None:
-            # A recorded truth is the same in all runs.
-            both = [
-                in_lanes(np.stack([state(slot) for slot in slots]), self._blocks)
-                for state in (self._truth.local, self._truth.absolute)
-            ]
-            return both[0], both[1], rebased
+            # A recorded truth is the same in all runs; of a drawn one slots come in order.
+            states = [(self._truth.local(slot), self._truth.absolute(slot)) for slot in slots]
+            local, absolute = (
+                in_lanes(np.stack(part), self._blocks) for part in zip(*states, strict=True)
+            )
+            return local, absolute, rebased
         # At the end of a frame the origin moves to the state.
         if setup.frame:
             rebased = np.array([slot > 0 and slot % setup.frame == 0 for slot in slots])
@@ -750,7 +750,7 @@ ROW_COLUMNS = ("t", "kind", "node", "peer", "message", "phase", "age")
 def run_slots(scenario: Scenario, streams: Streams, recorder: Recorder, progress: Progress) -> str:
     """Simulate one run in slots, see ``Engine.run``."""
     runs = SlotRuns(scenario, streams)
-    recorder.exact_errors = scenario.exact_errors
+    recorder.exact_errors, recorder.unknown = scenario.exact_errors, scenario.unknown_samples
     try:
         while not runs.over:
             if not _record_block(scenario, runs, recorder, progress):

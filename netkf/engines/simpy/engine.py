@@ -96,7 +96,7 @@ class _Simulation:
         self._scenario, self._streams = scenario, streams
         self._recorder, self._progress = recorder, progress
         self._transmitter = Transmitter(scenario, streams, self.timeline, recorder)
-        recorder.exact_errors = scenario.exact_errors
+        recorder.exact_errors, recorder.unknown = scenario.exact_errors, scenario.unknown_samples
 
     def clocks(self) -> list[Process]:
         """Return the SimPy processes of a scenario in continuous time."""
