@@ -151,8 +151,7 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
 def absorb(record: Any, h: int, run: Any) -> None:
     """Use the messages of this instant one after the other, by sender."""
     for k in range(run.count):
-        # What took time is of another instant.
-        for q in range(len(run.lanes) if not run.age[k] > 0.0 else 0):
+        for q in range(len(run.lanes)):
             if run.arrived[k, q] == 1:
                 hear(record, h, run, k, q)
 
@@ -168,12 +167,16 @@ def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
     payload = record.payload
     set_covariances(payload.root, payload.dependent, m, q, record.heard_P, record.heard_D)
     for i in range(tables.entry.shape[1]):
+        record.heard_x[i] = payload.xhat[m, i, q]
         if tables.entry[run.link[k], i] >= 0:
             count += 1
     if count > 0:
-        use_common(record, run.link[k], m, q)
+        if run.age[k] > 0.0:
+            predict_told(record, h, run, k)
+        use_common(record, run.link[k])
         fuse(f, count, record.rule)
-    if r >= 0 and len(pairs.row) > 0:
+    # A reading that took time is of a state that noise has moved since, which is in errors too.
+    if r >= 0 and len(pairs.row) > 0 and not run.age[k] > 0.0:
         for c in range(pairs.first[r], pairs.first[r + 1]):
             block = block_of_pair(pairs, c)
             if block >= 0 and tables.first[h, block] >= 0:
@@ -204,14 +207,44 @@ def set_covariances(
 
 
 @kernel
-def use_common(record: Any, link: int, m: int, q: int) -> None:
+def predict_told(record: Any, h: int, run: Any, k: int) -> None:
+    """Predict what message ``k`` tells of blocks that both estimate to now, as node ``h`` predicts
+    its own. The noise of the plant since is in the errors of both.
+    """
+    f, x, root, heard_P = record.fusion, record.late_x, record.late_root, record.heard_P
+    entry, n, gap = record.tables.entry, len(f.x), run.gap
+    x[:], f.part[:] = 0.0, 0.0
+    for i in range(entry.shape[1]):
+        for j in range(entry.shape[1] if entry[run.link[k], i] >= 0 else 0):
+            x[0, entry[run.link[k], i], 0] = record.heard_x[i]
+            if entry[run.link[k], j] >= 0:
+                f.part[entry[run.link[k], i], entry[run.link[k], j]] = heard_P[i, j]
+    semidefinite_root(f.part, n)
+    for i in range(n):
+        for j in range(n):
+            root[0, i, j, 0] = f.part[i, j] if j <= i else 0.0
+    run.gap = run.age[k]
+    predict_estimate(run.model, run, x, root, 0, h)
+    run.gap = gap
+    for i in range(entry.shape[1]):
+        for j in range(entry.shape[1] if entry[run.link[k], i] >= 0 else 0):
+            a, b, total = entry[run.link[k], i], entry[run.link[k], j], 0.0
+            record.heard_x[i] = x[0, a, 0]
+            for c in range(min(a, b) + 1 if b >= 0 else 0):
+                total += root[0, a, c, 0] * root[0, b, c, 0]
+            heard_P[i, j] = total
+            record.heard_D[i, j] = 0.0 if record.rule == NAIVE else total
+
+
+@kernel
+def use_common(record: Any, link: int) -> None:
     """Make the sender's estimate of what both estimate an observation."""
     f, entry = record.fusion, record.tables.entry
     row = 0
     for i in range(entry.shape[1]):
         if entry[link, i] < 0:
             continue
-        f.z[row] = record.payload.xhat[m, i, q]
+        f.z[row] = record.heard_x[i]
         f.H[row, :] = 0.0
         f.H[row, entry[link, i]] = 1.0
         column = 0
@@ -271,8 +304,11 @@ def block_record(
             "alone": np.array([info.alone for info in infos], dtype=np.int64),
             "tables": tables,
             "fusion": fusion_of(n, rows),
+            "heard_x": np.zeros(width),
             "heard_P": np.zeros((width, width)),
             "heard_D": np.zeros((width, width)),
+            "late_x": np.zeros((1, n, 1)),
+            "late_root": np.zeros((1, n, n, 1)),
         },
     )
 
@@ -296,13 +332,14 @@ class BlockIntersection(Filter):
           all independent, which is wrong and makes P too small
 
     With "split" and "ci" P is at least the covariance of the error. The weight is that with the
-    least trace of P. A message that took time is used for nothing: its readings are of another
-    instant.
+    least trace of P. What a message that took time tells of blocks that both estimate is predicted
+    to now; its readings are of another instant, and not used.
     """
 
     rule: str = field(one_of("split", "ci", "naive"), default="split")
 
     timing = Timing(clocks=("directions", "nodes", "readings"))
+
     @property
     def needs(self) -> Needs:
         """Samples; a note says what the naive rule does."""

@@ -21,9 +21,19 @@ Positions = dict[int, tuple[float, float]]
 """Coordinates (x, y) by node id, y upwards."""
 
 
-def get_positions(topology: Topology) -> Positions:
-    """Return the positions of the nodes: those of the topology, or computed ones if it has none."""
-    return topology.positions or compute_layout(topology)
+def get_positions(scenario: Any, run: Any = None) -> Positions:
+    """Return the positions of the nodes: where the scenario says that they begin, in the first
+    sample of a ``run`` if there is one; computed ones where it does not say so.
+    """
+    places, x = scenario.positions, scenario.plant.start_mean
+    if run is not None and len(run.x):
+        x = np.where(np.isfinite(run.x[0]), run.x[0], x)
+    if not all(map(places.has, scenario.nodes)):
+        return compute_layout(scenario.topology)
+    points = {node: places.at(node, 0.0, x) for node in scenario.nodes}
+    if len({*points.values()}) < len(points) or any(len(xy) < 2 for xy in points.values()):
+        return compute_layout(scenario.topology)
+    return {node: (xy[0], xy[1]) for node, xy in points.items()}
 
 
 def compute_layout(topology: Topology) -> Positions:

@@ -23,7 +23,7 @@ MAX_ASPECT = 2.2
 
 def network_figure(data: FigureData) -> Picture:
     """Draw the network once for each known quantity of the nodes, which their colours show."""
-    positions = get_positions(data.scenario.topology)
+    positions = get_positions(data.scenario, data.run)
     quantities = _colour_quantities(data)
     xy = np.array(list(positions.values()), dtype=np.float64)
     # Ratio of width to height.
@@ -114,7 +114,7 @@ def draw_network(
 ) -> None:
     """Draw links by what they delivered, and nodes by ``values`` (squares: with a sensor)."""
     if positions is None:
-        positions = get_positions(data.scenario.topology)
+        positions = get_positions(data.scenario, data.run)
     _draw_links(axes, data, positions)
     dots = _draw_nodes(axes, data, positions, values)
     # Labels are placed, in points, just outside the marker, whose side or diameter is sqrt(area).

@@ -102,7 +102,10 @@ def _draw_path(axes: Any, path: _Path, colour: str, labels: Sequence[str]) -> No
 def _headline(data: FigureData, paths: list[_Path]) -> str:
     if not data.shows_errors:
         return "Where nodes believe to be"
-    errors = {p.node: math.sqrt(np.nanmean(np.sum((p.x - p.xhat) ** 2, axis=1))) for p in paths}
+    known = [p for p in paths if np.isfinite(p.x).all(axis=1).any()]
+    errors = {p.node: math.sqrt(np.nanmean(np.sum((p.x - p.xhat) ** 2, axis=1))) for p in known}
+    if not errors:
+        return "Where nodes believe to be"
     worst, best = max(errors, key=lambda k: errors[k]), min(errors, key=lambda k: errors[k])
     best_text = f"{errors[best]:.3g} (node {best}) to " if len(errors) > 1 else ""
     return f"RMS error of positions: {best_text}{errors[worst]:.3g} (node {worst})"
@@ -115,7 +118,7 @@ def _coverage(data: FigureData, paths: list[_Path]) -> str:
         e @ np.linalg.pinv(P, hermitian=True) @ e
         for path in paths
         for e, P in zip((path.x - path.xhat)[1:], path.P[1:], strict=True)
-        if np.isfinite(P).all()
+        if np.isfinite(P).all() and np.isfinite(e).all()
     ]
     if not squares:
         return ""

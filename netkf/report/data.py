@@ -9,7 +9,7 @@ import numpy as np
 import scipy.special
 
 from netkf.checks.innovations import Innovations
-from netkf.figures.layout import compute_layout
+from netkf.figures.layout import get_positions
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import innovation_columns
 from netkf.report.messages import (
@@ -180,9 +180,7 @@ def sample_indices(run: StoredRun, max_values: int, instant: float) -> np.ndarra
 
 def positions(source: ReportSource, run: StoredRun) -> list[list[float]]:
     """Return the [x, y] of each node on the page, in 0 .. 1: the scenario's, or a layout."""
-    coordinates = source.scenario.topology.positions
-    if coordinates is None or any(node not in coordinates for node in run.nodes):
-        coordinates = compute_layout(source.scenario.topology)
+    coordinates = get_positions(source.scenario, run)
     points = np.array([coordinates[node] for node in run.nodes], dtype=float).reshape(-1, 2)
     if not len(points) or not np.isfinite(points).all():
         return [[0.5, 0.5] for _ in run.nodes]

@@ -354,3 +354,52 @@ def test_ranges_and_bearings_of_pairs_are_linearised_at_both_estimates(tmp_path:
     np.testing.assert_allclose(run.P[1, 0], one * np.eye(2), rtol=1e-12)
     np.testing.assert_allclose(run.P[2, 1], after + 0.1 * np.eye(2), rtol=1e-10)
     assert np.trace(run.P[3, 1]) <= np.trace(run.P[2, 1]) + 0.2 + 1e-12
+
+
+LATE = {"network__channel": {"delay": {"kind": "constant", "seconds": 0.3}}}
+
+
+@pytest.mark.parametrize("rule", ["split", "ci"])
+def test_what_is_late_is_predicted_to_now(tmp_path: Path, rule: str) -> None:
+    # A target of both, of which the first reads: of two estimates the better one is taken.
+    text = CLOCKED.replace('name = "pose"\nnodes = [1, 2, 3]', 'name = "pose"')
+    text = text.replace('[[sensors]]\nof = "pose"\nkind = "relative"', "")
+    start = text.index('[[sensors]]\nkind = "relative"')
+    text = text[:start] + text[text.index("[network]") :]
+    scenario = load(text, tmp_path, **LATE, filter__estimates="all", filter__rule=rule, probe=1.5)
+    runs = [netkf.simulate(scenario, engine=engine) for engine in ("simpy", "compiled")]
+
+    def predicted(P: float, gap: float) -> float:
+        F = np.exp(-0.2 * gap)
+        return float(F * P + 0.25 * (1.0 - F) / 0.2)
+
+    first = predicted(1.0, 1.0)
+    first -= first**2 / (first + 0.1)
+    for run in runs:
+        seen = run.P[1, :2, 0, 0]
+        np.testing.assert_allclose(seen, predicted(first, 0.5), rtol=1e-5)
+        np.testing.assert_allclose(run.xhat[1, 1], run.xhat[1, 0], rtol=1e-4)
+    np.testing.assert_allclose(runs[1].P, runs[0].P, rtol=0, atol=1e-10)
+
+
+def test_late_estimates_of_neighbours_are_used_and_none_is_below_the_truth(tmp_path: Path) -> None:
+    keys = {"filter__estimates": "own+neighbours", "horizon": 6.0} | LATE
+    scenario = load(CLOCKED, tmp_path, **keys)
+    runs = [netkf.simulate(scenario, engine=engine) for engine in ("simpy", "compiled")]
+    np.testing.assert_allclose(runs[1].xhat, runs[0].xhat, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(runs[1].P, runs[0].P, rtol=0, atol=1e-10)
+    lost = load(
+        CLOCKED, tmp_path, **keys, network__channel__loss={"kind": "bernoulli", "delivery": 0.0}
+    )
+    alone, central = (
+        netkf.simulate(one, engine="simpy")
+        for one in (lost, load(CLOCKED, tmp_path, **keys | {"filter": {"kind": "central"}}))
+    )
+    exact = netkf.theory.error_covariance(scenario, runs[0])
+    assert scenario.views is not None
+    for k, view in enumerate(scenario.views):
+        n = len(view)
+        P = runs[0].P[:, k, :n, :n]
+        for least in (exact[:, k, :n, :n], central.P[:, 0][:, view][:, :, view]):
+            assert np.linalg.eigvalsh(P - least).min() > -1e-9
+        assert np.trace(P[-1]) < np.trace(alone.P[-1, k, :n, :n]) * (0.9 if k == 2 else 1.0)

@@ -7,6 +7,7 @@ import pytest
 
 import netkf
 from netkf.core.errors import ScenarioError
+from netkf.figures.layout import get_positions
 from netkf.scenario.reading import from_table
 from netkf.scenario.usage import record_usage
 
@@ -335,3 +336,20 @@ def test_positions_are_asked_for_whenever_messages_are_sent(tmp_path, time):
     what = "a tick of the network" if time else "slot 1"
     with pytest.raises(ScenarioError, match=f"truth.csv has no state for {what}"):
         from_table({**table, "probe": 1.0, "horizon": 1.5}, tmp_path)
+
+
+def test_the_map_has_nodes_where_they_are(tmp_path):
+    table = team(tmp_path, input=RECORDED, position=[0, 1])
+    scenario = from_table(table, tmp_path)
+    assert get_positions(scenario) == {1: (0.0, 0.0), 2: (3.0, 4.0)}
+    run = netkf.simulate(scenario, engine="simpy")
+    first = {1: tuple(run.x[0, :2].tolist()), 2: tuple(run.x[0, 3:5].tolist())}
+    assert get_positions(scenario, run) == first
+    # Of nodes that no plant places a table says so.
+    (tmp_path / "places.csv").write_text("node,x,y\n1,7,1\n2,5,5\n")
+    table = team(tmp_path, input=RECORDED)
+    table["network"]["positions"] = "places.csv"
+    assert get_positions(from_table(table, tmp_path)) == {1: (7.0, 1.0), 2: (5.0, 5.0)}
+    del table["network"]["positions"]
+    places = get_positions(from_table(table, tmp_path))
+    assert math.dist(places[1], places[2]) == pytest.approx(2.0)
