@@ -209,6 +209,11 @@ class CurvePath:
 
     local = absolute
 
+    def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return local and absolute states (K, n), which are equal, at ``times`` (K,)."""
+        x = np.array([self._states[t] for t in times.tolist()]).reshape(-1, self._plant.n)
+        return x, x
+
     def rebase(self, k: int) -> FloatArray:
         """Raise IndexError: there are no frames, so that none begins."""
         raise IndexError(k)

@@ -1,16 +1,22 @@
 """Dynamics that are not linear in continuous time: order of the truth, filters against ODEs."""
 
+import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import scipy.integrate
 
 import netkf
+from netkf.kernels import kernel
 from netkf.linalg.arrays import FloatArray
+from netkf.network.clocks import Periodic
 from netkf.plants.curves import NonlinearDiffusion
+from netkf.plants.nonlinear import NonlinearSensor
 from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
+from tests.engines.agreement import assert_agree
 
 ROWS = [(0.0, 1.0, 0.0), (0.55, 1.0, 0.8), (1.3, 1.5, -0.4)]
 B = np.diag([0.03, 0.02, 0.05])
@@ -301,8 +307,104 @@ def test_mistakes_are_refused_in_one_line(folder, change, words):
     assert words in str(caught.value)
 
 
-def test_the_compiled_engine_says_that_it_cannot(folder):
-    scenario = from_table(table(), folder)
-    with pytest.raises(netkf.NetkfError, match="cannot run the plant 'nonlinear'"):
-        netkf.simulate(scenario, engine="compiled")
-    assert netkf.simulate(scenario).status == "complete"
+TICKING = {"kind": "periodic", "period": 0.31}
+DISTANCE = {
+    "kind": "range", "nodes": [0], "positions": [[-1.0, 2.0]], "R": [[0.04]], "sampling": TICKING,
+}  # fmt: skip
+DIRECTION = {
+    "kind": "range-bearing", "nodes": [0, 1], "positions": [[-1.0, 2.0], [2.0, -1.0]],
+    "R": [[0.04, 0.01], [0.01, 0.02]], "sampling": TICKING,
+}  # fmt: skip
+ENTRY = {"nodes": [0], "H": [[1.0, 0.0, 0.0]], "R": [[0.3]], "sampling": TICKING}
+LATE = {
+    "graph": {"kind": "path", "nodes": 2},
+    "activation": {"kind": "poisson", "rate": 4.0},
+    "channel": {
+        "loss": {"kind": "bernoulli", "delivery": 0.7},
+        "delay": {"kind": "exponential", "mean": 0.1},
+    },
+}
+ASKED = LATE | {"activation": {"kind": "readings"}}
+MOVER = {
+    "kind": "diffusion", "A": [[0.0, 1.0, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, -0.2]],
+    "B": np.eye(3).tolist(), "cov": np.eye(3).tolist(),
+    "input": {"kind": "sine", "G": [[0.0], [1.0], [1.0]], "amplitude": 2.0, "frequency": 0.5},
+}  # fmt: skip
+
+
+@kernel
+def swing(x, u, t, out):
+    out[0], out[1], out[2] = x[1], -math.sin(x[0]), math.cos(t) - x[2]
+
+
+@kernel
+def swing_jacobian(x, u, t, out):
+    out[:] = 0.0
+    out[0, 1], out[1, 0], out[2, 2] = 1.0, -math.cos(x[0]), -1.0
+
+
+class Swing:
+    kernels = (swing, swing_jacobian)
+
+
+@dataclass(frozen=True, eq=False)
+class Cubes(NonlinearSensor):
+    """A user's sensor of two values, which fails on a node beyond 1."""
+
+    def h(self, x, node):
+        if node > 1:
+            raise ValueError("no such node")
+        return np.array([x[0] ** 3 + node, x[1] * x[2]])
+
+    def jacobian(self, x, node):
+        return np.array([[3.0 * x[0] ** 2, 0.0, 0.0], [0.0, x[2], x[1]]])
+
+
+CUBES = Cubes(nodes=(0, 1), R=[[0.1, 0.05], [0.05, 0.2]], sampling=Periodic(period=0.2))
+SWING = {"kind": "nonlinear", "f": Swing(), "step": 0.02, "B": (0.1 * np.eye(3)).tolist()}
+COMPILED = {
+    "several readings of an instant": {"sensors": [DISTANCE, DIRECTION, ENTRY], "network": LATE},
+    "a linear plant with an input": {
+        "sensors": [ENTRY, DIRECTION], "network": LATE, "plant": MOVER,
+    },
+    "readings that are sent": {
+        "sensors": [DIRECTION | {"heading": 2}, ENTRY], "network": ASKED,
+        "filter": {"kind": "intermittent"},
+    },
+    "kernels and sensors of users": {
+        "plant": SWING, "network": LATE, "sensors": [DISTANCE], "custom": (CUBES,),
+    },
+    "one filter of all nodes": {"sensors": [DIRECTION, DISTANCE], "filter": {"kind": "central"}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("method", ["ekf", "ukf", "ckf"])
+@pytest.mark.parametrize("case", COMPILED)
+def test_both_engines_agree(folder, case, method):
+    """Where messages are late or lost, and predictions over parts of gaps are not those over the
+    whole ones.
+    """
+    changes = {"filter": {"kind": "hybrid", "epsilon": 0.3}} | COMPILED[case]
+    own = changes.pop("custom", ())
+    changes["filter"] |= {"linearise": method}
+    scenario = from_table(table(**changes), folder)
+    if own:
+        scenario = dataclasses.replace(scenario, sensors=scenario.sensors + own)
+    run = assert_agree(scenario)
+    assert run.status == "complete"
+    if case == "several readings of an instant" and method == "ekf":
+        batches = [
+            netkf.monte_carlo(scenario, 2, workers=1, engine=engine)
+            for engine in ("compiled", "simpy")
+        ]
+        np.testing.assert_allclose(batches[0].mean_P, batches[1].mean_P, rtol=1e-9)
+
+
+def test_an_error_of_a_sensor_ends_the_run(folder):
+    network = LATE | {"graph": {"kind": "path", "nodes": 3}}
+    scenario = from_table(table(plant=SWING, network=network, sensors=[DISTANCE]), folder)
+    with pytest.raises(ValueError, match="no such node"):
+        netkf.simulate(
+            dataclasses.replace(scenario, sensors=(dataclasses.replace(CUBES, nodes=(2,)),)),
+            engine="compiled",
+        )

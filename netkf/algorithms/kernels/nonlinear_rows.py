@@ -221,27 +221,36 @@ def linearise_rows(record: Any, h: int, s: int, run: Any) -> None:
     """Replace the nonlinear rows of the reading of filter ``h`` in slot number ``s`` of the plan by
     whitened linear ones.
     """
-    rows = run.nonlinear
-    n, p, r = len(run.size), rows.kind.shape[1], run.first_y + h
+    linearise_reading(run.nonlinear, record, h, run, run.first_y + h, h, s)
+
+
+@kernel
+def linearise_reading(
+    rows: NonlinearRows, record: Any, h: int, run: Any, r: int, f: int, s: int
+) -> None:
+    """Replace the nonlinear rows of reading number ``r`` of node ``h``, those of filter ``f`` in
+    ``rows`` and of slot number ``s``, by whitened linear ones.
+    """
+    n, p = len(run.size), rows.kind.shape[1]
     for q in range(rows.active):
-        own = min(h, len(rows.count) - 1)
+        own = min(f, len(rows.count) - 1)
         move_state(rows, record.xhat, h, q, s, own)
         for i in range(p):
             rows.y[i] = run.y[r, i, q]
             for k in range(p):
-                rows.C[i, k] = rows.R[min(s, len(rows.R) - 1), h, i, k]
-        read_rows(rows, h, run.H, r, q, rows.mean)
+                rows.C[i, k] = rows.R[min(s, len(rows.R) - 1), f, i, k]
+        read_rows(rows, f, run.H, r, q, rows.mean)
         if rows.distance[own] > 0.0:
-            _use_points(rows, record, h, run.H, r, q, s)
+            _use_points(rows, record, h, run.H, (r, f), q, s)
         else:
-            differentiate_rows(rows, h, run.H, r, q)
-        subtract_rows(rows, h, rows.y, rows.mean, rows.value)
+            differentiate_rows(rows, f, run.H, r, q)
+        subtract_rows(rows, f, rows.y, rows.mean, rows.value)
         for i in range(p):
             for j in range(n):
                 rows.value[i] += rows.J[i, j] * record.xhat[h, j, q]
-        _whiten(rows, h)
+        _whiten(rows, f)
         for i in range(p):
-            if rows.kind[h, i] != LINEAR:
+            if rows.kind[f, i] != LINEAR:
                 run.y[r, i, q] = rows.value[i]
                 for j in range(n):
                     run.H[r, i, j, q] = rows.J[i, j]
@@ -249,17 +258,18 @@ def linearise_rows(record: Any, h: int, s: int, run: Any) -> None:
 
 @kernel
 def _use_points(
-    rows: NonlinearRows, record: Any, h: int, H: FloatArray, r: int, q: int, s: int
+    rows: NonlinearRows, record: Any, h: int, H: FloatArray, of: tuple[int, int], q: int, s: int
 ) -> None:
-    own, slot = min(h, len(rows.count) - 1), min(s, len(rows.origin) - 1)
+    r, f = of
+    own, slot = min(f, len(rows.count) - 1), min(s, len(rows.origin) - 1)
     n, p, points = rows.count[own], rows.kind.shape[1], rows.points
     distance, weight = rows.distance[own], rows.weight[own]
     for k in range(1, 2 * n + 1):
         set_point(record.xhat, record.root, h, q, distance, k, rows.x[:n])
         for j in range(n):
             rows.x[j] += rows.origin[slot, rows.entries[own, j]]
-        read_rows(rows, h, H, r, q, rows.value)
-        subtract_rows(rows, h, rows.value, rows.mean, points[k])
+        read_rows(rows, f, H, r, q, rows.value)
+        subtract_rows(rows, f, rows.value, rows.mean, points[k])
     for i in range(p):
         # The mean of the deviations from the reading at the estimate.
         mean = 0.0
@@ -279,7 +289,7 @@ def _use_points(
             rows.J[i, j] = total / pivot if pivot != 0.0 else 0.0
     for i in range(p):
         for k in range(p):
-            if rows.kind[h, i] == LINEAR or rows.kind[h, k] == LINEAR:
+            if rows.kind[f, i] == LINEAR or rows.kind[f, k] == LINEAR:
                 continue
             # P_yy - H P H': what is even in the deviations, H P H' has all that is odd.
             total = 0.0
@@ -328,6 +338,29 @@ reads_only(Estimates, linearise_rows)
 def no_nonlinear() -> NonlinearRows:
     """Return no rows, where all readings are linear."""
     return linear_rows(0, 1, np.zeros((0, 1), dtype=np.int64))
+
+
+@kernel
+def copy_sensor(rows: NonlinearRows, f: int, first: int, sensors: NonlinearRows, k: int) -> int:
+    """Copy what ``sensors`` say of the rows of number ``k`` to those of filter ``f`` in ``rows``
+    from ``first`` on; return how many these are.
+    """
+    count = 0
+    while count < sensors.kind.shape[1] and sensors.kind[k, count] != LINEAR:
+        i = first + count
+        rows.kind[f, i], rows.heading[f, i] = sensors.kind[k, count], sensors.heading[k, count]
+        rows.dimensions[f, i] = sensors.dimensions[k, count]
+        rows.relative[f, i] = sensors.relative[k, count]
+        rows.length[f, i] = sensors.length[k, count]
+        for d in range(3):
+            rows.states[f, i, d] = sensors.states[k, count, d]
+            rows.functions[f, i, d] = sensors.functions[k, count, d]
+        count += 1
+    for j in range(len(rows.x)):
+        rows.entries[f, j] = sensors.entries[k, j]
+    rows.count[f] = sensors.count[k]
+    rows.distance[f], rows.weight[f] = sensors.distance[k], sensors.weight[k]
+    return count
 
 
 @kernel

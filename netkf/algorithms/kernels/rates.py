@@ -48,7 +48,8 @@ class RateTables(Struct):
     sine : (3, m), amplitudes, rad/s and radians of the components that are sines, nan of others
     Q : (n, n), the covariance of w over a second
     u, slope, J, state, stage, rates, points, work, mean, root : scratch, (m,), (n,), (n, n),
-        (n + 2 n n,) twice, (4, n + 2 n n), (2 n + 1, n), (n, 3 n + 1), (1, n, 1) and (1, n, n, 1)
+        (n + 2 n n,) twice, (4, n + 2 n n), (2 n + 1, n), (n, 3 n + 1), (1, n, 1) and (1, n, n, 1);
+        estimates may have room for more states than these n
     """
 
     f: int
@@ -150,7 +151,7 @@ def move_by_rate(
     """Predict estimate ``k`` of ``x`` (K, n, 1) and ``root`` (K, n, n, 1) over ``gap`` seconds, to
     the time ``end``.
     """
-    time, n = end - gap, x.shape[1]
+    time, n = end - gap, len(model.slope)
     while time < end:
         stop, later = end, last_jump(model.times, time) + 1
         if later < len(model.times) and model.times[later] < stop:
@@ -244,14 +245,15 @@ def _carry_by_rate(
 @carry_mean.register(RateTables)
 @kernel
 def _carry_mean_by_rate(model: RateTables, run: Any, x: FloatArray, m: int, age: float) -> None:
-    for i in range(x.shape[1]):
+    n = len(model.slope)
+    for i in range(n):
         model.mean[0, i, 0] = x[m, i, 0]
-        for j in range(x.shape[1]):
+        for j in range(n):
             # A root of zero: the mean of an extended filter does not depend on it.
             model.root[0, i, j, 0] = 0.0
     if age > 0.0:
         move_by_rate(model, model.mean, model.root, 0, run.now, age)
-    for i in range(x.shape[1]):
+    for i in range(n):
         x[m, i, 0] = model.mean[0, i, 0]
 
 
@@ -260,7 +262,8 @@ def _carry_mean_by_rate(model: RateTables, run: Any, x: FloatArray, m: int, age:
 def _transition_by_rate(
     model: RateTables, run: Any, x: FloatArray, k: int, out: FloatArray
 ) -> None:
-    n = x.shape[1]
+    n = len(model.slope)
+    out[:] = 0.0
     for c in range(n):
         # Central differences of means.
         step = DIFFERENCE * max(1.0, abs(x[k, c, 0]))

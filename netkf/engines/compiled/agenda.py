@@ -93,6 +93,7 @@ def is_immediate(scenario: Scenario) -> bool:
         and kernels.is_convex
         and node_filter.timing.talks
         and scenario.views is None
+        and scenario.plant.linear
         and not scenario.sampled_sensors
         and not len(scenario.followed_changes)
         and ticks_apart(network.activation)

@@ -9,6 +9,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.nonlinear_rows import linear_rows, no_nonlinear
 from netkf.algorithms.kernels.pairs import no_pairs, pairs_of
+from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.run import (
     ALL,
     ClockRun,
@@ -17,9 +18,11 @@ from netkf.algorithms.kernels.run import (
     scratch_of,
     size_of,
 )
+from netkf.algorithms.models import RateModel
 from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_arrays import BatchArrays
-from netkf.engines.compiled.clock_loop import batch_loop, clock_loop, clock_verbs
+from netkf.engines.compiled.clock_loop import NO_MODELS, batch_loop, clock_loop, clock_verbs
+from netkf.engines.compiled.nonlinear_samples import nonlinear_sensors
 from netkf.engines.compiled.samples import entries_of
 from netkf.engines.compiled.slot_pairs import BlockColumns
 from netkf.engines.compiled.state import (
@@ -33,6 +36,7 @@ from netkf.linalg.addresses import any_struct, call_kernel
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.generic import copy_arrays
 from netkf.linalg.lanes import ONE
+from netkf.linalg.plain import is_plain
 from netkf.scenario.scenario import Scenario
 
 
@@ -49,7 +53,12 @@ class ClockFilters:
         self.kernels = kernels
         self._p = self._samples = 1
         columns = BlockColumns(scenario, entries_of(scenario))
-        self._columns = columns.width, columns.entries.shape[1]
+        self._columns, self._n = (columns.width, columns.entries.shape[1]), scenario.plant.n
+        self._readings = None
+        if not (linear := all(sensor.linear for sensor in scenario.sensors)):
+            self._readings = nonlinear_sensors(scenario)
+            self._p = self._readings.R.shape[1]
+        self._rates = [m for m in scenario.model_pieces[0] if isinstance(m, RateModel)]
         pooled = scenario.node_filter.timing.pooled
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
         models = wide_models(scenario)[0]
@@ -64,7 +73,14 @@ class ClockFilters:
         self.run = self._run_of(scenario, start, links, messages)
         self._run = self.run.general
         reads = bool((start.nodes["sensors"] > start.nodes["sensor"]).any())
-        self._verbs = clock_verbs(kernels, self.record, self.run, reads)
+        own_models = NO_MODELS
+        if self._rates:
+            # The loop passes the model on, whatever it is.
+            self._run = self.run if is_plain() else ClockRun.at(self.run)
+            if scenario.views is not None and not pooled:
+                self._own_models = [model.tables() for model in self._rates]
+                own_models = np.stack([tables.memory for tables in self._own_models])
+        self._verbs = clock_verbs(kernels, self.record, self.run, reads, linear, own_models)
         self._conserved: tuple[str, ...] = ()
         if "conserved" in self.records.arrays:
             first = scenario.initial_estimate(infos[0].node)
@@ -79,9 +95,9 @@ class ClockFilters:
     ) -> Any:
         """Return what surrounds the nodes at time 0."""
         n, unrolled = start.xhat.shape[1], self.kernels.unrolled and scenario.views is None
-        size = size_of(n, unrolled)
+        size = size_of(n, unrolled and not self._rates)
         cls = ClockRun.of_size(n) if isinstance(size, tuple) else ClockRun
-        return cls(
+        made = cls(
             size=size,
             lanes=ONE,
             model=clock_tables(
@@ -108,6 +124,10 @@ class ClockFilters:
             now=0.0,
             **scratch_of(n, 1),
         )
+        if not self._rates:
+            return made
+        fields = {name: getattr(made, name) for name in cls.struct_fields}
+        return RateRun(**fields | {"model": self._rates[0].tables()})
 
     def begin(self, instants: Instants) -> None:
         """Go back to time 0, for a run whose sensors take samples at these ``instants``."""
@@ -126,6 +146,8 @@ class ClockFilters:
         predicted.
         """
         model = self.run.model
+        if self._rates:
+            return
         model.piece, model.models[:] = piece, self._first_models + piece * model.stride
 
     @property
@@ -154,9 +176,9 @@ class ClockFilters:
         columns, own = self._columns
         pairs = no_pairs()
         if columns > own:
-            entries = np.full((1, columns), -1)
-            rows = linear_rows(messages * self._samples, self._p, entries)
-            rows.R[0] = np.eye(self._p)
+            count = messages * self._samples
+            rows = linear_rows(count, self._p, np.full((count, columns), -1))
+            rows.R[0], rows.origin = np.eye(self._p), np.zeros((1, self._n))
             pairs = pairs_of(rows, own, np.zeros(1 + readings, dtype=np.int64))
         return {
             "pairs": pairs,
@@ -174,7 +196,11 @@ class ClockFilters:
 
     def advance(self, state: Simulation) -> int:
         """Run the event loop until it needs something from Python; return its request."""
-        return int(clock_loop(state, any_struct(self.record), self._run, self._verbs))
+        request = int(clock_loop(state, any_struct(self.record), self._run, self._verbs))
+        for one in (*self._rates, self._readings):
+            if one is not None:
+                one.raise_error()
+        return request
 
     def simulate(self, state: Simulation, batch: BatchArrays) -> None:
         """Simulate all runs of a batch; the results are in ``batch``, samples in

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.kernels import run as standard
+from netkf.algorithms.kernels.rates import RateTables
 from netkf.algorithms.kernels.run import ClockRun, interval_end
 from netkf.algorithms.records import Kernels
 from netkf.core.instants import snapped
@@ -54,11 +55,17 @@ from netkf.engines.compiled.events import (
 )
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.message_queue import push, release, sort_indices, take
+from netkf.engines.compiled.nonlinear_samples import (
+    linearise_instant,
+    no_table,
+    set_linear,
+    set_pair,
+)
 from netkf.engines.compiled.state import AFTER_READINGS, NODES, Instants, Simulation
 from netkf.linalg.addresses import NOTHING, address_of, call_at, call_at_two, number_at
 from netkf.linalg.arrays import IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.generic import copy_arrays, copy_row
+from netkf.linalg.generic import copy_arrays, copy_row, struct_like
 from netkf.linalg.structs import Struct, struct_at
 
 FLAGS = ("decides", "sends_readings", "remembers", "counts_sends", "addressed")
@@ -72,6 +79,9 @@ class ClockVerbs(Struct):
 
     copy : copies a payload to another one
     restart : copies all arrays of a record that is given in place of a run
+    linearise : makes linear readings of the samples of an instant that are not
+    whole_gaps : whether a prediction over a gap is not that over its parts
+    models : (N, words), the struct of each node's model, (0, 0) if that of the run is all's
     kept, room : of a filter that remembers, see ``records.Record``
     """
 
@@ -83,6 +93,8 @@ class ClockVerbs(Struct):
     interval: int
     copy: int
     restart: int
+    linearise: int
+    whole_gaps: int
     decides: int
     sends_readings: int
     remembers: int
@@ -90,6 +102,10 @@ class ClockVerbs(Struct):
     addressed: int
     room: int
     kept: IntArray
+    models: IntArray
+
+
+NO_MODELS: IntArray = np.zeros((0, 0), dtype=np.int64)
 
 
 @kernel
@@ -104,19 +120,31 @@ def restart(record: Any, _h: int, start: Any) -> None:
     copy_arrays(record, start)
 
 
-def clock_verbs(kernels: Kernels, record: Any, run: ClockRun, increments: bool) -> ClockVerbs:
-    """Return the verbs of a filter for its record and its run; ``increments``: some nodes read."""
-    key = kernels, type(record), type(run), increments
-    # Those of a filter that remembers are of one record.
-    if key not in _verbs or kernels.remembers:
-        _verbs[key] = _compiled_verbs(kernels, record, run, increments)
+def clock_verbs(
+    kernels: Kernels,
+    record: Any,
+    run: Any,
+    increments: bool,
+    linear: bool = True,
+    models: IntArray = NO_MODELS,
+) -> ClockVerbs:
+    """Return the verbs of a filter for its record and its run; ``increments``: some nodes read;
+    ``linear``: all samples are. Of a run with other than ClockTables nodes may have own ``models``.
+    """
+    key = kernels, type(record), type(run), increments, linear
+    # Those of a filter that remembers are of one record, and models are of one run.
+    if key not in _verbs or kernels.remembers or len(models):
+        _verbs[key] = _compiled_verbs(kernels, record, run, increments, linear)
+        _verbs[key].models = models
     return _verbs[key]
 
 
 _verbs: dict[tuple[Any, ...], ClockVerbs] = {}
 
 
-def _compiled_verbs(kernels: Kernels, record: Any, run: ClockRun, increments: bool) -> ClockVerbs:
+def _compiled_verbs(
+    kernels: Kernels, record: Any, run: Any, increments: bool, linear: bool
+) -> ClockVerbs:
     observes = kernels.observe is not standard.observe
     return ClockVerbs(
         predict=address_of(kernels.predict, record, run),
@@ -127,9 +155,12 @@ def _compiled_verbs(kernels: Kernels, record: Any, run: ClockRun, increments: bo
         interval=address_of(kernels.interval, record, run, number=True) if increments else NOTHING,
         copy=address_of(copy_payload, record, run, 2),
         restart=address_of(restart, record, record),
+        linearise=NOTHING if linear else address_of(linearise_instant, record, no_table(), 2),
+        whole_gaps=isinstance(run.model, RateTables),
         **{name: getattr(kernels, name) for name in FLAGS},
         room=record.room if kernels.remembers else 0,
         kept=record.kept if kernels.remembers else np.zeros((0, 1), dtype=np.int64),
+        models=NO_MODELS,
     )
 
 
@@ -178,7 +209,7 @@ def predict_participants(
 ) -> None:
     """Predict the nodes that take part in an event to ``now`` (seconds)."""
     # The sender of a message that is lost needs no prediction, unless it reads increments.
-    lost = event == ON_TICK and verbs.counts_sends == 0 and is_lost(state)
+    lost = event == ON_TICK and verbs.counts_sends + verbs.whole_gaps == 0 and is_lost(state)
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
         if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
@@ -189,6 +220,7 @@ def predict_participants(
 def on_probe(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs) -> bool:
     """Store a sample of all nodes; return False if there is no space for another one."""
     for h in range(len(state.nodes) if verbs.observe != NOTHING else 0):
+        choose_model(run, verbs, h)
         call_at(verbs.observe, record, h, run)
     store_sample(state, state.run, 0, state.samples)
     return count_sample(state)
@@ -204,6 +236,7 @@ def predict_node(
     if not now < time:
         return
     state.now[h] = time
+    choose_model(run, verbs, h)
     if node.sensors == node.sensor:
         run.gap = time - now
         call_at(verbs.predict, record, h, run)
@@ -228,6 +261,13 @@ def predict_node(
         now = end
 
 
+@kernel(inlined=True)
+def choose_model(run: ClockRun, verbs: ClockVerbs, h: int) -> None:
+    """Make the model of node ``h`` that of the run, where nodes have own ones."""
+    if len(verbs.models) > 0:
+        run.model = struct_like(run.model, verbs.models[h])
+
+
 @kernel
 def on_sample(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, now: float) -> None:
     """Update a node with its samples of the next instant, ``now`` (seconds)."""
@@ -238,8 +278,11 @@ def on_sample(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
         if instants.node[s] != last_node:
             last_node = instants.node[s]
             record_event(state, now, SENSE, last_node, -1, -1)
+    if verbs.linearise != NOTHING:
+        call_at_two(verbs.linearise, record, h, instant, instants.nonlinear)
     whiten_instant(state, run, OWN, instant)
     run.reading = OWN
+    choose_model(run, verbs, h)
     call_at(verbs.update, record, h, run)
     state.nodes[h].reading = instant
     state.instant_at += 1
@@ -281,6 +324,7 @@ def send_all(
     for k in range(after - first):
         arrives = arrives or ticks.delay[outcome + k] >= 0.0
     run.sends[0] = 1
+    choose_model(run, verbs, h)
     if arrives and verbs.addressed == 0:
         call_at_two(verbs.emit, record, h, m, run)
     if verbs.decides == 1 and run.sends[0] == 0:
@@ -337,6 +381,7 @@ def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
                 whiten_pairs(state, run, count + 1, message.tag)
         count, m = count + 1, message.next
     run.count = count
+    choose_model(run, verbs, h)
     call_at(verbs.absorb, record, h, run)
     # Messages return to the pool only now, since their payloads were read.
     m = node.inbox
@@ -405,8 +450,14 @@ def whiten_pairs(state: Simulation, run: ClockRun, r: int, instant: int) -> None
         return
     for s in range(instants.first[instant], instants.first[instant + 1]):
         if instants.block[s] >= 0:
-            whiten_sample(instants, run, r, s, row, instants.H.shape[2])
             rows = instants.rows[instants.sensor[s]]
+            if len(instants.nonlinear.sensor) > 0 and instants.nonlinear.sensor[s] >= 0:
+                for i in range(rows):
+                    run.y[r, row + i, 0] = instants.y[s, i]
+                set_pair(pairs, last, instants.nonlinear, s)
+            else:
+                whiten_sample(instants, run, r, s, row, instants.H.shape[2])
+                set_linear(pairs, last)
             pairs.block[0, last], pairs.row[last], pairs.length[last] = instants.block[s], row, rows
             row, last = row + rows, last + 1
     pairs.first[r + 1] = last

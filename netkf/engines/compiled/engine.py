@@ -21,6 +21,7 @@ from netkf.engines.compiled.slot_run import run_slots, slot_batches, with_ends
 from netkf.engines.compiled.slot_setup import slot_setup
 from netkf.linalg import compiling
 from netkf.linalg.plain import announce_plain, has_numba, is_plain
+from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.maps import NonlinearPlant
@@ -38,7 +39,7 @@ from netkf.trace.batch import RunBatch
 from netkf.trace.recorder import Recorder
 
 PLANTS = (
-    *(Diffusion, RecordedDiffusion, UnknownDiffusion),
+    *(Diffusion, NonlinearDiffusion, RecordedDiffusion, UnknownDiffusion),
     *(LinearPlant, NonlinearPlant, RecordedPlant, UnknownPlant),
 )
 

@@ -151,7 +151,7 @@ class Workspace:
         self._scratch: tuple[Scratch, FlowScratch] | None = None
         kernels = compiled_kernels(scenario.node_filter, clocked=True)
         assert kernels is not None
-        self._unrolled = kernels.unrolled and scenario.views is None
+        self._unrolled = kernels.unrolled and scenario.views is None and scenario.plant.linear
         self.clocked: ClockFilters | None = None
         if not is_immediate(scenario):
             self.clocked = ClockFilters(scenario, kernels, self._start, FIRST_MESSAGES)

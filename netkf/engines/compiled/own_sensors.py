@@ -31,11 +31,11 @@ def is_own(sensor: Sensor) -> bool:
 
 def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
     """Return True if Python can read a user's sensor for the engine: in slots, or by samples. Its
-    increments would be drawn by kernels, and a nonlinear one is linearised in slots only.
+    increments would be drawn by kernels.
     """
     if isinstance(sensor, NonlinearSensor):
-        is_usual = type(sensor).slot_path is NonlinearSensor.slot_path
-        return slotted and is_usual
+        name = "slot_path" if slotted else "samples"
+        return getattr(type(sensor), name) is getattr(NonlinearSensor, name)
     return sensor.linear and (slotted or getattr(sensor, "sampling", None) is not None)
 
 

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from netkf.engines.compiled.nonlinear_samples import block_of, nonlinear_table
 from netkf.engines.compiled.own_sensors import is_own
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.samples import entries_of
 from netkf.engines.compiled.slot_pairs import BlockColumns
-from netkf.engines.compiled.state import NOBODY, Instants
+from netkf.engines.compiled.state import Instants
 from netkf.engines.compiled.ticks import clocks_of, draw_instants, is_kernel_clock
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -34,7 +35,8 @@ from netkf.scenario.scenario import Scenario
 
 class SampledSensor(NamedTuple):
     """One sensor: the ``times`` (K,) in seconds of its ``samples``, their ``indices`` (K,) among
-    all samples of the run, whether each has an H of its own, and the index of its filter.
+    all samples of the run, whether each has an H of its own, the index of its filter, and whether
+    it is linear and read from a record.
     """
 
     times: FloatArray
@@ -42,6 +44,8 @@ class SampledSensor(NamedTuple):
     indices: np.ndarray
     varying: bool
     filter: int
+    linear: bool
+    recorded: bool
 
 
 class Samples(Protocol):
@@ -208,6 +212,8 @@ class SampleTables:
                 indices,
                 bool(varies),
                 int(h),
+                scenario.sensors[placed_sensor.entry].linear,
+                scenario.sensors[placed_sensor.entry].record is not None,
             )
             for (node, placed_sensor), indices, varies, h in zip(
                 placed,
@@ -220,7 +226,8 @@ class SampleTables:
         self._columns = None if scenario.views is None else _sensor_tables(scenario).columns
         self.instants = _make_instants(scenario, t[order], sensor[order])
         for (_, placed_sensor), sampled in zip(placed, self._sensors, strict=True):
-            if sampled.varying and hasattr(sampled.samples, "covariance"):
+            has_noise = sampled.varying and hasattr(sampled.samples, "covariance")
+            if has_noise and sampled.linear:
                 R = scenario.noise_covariance(placed_sensor.entry, believed=True)
                 _add_noises(self.instants, sampled.samples, sampled.indices, R)
 
@@ -235,6 +242,12 @@ class SampleTables:
             sample_times = sensor.times[first:last]
             # The state at each sample; ``times`` contains all of them.
             x = states[np.searchsorted(times, sample_times)]
+            if not sensor.linear:
+                # Recorded values are in the table already.
+                for k in range(first, last if not sensor.recorded else first):
+                    y = sensor.samples.reading(k, x[k - first])[0]
+                    instants.y[sensor.indices[k], : len(y)] = y
+                continue
             y, H = read_many(sensor.samples, range(first, last), x)
             indices, p = sensor.indices[first:last], y.shape[1]
             instants.y[indices, :p] = y
@@ -252,12 +265,7 @@ class SampleTables:
         for k, matrix in zip(indices.tolist(), H, strict=True):
             place = columns.other(sensor.filter, np.flatnonzero(matrix.any(axis=0)))
             instants.H[instants.matrix[k], :p] = columns.of(sensor.filter, matrix, place)
-            instants.block[k] = _block_of(columns, place)
-
-
-def _block_of(columns: BlockColumns, place: Any) -> int:
-    number = columns.number(place)
-    return number if place is None or number >= 0 else NOBODY
+            instants.block[k] = block_of(columns, place)
 
 
 def _add_noises(instants: Instants, samples: Any, indices: np.ndarray, R: FloatArray) -> None:
@@ -318,7 +326,9 @@ def _sensor_tables(scenario: Scenario) -> SensorTables:
     max_rows = int(rows.max(initial=1))
     root, H = np.zeros((len(parts), max_rows, max_rows)), np.zeros((len(parts), max_rows, n))
     for k, (part, R) in enumerate(parts):
-        root[k, : len(R), : len(R)], H[k, : len(R)] = np.linalg.cholesky(R), part.matrix_of(n)
+        # Nonlinear ones are whitened where they are used.
+        of_noise = np.linalg.cholesky(R) if part.linear else np.eye(len(R))
+        root[k, : len(R), : len(R)], H[k, : len(R)] = of_noise, part.matrix_of(n)
     filters = [0 if pooled else index[node] for node, _ in placed]
     columns = BlockColumns(scenario, entries_of(scenario))
     places = [
@@ -335,7 +345,7 @@ def _sensor_tables(scenario: Scenario) -> SensorTables:
         H=H,
         columns=columns,
         own=np.reshape(own, (len(parts), max_rows, columns.width)),
-        block=np.array([_block_of(columns, place) for place in places], dtype=np.int64),
+        block=np.array([block_of(columns, place) for place in places], dtype=np.int64),
     )
 
 
@@ -353,17 +363,20 @@ def _make_instants(scenario: Scenario, t: FloatArray, sensor: np.ndarray) -> Ins
     # Samples of one node at one time are one instant, and one update.
     begins = np.ones(len(t), dtype=bool)
     begins[1:] = (np.diff(t) != 0.0) | (np.diff(filters) != 0)
-    first = np.flatnonzero(begins)
+    first, block = np.flatnonzero(begins), tables.block[sensor]
+    y, after = np.zeros((len(t), tables.H.shape[1])), np.append(first, len(t))
+    read = {"first": after, "block": block, "matrix": matrix, "values": y, "matrices": H}
     return Instants(
         t=t[first],
         index=filters[first],
-        first=np.append(first, len(t)),
+        first=after,
         node=tables.node[sensor],
-        y=np.zeros((len(t), tables.H.shape[1])),
+        y=y,
         sensor=sensor,
         matrix=matrix,
-        block=tables.block[sensor],
+        block=block,
         rows=tables.rows,
         root=tables.root,
         H=H,
+        nonlinear=nonlinear_table(scenario, sensor, t, read),
     )

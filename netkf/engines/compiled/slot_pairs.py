@@ -23,6 +23,7 @@ class BlockColumns:
     def __init__(self, scenario: Scenario, entries: np.ndarray) -> None:
         """``entries`` (H, w) are those of the state that each filter estimates, -1 beyond."""
         self.entries, self.places = entries, scenario.layout.places
+        self._n = scenario.plant.n
         self.numbers = block_numbers(scenario.node_infos)
         needs = scenario.node_filter.needs.blocks and scenario.views is not None
         self.width: int = entries.shape[1] + (max(p.n for p in self.places) if needs else 0)
@@ -31,6 +32,21 @@ class BlockColumns:
         """Return the block of the ``support`` (k,) of a reading that filter ``h`` has not."""
         outside = np.setdiff1d(support, self.entries[h])
         return next((p for p in self.places if len(outside) and outside[0] < p.first + p.n), None)
+
+    def of_reading(self, h: int, sensor: Any, anchor: int) -> Place | None:
+        """Return the block beside those of filter ``h`` that a reading is about."""
+        if sensor.linear:
+            support = np.flatnonzero(matrix_of(sensor, anchor, self._n).any(axis=0))
+        else:
+            support = sensor.support(self._n, sensor.nodes[0] if anchor < 0 else anchor)
+        return self.other(h, support)
+
+    def others(self, h: int, sensor: Any, node: int) -> dict[int, Place]:
+        """Return by anchor the blocks beside those of filter ``h`` that a sensor of a node (id)
+        reads.
+        """
+        found = {anchor: self.of_reading(h, sensor, anchor) for anchor in anchors_of(sensor, node)}
+        return {anchor: place for anchor, place in found.items() if place is not None}
 
     def of(self, h: int, H: FloatArray, place: Place | None = None) -> FloatArray:
         """Return the columns (..., n) of H (..., N) of filter ``h``, and of a block behind them."""
@@ -70,18 +86,7 @@ class SlotPairs:
     def others(self, s: Any) -> dict[int, Place]:
         """Return by anchor the blocks beside those of its filter that an AssignedSensor reads."""
         sensor: Any = self._scenario.located_sensors[s.placed_sensor.entry]
-        anchors = anchors_of(sensor, s.node)
-        found = {anchor: self.other(s.estimator, sensor, anchor) for anchor in anchors}
-        return {anchor: place for anchor, place in found.items() if place is not None}
-
-    def other(self, h: int, sensor: Any, anchor: int) -> Place | None:
-        """Return the block beside those of filter ``h`` that a reading is about."""
-        n = self._scenario.plant.n
-        if sensor.linear:
-            support = np.flatnonzero(matrix_of(sensor, anchor, n).any(axis=0))
-        else:
-            support = sensor.support(n, sensor.nodes[0] if anchor < 0 else anchor)
-        return self.columns.other(h, support)
+        return self.columns.others(s.estimator, sensor, s.node)
 
     def add(self, s: Any, row: int, others: dict[int, Place]) -> int:
         """Add an AssignedSensor, with its first value in ``row``; return the number of its first
@@ -163,6 +168,8 @@ def _reads_in_its_own_way(
         return False
     if not sensor.linear:
         moved = scenario.input_responses is not None
+        if moved and not scenario.slotted:
+            return True
         return sensor.record is not None and (moved or not has_known_h(sensor))
     outside, places = np.ones(scenario.plant.n, dtype=bool), scenario.layout.places
     outside[view] = False

@@ -600,7 +600,11 @@ class SlotRuns:
         y[:, sensed, h, rows] = 0.0 if sensor.linear else np.nan
         for k in np.flatnonzero(sensed).tolist():
             for m, (values, anchor, R) in enumerate(path.readings_at(self._slot + k, s.R)):
-                place, pair, first = setup.pairs.other(h, sensor, anchor), s.pair + m, s.row + m * p
+                place, pair, first = (
+                    setup.columns.of_reading(h, sensor, anchor),
+                    s.pair + m,
+                    s.row + m * p,
+                )
                 if place is not None:
                     first = int(pairs.row[pair])
                     pairs.block[k, pair] = setup.columns.number(place)

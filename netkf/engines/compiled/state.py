@@ -19,7 +19,7 @@ from netkf.algorithms.kernels.root_flow import (
     flow_scratch,
     stack_tables,
 )
-from netkf.algorithms.models import FlowModel, first_roots
+from netkf.algorithms.models import FlowModel, RateModel, first_roots
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.senders import senders_of
 from netkf.linalg.arrays import FloatArray, IntArray, enlarged
@@ -129,6 +129,7 @@ class Instants(Struct):
             none, NOBODY: one that nobody estimates
     rows, root : (L,) and the root of R (L, p, p), by sensor
     H : (M, p, n), by matrix, of the states of a filter, then of such a block
+    nonlinear : ``nonlinear_samples.NonlinearTable``
     """
 
     t: FloatArray
@@ -142,6 +143,7 @@ class Instants(Struct):
     rows: IntArray
     root: FloatArray
     H: FloatArray
+    nonlinear: Any
 
 
 class PathBlock(Struct):
@@ -350,8 +352,8 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # ``sensor`` of the first node stays 0.
     nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
     nodes["inbox"] = nodes["reading"] = -1
-    # One table for each distinct model.
-    table, gains = _stack_model_tables(pieces)
+    # One table for each distinct model; those of models that are not linear are not used.
+    table, gains = _stack_model_tables([[_linear(m) for m in piece] for piece in pieces])
     n = len(models[0].information)
     starts = [(enlarged(mean, n), enlarged(cov, n, n)) for mean, cov in starts]
     xhat = np.stack([mean for mean, _ in starts])
@@ -379,6 +381,14 @@ def wide_models(scenario: Scenario) -> list[Sequence[FlowModel]]:
             ]
         columns.append(known[key])
     return list(zip(*columns, strict=True))
+
+
+def _linear(model: FlowModel) -> FlowModel:
+    if not isinstance(model, RateModel):
+        return model
+    n = len(model.Q)
+    nothing = np.zeros((n, n)), np.zeros((n, n)), np.zeros((0, n)), np.zeros((0, 0))
+    return FlowModel(*nothing, model.horizon, model.interval)
 
 
 def _stack_model_tables(pieces: list[list[FlowModel]]) -> tuple[FlowTable, Gains]:
