@@ -37,23 +37,29 @@ from typing import Any
 import numpy as np
 
 from netkf.algorithms.filter import NodeInfo
-from netkf.algorithms.kernels.constant_gains import fill_inverse_transition
 from netkf.algorithms.kernels.estimates import add_covariance_product
 from netkf.algorithms.kernels.intersection import invert_lanes
+from netkf.algorithms.kernels.root_flow import cell_of, transition_series
 from netkf.algorithms.kernels.run import predict_estimate, shift_vector, use_reading
 from netkf.algorithms.kernels.square_root import triangularise
-from netkf.algorithms.modes import rate_groups
+from netkf.algorithms.modes import RateGroups, rate_groups
 from netkf.algorithms.records import Kernels, Record
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane
 from netkf.linalg.jacobi import diagonalise
 from netkf.linalg.lanes import ONE
+from netkf.linalg.local import local_matrix, local_vector
+from netkf.linalg.series import ORDER_9, horner
 from netkf.linalg.structs import Size
 
 MIN_ACCURACY = 1e-4
 """Relative accuracy with which a total must grow by a share in floating point; otherwise the node
 offers nothing.
+"""
+CELLS, REACH = 64, 0.0625
+"""Cells of the table of M, and their length times the norm of its exponent: the terms of order 10
+are below rounding.
 """
 
 
@@ -64,7 +70,7 @@ def record(infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
     ``elapsed`` that they refer to, ``rounds`` and ``number`` count broadcasts.
     """
     groups, n = rate_groups(models[0].A), len(models[0].A)
-    m = 1 + n * n + n * len(groups.rates)
+    m, (unit, table) = 1 + n * n + n * len(groups.rates), _table_of(groups)
     return Record(
         node={
             **dict.fromkeys(("weight", "elapsed", "sent_at"), ()),
@@ -77,13 +83,33 @@ def record(infos: Sequence[NodeInfo], models: Sequence[Any]) -> Record:
         settings={
             "receivers": np.array([info.receivers for info in infos], dtype=np.int64),
             "nodes": float(infos[0].nodes),
-            "kept": np.ascontiguousarray(groups.kept),
-            "rates": np.ascontiguousarray(groups.rates),
             "projectors": np.ascontiguousarray(groups.projectors),
+            "unit": unit,
+            "table": table,
+            "back": np.zeros(table.shape[2]),
             "gain": np.zeros(m),
             "work": np.zeros((4, n, n)),
         },
     )
+
+
+def _table_of(groups: RateGroups) -> tuple[float, FloatArray]:
+    """Return the length of a cell (s), and Taylor coefficients (CELLS, terms, n n + G) around its
+    middle of M by rows and of each e^{-r_g gap}.
+    """
+    kept, rates, terms = groups.kept, groups.rates, len(ORDER_9) + 1
+    norm = max(np.abs(kept).sum(axis=1).max(), rates.max(initial=0.0), 1e-300)
+    unit, n = 2.0 ** np.floor(np.log2(REACH / norm)), len(kept)
+    middles = unit * (np.arange(CELLS) + 0.5)
+    middles[0] = 0.0
+    M = transition_series(-kept, np.zeros((n, n)), np.zeros((0, n)), middles)[0]
+    # A plant of one state for each rate: powers of one number.
+    fading = [
+        transition_series(-np.eye(1) * rate, np.zeros((1, 1)), np.zeros((0, 1)), middles)[0]
+        for rate in rates
+    ]
+    parts = [part[:, :terms].reshape(CELLS, terms, -1) for part in (M, *fading)]
+    return float(unit), np.concatenate(parts, axis=2).astype(np.float64)
 
 
 def weights(state: Any) -> dict[str, list[float]]:
@@ -120,32 +146,54 @@ def predict_total(record: Any, size: Size, total: FloatArray, gap: float) -> Non
     """Make a ``total`` (1 + n n + G n,) refer to the state ``gap`` seconds later, in place."""
     if not gap > 0.0:
         return
+    fill_back(record, size, gap)
+    n, M = len(size), record.back
+    half, predicted = local_matrix(size, record.work[1]), local_vector(size, record.work[2, 0])
     # Information moves by the transpose of M from the left and by M from the right.
-    fill_inverse_transition(size, record.kept, gap, record.work)
-    inverse, half, predicted = record.work[0], record.work[1], record.work[2]
-    n = len(size)
     for i in range(n):
         for j in range(n):
             entry = 0.0
             for r in range(n):
-                entry += total[1 + i * n + r] * inverse[r, j]
+                entry += total[1 + i * n + r] * M[r * n + j]
             half[i, j] = entry
     for i in range(n):
         for j in range(n):
             entry = 0.0
             for r in range(n):
-                entry += inverse[r, i] * half[r, j]
+                entry += M[r * n + i] * half[r, j]
             total[1 + i * n + j] = entry
-    for g in range(len(record.rates)):
+    for g in range(len(record.projectors)):
         # The mean of the modes of a group decays, unlike the information about them.
-        begin, fading = 1 + (n + g) * n, math.exp(-record.rates[g] * gap)
+        begin = 1 + (n + g) * n
         for i in range(n):
             entry = 0.0
             for r in range(n):
-                entry += inverse[r, i] * total[begin + r]
-            predicted[0, i] = fading * entry
+                entry += M[r * n + i] * total[begin + r]
+            predicted[i] = M[n * n + g] * entry
         for i in range(n):
-            total[begin + i] = predicted[0, i]
+            total[begin + i] = predicted[i]
+
+
+@kernel
+def fill_back(record: Any, size: Size, gap: float) -> None:
+    """Write M over a ``gap`` in seconds by rows, and each e^{-r_g gap}, into ``record.back``."""
+    table, back, doublings, n = record.table, record.back, 0, len(size)
+    while gap >= len(table) * record.unit:
+        gap, doublings = 0.5 * gap, doublings + 1
+    cell, since = cell_of(record.unit, gap)
+    horner(ORDER_9, back, len(back), table[cell], since)
+    product = local_matrix(size, record.work[0])
+    for _ in range(doublings):
+        for i in range(n):
+            for j in range(n):
+                product[i, j] = 0.0
+                for r in range(n):
+                    product[i, j] += back[i * n + r] * back[r * n + j]
+        for i in range(n):
+            for j in range(n):
+                back[i * n + j] = product[i, j]
+        for g in range(n * n, len(back)):
+            back[g] *= back[g]
 
 
 @kernel
@@ -191,7 +239,7 @@ def add_share(record: Any, h: int, run: Any, receivers: int) -> None:
                 total += inverse[r, i] * inverse[r, j]
             U[i, j] = record.weight[h, 0] / record.nodes * total
             sent[h, 1 + i * n + j, 0] += U[i, j] / (receivers + 1)
-    for g in range(len(record.rates)):
+    for g in range(len(record.projectors)):
         # U P_g xhat
         for i in range(n):
             part[0, i] = 0.0
@@ -303,7 +351,7 @@ def update_root_by_gain(
 def shift_total(record: Any, total: FloatArray, run: Any) -> None:
     """Add ``U P_g offset`` to each part of u: since u = U x, it moves with x."""
     n, moved = len(run.size), record.work[2]
-    for g in range(len(record.rates)):
+    for g in range(len(record.projectors)):
         for i in range(n):
             moved[0, i] = 0.0
             for j in range(n):

@@ -11,6 +11,7 @@ a *frame* (``truth`` says why).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -27,8 +28,8 @@ from netkf.plants.plant import Plant
 from netkf.plants.transitions import Transitions, decimal_below, frame_period
 from netkf.plants.tree import Tree
 from netkf.plants.truth import ChangingTruth, SampledTruth, multiples
-from netkf.rng.normals import GeneratorNormals, Normals
-from netkf.rng.streams import state_of
+from netkf.rng.normals import GeneratorNormals, Normals, StreamNormals
+from netkf.rng.streams import ReplicaStreams, Streams, state_of
 
 MAX_STEP = 8.0  # norm of A times a step, beyond which the series of e^{A g} loses digits
 NO_TIMES = np.empty(0)
@@ -163,6 +164,20 @@ class Diffusion(Plant):
         tree = self._tree(horizon)
         frame_times = multiples(tree.frame, horizon, self.time_grid)
         return SampledTruth(self.moves, tree, start, stream, times, frame_times, frames)
+
+    def sampled_states(
+        self, streams: Streams | ReplicaStreams, times: Sequence[FloatArray], horizon: float
+    ) -> list[FloatArray]:
+        """Return the states (K, n) of each run at its ``times`` (K,), in any order, as
+        ``sampled_truth`` of the stream "plant" of each run has them, without frames.
+        """
+        normals, tree = StreamNormals(streams.states("plant", [()])), self._tree(horizon)
+        started, starts, found = normals.states.copy(), self.starts(normals), []
+        for k, own in enumerate(times):
+            order, x = np.argsort(own), np.empty((len(own), self.n))
+            x[order] = tree.states(own[order], starts[k], started[k : k + 1], 0)[0]
+            found.append(x)
+        return found
 
     def _tree(self, horizon: float, piece: int = 0) -> Tree:
         """Return the cells of paths up to a horizon (seconds), made once for all runs."""

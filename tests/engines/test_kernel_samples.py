@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from netkf.engines.compiled.sample_tables import KernelSamples, SampleTables, samples_of
-from netkf.rng.streams import Streams
+from netkf.rng.streams import ReplicaStreams, Streams
 
 CLOCKS = [
     {"kind": "poisson", "rate": 2.0},
@@ -39,3 +39,25 @@ def test_samples_of_several_windows(case):
         one.read(states, times, 3.0, np.inf)
     np.testing.assert_array_equal(drawn.instants.y, plain.instants.y)
     assert len(np.unique(plain.instants.y[:, 0])) == len(plain.instants.y) > 300
+
+
+def test_samples_of_several_runs_are_those_of_each(case):
+    together = KernelSamples(case, ReplicaStreams(3, 2, 3))
+    states = np.random.default_rng(1).standard_normal((len(together.t), 2))
+    together.read_from(0, states)
+    all_of, place = together.instants, 0
+    for run in range(3):
+        own = slice(*together.edges[run : run + 2])
+        alone = KernelSamples(case, Streams(3, 2 + run))
+        alone.read_from(0, states[own])
+        count = len(alone.instants.t)
+        for name in ("node", "sensor", "matrix", "block", "y"):
+            found, expected = getattr(all_of, name)[own], getattr(alone.instants, name)
+            np.testing.assert_array_equal(found, expected)
+        for name, shift in (("t", 0.0), ("index", 0), ("first", own.start)):
+            found, expected = (getattr(one, name) for one in (all_of, alone.instants))
+            np.testing.assert_array_equal(found[place : place + count], expected[:count] + shift)
+        # An instant that never comes, without samples, ends the run.
+        assert all_of.t[place + count] == np.inf
+        assert all_of.first[place + count] == all_of.first[place + count + 1] == own.stop
+        place += count + 1

@@ -24,6 +24,7 @@ class BatchArrays(Struct):
     nodes, xhat, root : filters at time 0, (N,), (N, n) and (N, n, n)
     first, first_delay : (R + 1,), run r has the ticks ``first[r]`` to ``first[r + 1]`` - 1, whose
                          outcomes begin at ``first_delay[r]``
+    first_instant : (R,), where the samples of sensors of each run begin
     x, error : true states at the T sample times (R, T, n), and x - xhat (R, T, N, n)
     lengths, counts : number of samples (R,), and of events by kind (R, len(KINDS))
     diverged : (R,), 1 if the last sample is not finite
@@ -36,6 +37,7 @@ class BatchArrays(Struct):
     root: FloatArray
     first: IntArray
     first_delay: IntArray
+    first_instant: IntArray
     x: FloatArray
     error: FloatArray
     lengths: IntArray
@@ -55,6 +57,7 @@ def no_batch() -> BatchArrays:
         root=np.zeros((0, 0, 0)),
         first=no_runs,
         first_delay=no_runs,
+        first_instant=no_runs,
         x=np.zeros((0, 0, 0)),
         error=np.zeros((0, 0, 0, 0)),
         lengths=no_runs,
@@ -72,7 +75,8 @@ def begin(state: Simulation, batch: BatchArrays, run: int) -> None:
     """
     # ``path.known`` (G, C) belongs to the G runs that are simulated together: take this run's row.
     state.run, cached = run, run - state.first_run
-    state.frame_at = state.piece = state.grid_at = state.wake_at = state.instant_at = 0
+    state.frame_at = state.piece = state.grid_at = state.wake_at = 0
+    state.instant_at = batch.first_instant[run]
     state.tick_at, state.ticks_stop = batch.first[run], batch.first[run + 1]
     state.first_delay = batch.first_delay[run]
     state.probe_at = state.row = state.samples = 0

@@ -17,15 +17,26 @@ from netkf.core.memory import keep_freed_memory
 from netkf.engines.base import batch_sink, silent
 from netkf.engines.compiled.agenda import is_immediate, simulate_together, together
 from netkf.engines.compiled.batch_arrays import BatchArrays
-from netkf.engines.compiled.draws import Noise, Paths, blocks_to_the_end, steps_to_the_end
+from netkf.engines.compiled.draws import (
+    Noise,
+    Paths,
+    blocks_to_the_end,
+    no_path,
+    no_sensing,
+    steps_to_the_end,
+)
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace, empty_samples
 from netkf.engines.compiled.per_scenario import once_per_scenario
-from netkf.engines.compiled.sample_tables import no_instants
+from netkf.engines.compiled.sample_tables import KernelSamples, kernel_sensors, no_instants
+from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import Filters, PathBlock, TickArrays
 from netkf.engines.compiled.ticks import Schedule
 from netkf.engines.compiled.truth import PathStates
+from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
+from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.paths import BLOCK
+from netkf.plants.transitions import frame_period
 from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.sampling import uses_grid
 from netkf.scenario.scenario import Scenario
@@ -71,11 +82,11 @@ def _simulate(
     scenario: Scenario, workspace: Workspace, seed: int, replicas: range, rows: bool = False
 ) -> RunBatch:
     with np.errstate(over="ignore", invalid="ignore"):  # growth to infinity is reported
-        # Runs that are drawn together write no rows. Conserved sums, longer pasts and moves of the
-        # origin of filters with messages under way need Python, run by run.
+        # Runs that are drawn together write no rows. Longer pasts and moves of the origin of
+        # filters with messages under way need Python, run by run.
         together, clocked = drawn_together(scenario) and not rows, workspace.clocked
         if together and clocked is not None:
-            together = not (clocked.needs_python or _has_frames(scenario))
+            together = not (clocked.kernels.remembers or _has_frames(scenario))
         batch = _all_at_once(scenario, workspace, seed, replicas) if together else None
         if batch is None:
             batch = _run_by_run(scenario, workspace, seed, replicas, rows)
@@ -83,7 +94,7 @@ def _simulate(
 
 
 def _has_frames(scenario: Scenario) -> bool:
-    return scenario.exact_errors and scenario.diffusion.frame_steps is not None
+    return scenario.exact_errors and frame_period(scenario.diffusion.A) is not None
 
 
 def _run_by_run(
@@ -101,12 +112,14 @@ def _run_by_run(
 def _all_at_once(
     scenario: Scenario, workspace: Workspace, seed: int, replicas: range
 ) -> RunBatch | None:
-    """Simulate the runs in one call of a kernel; return None if the states of one overflow."""
+    """Simulate the runs in one call of a kernel; return None if the states of one overflow, or its
+    conserved sums count at the sample at which it diverges.
+    """
     draws = BatchDraws(scenario, seed, replicas)
     start, runs = workspace.filters, len(replicas)
     # np.empty: runs that diverge go on to the end, so that all samples are written.
     buffer = empty_samples((runs, len(scenario.times), *start.xhat.shape), make=np.empty)
-    arrays = _batch_arrays(scenario, start, draws)
+    arrays, sums = _batch_arrays(scenario, start, draws), {}
     # Messages that take no time: several runs side by side in SIMD lanes.
     if is_immediate(scenario):
         group = together(len(start.nodes), runs)
@@ -114,7 +127,10 @@ def _all_at_once(
         simulate_together(state, workspace.visits(group), arrays, group)
     else:
         assert workspace.clocked is not None
-        workspace.clocked.simulate(workspace.begin(draws, traced=False, buffer=buffer), arrays)
+        state = workspace.begin(draws, traced=False, buffer=buffer)
+        sums = workspace.clocked.simulate(state, arrays)
+        if sums and arrays.diverged.any():
+            return None
     for k in range(len(draws.states.frame_times)):
         draws.states.rebase(k)
     local, absolute = draws.states.of_runs(scenario.times)
@@ -135,6 +151,7 @@ def _all_at_once(
         lengths=arrays.lengths,
         counts=arrays.counts,
         status=np.where(arrays.diverged > 0, DIVERGED, COMPLETE),
+        sums=sums,
         exact_errors=scenario.exact_errors,
     )
 
@@ -148,6 +165,7 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
         root=start.root,
         first=draws.ticks.first,
         first_delay=draws.ticks.first_delay,
+        first_instant=draws.first_instant,
         x=x,
         error=np.empty((*x.shape[:2], *start.xhat.shape)),
         lengths=np.zeros(runs, dtype=np.int64),
@@ -159,11 +177,16 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
 
 
 def drawn_together(scenario: Scenario) -> bool:
-    """Return True if runs are drawn together: on the sensing grid, without samples or changes, for
-    filters of one state.
+    """Return True if runs are drawn together, for filters of one state of a plant that does not
+    change: on the sensing grid without samples, or with samples that kernels draw without a grid.
     """
-    alike = scenario.views is None and not len(scenario.plant.changes)
-    return uses_grid(scenario) and not scenario.sampled_sensors and alike
+    if scenario.views is not None or len(scenario.plant.changes):
+        return False
+    if not scenario.sampled_sensors:
+        return uses_grid(scenario)
+    is_free = scenario.plant.is_random and scenario.plant.linear and not uses_grid(scenario)
+    at_readings = senders_of(scenario).at == "readings" or scenario.input_responses is not None
+    return is_free and not at_readings and kernel_sensors(scenario) is not None
 
 
 @once_per_scenario
@@ -176,14 +199,21 @@ def batch_size(scenario: Scenario) -> int:
     if not drawn_together(scenario):
         return ALONE if 8.0 * ALONE * sample_floats < MAX_BATCH_BYTES else 1
     # An estimate of the floats that one run draws and stores as samples.
-    period = scenario.diffusion.sensing_period
-    # One piece for each step, and one more for each sample that cuts a step.
-    steps = BLOCK + len(scenario.times) + (scenario.horizon / period if period else 0.0)
-    sensors = sum(len(placed) for placed in scenario.placed_sensors.values())
+    sensors = kernel_sensors(scenario)
     rows = max((len(sensor.R) for sensor in scenario.sensors), default=0)
-    # Per piece: two states, two moments and the three coefficients of the cubic, of n entries each;
-    # per step the two moments of each sensor's noise.
-    floats = steps * (7 * n + 2 * sensors * rows) + 8.0 * _expected_ticks(scenario)
+    if sensors is not None:
+        # Per sample its time, state, value and a few indices.
+        taken = sum(float(rates.sum()) for *_, rates in sensors.clocks) * scenario.horizon
+        floats = taken * (8 + n + rows)
+    else:
+        period = scenario.diffusion.sensing_period
+        # One piece for each step, and one more for each sample that cuts a step.
+        steps = BLOCK + len(scenario.times) + (scenario.horizon / period if period else 0.0)
+        reading = sum(len(placed) for placed in scenario.placed_sensors.values())
+        # Per piece: two states, two moments and the three coefficients of the cubic, of n entries
+        # each; per step the two moments of each sensor's noise.
+        floats = steps * (7 * n + 2 * reading * rows)
+    floats += 8.0 * _expected_ticks(scenario)
     # At least one run, however large it is.
     return max(1, int(min(MAX_BATCH_RUNS, MAX_BATCH_BYTES / (8.0 * (floats + sample_floats)))))
 
@@ -191,7 +221,7 @@ def batch_size(scenario: Scenario) -> int:
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
     """Return the number of runs, a power of two, that take some thirty milliseconds."""
-    if not (drawn_together(scenario) and is_immediate(scenario)):
+    if not (drawn_together(scenario) and is_immediate(scenario) and uses_grid(scenario)):
         return 1
     steps, nodes = steps_to_the_end(scenario), len(scenario.nodes)
     visits = steps * len(scenario.increment_sensors) + nodes * len(scenario.times)
@@ -214,16 +244,31 @@ class BatchDraws:
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
-        self._paths = Paths(scenario, streams, blocks_to_the_end(scenario))
         self.ticks = Schedule(scenario, streams, is_immediate(scenario)).all()
-        steps = steps_to_the_end(scenario)
-        self._block = self._paths.following(steps)
-        noise = Noise(scenario, streams, steps)
-        # One block of noise reaches the horizon.
-        noise.following()
-        self.sensing = noise.sensing
-        self.instants = no_instants(scenario)
-        self.states = PathStates(scenario, self._paths.frame_times, self.path())
+        self._paths: Paths | None = None
+        self.states: PathStates | KnownStates
+        if uses_grid(scenario):
+            self._paths = Paths(scenario, streams, blocks_to_the_end(scenario))
+            steps = steps_to_the_end(scenario)
+            self._block = self._paths.following(steps)
+            noise = Noise(scenario, streams, steps)
+            # One block of noise reaches the horizon.
+            noise.following()
+            self.sensing, self.instants = noise.sensing, no_instants(scenario)
+            self.first_instant = np.zeros(len(replicas), dtype=np.int64)
+            self.states = PathStates(scenario, self._paths.frame_times, self.path())
+            return
+        samples = KernelSamples(scenario, streams)
+        self.sensing, self.instants = no_sensing(scenario), samples.instants
+        self._no_path = no_path(scenario.plant.n)
+        never = np.flatnonzero(np.isinf(samples.instants.t))
+        self.first_instant = np.append(0, never + 1)[: len(replicas)]
+        times, probes = np.split(samples.t, samples.edges[1:-1]), scenario.times
+        x = scenario.diffusion.sampled_states(
+            streams, [np.concatenate([probes, own]) for own in times], scenario.horizon
+        )
+        samples.read_from(0, np.concatenate([states[len(probes) :] for states in x]))
+        self.states = KnownStates(np.stack([states[: len(probes)] for states in x]))
 
     def window(self) -> TickArrays:
         """Return the ticks of all R runs, one run after the other in each array."""
@@ -240,4 +285,27 @@ class BatchDraws:
 
     def path(self, together: int = 1) -> PathBlock:
         """Return all steps of the paths of all R runs, of which ``together`` run at a time."""
+        if self._paths is None:
+            return self._no_path
         return self._paths.block(self._block, together)
+
+
+class KnownStates:
+    """The states ``x`` (R, T, n) of R runs at all sample times, whose origin does not move."""
+
+    frame_times = NO_TIMES
+
+    def __init__(self, x: FloatArray) -> None:
+        self._x = x
+
+    def local(self, _: FloatArray) -> FloatArray:
+        """Return the states."""
+        return self._x
+
+    def of_runs(self, _: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the states, local and absolute ones."""
+        return self._x, self._x
+
+    def rebase(self, k: int) -> FloatArray:
+        """Raise IndexError: there is no frame number ``k``."""
+        raise IndexError(k)

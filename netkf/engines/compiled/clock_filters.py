@@ -156,11 +156,6 @@ class ClockFilters:
         arrays = self.records.arrays
         return arrays["xhat"][0, ..., 0], arrays["root"][0, ..., 0]
 
-    @property
-    def needs_python(self) -> bool:
-        """Whether a run must stop for sums that exchanges conserve, or for a longer past."""
-        return bool(self._conserved) or self.kernels.remembers
-
     def sums(self) -> dict[str, tuple[float, float]]:
         """Return by name the sums that exchanges conserve, at the start and at the last sample."""
         pairs = zip(self._at_start, self._sums(), strict=True)
@@ -202,20 +197,25 @@ class ClockFilters:
                 one.raise_error()
         return request
 
-    def simulate(self, state: Simulation, batch: BatchArrays) -> None:
+    def simulate(self, state: Simulation, batch: BatchArrays) -> dict[str, FloatArray]:
         """Simulate all runs of a batch; the results are in ``batch``, samples in
-        ``state.buffer``.
+        ``state.buffer``. Return by name the sums (R, 2) that exchanges conserve, at the start and
+        at the last sample of each run.
         """
-        run, resumed = 0, False
+        run, resumed, runs, sums = 0, False, len(batch.lengths), []
         records = any_struct(self.record), any_struct(self.start)
-        while run < len(batch.lengths):
-            arguments = *records, self._run, self._verbs, batch.memory, run, resumed
+        while run < runs:
+            after = run + 1 if self._conserved else runs
+            arguments = *records, self._run, self._verbs, batch.memory, run, after, resumed
             run = int(batch_loop(state, *arguments))
             # A run stops only if the pool of messages is too small.
-            if run < len(batch.lengths):
+            resumed = run < after
+            if resumed:
                 add_messages(state, state.most_messages)
                 self.grow(len(state.pool))
-                resumed = True
+            else:
+                sums.append(self.sums())
+        return {name: np.array([one[name] for one in sums]) for name in self._conserved}
 
     def grow(self, messages: int) -> None:
         """Make room for so many messages; those that are there stay."""

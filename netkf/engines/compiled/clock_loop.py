@@ -506,14 +506,14 @@ def dispatch(state: Simulation, w: int, m: int, tag: int, delay: float, now: flo
 @kernel
 def batch_loop(
     state: Simulation, record: Any, start: Any, run: ClockRun, verbs: ClockVerbs,
-    batch_memory: Any, first: int, resumed: bool,
+    batch_memory: Any, first: int, after: int, resumed: bool,
 ) -> int:  # fmt: skip
-    """Simulate the runs of a batch from number ``first`` on, each from the record ``start``; return
-    the number of the run that needs a larger pool of messages, or the number of runs.
+    """Simulate the runs of a batch from number ``first`` to ``after`` - 1, each from the record
+    ``start``; return the number of the run that needs a larger pool of messages, or ``after``.
     ``resumed``: the first goes on where it stopped.
     """
     batch, r = struct_at(batch_memory, BatchArrays), first
-    while r < len(batch.lengths):
+    while r < after:
         if not resumed:
             state.first_run = r
             call_at(verbs.restart, record, 0, start)

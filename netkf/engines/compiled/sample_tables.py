@@ -27,10 +27,12 @@ from netkf.plants.readings import read_many
 from netkf.plants.sensors import LinearSensor
 from netkf.rng.draws import ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
-from netkf.rng.streams import Streams
+from netkf.rng.streams import ReplicaStreams, Streams
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.sampling import all_sample_times
 from netkf.scenario.scenario import Scenario
+
+ONE_RUN: np.ndarray = np.zeros(2, dtype=np.int64)
 
 
 class SampledSensor(NamedTuple):
@@ -65,7 +67,7 @@ class Samples(Protocol):
 
 def samples_of(scenario: Scenario, streams: Streams) -> Samples:
     """Return the samples of a run, drawn in compiled code if possible."""
-    cls = KernelSamples if _kernel_sensors(scenario) is not None else SampleTables
+    cls = KernelSamples if kernel_sensors(scenario) is not None else SampleTables
     return cls(scenario, streams)
 
 
@@ -81,7 +83,7 @@ class KernelSensors(NamedTuple):
 
 
 @once_per_scenario
-def _kernel_sensors(scenario: Scenario) -> KernelSensors | None:
+def kernel_sensors(scenario: Scenario) -> KernelSensors | None:
     """Return what kernels need to draw the samples of a scenario; None if they cannot."""
     placed, tables = _placed_sensors(scenario), _sensor_tables(scenario)
     parts = [scenario.sensors[p.entry] for _, p in placed]
@@ -104,35 +106,41 @@ def _kernel_sensors(scenario: Scenario) -> KernelSensors | None:
 
 
 class KernelSamples:
-    """The samples of linear sensors with built-in clocks."""
+    """The samples of linear sensors with built-in clocks, of one run or of several. Those of run r
+    are number ``edges[r]`` to ``edges[r + 1]`` - 1 of all, taken at ``t`` (K,), seconds.
+    """
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
-        sensors = _kernel_sensors(scenario)
+    def __init__(self, scenario: Scenario, streams: Streams | ReplicaStreams) -> None:
+        sensors = kernel_sensors(scenario)
         assert sensors is not None
         self._tables, self._root = _sensor_tables(scenario), sensors.root
         parts = [
             self._times(scenario, streams, clock, own, rates, indices)
             for clock, indices, own, rates in sensors.clocks
         ]
-        t, sensor = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.lexsort((sensor, t))
-        self._t, sensor = t[order], sensor[order]
-        self.instants = _make_instants(scenario, self._t, sensor)
-        self.sampled = np.unique(self._t)
+        t, stream = (np.concatenate(column) for column in zip(*parts, strict=True))
+        # Streams are numbered run by run.
+        run, sensor = np.divmod(stream, len(sensors.keys))
+        order = np.lexsort((sensor, t, run))
+        self.t, self._stream = t[order], stream[order]
+        self.edges = np.searchsorted(run[order], np.arange(streams.runs + 1))
+        self.instants = _make_instants(scenario, self.t, sensor[order], self.edges)
+        self.sampled = np.unique(self.t)
         self._noise = streams.states("noise", sensors.keys)
 
     @staticmethod
     def _times(
         scenario: Scenario,
-        streams: Streams,
+        streams: Streams | ReplicaStreams,
         clock: LinkClock,
         own: list[tuple[int, int]],
         rates: FloatArray,
         indices: np.ndarray,
     ) -> tuple[FloatArray, np.ndarray]:
-        """Return times (K,) and sensors (K,) of all samples of one entry."""
-        expected = scenario.horizon * float(rates.sum())
-        space = int(expected + 8.0 * math.sqrt(expected)) + len(own) + 8
+        """Return times (K,) and numbers of streams (K,) of all samples of one entry."""
+        expected = scenario.horizon * float(rates.sum()) * streams.runs
+        space = int(expected + 8.0 * math.sqrt(expected)) + len(own) * streams.runs + 8
+        numbers = indices + len(_placed_sensors(scenario)) * np.arange(streams.runs)[:, None]
         purposes, per_second = ("sampling", "sampling phase"), scenario.time_grid.per_second
         while True:
             clocks = clocks_of(clock, own, rates, streams, purposes, per_second)
@@ -140,17 +148,20 @@ class KernelSamples:
             tables = ziggurat(), normal_ziggurat()
             count = draw_instants(clocks, scenario.horizon, *tables, t, entity)
             if count >= 0:
-                return t[:count], indices[entity[:count]]
+                return t[:count], numbers.ravel()[entity[:count]]
             space *= 2
 
     def read(self, states: FloatArray, times: FloatArray, after: float, until: float) -> None:
         """Fill in the values of the samples taken in (``after``, ``until``], see Samples."""
-        first, last = np.searchsorted(self._t, [after, until], side="right")
-        place = np.searchsorted(times, self._t[first:last])
-        tables, instants = self._tables, self.instants
+        first, last = np.searchsorted(self.t, [after, until], side="right")
+        self.read_from(first, states[np.searchsorted(times, self.t[first:last])])
+
+    def read_from(self, first: int, states: FloatArray) -> None:
+        """Fill in the values of the samples number ``first`` and on, taken in ``states`` (K, n)."""
+        tables = self._tables
         draw_samples(
-            self._noise, normal_ziggurat(), first, instants.sensor, tables.rows, self._root,
-            tables.H, place, np.ascontiguousarray(states), instants.y,
+            self._noise, normal_ziggurat(), first, self._stream, tables.rows, self._root,
+            tables.H, np.ascontiguousarray(states), self.instants.y,
         )  # fmt: skip
 
 
@@ -159,23 +170,22 @@ def draw_samples(
     noise: np.ndarray,
     ziggurat: NormalZiggurat,
     first: int,
-    sensor: IntArray,
+    stream: IntArray,
     rows: IntArray,
     root: FloatArray,
     H: FloatArray,
-    place: IntArray,
     states: FloatArray,
     y: FloatArray,
 ) -> None:
-    """Write the samples ``y[first:]`` (K, p) of the next K = len(place) of all, taken by sensors
-    number ``sensor[first:]`` in the states ``states[place]``: H x + v, with v the ``root`` (S, p,
-    p) times the next normals of the sensor's stream ``noise`` (S, WIDTH).
+    """Write the samples ``y[first:]`` (K, p) of the next K of all, taken in ``states`` (K, n):
+    H x + v, with v the ``root`` (S, p, p) times the next normals of the states of streams ``noise``
+    (R S, WIDTH) number ``stream[first:]``, that of the sensor in its run, run by run.
     """
     z = np.empty(H.shape[1])
-    for k in range(len(place)):
-        s, x = sensor[first + k], states[place[k]]
+    for k in range(len(states)):
+        s, x = stream[first + k] % len(rows), states[k]
         for i in range(rows[s]):
-            z[i] = next_normal(noise, s, ziggurat)
+            z[i] = next_normal(noise, stream[first + k], ziggurat)
         for i in range(rows[s]):
             value, drawn = 0.0, 0.0
             for j in range(len(x)):
@@ -349,8 +359,12 @@ def _sensor_tables(scenario: Scenario) -> SensorTables:
     )
 
 
-def _make_instants(scenario: Scenario, t: FloatArray, sensor: np.ndarray) -> Instants:
-    """Return the instants: times at which a node uses one or several samples at once."""
+def _make_instants(
+    scenario: Scenario, t: FloatArray, sensor: np.ndarray, edges: np.ndarray = ONE_RUN
+) -> Instants:
+    """Return the instants: times at which a node uses one or several samples at once. Samples of
+    several runs lie between ``edges``, and an instant that never comes ends each run.
+    """
     tables = _sensor_tables(scenario)
     # Sensors whose H varies get a matrix for each sample, behind the fixed ones.
     varying, count = tables.varying[sensor], len(tables.rows)
@@ -363,12 +377,19 @@ def _make_instants(scenario: Scenario, t: FloatArray, sensor: np.ndarray) -> Ins
     # Samples of one node at one time are one instant, and one update.
     begins = np.ones(len(t), dtype=bool)
     begins[1:] = (np.diff(t) != 0.0) | (np.diff(filters) != 0)
+    if len(edges) > 2:
+        begins[edges[edges < len(t)]] = True
     first, block = np.flatnonzero(begins), tables.block[sensor]
+    times, index = t[first], filters[first]
+    if len(edges) > 2:
+        places = np.searchsorted(first, edges[1:])
+        times, index = np.insert(times, places, math.inf), np.insert(index, places, 0)
+        first = np.insert(first, places, edges[1:])
     y, after = np.zeros((len(t), tables.H.shape[1])), np.append(first, len(t))
     read = {"first": after, "block": block, "matrix": matrix, "values": y, "matrices": H}
     return Instants(
-        t=t[first],
-        index=filters[first],
+        t=times,
+        index=index,
         first=after,
         node=tables.node[sensor],
         y=y,
