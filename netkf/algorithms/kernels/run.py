@@ -39,12 +39,12 @@ from netkf.algorithms.kernels.root_flow import (
     information_rate,
     propagate_root,
 )
-from netkf.linalg.addresses import reads_only
+from netkf.linalg.addresses import NOTHING, address_of, call_at, reads_only
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane, generic
 from netkf.linalg.lanes import ONE, Lanes, aligned, load, store
-from netkf.linalg.structs import Size, Struct, sized
+from netkf.linalg.structs import MAX_UNROLLED, Size, Struct, sized
 
 MAX_RELATIVE_GAIN = 1.0
 """Largest integral of trace(P G), G = H' R^-1 H, over the increments that one update uses."""
@@ -147,8 +147,9 @@ class ClockTables(Struct):
     models : (H,), index of each node's model in the present piece
     gains, moments, increments : for nodes that read increments: the tables of their gains, the
         moments (2 p,) of the reading of ``update``, and 1 where that is one of increments
-    scratch, values, mean, mean_root : scratch of predictions, of gains, and of means (1, n) and
+    scratch, values, mean, mean_root : scratch of predictions, of gains, and an estimate (1, n) and
         (1, n, n)
+    move, gap, now : the address of what moves this estimate over so many seconds up to a time
     """
 
     table: FlowTable
@@ -163,6 +164,9 @@ class ClockTables(Struct):
     values: FloatArray
     mean: FloatArray
     mean_root: FloatArray
+    move: int
+    gap: float
+    now: float
 
 
 class ClockRun(Struct):
@@ -228,7 +232,12 @@ def clock_tables(
         values=np.zeros(max(1, gains.series.shape[2])),
         mean=np.zeros((1, n)),
         mean_root=np.zeros((1, n, n)),
+        move=NOTHING,
+        gap=0.0,
+        now=0.0,
     )
+    if not unrolled:
+        made.move = address_of(move_mean, made, made)
     return made
 
 
@@ -381,40 +390,64 @@ def _carry_over_age(
         move(model, run, model.stride - 1, drop_lane(root), drop_lane(x), m, age)
 
 
-@kernel(inlined=True)
-def move(
-    model: ClockTables, run: Any, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
-) -> None:
+@generic
+def move(model: Any, run: Any, m: int, root: FloatArray, x: FloatArray, k: int, gap: float) -> None:
     """Predict estimate ``k`` of ``x`` (K, n) and ``root`` (K, n, n) over the ``gap`` seconds up to
     ``run.now`` by model number ``m`` of each piece.
     """
-    piece = model.piece
-    if piece > 0 and begins_before(model, run.now - gap, piece):
-        move_over_pieces(model, run.now, m, root, x, k, gap)
-    else:
-        propagate_root(model.table, piece * model.stride + m, root, x, k, gap, model.scratch)
+
+
+@move.register(ClockTables)
+@kernel
+def _move_by_address(
+    model: ClockTables, run: Any, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
+) -> None:
+    # Compiling what moves an estimate takes seconds: verbs that do so share the code.
+    n, mean, mean_root = x.shape[1], model.mean, model.mean_root
+    for i in range(n):
+        mean[0, i] = x[k, i]
+        for j in range(i + 1):
+            mean_root[0, i, j] = root[k, i, j]
+    model.gap, model.now = gap, run.now
+    call_at(model.move, model, m, model)
+    for i in range(n):
+        x[k, i] = mean[0, i]
+        for j in range(i + 1):
+            root[k, i, j] = mean_root[0, i, j]
 
 
 @kernel
-def begins_before(model: ClockTables, time: float, piece: int) -> bool:
-    """Return True if a gap from ``time`` on (seconds) begins before this piece does."""
-    return bool(time * (1.0 + CLOSE) < model.changes[piece - 1])
+def move_mean(model: ClockTables, m: int, _same: ClockTables) -> None:
+    """Predict the estimate ``model.mean`` over ``model.gap`` seconds up to ``model.now``."""
+    move_in_pieces(model, model.now, m, model.mean_root, model.mean, 0, model.gap)
 
 
 @kernel
-def move_over_pieces(
+def _move_unrolled(
+    model: ClockTables, run: Any, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
+) -> None:
+    move_in_pieces(model, run.now, m, root, x, k, gap)
+
+
+for _n in range(2, MAX_UNROLLED + 1):
+    move.register(ClockTables.of_size(_n))(_move_unrolled)
+
+
+@kernel(inlined=True)
+def move_in_pieces(
     model: ClockTables, now: float, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
 ) -> None:
-    """Predict an estimate over a ``gap`` that begins before the present piece, cut at changes."""
-    time, piece = now - gap, model.piece
-    while piece > 0 and begins_before(model, time, piece):
+    """Predict an estimate over the ``gap`` seconds up to ``now``, cut where the plant changes."""
+    piece, rest = model.piece, gap
+    while piece > 0 and (now - gap) * (1.0 + CLOSE) < model.changes[piece - 1]:
         piece -= 1
-    while time < now:
-        end = now
+    while rest > 0.0:
+        length = rest
         if piece < model.piece:
-            end = min(now, model.changes[piece])
-        propagate_root(model.table, piece * model.stride + m, root, x, k, end - time, model.scratch)
-        time, piece = end, piece + 1
+            length = min(rest, model.changes[piece] - (now - rest))
+        propagate_root(model.table, piece * model.stride + m, root, x, k, length, model.scratch)
+        rest -= length
+        piece += 1
 
 
 @update_estimate.register(ClockTables)
