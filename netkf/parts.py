@@ -93,10 +93,12 @@ from netkf.network.losses import (
     Loss,
     NoLoss,
     PerLink,
+    SharedLoss,
     Transmission,
 )
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.network.scheduled import Hopping, ScheduledLoss
 from netkf.plants.blocks import Block
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
@@ -192,6 +194,7 @@ __all__ = [
     "GraphmlGraph",
     "Grid",
     "Hcmci",
+    "Hopping",
     "Hybrid",
     "Icf",
     "Increments",
@@ -251,7 +254,9 @@ __all__ = [
     "RelativeSensor",
     "Renewal",
     "Scenario",
+    "ScheduledLoss",
     "Sensor",
+    "SharedLoss",
     "SineInput",
     "SlotActivation",
     "Star",

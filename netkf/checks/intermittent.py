@@ -240,7 +240,7 @@ class IntermittentSamples(SwitchedSamples):
 
 
 def _delivery_probability(scenario: Scenario, direction: Direction) -> float:
-    if not scenario.network.channel.loss.independent:
+    if not scenario.network.channel.independent:
         raise TheoryError("losses come in bursts or recorded")
     return arrival_of(scenario, direction)
 

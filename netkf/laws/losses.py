@@ -39,6 +39,7 @@ class LossLaw(NamedTuple):
     opposite    : (D,) index of the opposite direction, -1 without one
     at_once     : both directions carry messages at once and draw their own losses
     links       : the directions, (sender, receiver)
+    share       : probability that all hearers of a broadcast have one fate
     """
 
     lost: FloatArray
@@ -50,6 +51,7 @@ class LossLaw(NamedTuple):
     opposite: np.ndarray
     at_once: bool
     links: Sequence[tuple[int, int]]
+    share: float = 0.0
 
     @property
     def variance_factor(self) -> float:
@@ -75,6 +77,8 @@ class LossCounts(NamedTuple):
     repeated   : (D,) pairs of consecutive messages that were both lost
     both       : (D,) messages lost together with the message of the same number in the opposite
                  direction
+    hearers    : () pairs of messages of one broadcast
+    alike      : () pairs of them that were both lost
     """
 
     sent: np.ndarray
@@ -82,6 +86,8 @@ class LossCounts(NamedTuple):
     followed: np.ndarray
     repeated: np.ndarray
     both: np.ndarray
+    hearers: np.ndarray
+    alike: np.ndarray
 
 
 class PairCounts(NamedTuple):
@@ -109,6 +115,7 @@ def count_outcomes(lost: np.ndarray, opposite: np.ndarray) -> LossCounts:
         lost[:, :-1].sum(axis=1),
         (lost[:, 1:] & lost[:, :-1]).sum(axis=1),
         (lost & lost[..., opposite] & (opposite >= 0)).sum(axis=1),
+        *np.zeros((2, len(lost))),
     )
 
 
@@ -228,6 +235,22 @@ def compare_bursts(law: LossLaw, counts: LossCounts, level: float) -> Comparison
     distance = deviation_interval(probability, student_interval(estimate, spread, runs, level))
     text = f"{total:,.0f} losses, after which the next message is lost with a probability off"
     return Comparison([(distance, "all directions")], text)
+
+
+def compare_shares(law: LossLaw, counts: LossCounts, level: float) -> Comparison:
+    """Compare how often two hearers of a broadcast lose it both, in R runs, with c q + (1 - c) q^2
+    for the share c of broadcasts that have one fate and the probability q of a loss.
+    """
+    q, runs, pairs = float(law.lost[0]), len(counts.hearers), counts.hearers
+    expected, total = law.share * q + (1.0 - law.share) * q**2, float(pairs.sum())
+    if total < MIN_COUNT or runs < MIN_RUNS:
+        return NO_COMPARISON
+    excess = counts.alike - expected * pairs
+    spread = math.sqrt(max(float(excess.var(ddof=1)) * runs, total * expected, 1.0)) / total
+    estimate = expected + float(excess.sum()) / total
+    distance = deviation_interval(expected, student_interval(estimate, spread, runs, level))
+    text = f"{total:,.0f} pairs of hearers, which lose a broadcast both with a probability off"
+    return Comparison([(distance, "all senders")], text)
 
 
 def compare_independence(law: LossLaw, counts: LossCounts, level: float) -> Comparison:

@@ -10,7 +10,7 @@ import numpy as np
 
 from netkf.core.fields import field, instance_of
 from netkf.network.delays import Delay
-from netkf.network.graphs import Topology
+from netkf.network.graphs import Link, Topology
 from netkf.network.losses import Loss, Transmission
 
 
@@ -69,9 +69,19 @@ class DeliveringLoss(Loss):
         """Return the conditions of the run by the model ``given``."""
         return self.given.conditions(random, horizon)
 
-    def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
+    @property
+    def fate_share(self) -> float:
+        """The value of the model ``given``, so that the same numbers are drawn."""
+        return self.given.fate_share
+
+    @property
+    def state_of(self) -> str:
+        """The value of the model ``given``, so that the same numbers are drawn."""
+        return self.given.state_of
+
+    def next_state(self, link: Link, bad: bool | None, random: np.random.Generator) -> bool:
         """Return the next state of the channel, True if it is bad, by the model ``given``."""
-        return self.given.next_state(bad, random)
+        return self.given.next_state(link, bad, random)
 
     def delivery_probability(self, sent: Transmission) -> float:
         """Return 1 for messages that the replay delivers, else the given probability."""

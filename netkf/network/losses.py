@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from netkf.core.csv_files import read_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
     Rule,
+    SourceFile,
+    boolean,
     field,
     matrix,
     number,
     one_of,
     positive,
     probability,
+    source_file,
 )
 from netkf.core.laws import Chain
 from netkf.linalg.arrays import FloatArray
-from netkf.network.graphs import Link, Topology
+from netkf.network.graphs import Link, Topology, demand_links
 
 
 class Transmission(NamedTuple):
@@ -61,7 +67,7 @@ class Loss(Component):
 
     For each activation the engine draws one uniform number; a message is delivered when that is
     below its ``delivery_probability``. Both directions share the number when the channel is
-    symmetric, and with probability ``share`` all hearers of a broadcast.
+    symmetric, and with probability ``fate_share`` all hearers of a broadcast.
     """
 
     _called_if = MappingProxyType({"next_state": "stateful"})
@@ -91,7 +97,7 @@ class Loss(Component):
         return False
 
     @property
-    def share(self) -> float:
+    def fate_share(self) -> float:
         """The probability that all hearers of a broadcast have one uniform number."""
         return 0.0
 
@@ -102,8 +108,8 @@ class Loss(Component):
         """
         return "link"
 
-    def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
-        """Return True if the link is in its bad state at the next activation.
+    def next_state(self, link: Link, bad: bool | None, random: np.random.Generator) -> bool:
+        """Return True if a directed ``link`` is in its bad state at the next activation.
 
         ``bad`` is its state at the last activation, None at the first.
         """
@@ -162,6 +168,29 @@ class Bernoulli(Loss):
     vectorised = True
 
     delivery: float = field(probability)
+
+    def delivery_probability(self, sent: Transmission) -> Any:
+        """Return ``delivery``, for any message in any state of the link."""
+        return self.delivery
+
+
+@dataclass(frozen=True, eq=False)
+class SharedLoss(Loss):
+    """A message arrives with probability ``delivery``; with probability ``share`` all hearers of a
+    broadcast have one fate, and otherwise each of them has its own.
+
+    With share c two hearers are both served with probability p^2 + c p (1 - p).
+    """
+
+    vectorised = True
+
+    delivery: float = field(probability)
+    share: float = field(probability)
+
+    @property
+    def fate_share(self) -> float:
+        """The field ``share``."""
+        return self.share
 
     def delivery_probability(self, sent: Transmission) -> Any:
         """Return ``delivery``, for any message in any state of the link."""
@@ -269,13 +298,19 @@ class DistanceLoss(Loss):
         return np.interp(sent.distance, *self.delivery.T)
 
 
+_CHAIN = ("to_bad", "to_good", "deliver_good", "deliver_bad", "mean_loss", "mean_burst")
+
+
 @dataclass(frozen=True, eq=False)
 class GilbertElliott(Loss):
     """A two-state Markov chain that makes one step per activation.
 
     Give either ``to_bad``, ``to_good``, ``deliver_good`` (default 1) and ``deliver_bad`` (default
     0), or ``mean_loss`` and ``mean_burst`` (activations) for a chain that loses every message in
-    its bad state.
+    its bad state. Or give these, for each directed link, as columns of a table in ``path`` that
+    begins with ``sender,receiver``; links without a row have the values of the scenario. With
+    ``shared`` all links of a sender are in the state of one chain, which makes a step at each of
+    its transmissions; their rows then have the same transitions.
     """
 
     stateful = True
@@ -287,12 +322,18 @@ class GilbertElliott(Loss):
     deliver_bad: float | None = field(probability, default=None)
     mean_loss: float | None = field(number(low=0.0, below=1.0), default=None)
     mean_burst: float | None = field(number(low=1.0), default=None)
+    path: SourceFile | None = field(source_file, default=None)
+    shared: bool = field(boolean, default=False)
 
     def __post_init__(self) -> None:
         """Check the fields; raises ScenarioError unless one of the two forms is given, and
         possible.
         """
         super().__post_init__()
+        if self.path is not None:
+            _ = self._table  # a mistake in the file is found on construction
+            if all(getattr(self, name) is None for name in _CHAIN):
+                return
         # One of two forms, each with two required fields: transition probabilities, or means.
         chain = {name: getattr(self, name) for name in ("to_bad", "to_good")}
         means = {name: getattr(self, name) for name in ("mean_loss", "mean_burst")}
@@ -322,6 +363,58 @@ class GilbertElliott(Loss):
             )
 
     @property
+    def state_of(self) -> str:
+        """Whose the two states are: "sender" if they are ``shared``."""
+        return "sender" if self.shared else "link"
+
+    @cached_property
+    def _table(self) -> tuple[dict[Link, GilbertElliott], dict[Link, int]]:
+        """The chain of each directed link with a row, and the number of its line."""
+        if self.path is None:
+            return {}, {}
+        table = read_columns(self.path, ("sender", "receiver"), _CHAIN)
+        links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
+        columns = [name for name in _CHAIN if name in table]
+        chains: dict[Link, GilbertElliott] = {}
+        for row, link in enumerate(links):
+            if link in chains:
+                rule = f"{table.where(row)}: a second row of this direction"
+                raise ScenarioError("path", rule, list(link), "leave one of the two out")
+            try:
+                values: dict[str, Any] = {name: float(table[name][row]) for name in columns}
+                chains[link] = GilbertElliott(**values, shared=self.shared)
+            except ScenarioError as error:
+                rule = f"{table.where(row)}: {error.key} {error.rule}"
+                raise ScenarioError("path", rule, error.value, error.remedy) from None
+        lines = {link: int(line) for link, line in zip(links, table.lines, strict=True)}
+        for first, second in itertools.pairwise(sorted(chains) if self.shared else ()):
+            steps = chains[first].transitions, chains[second].transitions
+            if first[0] == second[0] and steps[0] != steps[1]:
+                rule = "must give all links of a sender the same transitions, if they are shared"
+                got = f"{list(first)} in line {lines[first]} and {list(second)} in line"
+                raise ScenarioError("path", rule, f"{got} {lines[second]}", "correct the rows")
+        return chains, lines
+
+    def of(self, link: Link) -> GilbertElliott:
+        """Return the chain of a directed link."""
+        return self._table[0].get(link, self)
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError unless every row of the table is of a link, and every link has a
+        chain.
+        """
+        if self.path is None:
+            return
+        chains, lines = self._table
+        demand_links(self.path, lines, topology)
+        if all(getattr(self, name) is None for name in _CHAIN):
+            for link in topology.directions:
+                if link not in chains:
+                    rule = f"{self.path.name} must have a row of each direction"
+                    remedy = "add the row, or give mean_loss and mean_burst for all others"
+                    raise ScenarioError("path", rule, f"none of {list(link)}", remedy)
+
+    @property
     def transitions(self) -> tuple[float, float]:
         """The probabilities that an activation turns a good state bad, and a bad one good."""
         if self.mean_loss is not None and self.mean_burst is not None:
@@ -331,9 +424,9 @@ class GilbertElliott(Loss):
         assert self.to_good is not None
         return self.to_bad, self.to_good
 
-    def next_state(self, bad: bool | None, random: np.random.Generator) -> bool:
+    def next_state(self, link: Link, bad: bool | None, random: np.random.Generator) -> bool:
         """Return True if the chain is in its bad state after a step from ``bad``."""
-        to_bad, to_good = self.transitions
+        to_bad, to_good = self.of(link).transitions
         u = random.random()
         if bad is None:
             return bool(u < to_bad / (to_bad + to_good))
@@ -341,13 +434,14 @@ class GilbertElliott(Loss):
 
     def delivery_probability(self, sent: Transmission) -> Any:
         """Return the delivery probability of any message in the ``bad`` or good state."""
-        bad = 0.0 if self.deliver_bad is None else self.deliver_bad
-        good = 1.0 if self.deliver_good is None else self.deliver_good
+        chain = self.of(sent.link)
+        bad = 0.0 if chain.deliver_bad is None else chain.deliver_bad
+        good = 1.0 if chain.deliver_good is None else chain.deliver_good
         return np.where(sent.bad, bad, good)
 
     def mean_delivery(self, sent: Transmission) -> float:
         """Return the mean delivery probability under the stationary law of the two states."""
-        to_bad, to_good = self.transitions
+        to_bad, to_good = self.of(sent.link).transitions
         bad = to_bad / (to_bad + to_good)
         good, both = (float(self.delivery_probability(sent._replace(bad=b))) for b in (False, True))
         return bad * both + (1.0 - bad) * good
@@ -356,11 +450,13 @@ class GilbertElliott(Loss):
     def independent(self) -> bool:
         """True only if the next state does not depend on the present one."""
         # Then both rows of the transition matrix are equal.
-        return sum(self.transitions) == 1.0
+        return self.path is None and sum(self.transitions) == 1.0
 
     @property
-    def chain(self) -> Chain:
-        """The chain of the two states of a link."""
+    def chain(self) -> Chain | None:
+        """The chain of the two states of a link, None if links differ."""
+        if self.path is not None:
+            return None
         sent = Transmission((0, 1))
         delivery = (float(self.delivery_probability(sent._replace(bad=b))) for b in (False, True))
         return Chain(*self.transitions, *delivery)
@@ -371,7 +467,7 @@ def identical_per_link(loss: Loss) -> bool:
     nodes stay where they are.
     """
     # By exact type: a subclass may override delivery_probability.
-    return type(loss) in (NoLoss, Bernoulli, PerLink, DistanceLoss)
+    return type(loss) in (NoLoss, Bernoulli, SharedLoss, PerLink, DistanceLoss)
 
 
 def has_conditions(loss: Loss) -> bool:

@@ -485,13 +485,20 @@ class ScenarioModel(Component):
         table = 1.0 if delivery is None else delivery.get(link, 0.0)
         return Transmission(link, table_probability=table, distance=distance)
 
+    @property
+    def has_broadcasts(self) -> bool:
+        """True if a transmission has several hearers: of nodes, but not of links or pairs."""
+        if self.slotted:
+            return not self.node_filter.timing.pairwise
+        return getattr(self.network.activation, "at", "links") in ("nodes", "readings")
+
     def mean_delivery(self, link: Link) -> float:
         """Return the fraction of messages of a directed link that arrive in the long run, nan if it
         is unknown before a run.
         """
         if self.topology.radius is not None:
             return math.nan
-        return self.network.channel.loss.mean_delivery(self.transmission(link))
+        return self.network.channel.mean_delivery(self.transmission(link))
 
     @cached_property
     def increment_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:

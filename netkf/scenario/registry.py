@@ -21,6 +21,7 @@ from netkf.network import (
     losses,
     matchings,
     recorded,
+    scheduled,
 )
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
@@ -122,9 +123,11 @@ KINDS: dict[str, dict[str, type[Component]]] = {
     "loss": {
         "none": losses.NoLoss,
         "bernoulli": losses.Bernoulli,
+        "shared": losses.SharedLoss,
         "per-link": losses.PerLink,
         "distance": losses.DistanceLoss,
         "gilbert-elliott": losses.GilbertElliott,
+        "scheduled": scheduled.ScheduledLoss,
         "recorded": recorded.RecordedLoss,
     },
     "delay": {

@@ -20,6 +20,7 @@ from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
+from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.plants.states import state_file
 from netkf.scenario.derived import DerivedScenario
@@ -371,7 +372,10 @@ def _build_activation(origin: Origin, time: str, value: Any) -> Any:
 
 
 def _build_channel(origin: Origin, value: Any) -> Any:
-    builders = {key: partial(_build_component, key, origin) for key in ("loss", "delay")}
+    builders: dict[str, Callable[[Any], Any]] = {
+        key: partial(_build_component, key, origin) for key in ("loss", "delay")
+    }
+    builders["channels"] = partial(_build_table, Hopping, origin)
     return _build_object(Channel, _build_inner(_as_dict(value), builders), origin)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import compress
 from typing import Any
 
@@ -222,7 +223,7 @@ def _check_channel_state(watched: WatchedPart) -> None:
     for _ in range(2):
         random, bad, history = RecordingGenerator(5), None, []
         for k in range(DRAWS):
-            bad = watched.call("next_state", bad, random, repeatable=False)
+            bad = watched.call("next_state", (0, 1), bad, random, repeatable=False)
             demand(bad is True or bad is False, where, "must be True or False", bad)
             calls = random.take_calls()
             history.append((bad, calls))
@@ -288,7 +289,7 @@ def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndar
         streams = Streams(seed + 7, chain)
         conditions = conditions_of(part, streams, HORIZON)
         for k, (link, table_probability) in enumerate(links.items()):
-            sampler = ChannelSampler(channel, lambda purpose: streams.generator(purpose, *link))  # noqa: B023
+            sampler = ChannelSampler(channel, link, partial(_stream, streams, link))
             uniform, bad, _ = sampler.draws(LENGTH)
             sent = Transmission(
                 link, np.arange(LENGTH), times, bad, table_probability, DISTANCES[0],
@@ -296,6 +297,10 @@ def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndar
             )  # fmt: skip
             lost[chain, :, k] = uniform >= delivery_probabilities(part, sent)
     return lost
+
+
+def _stream(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
+    return streams.generator(purpose, *link)
 
 
 def _check_delay_law(watched: WatchedPart, links: tuple[Link, ...]) -> None:

@@ -197,11 +197,11 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "losses are independent of each other and of the past",
             "H Theorem 2, derived",
-            None if is_unknown else channel.loss.independent,
+            None if is_unknown else channel.independent,
             NO_CHANNEL_LAW
             if scenario.links_move
             else "arrivals are Poisson processes of lower rates"
-            if channel.loss.independent
+            if channel.independent
             else "losses are recorded or depend on earlier ones: H(12) is not promised",
         ),
         (

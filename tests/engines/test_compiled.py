@@ -553,7 +553,9 @@ def test_fates_drawn_at_once_are_those_drawn_one_by_one():
                 {"network.channel": {"loss": loss, "delay": delay}}
             )
             one, other = (
-                ChannelSampler(scenario.network.channel, lambda p: Streams(1).generator(p, 0, 1))
+                ChannelSampler(
+                    scenario.network.channel, (0, 1), lambda p: Streams(1).generator(p, 0, 1)
+                )
                 for _ in range(2)
             )
             singles = [one.draw() for _ in range(100)]

@@ -80,7 +80,7 @@ class Fading(Loss):
     def independent(self):
         return False
 
-    def next_state(self, bad, random):
+    def next_state(self, link, bad, random):
         u = random.random()
         if bad is None:
             return bool(u < 0.25)

@@ -13,7 +13,9 @@ import netkf  # isort: skip
 
 def sampled_outcomes(count, **settings):
     channel = channels.Channel(**settings)
-    sampler = channels.ChannelSampler(channel, lambda purpose: Streams(1).generator(purpose, 0, 1))
+    sampler = channels.ChannelSampler(
+        channel, (0, 1), lambda purpose: Streams(1).generator(purpose, 0, 1)
+    )
     draws = [sampler.draw() for _ in range(count)]
     arrived = [
         u < channel.loss.delivery_probability(losses.Transmission((0, 1), k, bad=bad))

@@ -82,7 +82,7 @@ def test_what_is_used_of_a_record(record, cls):
 def test_nothing_is_drawn_for_recorded_delays(record):
     asked = []
     channel = Channel(delay=record(RecordedDelay, ["0,1,0,0.5"]))
-    sampler = ChannelSampler(channel, asked.append)
+    sampler = ChannelSampler(channel, (0, 1), asked.append)
     assert sampler.draw() == FINE
     assert [column.tolist() for column in sampler.draws(2)] == [
         [0.0, 0.0],

@@ -157,7 +157,7 @@ MISTAKES = {
     "a law's number outside the law": ("DELAY", "def cdf(self, t): return t\ndef draw(self, random): return 1.0",
                                        r"F\.cdf \(FILE, line 6\) is never called: state it in law, as WaitingLaw\(cdf"),
     "a state that is never asked for": (
-        "LOSS", "def next_state(self, bad, random): return random.random() < 0.5",
+        "LOSS", "def next_state(self, link, bad, random): return random.random() < 0.5",
         r"F\.next_state \(FILE, line 6\) is never called where stateful is False"),
     "a misspelled start": ("PLANT", "def start_meen(self): return np.zeros(1)",
                            r"F\.start_meen \(FILE, line 6\) is never called: did you mean start_mean\?"),
@@ -380,7 +380,7 @@ def test_overrides_that_no_engine_calls_are_told_and_settings_may_decide():
         def stateful(self):
             return self.bursts
 
-        def next_state(self, bad, random):
+        def next_state(self, link, bad, random):
             return random.random() < 0.5
 
     with pytest.raises(TypeError, match=r"Timid.draw \(.*\) is never called where is_random is F"):

@@ -67,7 +67,7 @@ class HalfSure(Bernoulli):
 
 @says(CHANNELS, "Fickle.next_state (tests/testing/broken_channels.py", delivery=0.5)
 class Fickle(Bernoulli):
-    def next_state(self, bad, random):
+    def next_state(self, link, bad, random):
         return random.random() < 0.5
 
 
@@ -75,7 +75,7 @@ class Fickle(Bernoulli):
 class Denies(Bernoulli):
     stateful = False
 
-    def next_state(self, bad, random):
+    def next_state(self, link, bad, random):
         return random.random() < 0.5
 
 
@@ -86,10 +86,10 @@ class Denies(Bernoulli):
     mean_burst=5.0,
 )
 class Lazy(GilbertElliott):
-    def next_state(self, bad, random):
+    def next_state(self, link, bad, random):
         if not bad:
             return bool(random.random() < 0.3)
-        return super().next_state(random.random() < 2, random)
+        return super().next_state(link, random.random() < 2, random)
 
 
 @says(CHANNELS, "OwnLuck.delivery_probability: must return the same for the same arguments")
@@ -356,8 +356,8 @@ class Instant(ConstantDelay):
 class Scattered(GilbertElliott):
     """Loses as many messages, one by one."""
 
-    def next_state(self, bad, random):
-        return super().next_state(None, random)
+    def next_state(self, link, bad, random):
+        return super().next_state(link, None, random)
 
 
 @says(

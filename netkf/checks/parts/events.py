@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any
@@ -167,16 +168,18 @@ def loss_law(scenario: Scenario) -> LossLaw:
     """Return what a scenario states of losses on its directions."""
     channel, clock = scenario.network.channel, scenario.network.activation
     loss, links = stated_part(channel.loss, "loss"), scenario.topology.directions
-    delivery = [loss.mean_delivery(scenario.transmission(link)) for link in links]
+    stated = dataclasses.replace(channel, loss=loss)
+    delivery = [stated.mean_delivery(scenario.transmission(link)) for link in links]
     indices, at_once = direction_indices(scenario), getattr(clock, "at", "links") == "links"
     opposite = np.array([indices.get((j, i), -1) for i, j in links], dtype=np.int64)
     # Broadcasts of two nodes at different times would both step a chain that they share.
     one_step = isinstance(clock, Matching) or (
         isinstance(clock, LinkClock) and (clock.at == "links" or not channel.symmetric)
     )
+    share = loss.fate_share if scenario.has_broadcasts else 0.0
     return LossLaw(
         lost=1.0 - np.array(delivery),
-        independent=bool(loss.independent) and _redraws_links(scenario),
+        independent=stated.independent and share == 0.0 and _redraws_links(scenario),
         chain=stated_law(channel.loss, "loss") if one_step else None,
         steady=has_constant_losses(scenario),
         symmetric=channel.symmetric,
@@ -184,6 +187,7 @@ def loss_law(scenario: Scenario) -> LossLaw:
         opposite=opposite,
         at_once=at_once and not channel.symmetric,
         links=links,
+        share=share,
     )
 
 
@@ -219,7 +223,19 @@ def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
     both_lost = np.isin(opposite * width + number, keys) & (opposite >= 0)
     followed = number + 1 < sent.sum(axis=0)[lost_at]
     masks = (followed, after_loss, both_lost)
-    return LossCounts(sent, lost, *(np.bincount(lost_at[m], minlength=size) for m in masks))
+    counts = [np.bincount(lost_at[m], minlength=size) for m in masks]
+    is_lost = np.isin(sent_at * width + sends["message"], keys)
+    return LossCounts(sent, lost, *counts, *_pairs_of_hearers(sends, is_lost))
+
+
+def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
+    """Return the number of pairs of messages (K,) of one broadcast, and of those both lost."""
+    order = np.lexsort((sends["node"], sends["phase"], sends["t"]))
+    group = sends[["t", "phase", "node"]][order]
+    begins = np.flatnonzero(np.append(True, group[1:] != group[:-1]) if len(group) else [])
+    sizes = np.diff(np.append(begins, len(group)))
+    gone = np.add.reduceat(is_lost[order].astype(np.int64), begins) if len(begins) else sizes
+    return [np.array(float((k * (k - 1) // 2).sum())) for k in (sizes, gone)]
 
 
 def _in_direction(

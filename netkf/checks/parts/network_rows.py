@@ -260,6 +260,14 @@ BURSTS = _row(
     DRAWN,
     STATED,
 )
+SHARED_ROW = _row(
+    "hearers of a broadcast lose it together as often as the scenario says",
+    evidence.LOSSES,
+    _of_losses(losses.compare_shares, PROBABILITY_TOLERANCE),
+    DRAWN,
+    STATED,
+    SAME,
+)
 MATCHING_ROW = _row(
     "links are paired as often as the protocol says, whatever happened before",
     evidence.MATCHINGS,
@@ -314,6 +322,8 @@ def network_promises(samples: PartSamples) -> list[Promise]:
         promises.append(LOSSES_APART)
     if law.chain is not None:
         promises.append(BURSTS)
+    if law.share > 0.0 and np.ptp(law.lost) == 0.0:
+        promises.append(SHARED_ROW)
     if samples.delays is not None:
         promises.append(DELAY_LAW if stated_delay(scenario)[0] is None else FIXED)
     return promises

@@ -15,7 +15,14 @@ import numpy as np
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.network.channels import Channel, ChannelSampler, conditions_of
+from netkf.network.channels import (
+    BroadcastDraw,
+    Channel,
+    ChannelSampler,
+    broadcasts_of,
+    conditions_of,
+    draws_per_link,
+)
 from netkf.network.delays import (
     ConstantDelay,
     ExponentialDelay,
@@ -34,7 +41,6 @@ from netkf.network.losses import (
     NoLoss,
     PerLink,
     Transmission,
-    delivery_probabilities,
 )
 from netkf.rng.draws import Ziggurat, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
@@ -167,8 +173,10 @@ def list_outcomes(
     for run, one in enumerate(streams.per_replica):
         of_run = [np.empty(0)] * len(senders.directions)
         conditions = conditions_of(channel.loss, one, scenario.horizon)
+        of_run_ticks = ticks[run * entities : (run + 1) * entities]
+        shared = _shared_draws(scenario, one, senders, of_run_ticks)
         for e in range(entities):
-            times = scenario.time_grid.before(scenario.horizon, ticks[run * entities + e])
+            times = scenario.time_grid.before(scenario.horizon, of_run_ticks[e])
             draws, last = (np.empty(0), np.empty(0), np.empty(0)), -1
             for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
                 # Directions that share a stream share its draws.
@@ -176,23 +184,58 @@ def list_outcomes(
                     last = int(senders.source[w])
                     draws = _sampler(channel, one, senders.sources[last]).draws(len(times))
                 first = scenario.transmission(senders.directions[w])
+                (uniform, bad, delay), common = draws, shared.get((e, first.link[0]))
+                if common is not None:
+                    uniform = np.where(np.isnan(common.uniform), uniform, common.uniform)
+                    bad = bad if common.bad is None else common.bad
                 sent = first._replace(
-                    number=np.arange(len(times)), time=times, bad=draws[1], conditions=conditions
+                    number=np.arange(len(times)), time=times, bad=bad, conditions=conditions
                 )
-                of_run[w] = _delays(channel, sent, draws[0], draws[2])
+                of_run[w] = _delays(channel, sent, uniform, delay)
         outcomes += of_run
     return outcomes
 
 
+def _shared_draws(
+    scenario: Scenario, streams: Streams, senders: Senders, ticks: Sequence[FloatArray]
+) -> dict[tuple[int, int], BroadcastDraw]:
+    """Return what the hearers share of each tick of entity e at which a node sends, by (e, id of
+    the node), if they share anything; ``ticks`` in seconds of each entity.
+    """
+    broadcasts = broadcasts_of(scenario, streams)
+    if broadcasts is None:
+        return {}
+    entities_of: dict[int, set[int]] = {}
+    for e in range(len(ticks)):
+        for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
+            entities_of.setdefault(senders.directions[w][0], set()).add(e)
+    shared = {}
+    for node, entities in entities_of.items():
+        times = [scenario.time_grid.before(scenario.horizon, ticks[e]) for e in sorted(entities)]
+        owner = np.repeat(sorted(entities), [len(of_one) for of_one in times])
+        # The transmissions of a node, in the order of time: by (time, entity).
+        order = np.lexsort((owner, np.concatenate(times)))
+        drawn = broadcasts.draws(node, len(owner))
+        uniform, bad = np.empty(len(owner)), None
+        uniform[order] = drawn.uniform
+        if drawn.bad is not None:
+            bad = np.empty(len(owner), dtype=bool)
+            bad[order] = drawn.bad
+        for e in entities:
+            chosen = owner == e
+            shared[e, node] = BroadcastDraw(uniform[chosen], None if bad is None else bad[chosen])
+    return shared
+
+
 def _sampler(channel: Channel, streams: Streams, ends: Link) -> ChannelSampler:
-    return ChannelSampler(channel, lambda purpose: streams.generator(purpose, *ends))
+    return ChannelSampler(channel, ends, lambda purpose: streams.generator(purpose, *ends))
 
 
 def _delays(
     channel: Channel, sent: Transmission, uniform: FloatArray, delay: FloatArray
 ) -> FloatArray:
     """Return the outcomes (K,) of the messages ``sent`` on one link."""
-    lost = uniform >= delivery_probabilities(channel.loss, sent)
+    lost = uniform >= channel.deliveries(sent)
     if delay_depends_on_message(channel.delay):
         delay = delay.copy()
         # A delay is asked only for messages that arrive.
@@ -205,7 +248,8 @@ def _delays(
 def is_kernel_channel(channel: Channel) -> bool:
     """Return True if kernels can draw the outcomes of a channel."""
     # By exact type: a subclass may override the law.
-    return type(channel.loss) in LOSSES and type(channel.delay) in DELAYS
+    has_known_law = type(channel.loss) in LOSSES and type(channel.delay) in DELAYS
+    return has_known_law and draws_per_link(channel)
 
 
 def delay_is_zero(channel: Channel) -> bool:

@@ -30,7 +30,14 @@ from netkf.engines.compiled.slot_messages import (
 )
 from netkf.engines.compiled.slot_setup import SlotSetup
 from netkf.engines.reach import Reach
-from netkf.network.channels import ChannelDraw, ChannelSampler, conditions_of, transit_time
+from netkf.network.channels import (
+    ChannelDraw,
+    ChannelSampler,
+    broadcasts_of,
+    conditions_of,
+    senders_of_pairs,
+    transit_time,
+)
 from netkf.network.graphs import Link
 from netkf.network.losses import Transmission
 from netkf.network.matchings import used_links
@@ -100,11 +107,12 @@ class SlotEvents:
         }
         self._samplers = {
             link: [
-                ChannelSampler(channel, partial(_stream, streams, one.ends))
+                ChannelSampler(channel, one.ends, partial(_stream, streams, one.ends))
                 for one in (both[:1] if channel.symmetric else both)
             ]
             for link, both in self._by_link.items()
         }
+        self._broadcasts = broadcasts_of(scenario, streams)
         # The last draws of each link, for steps in which links keep them.
         self._last: dict[Link, list[ChannelDraw]] = {}
         # A heap by (arrival, index of the direction, order); then direction, number, time of
@@ -260,6 +268,9 @@ class SlotEvents:
             connected = {pair for pair in pairs if self._reach.connects(*pair, now)}
         if broadcast:
             self._append_row((now, ROUND, -1, -1, -1, phase, NAN))
+        if self._broadcasts is not None:
+            senders = senders_of_pairs(pairs, self._scenario.topology.directed)
+            self._broadcasts.begin(senders, bool(self._setup.fresh[step.step]))
         for i, j in pairs:
             if not broadcast:
                 self._append_row((now, TICK, i, j, -1, phase, NAN))
@@ -308,6 +319,8 @@ class SlotEvents:
         self._append_row((now, SEND, sender, receiver, number, step.phase, NAN))
         channel, delay = self._scenario.network.channel, math.nan
         if draw is not None:
+            if self._broadcasts is not None:
+                draw = self._broadcasts.over(sender, draw)
             sent = direction.first._replace(number=number, time=now, bad=draw.bad)
             if self._follows_distance and self._reach is not None:
                 sent = sent._replace(distance=self._reach.distance(*direction.ends, now))

@@ -30,6 +30,7 @@ from netkf.engines.compiled.slot_pairs import BlockColumns, SlotPairs
 from netkf.linalg.arrays import FloatArray, block_diagonal, enlarged
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
+from netkf.network.channels import draws_per_link
 from netkf.network.deliveries import Deliveries, DeliveringLoss
 from netkf.network.graphs import Link
 from netkf.network.losses import GilbertElliott, identical_per_link
@@ -349,7 +350,8 @@ class SlotSetup:
             channel = dataclasses.replace(channel, loss=channel.loss.given)
         self.channel, loss = channel, channel.loss
         # The probabilities of a user's own loss model are computed in Python, message by message.
-        self.has_known_probabilities = identical_per_link(loss) or type(loss) is GilbertElliott
+        has_known_law = identical_per_link(loss) or type(loss) is GilbertElliott
+        self.has_known_probabilities = has_known_law and draws_per_link(channel)
         self.delivery = np.ones((2, len(self.directions)))
         if self.has_known_probabilities:
             self.delivery = delivery_table(scenario, loss, self.directions)

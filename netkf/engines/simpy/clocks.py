@@ -110,6 +110,7 @@ def _link_activations(
     def activate(exchange: LinkExchange, i: int, j: int, now: float) -> None:
         recorder.append((now, TICK, i, j, -1, -1, NAN))
         # The channel takes its step even where nothing is sent.
+        transmitter.begin((i,) if scenario.topology.directed else (i, j))
         payloads: tuple[Any, Any] = (None, None)
         if transmitter.connects(i, j):
             # Both payloads are computed before either end receives.
@@ -136,6 +137,7 @@ def _direction_activations(
         recorder.append((now, TICK, i, j, -1, -1, NAN))
         # Drawn in any case: even if nothing is sent, the channel takes its step.
         outcome = direction.sampler.draw()
+        transmitter.begin((i,))
         if transmitter.connects(i, j):
             transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
 
@@ -171,6 +173,7 @@ def broadcasts(
     def transmit(node: int, now: float) -> None:
         # Drawn even if the filter sends nothing, so that the network does not depend on it.
         outcomes = [direction.sampler.draw() for direction in directions[node]]
+        transmitter.begin((node,))
         heard = [transmitter.connects(*direction.link) for direction in directions[node]]
         receivers = tuple(d.link[1] for d in itertools.compress(directions[node], heard))
         payload = nodes[node].emit(now, receivers)

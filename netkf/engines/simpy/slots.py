@@ -20,6 +20,7 @@ from netkf.engines.simpy.nodes import Envelope, Node, distinct
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import LinkExchange, Transmitter
 from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.network.channels import senders_of_pairs
 from netkf.network.matchings import used_links
 from netkf.plants.linear import Readings
 from netkf.plants.readings import covariance_of
@@ -345,6 +346,7 @@ class SlotClock:
         payloads = {node: self._nodes[node].emit(exchange) for node in senders}
         # Held links keep their outcome for all steps of an exchange.
         fresh = self._timing.redraws(phase, stage.step)
+        self._transmitter.begin(senders_of_pairs(pairs, self._scenario.topology.directed), fresh)
         for i, j in pairs:
             if not broadcast:
                 self._recorder.append((now, TICK, i, j, -1, phase, NAN))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import partial
 from typing import Any, Protocol
 
@@ -15,7 +16,13 @@ from netkf.engines.reach import Reach
 from netkf.engines.simpy.nodes import Envelope
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray
-from netkf.network.channels import ChannelDraw, ChannelSampler, conditions_of, transit_time
+from netkf.network.channels import (
+    ChannelDraw,
+    ChannelSampler,
+    broadcasts_of,
+    conditions_of,
+    transit_time,
+)
 from netkf.network.graphs import Link
 from netkf.network.losses import Transmission
 from netkf.rng.streams import Streams
@@ -71,6 +78,8 @@ class Transmitter:
         self._channel = scenario.network.channel
         self._follows_distance = self._channel.loss.follows_distance
         self._conditions = conditions_of(self._channel.loss, streams, scenario.horizon)
+        # What hearers share is drawn for each transmission of a sender.
+        self.broadcasts = broadcasts_of(scenario, streams)
         self._horizon, self._until = scenario.horizon, scenario.end_time
         self._instant = scenario.time_grid.instant
         # Of nodes that move: who hears whom. Set when the true state of the run is known.
@@ -81,11 +90,18 @@ class Transmitter:
     def sampler(self, link: Link) -> ChannelSampler:
         """Return the sampler of ``link``: of both directions if the channel is symmetric."""
         # The sampler makes its streams when it needs them, by purpose.
-        return ChannelSampler(self._channel, partial(stream, self._streams, link))
+        return ChannelSampler(self._channel, link, partial(stream, self._streams, link))
 
     def first(self, link: Link) -> Transmission:
         """Return what is known of the first message on a directed link in this run."""
         return self._scenario.transmission(link)._replace(conditions=self._conditions)
+
+    def begin(self, senders: Iterable[int], fresh: bool = True) -> None:
+        """Draw what the hearers of the next transmission of each of these ``senders`` share; unless
+        it is ``fresh`` they keep what they have.
+        """
+        if self.broadcasts is not None:
+            self.broadcasts.begin(senders, fresh)
 
     def connects(self, i: int, j: int) -> bool:
         """Return True if nodes ``i`` and ``j`` (ids) can hear each other now."""
@@ -109,6 +125,8 @@ class Transmitter:
         append = self._recorder.append
         # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
+        if self.broadcasts is not None and outcome is not LINK_DOWN:
+            outcome = self.broadcasts.over(sender, outcome)
         sent = direction.first._replace(number=number, time=now, bad=outcome.bad)
         if self._follows_distance and self.reach is not None:
             sent = sent._replace(distance=self.reach.distance(*direction.link, now))

@@ -41,6 +41,7 @@ class Directions(NamedTuple):
     source           : (K,) index of the draw (and of the Gilbert-Elliott chain) that decides on
                        delivery; directions that fail together have the same source
     delivery         : (S, K) probability that a message arrives, by mode
+    share            : probability that all hearers of a broadcast have one fate
     steps            : transition probabilities (to_bad, to_good) of each chain, which makes a step
                        at each activation; None if there is one mode only. Bit c of the index of a
                        mode is 1 if chain c is in its bad state
@@ -51,6 +52,7 @@ class Directions(NamedTuple):
     weight: FloatArray
     source: IntArray
     delivery: FloatArray
+    share: float
     steps: tuple[float, float] | None
 
     @property
@@ -125,9 +127,15 @@ class Directions(NamedTuple):
     def joint(self, first: IntArray, second: IntArray) -> FloatArray:
         """Return the probability (S, P), by mode, that both of each pair of directions arrive."""
         p, q = self.delivery[:, first], self.delivery[:, second]
-        # Directions of one source share one uniform draw: both arrive if it is below min(p, q).
-        same = self.source[first] == self.source[second]
-        return np.asarray(np.where(same, np.minimum(p, q), p * q))
+        # Directions of one source share one uniform draw, unless one of both senders has one fate
+        # for all of its hearers, which then share a draw: both arrive if it is below min(p, q).
+        same = np.where(
+            self.source[first] == self.source[second],
+            (1.0 - self.share) ** 2,
+            np.where(self.sender[first] == self.sender[second], self.share, 0.0),
+        )
+        same = np.where(first == second, 1.0, same)
+        return np.asarray(same * np.minimum(p, q) + (1.0 - same) * p * q)
 
 
 def _add_blocks(blocks: FloatArray, rows: IntArray, columns: IntArray, terms: FloatArray) -> None:
@@ -155,9 +163,13 @@ def directions_of(
         raise TheoryError(NO_CHANNEL_LAW)
     if delay is None:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
-    chained = isinstance(loss, GilbertElliott) and not loss.independent
+    if not has_constant_losses(scenario):
+        raise TheoryError("messages of one link are lost with different probabilities")
+    chained = isinstance(loss, GilbertElliott) and loss.chain is not None and not loss.independent
     if not (chained or loss.independent):
         raise TheoryError("losses depend on earlier ones in a way that is not known here")
+    if loss.state_of != "link":
+        raise TheoryError("the links of a sender share their bursts, which is not known here")
     links, index = list(weights), scenario.topology.index
     clock: Any = scenario.network.activation
     # One draw decides about both directions of a link that are activated and lost together.
@@ -174,6 +186,7 @@ def directions_of(
         np.stack(list(weights.values())),
         source,
         delivery,
+        loss.fate_share if scenario.has_broadcasts else 0.0,
         loss.transitions if isinstance(loss, GilbertElliott) and chained else None,
     )
 
@@ -220,8 +233,8 @@ def has_constant_losses(scenario: Scenario) -> bool:
     """Return True if all messages of a link arrive with one probability; a class is asked."""
     loss = scenario.network.channel.loss
     if identical_per_link(loss) or isinstance(loss, GilbertElliott):
-        return True
-    if has_conditions(loss):
+        return scenario.network.channel.channels is None
+    if has_conditions(loss) or scenario.network.channel.channels is not None:
         return False
     times = np.linspace(0.0, scenario.horizon, MESSAGES_ASKED, endpoint=False)
     for direction in scenario.topology.directions:

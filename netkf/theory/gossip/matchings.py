@@ -40,7 +40,7 @@ def effective_matching(scenario: Scenario) -> FloatArray:
     if not isinstance(activation, Matching):
         raise TheoryError("the matching is recorded, not drawn")
     delay = channel.delay.fixed
-    if not channel.loss.independent:
+    if not channel.independent:
         raise TheoryError("losses come in bursts or recorded")
     if delay is None or delay > scenario.phase_length:
         raise TheoryError("messages may be late")

@@ -124,7 +124,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
     if scenario.links_move:
         dependent = f"not promised: {NO_CHANNEL_LAW}"
-    independent = network.channel.loss.independent and not scenario.links_move
+    independent = network.channel.independent and not scenario.links_move
     return _reason_of_samples(scenario) if independent else dependent
 
 

@@ -38,7 +38,7 @@ def second_moment_rate(scenario: Scenario) -> float:
         raise TheoryError("the second moments of P are known for clocks of links and increments")
     if scenario.links_move:
         raise TheoryError(NO_CHANNEL_LAW)
-    if not channel.loss.independent or channel.delay.fixed != 0.0:
+    if not channel.independent or channel.delay.fixed != 0.0:
         raise TheoryError("the second moments of P are known without bursts and delays only")
     nodes, n = len(scenario.nodes), scenario.plant.n
     size = nodes * n * n

@@ -63,13 +63,12 @@ def _detectability_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     channel = scenario.network.channel
-    loss = channel.loss
     # R (12) needs independent arrivals of positive probability.
     rates = [scenario.mean_delivery(link) for link in scenario.topology.directions]
     finite_rates = [rate for rate in rates if np.isfinite(rate)]
     smallest = min(finite_rates, default=1.0)
-    holds: bool | None = loss.independent and len(finite_rates) == len(rates) and smallest > 0.0
-    evidence = f"delivery from {smallest:g}" if loss.independent else "losses come in bursts"
+    holds: bool | None = channel.independent and len(finite_rates) == len(rates) and smallest > 0.0
+    evidence = f"delivery from {smallest:g}" if channel.independent else "losses come in bursts"
     if lacks_channel_law(scenario):
         # A recording has no probabilities: the assumption is neither true nor false.
         holds, evidence = None, NO_CHANNEL_LAW
@@ -83,7 +82,7 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     ]
     if any(sensor.varying for sensor in scenario.sensors):
         return rows
-    if loss.independent and len(finite_rates) == len(rates):
+    if channel.independent and len(finite_rates) == len(rates):
         rows.append(_bounded_mean_row(scenario))
     return rows
 

@@ -121,7 +121,7 @@ def _probabilities(scenario: Scenario, delivery: float | None) -> FloatArray:
         if not 0.0 <= delivery <= 1.0:
             raise TheoryError(f"delivery must lie in [0, 1], got {delivery!r}")
         return np.full((len(links), 2), float(delivery))
-    if not loss.independent:
+    if not scenario.network.channel.independent:
         name = type(loss).__name__
         raise TheoryError(f"the draws of {name} depend on each other: no mean square is known")
     # The first end hears the second by the direction (j, i).

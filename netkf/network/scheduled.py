@@ -1,0 +1,179 @@
+"""Losses whose quality changes with time, by a table, and channels that nodes hop over."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from netkf.core.csv_files import Columns, read_columns
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import (
+    Component,
+    SourceFile,
+    field,
+    integer,
+    list_of,
+    probability,
+    source_file,
+)
+from netkf.linalg.arrays import FloatArray
+from netkf.network.graphs import Link, Topology, demand_links
+from netkf.network.losses import Loss, Transmission
+
+
+def _read_deliveries(
+    source: SourceFile, required: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> Columns:
+    """Return the columns of a table that has a column ``delivery`` of probabilities."""
+    table = read_columns(source, (*required, "delivery"), optional)
+    values = table["delivery"]
+    wrong = np.flatnonzero(~((values >= 0.0) & (values <= 1.0)))
+    if wrong.size:
+        row = int(wrong[0])
+        rule = f"{table.where(row)}: delivery must be a number from 0 to 1"
+        raise ScenarioError("path", rule, float(values[row]), "correct the row")
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class ScheduledLoss(Loss):
+    """A message arrives with the probability that a table ``from,until,sender,receiver,delivery``
+    gives its direction at the time when it is sent: a row holds from its beginning to before its
+    end, and outside all rows ``otherwise`` does.
+    """
+
+    vectorised = True
+
+    path: SourceFile = field(source_file)
+    otherwise: float = field(probability, default=1.0)
+
+    def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
+        super().__post_init__()
+        _ = self._steps  # a mistake in the file is found on construction
+
+    @cached_property
+    def _steps(self) -> tuple[dict[Link, tuple[FloatArray, FloatArray]], dict[Link, int]]:
+        """By directed link the times (K,) from which its probabilities (K,) hold, and the number of
+        the first line of each.
+        """
+        table = _read_deliveries(self.path, ("from", "until", "sender", "receiver"))
+        begins, ends, values = (table[name].tolist() for name in ("from", "until", "delivery"))
+        links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
+        rows: dict[Link, list[int]] = {}
+        for row, link in enumerate(links):
+            if not ends[row] > begins[row]:
+                rule = f"{table.where(row)}: until must be after from"
+                raise ScenarioError("path", rule, [begins[row], ends[row]], "correct the row")
+            rows.setdefault(link, []).append(row)
+        steps = {}
+        for link, numbers in rows.items():
+            times, probabilities = [-math.inf], [self.otherwise]
+            numbers.sort(key=lambda row: begins[row])
+            for before, row in zip([None, *numbers], numbers, strict=False):
+                if before is not None and begins[row] < ends[before]:
+                    rule = f"{table.where(row)}: overlaps the interval of {table.where(before)}"
+                    given = [begins[row], ends[row]]
+                    raise ScenarioError("path", rule, given, "let each end before the next begins")
+                times += [begins[row], ends[row]]
+                probabilities += [values[row], self.otherwise]
+            steps[link] = np.array(times), np.array(probabilities)
+        return steps, {link: int(table.lines[numbers[0]]) for link, numbers in rows.items()}
+
+    def delivery_probability(self, sent: Transmission) -> Any:
+        """Return the probability of the direction at the time of sending."""
+        if sent.link not in self._steps[0]:
+            return self.otherwise
+        times, probabilities = self._steps[0][sent.link]
+        # Of a row that begins where another ends the last entry counts.
+        return probabilities[np.searchsorted(times, sent.time, side="right") - 1]
+
+    @property
+    def independent(self) -> bool:
+        """True only if no direction changes: then neighbouring messages are not lost alike."""
+        return all(np.ptp(values) == 0.0 for _, values in self._steps[0].values())
+
+    def mean_delivery(self, sent: Transmission) -> float:
+        """Return the probability of a direction if it does not change, else nan."""
+        if sent.link not in self._steps[0]:
+            return self.otherwise
+        _, probabilities = self._steps[0][sent.link]
+        return float(probabilities[0]) if np.ptp(probabilities) == 0.0 else math.nan
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError unless every pair of the table is a link."""
+        demand_links(self.path, self._steps[1], topology)
+
+
+@dataclass(frozen=True, eq=False)
+class Hopping(Component):
+    """The channels (frequencies) over which messages hop, and how well each of them delivers.
+
+    hopping  numbers of channels: message k of a link is sent on ``hopping[k mod len(hopping)]``
+    path     a table ``channel,delivery``, or ``channel,sender,receiver,delivery`` for each
+             direction: the probability that a message on this channel arrives, if the loss model
+             does not lose it
+    """
+
+    hopping: tuple[int, ...] = field(list_of(integer(0), "channels"))
+    path: SourceFile = field(source_file)
+
+    def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either, and
+        for a channel that the table does not list.
+        """
+        super().__post_init__()
+        listed = {channel for channel, _ in self._table[0]}
+        for channel in self.hopping:
+            if channel not in listed:
+                rule, remedy = f"needs rows of each channel in {self.path.name}", "add its rows"
+                raise ScenarioError("hopping", rule, channel, remedy)
+
+    @cached_property
+    def _table(self) -> tuple[Mapping[tuple[int, Link | None], float], dict[Link, int]]:
+        """The deliveries by channel and directed link (None: all), and lines of the links."""
+        table = _read_deliveries(self.path, ("channel",), ("sender", "receiver"))
+        channels: list[int] = table.integers("channel")
+        links: list[Link | None] = [None] * len(channels)
+        if "sender" in table or "receiver" in table:
+            missing = [name for name in ("sender", "receiver") if name not in table]
+            if missing:
+                rule = f"{self.path.name} has only one end of the links"
+                raise ScenarioError("path", rule, None, f"add a column {missing[0]}")
+            links = list(zip(table.integers("sender"), table.integers("receiver"), strict=True))
+        deliveries: dict[tuple[int, Link | None], float] = {}
+        lines: dict[Link, int] = {}
+        for row, key in enumerate(zip(channels, links, strict=True)):
+            value = float(table["delivery"][row])
+            if deliveries.setdefault(key, value) != value:
+                rule = f"{table.where(row)}: has another delivery than a row before"
+                raise ScenarioError("path", rule, value, "leave one of the two rows out")
+            if key[1] is not None:
+                lines.setdefault(key[1], int(table.lines[row]))
+        return deliveries, lines
+
+    def channel_of(self, number: Any) -> Any:
+        """Return the channel of message ``number`` of a link, or of many."""
+        return np.array(self.hopping)[np.asarray(number) % len(self.hopping)]
+
+    def delivery(self, sent: Transmission) -> Any:
+        """Return the probability that the message ``sent`` arrives on its channel."""
+        return self._per_hop(sent.link)[np.asarray(sent.number) % len(self.hopping)]
+
+    def mean(self, link: Link) -> float:
+        """Return the mean of that probability over the hops, for a directed link."""
+        return float(self._per_hop(link).mean())
+
+    def _per_hop(self, link: Link) -> FloatArray:
+        deliveries = self._table[0]
+        key = None if (self.hopping[0], None) in deliveries else link
+        return np.array([deliveries.get((channel, key), 0.0) for channel in self.hopping])
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError unless every pair of the table is a link."""
+        demand_links(self.path, self._table[1], topology)
