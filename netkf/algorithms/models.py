@@ -516,8 +516,13 @@ def sample_update(
     xhat: FloatArray, root: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the estimate (n,) and the root (n, n) of its covariance after a sample ``y = H x + v``
-    (p,) of p > 0 rows, H (p, n), cov(v) = R (p, p), from ``xhat`` (n,) and ``root`` (n, n) before.
+    (p,) of p > 0 rows, H (p, n), cov(v) = R (p, p), from ``xhat`` (n,) and ``root`` (n, n) before;
+    or several estimates (n, C) after samples (p, C), see ``Analysis.affine``.
     """
+    if xhat.ndim == 2:
+        S = sample_update(np.zeros(len(xhat)), root, np.zeros(len(y)), H, R)[1]
+        gain = S @ S.T @ np.linalg.solve(R, H).T
+        return xhat + gain @ (y - H @ xhat), S
     (p, n), (white_y, white_H) = H.shape, whiten_reading(y, H, R)
     x, S = np.array(xhat).reshape(1, n, 1), np.array(root).reshape(1, n, n, 1)
     scratch = np.empty((n, 1)), np.empty((n, 1))

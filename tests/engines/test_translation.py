@@ -195,3 +195,73 @@ def test_what_is_told_late_leaves_blocks_whose_dynamics_are_not_linear(folder: P
     )
     assert both.count("deliver") > 20
     np.testing.assert_allclose(both.xhat[:, :, :3], alone.xhat[:, :, :3], atol=1e-10)
+
+
+AFFINE = """
+from dataclasses import dataclass
+
+import kcf
+import tuples
+from netkf.parts import Analysis
+
+
+@dataclass(frozen=True, eq=False)
+class Affine(kcf.Kcf):
+    analysis = Analysis(affine=True)
+    shift = kcf.Kcf.shift
+
+
+@dataclass(frozen=True, eq=False)
+class AffineTuples(tuples.Tuples):
+    analysis = Analysis(affine=True)
+
+    def shift(self, state, offset):
+        if not hasattr(state, "xhat"):
+            return state[0] + offset, state[1]
+        return super().shift(state, offset)
+"""
+
+
+@pytest.mark.parametrize("kind", ["affine:Affine", "affine:AffineTuples"])
+def test_errors_of_translated_messages_are_exact(folder: Path, kind: str) -> None:
+    """By the recursion of all poses and estimates together, written plainly."""
+    for name, text in {"tuples": TUPLES, "affine": AFFINE}.items():
+        (folder / f"{name}.py").write_text(text)
+    drawn = {"kind": "linear", "H": [[1.0]], "R": [[0.1]], "nodes": list(NODES), "of": "pose"}
+    given = scenario(folder, "own+neighbours", kind, sensors=[drawn])
+    exact = netkf.theory.error_covariance(given, netkf.simulate(given))
+    (F, Q), blocks = RATES["pose"], BLOCKS["own+neighbours"]
+    rows = {key: 4 + k for k, key in enumerate((i, b[1]) for i in NODES for b in blocks[i])}
+    size, P, C = 4 + len(rows), dict.fromkeys(rows, 1.0), np.zeros((4 + len(rows),) * 2)
+    C[:4, :4] = np.eye(4)
+    for slot in range(1, 5):
+        x, prior = (np.eye(size) * F for _ in range(2))
+        noise = np.zeros((size, 8))
+        noise[:4, :4] = np.eye(4) * np.sqrt(Q)
+        M, moved = x.copy(), noise.copy()
+        for (i, b), row in rows.items():
+            P[i, b] = F * P[i, b] * F + Q
+            K = P[i, b] / (P[i, b] + 0.1) if i == b else 0.0
+            P[i, b] *= 1.0 - K
+            M[row] += K * (x[b - 1] - prior[row])
+            moved[row] += K * noise[b - 1]
+            moved[row, 3 + i] += K * np.sqrt(0.1)
+        for (i, b), row in rows.items():
+            for j in [j for link in LINKS if i in link for j in link if j != i]:
+                if (j, b) in rows:
+                    M[row] += EPSILON * (prior[rows[j, b]] - prior[row])
+        C = M @ C @ M.T + moved @ moved.T
+        for k, i in enumerate(NODES):
+            E = np.zeros((len(blocks[i]), size))
+            for a, (_, b) in enumerate(blocks[i]):
+                E[a, b - 1], E[a, rows[i, b]] = 1.0, -1.0
+            n = len(E)
+            np.testing.assert_allclose(exact[slot, k, :n, :n], E @ C @ E.T, rtol=1e-9, atol=1e-12)
+    if kind == "affine:Affine":
+        late = given.replace(CLOCKED | {"sensors.0.sampling": {"kind": "periodic", "period": 1.0}})
+        verdict = netkf.consistency(late, runs=10, workers=1)
+        assert all(
+            np.isfinite(row.expected) and "BROKEN" not in row.verdict for row in verdict.rows
+        )
+    sys.modules.pop("tuples")
+    sys.modules.pop("affine")
