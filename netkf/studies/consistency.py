@@ -33,6 +33,13 @@ from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, require_scenario, simulate
 from netkf.runs.summary import NO_COVARIANCE, nees_bounds
 from netkf.scenario.scenario import Scenario
+from netkf.studies.innovations import (
+    ClockedInnovations,
+    JudgedBlock,
+    has_clocked_innovations,
+    readings_of_block,
+    times_for_innovations,
+)
 from netkf.theory.errors import error_squares
 from netkf.trace.nees import errors
 from netkf.trace.run import Run, blurred_samples
@@ -48,19 +55,6 @@ some seconds for each run, and the work grows with the third power of the number
 UNDECIDED = "undecided: rounding blurs the errors of too many samples"
 BIAS_TOLERANCE = 0.02
 """Relative distance of the expected value from n above which the verdict has a remark."""
-
-
-class JudgedBlock(NamedTuple):
-    """A block as one node estimates it: ``node`` (index), name of the ``block`` and whose it is,
-    as pose@3, its ``entries`` in the state of the node, and in that of the plant, (n,).
-
-    Without several blocks of ``[[plants]]`` a node has one, with all states and without a name.
-    """
-
-    node: int
-    block: str
-    entries: np.ndarray
-    states: np.ndarray
 
 
 def judged_blocks(scenario: Scenario) -> list[JudgedBlock]:
@@ -106,8 +100,13 @@ def run_consistency(
     as nodes estimate them, and the means over time (K,) of NEES and NIS, with their expected values
     given the events of the run. A task of ``replicate``.
     """
-    run, blocks = simulate(scenario, seed, replica, engine), judged_blocks(scenario)
-    after_start = np.flatnonzero(run.times > 0.0)
+    blocks, shown = judged_blocks(scenario), scenario.times
+    run = simulate(scenario, seed, replica, engine)
+    if has_clocked_innovations(scenario):
+        # Innovations are those of predictions from the last event before: states are shown there.
+        scenario = dataclasses.replace(scenario, probe=times_for_innovations(scenario, run))
+        run = simulate(scenario, seed, replica, engine)
+    after_start = np.flatnonzero((run.times > 0.0) & np.isin(run.times, shown))
     sigma = None  # (T, N, n, n), E[e e'] given the events; None if unknown or too large
     if _count_errors(scenario) <= MAX_ERRORS:
         with contextlib.suppress(TheoryError):
@@ -174,13 +173,17 @@ def _mean_nis(
     judged: tuple[list[JudgedBlock], np.ndarray],
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean NIS (K,) of the nodes' own readings of each block and its expected value; nan
-    without slots, and where errors alone do not tell innovations. ``judged`` are the blocks, and
+    where errors alone do not tell innovations. ``judged`` are the blocks, and
     the samples (T, K) in which rounding blurs them.
     """
     unknown = np.full(len(judged[0]), np.nan)
-    if not scenario.slotted or not scenario.plant.linear:
+    innovations: Any = None
+    if scenario.slotted and scenario.plant.linear:
+        innovations = _Innovations(scenario, run, sigma)
+    elif has_clocked_innovations(scenario):
+        innovations = ClockedInnovations(scenario, run, sigma)
+    if innovations is None:
         return unknown, unknown.copy()
-    innovations = _Innovations(scenario, run, sigma)
     pairs = [
         np.array(list(innovations.of_block(block, judged[1][:, k])))
         for k, block in enumerate(judged[0])
@@ -213,29 +216,11 @@ class _Innovations:
         path = memoryless.truth(self._streams.generator("plant"))
         self._noise = [path.state(slot) for slot in self._slots]
 
-    def _readings_of(self, block: JudgedBlock) -> tuple[Any, ...]:
-        """Return the node's sensors that read a block, and nothing that it does not estimate."""
-        scenario, i = self._scenario, block.node
-        placed = scenario.placed_sensors.get(self._run.nodes[i], ())
-        if not block.block or not scenario.is_linear:
-            return placed
-        view = np.arange(scenario.plant.n)[scenario.view(i)]
-        supports = [(sensor, scenario.support(sensor)) for sensor in placed]
-        # What drives its blocks from outside is not in its errors.
-        outside = np.setdiff1d(np.arange(scenario.plant.n), view)
-        if any(piece.F[np.ix_(view, outside)].any() for piece in scenario.linear_plant.pieces):
-            return ()
-        return tuple(
-            sensor
-            for sensor, support in supports
-            if np.isin(support, view).all() and np.isin(block.states, support).any()
-        )
-
     def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
         """Yield NIS of the linear readings of a block and its expected value (nan: unknown), but
         for samples (T,) that are ``blurred``.
         """
-        i, placed = block.node, self._readings_of(block)
+        i, placed = block.node, readings_of_block(self._scenario, block)
         # A nonlinear reading has no H given the errors alone.
         if not placed or not self._scenario.is_linear:
             return

@@ -11,16 +11,18 @@ import scipy.stats
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
+from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table
 from netkf.studies.consistency import (
     RunConsistency,
     consistency,
     judge_consistency,
+    judged_blocks,
     run_consistency,
 )
 from netkf.studies.metrics import expected_metrics
 from netkf.studies.tables import format_consistency
-from tests.algorithms.test_block_intersection import ROBOTS, load
+from tests.algorithms.test_block_intersection import CLOCKED, ROBOTS, load
 from tests.checks.broken import Overconfident
 from tests.conftest import SCENARIOS
 
@@ -247,3 +249,32 @@ def test_each_block_of_a_node_is_judged(tmp_path):
     text = format_consistency(found)
     assert "pose@3" in text
     assert "all blocks together" in text
+
+
+def test_nis_under_clocks_is_that_of_samples(tmp_path):
+    """Of a node alone by a plain Kalman filter; where P is exact its mean is that of chi-square."""
+    lost = {"loss": {"kind": "bernoulli", "delivery": 0.0}}
+    alone = load(CLOCKED, tmp_path, network__channel=lost)
+    seen, run = run_consistency(alone, 3, 2), netkf.simulate(alone, seed=3, replica=2)
+    path = alone.sample_path(Streams(3, 2), 1, alone.placed_sensors[1][0])
+    F, values, x, P = np.exp(-0.1), [], 0.0, 1.0
+    for k in range(1, 12):
+        x, P = F * x, F * P * F + 0.25 * (1.0 - np.exp(-0.2)) / 0.2
+        y = path.reading(k - 1, run.x[k])[0][0]
+        values.append((y - x) ** 2 / (P + 0.1))
+        x, P = x + P / (P + 0.1) * (y - x), P * 0.1 / (P + 0.1)
+    assert seen.nis[0] == pytest.approx(np.mean(values))
+    assert seen.expected_nis[0] == pytest.approx(1.0)
+    assert seen.nees.shape == (3,)
+    filtering = {"kind": "central", "estimates": "own+neighbours"}
+    late = {"network__channel": {"delay": {"kind": "constant", "seconds": 0.3}}}
+    drawn = load(CLOCKED, tmp_path, filter=filtering, horizon=4.0, **late)
+    # Two instants of an absolute reading and a relative one for each with a relative one alone.
+    blocks = {(b.node, b.block): k for k, b in enumerate(judged_blocks(drawn))}
+    found = run_consistency(drawn, 3, 2)
+    assert found.expected_nis[blocks[0, "pose@1"]] == pytest.approx((3 * 2 + 4) / 7)
+    assert found.expected_nis[blocks[1, "pose@1"]] == pytest.approx(1.0)
+    own = load(CLOCKED, tmp_path, filter__estimates="own+neighbours", horizon=4.0, **late)
+    found = run_consistency(own, 3, 2)
+    assert np.isfinite(found.nis[blocks[2, "pose@3"]])
+    assert found.expected_nis[blocks[2, "pose@3"]] <= 1.0 + 1e-9

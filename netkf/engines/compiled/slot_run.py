@@ -444,9 +444,9 @@ class SlotRuns:
         rebased = np.zeros(count, dtype=bool)
         if self._path is None:
             # A recorded truth is the same in all runs; of a drawn one slots come in order.
-            states = [(self._truth.local(slot), self._truth.absolute(slot)) for slot in slots]
+            given = [(self._truth.local(slot), self._truth.absolute(slot)) for slot in slots]
             local, absolute = (
-                in_lanes(np.stack(part), self._blocks) for part in zip(*states, strict=True)
+                in_lanes(np.stack(part), self._blocks) for part in zip(*given, strict=True)
             )
             return local, absolute, rebased
         # At the end of a frame the origin moves to the state.
