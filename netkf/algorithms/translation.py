@@ -39,7 +39,8 @@ def read_vector(payload: Any, own: Any, common: Common) -> Any:
         read = read_vector(getattr(payload, name), getattr(own, name), common)
         return own._replace(**{name: read})
     for one in (payload, own):
-        if not isinstance(one, np.ndarray) or one.ndim != 1:
+        # Of several columns, see ``Analysis.affine``, both have as many.
+        if not isinstance(one, np.ndarray) or not one.ndim or one.shape[1:] != own.shape[1:]:
             raise ContractError(
                 "a message between nodes that estimate different blocks must be one vector of the "
                 f"state, and this one is a {type(one).__name__}: {REMEDY}"

@@ -38,7 +38,6 @@ from netkf.studies.innovations import (
     JudgedBlock,
     has_clocked_innovations,
     readings_of_block,
-    times_for_innovations,
 )
 from netkf.theory.errors import error_squares
 from netkf.trace.nees import errors
@@ -102,10 +101,12 @@ def run_consistency(
     """
     blocks, shown = judged_blocks(scenario), scenario.times
     run = simulate(scenario, seed, replica, engine)
+    innovations: Any = None
     if has_clocked_innovations(scenario):
-        # Innovations are those of predictions from the last event before: states are shown there.
-        scenario = dataclasses.replace(scenario, probe=times_for_innovations(scenario, run))
-        run = simulate(scenario, seed, replica, engine)
+        # They are those of predictions from the last event before: states are shown there.
+        innovations = ClockedInnovations(scenario, run.log, Streams(seed, replica))
+        scenario = dataclasses.replace(scenario, probe=innovations.times)
+        run = innovations.run = simulate(scenario, seed, replica, engine)
     after_start = np.flatnonzero((run.times > 0.0) & np.isin(run.times, shown))
     sigma = None  # (T, N, n, n), E[e e'] given the events; None if unknown or too large
     if _count_errors(scenario) <= MAX_ERRORS:
@@ -113,7 +114,11 @@ def run_consistency(
             sigma = error_squares(scenario, run)
     columns = [_block_consistency(run, sigma, block) for block in blocks]
     nees, expected, blurred = (np.stack(column, axis=1) for column in zip(*columns, strict=True))
-    nis, expected_nis = _mean_nis(scenario, run, sigma, (blocks, blurred))
+    if innovations is not None:
+        innovations.sigma = sigma
+    elif scenario.slotted and scenario.plant.linear:
+        innovations = _Innovations(scenario, run, sigma)
+    nis, expected_nis = _mean_nis(innovations, blocks, blurred)
     times = run.times[blurred.any(axis=1) & (run.times > 0.0)]
     return RunConsistency(
         samples=np.where(blurred, np.nan, nees)[after_start],
@@ -167,26 +172,15 @@ def _expected_nees(P: FloatArray, sigma: FloatArray | None) -> FloatArray:
 
 
 def _mean_nis(
-    scenario: Scenario,
-    run: Run,
-    sigma: FloatArray | None,
-    judged: tuple[list[JudgedBlock], np.ndarray],
+    innovations: Any, blocks: list[JudgedBlock], blurred: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean NIS (K,) of the nodes' own readings of each block and its expected value; nan
-    where errors alone do not tell innovations. ``judged`` are the blocks, and
-    the samples (T, K) in which rounding blurs them.
+    without ``innovations``, as where errors alone do not tell them. Of samples (T, K) that are
+    ``blurred`` nothing is used.
     """
-    unknown = np.full(len(judged[0]), np.nan)
-    innovations: Any = None
-    if scenario.slotted and scenario.plant.linear:
-        innovations = _Innovations(scenario, run, sigma)
-    elif has_clocked_innovations(scenario):
-        innovations = ClockedInnovations(scenario, run, sigma)
-    if innovations is None:
-        return unknown, unknown.copy()
     pairs = [
-        np.array(list(innovations.of_block(block, judged[1][:, k])))
-        for k, block in enumerate(judged[0])
+        np.array(list(innovations.of_block(block, blurred[:, k]) if innovations else ()))
+        for k, block in enumerate(blocks)
     ]
     means = np.array([p.mean(axis=0) if len(p) else (np.nan, np.nan) for p in pairs])
     return means[:, 0], means[:, 1]

@@ -64,95 +64,73 @@ def has_clocked_innovations(scenario: Scenario) -> bool:
     return known and bool(scenario.sampled_sensors)
 
 
-def times_for_innovations(scenario: Scenario, run: Run) -> FloatArray:
-    """Return the times (T,) of samples of a ``run``, those of some of its readings, and of the last
-    event before these of each node.
-    """
-    chosen = _chosen_instants(scenario, run)
-    before = [events[np.searchsorted(events, chosen) - 1] for events in _events(scenario, run)]
-    every = np.unique(np.concatenate([scenario.times, chosen, *before]))
-    return every[every <= scenario.horizon]
-
-
-def _chosen_instants(scenario: Scenario, run: Run) -> FloatArray:
-    times = sample_times(scenario, Streams(run.seed, run.replica)).values()
-    every = np.unique(np.concatenate([np.empty(0), *times]))
-    every = every[(every > 0.0) & (every < scenario.horizon)]
-    chosen: FloatArray = every[np.unique(np.linspace(0, len(every) - 1, MAX_INSTANTS).astype(int))]
-    return chosen
-
-
-def _events(scenario: Scenario, run: Run) -> list[FloatArray]:
-    """Return for each node the increasing times of its events, and 0."""
-    t, node = run.log["t"], run.log["node"]
-    pooled = scenario.node_filter.timing.pooled
-    return [
-        np.unique(np.append(t if pooled else t[(node == i) | (run.log["peer"] == i)], 0.0))
-        for i in scenario.nodes
-    ]
-
-
 class ClockedInnovations:
-    """The innovations of a ``run`` with samples at ``times_for_innovations``; ``sigma`` (T, N, n,
-    n) is E[e e'] of its samples, None if it is unknown.
+    """The innovations of the run of ``scenario`` that has the ``log`` and the samples ``streams``:
+    ``run`` is the same one, with samples at ``times``; ``sigma`` (T, N, n, n) is E[e e'] there,
+    None if it is unknown.
+
+    times : the samples of ``scenario``, instants of its sensors, and for each node the last event
+            before each of these
     """
 
-    def __init__(self, scenario: Scenario, run: Run, sigma: FloatArray | None) -> None:
-        self._scenario, self._run, self._sigma = scenario, run, sigma
+    run: Run
+    sigma: FloatArray | None
+
+    def __init__(self, scenario: Scenario, log: np.ndarray, streams: Streams) -> None:
         plant: Any = scenario.plant
-        self._moves = Transitions(plant.A, plant.B)
-        self._chosen, self._events = _chosen_instants(scenario, run), _events(scenario, run)
-        response = scenario.believed_response if scenario.knows_input else None
-        # States without the known response to the input.
-        self._x = run.x if response is None else run.x - response.states(run.times)
+        self._scenario, self._streams = scenario, streams
+        self._moves, self._sampled = Transitions(plant.A, plant.B), sample_times(scenario, streams)
+        every = np.unique(np.concatenate([*self._sampled.values()]))
+        every = every[(every > 0.0) & (every < scenario.horizon)]
+        chosen = np.linspace(0, len(every) - 1, MAX_INSTANTS if len(every) else 0)
+        self._chosen = every[np.unique(chosen.astype(int))]
+        pooled, parts = scenario.node_filter.timing.pooled, [scenario.times, self._chosen]
+        for node in scenario.nodes:
+            is_own = pooled | (log["node"] == node) | (log["peer"] == node)
+            events = np.unique(np.append(log["t"][is_own], 0.0))
+            parts.append(events[np.searchsorted(events, self._chosen) - 1])
+        self._before = parts[2:]
+        self.times = np.unique(np.concatenate(parts))
 
     def of_block(self, block: JudgedBlock, blurred: np.ndarray) -> Iterator[tuple[float, float]]:
         """Yield NIS of the samples of a block and its expected value (nan: unknown), but for those
         whose prediction begins at a sample of the run (T,) that is ``blurred``.
         """
-        scenario, run, events = self._scenario, self._run, self._events[block.node]
-        readings = self._readings(block)
-        for time in self._chosen.tolist():
-            now = int(np.searchsorted(run.times, time))
-            last = int(np.searchsorted(run.times, events[np.searchsorted(events, time) - 1]))
+        scenario, run, i, readings = self._scenario, self.run, block.node, self._readings(block)
+        x, view, own = run.x, scenario.view(i), scenario.is_estimated[i]
+        if scenario.knows_input:
+            x = x - scenario.believed_response.states(run.times)
+        for time, start in zip(self._chosen.tolist(), self._before[i].tolist(), strict=True):
+            now, last = np.searchsorted(run.times, [time, start]).tolist()
             if time not in readings or now >= len(run.times) or blurred[last]:
                 continue
-            view, own = scenario.view(block.node), scenario.is_estimated[block.node]
-            (F,), (root,) = self._moves.laws(np.array([time - run.times[last]]))
-            noise = self._x[now] - F @ self._x[last]
+            (F,), (root,) = self._moves.laws(np.array([time - start]))
+            moved, e, square = x[now] - F @ x[last], np.zeros(len(F)), np.ix_(own, own)
             F, Q = F[view][:, view], (root @ root.T)[view][:, view]
-            e = np.zeros(scenario.plant.n)
-            e[view] = F @ run.error[last, block.node, own] + noise[view]
-            square = np.ix_(own, own)
-            P = F @ run.P[last, block.node][square] @ F.T + Q
-            if ROUNDING * abs(self._x[last]).max() * BLUR > np.sqrt(np.diag(P).min()):
+            e[view] = F @ run.error[last, i, own] + moved[view]
+            P = F @ run.P[last, i][square] @ F.T + Q
+            if ROUNDING * abs(x[last]).max() * BLUR > np.sqrt(np.diag(P).min()):
                 continue
-            parts = [(*reading(e), R, true) for reading, R, true in readings[time]]
-            y, H = (np.concatenate([part[k] for part in parts]) for k in range(2))
-            H = H[:, view]
-            S = H @ P @ H.T + block_diagonal([part[2] for part in parts])
-            expected = np.nan
-            if self._sigma is not None:
-                Sigma = F @ self._sigma[last, block.node][square] @ F.T + Q
-                law = H @ Sigma @ H.T + block_diagonal([part[3] for part in parts])
-                expected = float(np.trace(np.linalg.solve(S, law)))
-            yield float(y @ np.linalg.solve(S, y)), expected
+            parts = list(zip(*readings[time], strict=True))
+            H, noise = (np.concatenate(part) for part in parts[:2])
+            believed, R = (block_diagonal(part) for part in parts[2:])
+            v, H, expected = H @ e + noise, H[:, view], np.nan
+            S = H @ P @ H.T + believed
+            if self.sigma is not None:
+                Sigma = F @ self.sigma[last, i][square] @ F.T + Q
+                expected = float(np.trace(np.linalg.solve(S, H @ Sigma @ H.T + R)))
+            yield float(v @ np.linalg.solve(S, v)), expected
 
-    def _readings(self, block: JudgedBlock) -> dict[float, list[Any]]:
-        """Return by time of the samples of a block a function of the state, which gives y (p,) and
-        H (p, n), and the R that filters believe and that of the readings.
+    def _readings(self, block: JudgedBlock) -> dict[float, list[tuple[FloatArray, ...]]]:
+        """Return by time, of each sensor that reads a block: H (p, n), the noise (p,), the R that
+        filters believe, and that of the noise.
         """
-        scenario, run, found = self._scenario, self._run, dict[float, list[Any]]()
-        streams, node = Streams(run.seed, run.replica), run.nodes[block.node]
-        times = sample_times(scenario, streams)
+        scenario, found = self._scenario, dict[float, list[tuple[FloatArray, ...]]]()
+        node, zero = scenario.nodes[block.node], np.zeros(scenario.plant.n)
         for placed in readings_of_block(scenario, block):
-            samples = scenario.sample_path(streams, node, placed)
-            R, true = (scenario.noise_covariance(placed.entry, believed=b) for b in (True, False))
-            for k, time in enumerate(times[node, placed.ordinal].tolist()):
-                y, H = samples.reading(k, np.zeros(scenario.plant.n))
-
-                def reading(x: FloatArray, noise: Any = y, H: Any = H) -> tuple[Any, Any]:
-                    return H @ x + noise, H
-
-                found.setdefault(time, []).append((reading, R, true))
+            samples = scenario.sample_path(self._streams, node, placed)
+            laws = [scenario.noise_covariance(placed.entry, believed=b) for b in (True, False)]
+            for k, time in enumerate(self._sampled[node, placed.ordinal].tolist()):
+                noise, H = samples.reading(k, zero)
+                found.setdefault(time, []).append((H, noise, *laws))
         return found

@@ -128,7 +128,8 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         raise TheoryError("the true state says who hears whom: events tell of it")
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
-    if takes_columns(scenario.node_filter):
+    reads_kernels = scenario.node_filter.kernels is not None and scenario.common_entries
+    if takes_columns(scenario.node_filter) and not reads_kernels:
         return (SlotBlocks if scenario.slotted else ClockBlocks)(scenario, run)
     if not scenario.node_filter.timing.talks and scenario.views is not None:
         return SeenErrors(_errors_of(scenario_of_all(scenario), run), scenario)

@@ -161,27 +161,18 @@ class BlockColumns(ErrorColumns):
     def _absorb(self, h: int, heard: Sequence[tuple[int, Any, float]], exchange: Exchange) -> None:
         """Let node number ``h`` absorb messages: sender (id), key among ``_messages``, age."""
         weight, node = self._scenario.weight, self._scenario.nodes[h]
-        translated = self._translations(h, exchange) if self._scenario.common_entries else {}
+        common, own = self._scenario.common_entries, None
+        if common:
+            own = self._filter.emit(self._states[h], exchange)[1]
         messages = []
         for sender, key, age in heard:
             payload = self._messages[key]
-            if sender in translated:
-                payload = translated[sender](payload, age)
+            if (entries := common.get((sender, node))) is not None:
+                before = partial(state_before, self._models[h], age=age)
+                translate = self._scenario.node_filter.needs.translate
+                payload = translate(payload, own, Common(*entries, before))
             messages.append(Message(sender, weight(node, sender), payload, age))
         self._states[h] = self._filter.absorb(self._states[h], messages, exchange)
-
-    def _translations(self, h: int, exchange: Exchange) -> dict[int, Callable[[Any, float], Any]]:
-        """Return how node number ``h`` reads payloads of those that estimate other blocks."""
-        node, width = self._scenario.nodes[h], self._x.shape[1]
-        own = self._filter.emit(self._states[h], exchange)[1]
-        translate, model = self._scenario.node_filter.needs.translate, self._models[h].moving
-
-        def read(entries: Any, payload: Any, age: float) -> Any:
-            common = Common(*entries, partial(state_before, model, age=age))
-            return mapped(lambda one, mine: translate(one, mine, common), (payload, own), width)
-
-        links = self._scenario.common_entries.items()
-        return {i: partial(read, entries) for (i, j), entries in links if j == node}
 
     def _forms(self) -> FloatArray:
         """Return the errors (M n, C): those of states that a node does not estimate are 0."""
@@ -357,37 +348,6 @@ def _arrivals(
             heard = arrivals.setdefault(places.pop((peer, node, number)), {})
             heard.setdefault(node, []).append((peer, peer, age))
     return arrivals
-
-
-def mapped(verb: Callable[..., Any], values: tuple[Any, ...], width: int) -> Any:
-    """Return an affine ``verb`` of single values for ``values`` in which arrays have ``width``
-    columns: its values at zero and at unit vectors give the map.
-    """
-    found: dict[int, FloatArray] = {}
-    replace_columns(values, width, lambda array: found.setdefault(id(array), array))
-    stack = np.concatenate([array.reshape(-1, width) for array in found.values()])
-    ends = np.cumsum([array.size // width for array in found.values()])
-
-    def at(rows: FloatArray) -> Any:
-        parts = dict(zip(found, np.split(rows, ends[:-1]), strict=True))
-        taken = replace_columns(values, width, lambda a: parts[id(a)].reshape(a.shape[:-1]))
-        return verb(*taken)
-
-    def combined(base: Any, units: Sequence[Any]) -> Any:
-        if isinstance(base, list | tuple):
-            whole = [combined(*parts) for parts in zip(base, zip(*units, strict=True), strict=True)]
-            return type(base)(*whole) if hasattr(base, "_fields") else type(base)(whole)
-        if not isinstance(base, np.ndarray) or base.dtype.kind != "f":
-            return base
-        slopes = np.array(units) - base
-        # What does not depend on estimates, such as a covariance, is as it is.
-        if base.ndim != 1 and not slopes.any():
-            return base
-        columns = np.tensordot(slopes, stack, (0, 0))
-        columns[..., MEAN] += base
-        return columns
-
-    return combined(at(np.zeros(len(stack))), [at(unit) for unit in np.eye(len(stack))])
 
 
 def replace_columns(value: Any, width: int, replace: Callable[[FloatArray], FloatArray]) -> Any:
