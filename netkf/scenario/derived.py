@@ -519,7 +519,8 @@ class DerivedScenario(ScenarioModel):
             )
         if responses is not None:
             forced = on_grid and not self.tells_models
-            truth = driven(truth, responses, not plant.draws, forced, (times, probes))
+            shown = times if self.links_follow_state else probes
+            truth = driven(truth, responses, not plant.draws, forced, (times, shown))
         return self._with_given_states(truth)
 
     def slot_truth(self, streams: Streams, frames: bool | None = None) -> Any:

@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 import netkf
-from netkf.core.errors import EngineError, NetkfError, TheoryError
+from netkf.core.errors import NetkfError, TheoryError
 from netkf.network.losses import DistanceLoss, Transmission
 from netkf.rng.streams import Streams
 from netkf.scenario.reading import from_table, parse_toml
@@ -143,7 +143,7 @@ def test_each_message_meets_the_distance_at_its_sending(tmp_path, clock, source)
         moving, place = scenario(tmp_path, clock, positions=MOVING), MOVED
     else:
         moving = scenario(tmp_path, clock, **robots(clock, spread=9.0))
-    run = netkf.simulate(moving)
+    run = assert_agree(moving)
     sent, lost = rows(run, "send"), rows(run, "lost")
     if source == "state":
         # In slots everything of a slot happens at its state.
@@ -211,7 +211,7 @@ def test_filters_know_what_they_hear(tmp_path, clock, filtering):
     """P of filters whose links come and go is what their equations give for the events."""
     graph = {"kind": "range", "nodes": 4, "radius": 5.5}
     moving = scenario(tmp_path, clock, None, graph, MOVING, filter=filtering)
-    run = netkf.simulate(moving)
+    run = assert_agree(moving)
     law = error_law(moving, run)
     np.testing.assert_allclose(run.P, law.P, rtol=1e-10)
 
@@ -233,7 +233,7 @@ def test_nothing_is_sent_out_of_range(tmp_path, clock, source):
     graph = {"kind": "range", "nodes": 4, "radius": 5.5 if source == "table" else 3.0}
     more = {"positions": MOVING} if source == "table" else robots(clock)
     moving = scenario(tmp_path, clock, {"kind": "bernoulli", "delivery": 0.8}, graph, **more)
-    run = assert_agree(moving) if clock in SLOTTED else netkf.simulate(moving)
+    run = assert_agree(moving)
     log = run.log
     slotted = clock in SLOTTED and source == "state"
     times = np.floor(log["t"]) if slotted else log["t"]
@@ -273,6 +273,26 @@ def test_truth_and_clocks_do_not_depend_on_who_hears_whom(tmp_path, clock):
     for kind in ("tick", "sense"):
         assert rows(one, kind).tobytes() == rows(other, kind).tobytes()
     assert len(rows(one, "send")) < len(rows(other, "send"))
+
+
+@pytest.mark.parametrize("clock", ["links", "directions", "nodes"])
+def test_unicycles_that_send_late(tmp_path, clock):
+    """Predictions are cut where nodes send to somebody, or broadcast to nobody."""
+    graph = {"kind": "range", "nodes": 4, "radius": 2.0}
+    driven = {"kind": "constant", "value": [0.5, 0.4]}
+    plant = {
+        "kind": "nonlinear", "name": "pose", "nodes": [0, 1, 2, 3], "f": "unicycle", "step": 0.2,
+        "B": (0.1 * np.eye(3)).tolist(), "cov": np.eye(3).tolist(), "input": driven,
+        "position": [0, 1],
+    }  # fmt: skip
+    sensor = {"kind": "range", "of": "pose", "nodes": [0, 3], "positions": [[5, 0], [0, 5]]}
+    moving = scenario(
+        tmp_path, clock, {"kind": "none"}, graph, plants=[plant],
+        sensors=[sensor | {"R": [[0.1]]} | PERIODIC],
+    ).replace({"network.channel.delay": {"kind": "exponential", "mean": 0.2}})  # fmt: skip
+    run = assert_agree(moving)
+    assert 4 < len(rows(run, "send")) < 700
+    assert len(rows(run, "link")) > 6
 
 
 @pytest.mark.parametrize("source", ["table", "state"])
@@ -390,8 +410,6 @@ def test_theory_promises_nothing_of_links_that_move(tmp_path):
         positions=FIXED,
     )  # fmt: skip
     assert not lossless.delivers_all
-    with pytest.raises(EngineError, match="range graph"):
-        netkf.simulate(moving, engine="compiled")
     # Given their events errors are Gaussian, unless these tell of the state.
     assert error_covariance(moving, netkf.simulate(moving)).shape[1] == 4
     coupled = scenario(tmp_path, **robots("links"))

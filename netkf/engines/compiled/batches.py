@@ -30,7 +30,7 @@ from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.sample_tables import KernelSamples, kernel_sensors, no_instants
 from netkf.engines.compiled.senders import senders_of
 from netkf.engines.compiled.state import Filters, PathBlock, TickArrays
-from netkf.engines.compiled.ticks import Schedule
+from netkf.engines.compiled.ticks import NO_LINKS, Schedule
 from netkf.engines.compiled.truth import PathStates
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
@@ -178,9 +178,10 @@ def _batch_arrays(scenario: Scenario, start: Filters, draws: BatchDraws) -> Batc
 
 def drawn_together(scenario: Scenario) -> bool:
     """Return True if runs are drawn together, for filters of one state of a plant that does not
-    change: on the sensing grid without samples, or with samples that kernels draw without a grid.
+    change, and nodes that do not move: on the sensing grid without samples, or with samples that
+    kernels draw without a grid.
     """
-    if scenario.views is not None or len(scenario.plant.changes):
+    if scenario.views is not None or len(scenario.plant.changes) or scenario.links_move:
         return False
     if not scenario.sampled_sensors:
         return uses_grid(scenario)
@@ -281,6 +282,8 @@ class BatchDraws:
             delay=ticks.delay,
             # The same array holds the indices of outcomes or, if no message takes time, the bits.
             arrival_bits=ticks.first_outcome if ticks.bits else np.zeros_like(ticks.entity),
+            owner=NO_LINKS.owner,
+            link=NO_LINKS.link,
         )
 
     def path(self, together: int = 1) -> PathBlock:

@@ -23,6 +23,7 @@ from netkf.engines.compiled.events import (
     DONE,
     GO_ON,
     LOST,
+    NONE_SENT,
     ON_ABSORB,
     ON_DELIVER,
     ON_REBASE,
@@ -31,6 +32,7 @@ from netkf.engines.compiled.events import (
     ON_TICK,
     SEND,
     SENSE,
+    SOME_ARRIVE,
     TICK,
     TRANSMIT,
     WANT_MESSAGES,
@@ -42,14 +44,16 @@ from netkf.engines.compiled.events import (
     count_sample,
     ends_instant,
     find_shortage,
-    is_lost,
     max_readings,
     next_event,
+    next_reached,
     on_deliver,
     on_sense,
     participant,
+    reached,
     record_event,
     record_event_with_age,
+    record_links,
     seek_piece,
     store_sample,
 )
@@ -61,6 +65,7 @@ from netkf.engines.compiled.nonlinear_samples import (
     set_linear,
     set_pair,
 )
+from netkf.engines.compiled.outcomes import OUT_OF_RANGE
 from netkf.engines.compiled.state import AFTER_READINGS, NODES, Instants, Simulation
 from netkf.linalg.addresses import NOTHING, address_of, call_at, call_at_two, number_at
 from netkf.linalg.arrays import IntArray
@@ -208,8 +213,13 @@ def predict_participants(
     state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, event: int, now: float
 ) -> None:
     """Predict the nodes that take part in an event to ``now`` (seconds)."""
-    # The sender of a message that is lost needs no prediction, unless it reads increments.
-    lost = event == ON_TICK and verbs.counts_sends + verbs.whole_gaps == 0 and is_lost(state)
+    lost = False
+    if event == ON_TICK:
+        becomes = next_reached(state)
+        if becomes == NONE_SENT and state.clock_kind < NODES:
+            return
+        # The sender of a message that is lost needs no prediction, unless it reads increments.
+        lost = becomes != SOME_ARRIVE and verbs.counts_sends + verbs.whole_gaps == 0
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
         if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
@@ -222,6 +232,7 @@ def on_probe(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs) -
     for h in range(len(state.nodes) if verbs.observe != NOTHING else 0):
         choose_model(run, verbs, h)
         call_at(verbs.observe, record, h, run)
+    record_links(state, -1 - state.probe_at, state.probes[state.probe_at])
     store_sample(state, state.run, 0, state.samples)
     return count_sample(state)
 
@@ -299,6 +310,7 @@ def on_tick(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, no
     # A transmission after a sample has no tick of its own.
     if state.clock_kind != AFTER_READINGS:
         record_event(state, now, TICK, nodes[i].id, nodes[j].id if j >= 0 else -1, -1)
+    record_links(state, k, now)
     state.tick_at += 1
     outcome = state.first_delay + ticks.first_outcome[k]
     if state.clock_kind >= NODES:
@@ -319,10 +331,12 @@ def send_all(
     outcomes begin at ``delay[outcome]``; ``links`` = (first, after, outcome).
     """
     first, after, outcome = links
-    ticks, broadcast, m = state.ticks, state.clock_kind >= NODES, take(state)
-    arrives = verbs.counts_sends == 1 or verbs.decides == 1
-    for k in range(after - first):
-        arrives = arrives or ticks.delay[outcome + k] >= 0.0
+    ticks, broadcast = state.ticks, state.clock_kind >= NODES
+    becomes = reached(state, outcome, after - first)
+    if becomes == NONE_SENT and not broadcast:
+        return
+    m = take(state)
+    arrives = becomes == SOME_ARRIVE or verbs.counts_sends == 1 or verbs.decides == 1
     run.sends[0] = 1
     choose_model(run, verbs, h)
     if arrives and verbs.addressed == 0:
@@ -465,11 +479,13 @@ def whiten_pairs(state: Simulation, run: ClockRun, r: int, instant: int) -> None
 
 @kernel
 def is_sent(state: Simulation, w: int, delay: float, now: float) -> bool:
-    """Record that a message is sent on directed link ``w``, and whether it is lost, which a
-    ``delay`` that is negative or nan says; return True if it will arrive.
+    """Record that a message is sent on directed link ``w``, unless it is OUT_OF_RANGE, and whether
+    it is lost, which a ``delay`` that is negative or nan says; return True if it will arrive.
     """
     direction = state.directions[w]
     number = direction.messages
+    if delay == OUT_OF_RANGE:
+        return False
     # A lost message has a number too: recorded losses refer to it.
     direction.messages += 1
     sender_id = state.nodes[direction.sender].id

@@ -72,9 +72,6 @@ class CompiledEngine(Engine):
         if unknown:
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
-        if scenario.links_move and not scenario.slotted:
-            rule = "links or losses that change while nodes move, or a range graph"
-            return f'engine "compiled" cannot run {rule}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)
             return (

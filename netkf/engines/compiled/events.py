@@ -15,14 +15,15 @@ import numpy as np
 
 from netkf.core.instants import snapped
 from netkf.engines.compiled.message_queue import pop, put, release, sort_indices
+from netkf.engines.compiled.outcomes import OUT_OF_RANGE
 from netkf.engines.compiled.state import LINKS, Simulation
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.trace.schema import CODES
 
-SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT = (
+SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT, LINK = (
     CODES[kind]
-    for kind in ("sense", "tick", "send", "deliver", "lost", "late", "absorb", "transmit")
+    for kind in ("sense", "tick", "send", "deliver", "lost", "late", "absorb", "transmit", "link")
 )
 (GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE,
  WANT_PAST, DONE) = range(9)  # fmt: skip
@@ -33,6 +34,8 @@ has reached the horizon. GO_ON: no request.
 ON_REBASE, ON_SENSE, ON_SAMPLE, ON_TICK, ON_DELIVER, ON_ABSORB, ON_PROBE = range(7)
 """Kinds of events, in the order in which those of one instant happen."""
 NEVER = math.inf
+NONE_SENT, ALL_LOST, SOME_ARRIVE = range(3)
+"""What becomes of the messages of a tick: none is sent, since nobody is in range; or else."""
 
 
 @kernel
@@ -196,15 +199,38 @@ def on_sense(state: Simulation, now: float) -> None:
 
 
 @kernel
-def is_lost(state: Simulation) -> bool:
-    """Return True if all messages of the next tick are lost."""
+def reached(state: Simulation, first: int, count: int) -> int:
+    """Return what becomes of ``count`` messages whose outcomes begin at ``delay[first]``:
+    SOME_ARRIVE, ALL_LOST, or NONE_SENT.
+    """
+    found = NONE_SENT
+    for m in range(first, first + count):
+        if state.ticks.delay[m] >= 0.0:
+            return SOME_ARRIVE
+        if state.ticks.delay[m] != OUT_OF_RANGE:
+            found = ALL_LOST
+    return found
+
+
+@kernel
+def next_reached(state: Simulation) -> int:
+    """Return what becomes of the messages of the next tick, see ``reached``."""
     ticks = state.ticks
     entity = state.entities[ticks.entity[state.tick_at]]
     first = state.first_delay + ticks.first_outcome[state.tick_at]
-    any_arrives = False
-    for m in range(entity.after - entity.first):
-        any_arrives = any_arrives or ticks.delay[first + m] >= 0.0
-    return not any_arrives
+    return int(reached(state, first, entity.after - entity.first))
+
+
+@kernel
+def record_links(state: Simulation, owner: int, now: float) -> None:
+    """Record the links that come up or go down at the tick with number ``owner``, or, -1 - k, at
+    sample k.
+    """
+    ticks = state.ticks
+    while state.link_at < len(ticks.owner) and ticks.owner[state.link_at] == owner:
+        link = ticks.link[state.link_at]
+        record_event(state, now, LINK, link[0], link[1], link[2])
+        state.link_at += 1
 
 
 @kernel

@@ -69,7 +69,17 @@ FIRST_MESSAGES, FIRST_ROWS = 64, 4096
 MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS = 256, 1 << 18
 AT_START = (
     *("run", "first_run", "first_delay", "frame_at", "piece", "grid_at", "wake_at", "instant_at"),
-    *("tick_at", "probe_at", "row", "first_free", "in_flight", "order", "receivers", "absorbing"),
+    *(
+        "tick_at",
+        "link_at",
+        "probe_at",
+        "row",
+        "first_free",
+        "in_flight",
+        "order",
+        "receivers",
+        "absorbing",
+    ),
     "samples",
 )
 """Integer fields of a Simulation that are 0 when a run begins."""
@@ -87,7 +97,6 @@ class Source:
         self._samples = samples = samples_of(scenario, streams)
         self._sampled = sampled = samples.sampled
         self.instants = samples.instants
-        self._ticks = Schedule(scenario, streams, instants=samples.instants)
         self._grid = uses_grid(scenario)
         self._read_until, no_block = -math.inf, no_path(scenario.plant.n)
         if self._grid:
@@ -106,6 +115,7 @@ class Source:
             is_driven = isinstance(states, DrivenTruth)
             x = states.local_states(sampled) if is_driven else states.states(sampled)[0]
             samples.read(x, sampled, -math.inf, math.inf)
+        self._ticks = Schedule(scenario, streams, instants=samples.instants, truth=self.states)
 
     def window(self) -> TickArrays:
         """Return the next window of ticks."""
@@ -244,7 +254,11 @@ class Workspace:
             # Each message of a tick leaves a "send", its outcome and perhaps an "absorb", and the
             # tick or transmission two rows more; an instant of samples leaves one row per sensing
             # node.
-            "most_rows": 2 + 3 * max_messages + int(np.diff(instants.first).max(initial=0)),
+            "most_rows": 2
+            + 3 * max_messages
+            + int(np.diff(instants.first).max(initial=0))
+            # Links that come up or go down.
+            + len(self._scenario.topology.links) * self._scenario.links_move,
             "horizon": self._scenario.horizon,
             "per_second": self._scenario.time_grid.per_second,
             "age_limit": algorithm.timing.max_age,

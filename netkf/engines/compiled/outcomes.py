@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.engines.compiled.moving_links import MovingLinks
 from netkf.engines.compiled.senders import Senders
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
@@ -47,7 +48,10 @@ from netkf.rng.numbers import NormalZiggurat, next_normal, normal_ziggurat
 from netkf.rng.streams import WIDTH, ReplicaStreams, Streams
 from netkf.scenario.scenario import Scenario
 
-LOST = -1.0  # no delay is negative
+LOST, OUT_OF_RANGE = -1.0, -2.0
+"""Outcomes that are no delay: a message is lost, or not sent at all, since its ends are too far
+apart.
+"""
 LOSSES = (NoLoss, Bernoulli, PerLink, DistanceLoss, GilbertElliott)
 DELAYS = (NoDelay, ConstantDelay, ExponentialDelay, UniformDelay, LognormalDelay)
 FIXED, EXPONENTIAL, UNIFORM, LOGNORMAL, LISTED = range(5)
@@ -126,7 +130,7 @@ def draw_outcomes(
         if channels.bits:
             outcome |= np.int64(arrives) << (m - first)
         else:
-            out[counts[1]] = delay if arrives else LOST
+            out[counts[1]] = delay if arrives or channels.law == LISTED else LOST
             counts[1] += 1
     return outcome
 
@@ -165,9 +169,11 @@ def list_outcomes(
     streams: Streams | ReplicaStreams,
     senders: Senders,
     ticks: Sequence[FloatArray],
+    moving: MovingLinks | None = None,
 ) -> list[FloatArray]:
-    """Return the outcomes, seconds or LOST, of all messages of a user's channel on each direction
-    of each run (R W), whose entities (R E) have these ``ticks`` in seconds.
+    """Return the outcomes, seconds, LOST or OUT_OF_RANGE, of all messages of a user's channel, or
+    between nodes that are ``moving``, on each direction of each run (R W), whose entities (R E)
+    have these ``ticks`` in seconds.
     """
     channel, outcomes, entities = scenario.network.channel, [], len(senders.entities)
     for run, one in enumerate(streams.per_replica):
@@ -183,15 +189,21 @@ def list_outcomes(
                 if senders.source[w] != last:
                     last = int(senders.source[w])
                     draws = _sampler(channel, one, senders.sources[last]).draws(len(times))
-                first = scenario.transmission(senders.directions[w])
+                first, heard = scenario.transmission(senders.directions[w]), slice(None)
                 (uniform, bad, delay), common = draws, shared.get((e, first.link[0]))
                 if common is not None:
                     uniform = np.where(np.isnan(common.uniform), uniform, common.uniform)
                     bad = bad if common.bad is None else common.bad
+                if moving is not None:
+                    heard = moving.heard[w]
+                if moving is not None and channel.loss.follows_distance:
+                    first = first._replace(distance=moving.distance[w][heard])
                 sent = first._replace(
-                    number=np.arange(len(times)), time=times, bad=bad, conditions=conditions
-                )
-                of_run[w] = _delays(channel, sent, uniform, delay)
+                    number=np.arange(len(times[heard])), time=times[heard], bad=bad[heard],
+                    conditions=conditions,
+                )  # fmt: skip
+                of_run[w] = np.full(len(times), OUT_OF_RANGE)
+                of_run[w][heard] = _delays(channel, sent, uniform[heard], delay[heard])
         outcomes += of_run
     return outcomes
 

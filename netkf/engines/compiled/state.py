@@ -187,6 +187,7 @@ class TickArrays(Struct):
                     directed link of its entity
     delay : seconds that each message takes, negative or nan if it is lost
     arrival_bits : (K,), if no message takes time: bit m is 1 if message m of a tick arrives
+    owner, link : where nodes move, ``moving_links.MovingLinks``; the window is the whole run then
     """
 
     end: float
@@ -195,6 +196,8 @@ class TickArrays(Struct):
     first_outcome: IntArray
     delay: FloatArray
     arrival_bits: IntArray
+    owner: IntArray
+    link: IntArray
 
 
 class SampleBuffer(Struct):
@@ -246,6 +249,7 @@ class Simulation(Struct):
     path, piece : path of the plant, and its present piece
     ticks, tick_at, ticks_stop, first_delay : ticks, where those of this run end, and where their
                                               outcomes begin
+    link_at : the next change of a link, of those in ``ticks``
     frames, frame_at : times (F,) at which frames begin
     probes, probe_at : times (T,) of samples
     run, first_run : number of the present run, and of the first one
@@ -302,6 +306,7 @@ class Simulation(Struct):
     wake_at: int
     instant_at: int
     tick_at: int
+    link_at: int
     probe_at: int
     row: int
     most_rows: int

@@ -12,12 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from netkf.core.clock import generate_ticks
 from netkf.core.instants import snapped
+from netkf.engines.compiled.moving_links import MovingLinks, moving_links
 from netkf.engines.compiled.outcomes import (
     ChannelStreams,
     channel_streams,
@@ -49,6 +50,7 @@ and times that were drawn in Python.
 CROWDING_SHAPE = 100.0
 """Gaps of larger shapes are so regular that the ticks of all entities crowd."""
 NOTHING_SENT: IntArray = np.zeros(0, dtype=np.int64)
+NO_LINKS = MovingLinks([], [], NOTHING_SENT, np.zeros((0, 3), dtype=np.int64))
 
 
 class Clocks(NamedTuple):
@@ -335,9 +337,13 @@ def ticks_apart(clock: object) -> bool:
 
 
 def _is_listed(scenario: Scenario) -> bool:
-    """Return True if Python lists the ticks: of a user's clock or channel, or after samples."""
+    """Return True if Python lists the ticks: of a user's clock or channel, of nodes that move, or
+    after samples.
+    """
     network = scenario.network
-    return not (is_kernel_clock(network.activation) and is_kernel_channel(network.channel))
+    return scenario.links_move or not (
+        is_kernel_clock(network.activation) and is_kernel_channel(network.channel)
+    )
 
 
 def _list_ticks(
@@ -469,7 +475,8 @@ class Schedule:
     """The ticks of some runs of a scenario, and which of their messages arrive: window by window,
     or all at once. ``bits``: the outcomes of a tick are one integer with a bit for each of its
     messages, 1 if it arrives, instead of a delay for each; only if no message takes time. Where
-    nodes transmit after their samples, these are those of ``instants``.
+    nodes transmit after their samples, these are those of ``instants``; where they move, they are
+    where the ``truth`` of the run says.
     """
 
     def __init__(
@@ -478,6 +485,7 @@ class Schedule:
         streams: Streams | ReplicaStreams,
         bits: bool = False,
         instants: Instants | None = None,
+        truth: Any = None,
     ) -> None:
         senders, channel = senders_of(scenario), scenario.network.channel
         self._runs, sizes = streams.runs, np.diff(senders.first)
@@ -488,10 +496,17 @@ class Schedule:
             rates = numbers.mean(axis=0) / scenario.horizon
         else:
             rates = _rates(scenario)
-        if senders.entities and is_kernel_channel(channel):
+        self._moving: MovingLinks | None = None
+        if scenario.links_move and listed is not None:
+            self._moving = moving_links(scenario, senders, listed, truth)
+        elif senders.entities and is_kernel_channel(channel):
             delivery = _delivery(scenario)
-        elif listed is not None and senders.entities:
-            outcomes = list_outcomes(scenario, streams, senders, listed)
+        if (
+            listed is not None
+            and senders.entities
+            and (self._moving or not is_kernel_channel(channel))
+        ):
+            outcomes = list_outcomes(scenario, streams, senders, listed, self._moving)
         # The laws of a user's clock are its own.
         clock = scenario.network.activation if listed is None else None
         purposes = "clock", "phase"
@@ -507,7 +522,8 @@ class Schedule:
         self._max_sends = int(sizes.max(initial=0))
         self._horizon, self._length = scenario.horizon, math.inf
         self._instant = scenario.time_grid.instant
-        if self._rate > 0.0:
+        # Ticks are numbered through the run where links are looked at.
+        if self._rate > 0.0 and self._moving is None:
             entities = len(senders.entities)
             # A window of some thousand ticks, more of them where there are many links.
             self._length = (
@@ -576,8 +592,13 @@ class Schedule:
             merge_in_time_order(count, self._buffer, ordered, _sorting(count))
         else:
             put_in_time_order(begin, last, count, self._buffer, ordered, _sorting(count))
+        moving = self._moving or NO_LINKS
         return TickArrays(
-            **ordered._asdict(), end=end, arrival_bits=np.zeros(count, dtype=np.int64)
+            **ordered._asdict(),
+            end=end,
+            arrival_bits=np.zeros(count, dtype=np.int64),
+            owner=moving.owner,
+            link=moving.link,
         )
 
     def _enlarge_buffer(self, ticks: int, sends: int) -> None:
