@@ -276,7 +276,6 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
         "schedule": _stacked_schedule(blocks, layout),
     }
     if not is_random:
-        _check_what_drives(blocks, layout)
         parts["path"] = StackedStates(plants)
     if slotted:
         parts["period"] = _one(blocks, "period")
@@ -413,27 +412,19 @@ def _check_gain(k: int, u: Input | None, n: int) -> None:
 
 
 def _add_couplings(M: FloatArray, blocks: Sequence[Block], layout: Layout) -> None:
+    is_drawn = dict(zip(layout.places, (p.is_random for p in _plants(blocks)), strict=True))
     for place, (k, _) in zip(layout.places, _copies(blocks), strict=True):
         for c, coupling in enumerate(blocks[k].coupling):
             key = f"[{k}].coupling[{c}]"
             for origin in _origins(f"{key}.from", coupling, place, layout):
+                if is_drawn[place] and not is_drawn[origin]:
+                    rule = "must be drawn as this block is, not recorded or unknown"
+                    remedy = "record this block too, or draw the other"
+                    raise ScenarioError(f"{key}.from", rule, coupling.origin, remedy)
                 if coupling.A.shape != (place.n, origin.n):
                     rule = f"must be {place.n} x {origin.n}, from the block of {origin.n} states"
                     raise ScenarioError(f"{key}.A", rule, coupling.A, "correct the shape")
                 M[place.entries, origin.entries] += coupling.A
-
-
-def _check_what_drives(blocks: Sequence[Block], layout: Layout) -> None:
-    """Raise ScenarioError for a block that is drawn and driven by one that is not."""
-    is_random = dict(zip(layout.places, (p.is_random for p in _plants(blocks)), strict=True))
-    for place, (k, plant) in zip(layout.places, _copies(blocks), strict=True):
-        for c, coupling in enumerate(blocks[k].coupling if plant.is_random else ()):
-            key = f"[{k}].coupling[{c}].from"
-            for origin in _origins(key, coupling, place, layout):
-                if not is_random[origin]:
-                    rule = "must be drawn as this block is, not recorded or unknown"
-                    remedy = "record this block too, or draw the other"
-                    raise ScenarioError(key, rule, coupling.origin, remedy)
 
 
 def _origins(key: str, coupling: Coupling, place: Place, layout: Layout) -> list[Place]:

@@ -125,17 +125,18 @@ class StackedStates:
         self.truth = StackedTruth([table and table.truth for table in tables], sizes)
 
 
-class PartlyDrawnTruth:
+class PartlyDrawnTruth(RecordedTruth):
     """The states of a plant whose blocks are drawn, recorded or unknown: those of a ``truth`` that
     was drawn for all of it, with the others in place. Instants are seconds, or slots of ``period``
     seconds; coordinates begin at the response ``believed``.
     """
 
-    frame_times, frame_slots = np.empty(0), None
+    frame_slots: int | None = None
 
     def __init__(
         self, truth: Any, states: StackedStates, believed: Any, period: float | None
     ) -> None:
+        super().__init__(np.empty(0), np.empty((0, len(states.drawn))), len(states.drawn))
         self._truth, self._given, self._drawn = truth, states.truth, states.drawn
         self._believed, self._period = believed, period
 
@@ -152,15 +153,6 @@ class PartlyDrawnTruth:
         if self._believed is not None:
             given = given - self._believed.states(np.array([time]))[0]
         return np.where(self._drawn, self._truth.local(time), given)
-
-    def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""
-        shape = -1, len(self._drawn)
-        local, absolute = (
-            np.array([state(time) for time in times.tolist()]).reshape(shape)
-            for state in (self.local, self.absolute)
-        )
-        return local, absolute
 
 
 class RecordedPath:

@@ -217,11 +217,10 @@ class RecordedTruth:
         raise IndexError(k)
 
     def states(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return local and absolute states (K, n), which are equal, at ``times`` (K,), in any
-        order.
-        """
-        x = np.array([self.local(time) for time in times.tolist()]).reshape(-1, len(self._missing))
-        return x, x
+        """Return local and absolute states (K, n) each at ``times`` (K,), in any order."""
+        x = [(self.local(time), self.absolute(time)) for time in times.tolist()]
+        local, absolute = np.array(x).reshape(-1, 2, self.n).swapaxes(0, 1)
+        return local, absolute
 
 
 def nearest_row(times: FloatArray, time: float) -> int | None:

@@ -556,11 +556,8 @@ class DerivedScenario(ScenarioModel):
         """
         if not self.unknown.any():
             return None
-        of_nodes = np.zeros((len(self.nodes), self.width), dtype=bool)
-        for k in range(len(self.nodes)):
-            known = self.unknown[self.view(k)]
-            of_nodes[k, : len(known)] = known
-        return self.unknown, of_nodes
+        of_nodes = [self.unknown[self.view(k)] for k in range(len(self.nodes))]
+        return self.unknown, np.array([np.resize(m, self.width) for m in of_nodes])
 
     @cached_property
     def knows_input(self) -> bool:

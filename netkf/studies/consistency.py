@@ -27,7 +27,7 @@ from netkf.engines.base import Engine
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
 from netkf.laws.intervals import interval_of_squares
-from netkf.linalg.arrays import FloatArray, block_diagonal, is_definite
+from netkf.linalg.arrays import FloatArray, is_definite
 from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, require_scenario, simulate
@@ -37,6 +37,7 @@ from netkf.studies.innovations import (
     ClockedInnovations,
     JudgedBlock,
     has_clocked_innovations,
+    nis_of,
     readings_of_block,
 )
 from netkf.theory.errors import error_squares
@@ -214,35 +215,22 @@ class _Innovations:
         """Yield NIS of the linear readings of a block and its expected value (nan: unknown), but
         for samples (T,) that are ``blurred``.
         """
-        i, placed = block.node, readings_of_block(self._scenario, block)
+        scenario, i, placed = self._scenario, block.node, readings_of_block(self._scenario, block)
         # A nonlinear reading has no H given the errors alone.
-        if not placed or not self._scenario.is_linear:
+        if not placed or not scenario.is_linear:
             return
-        sensors = [self._scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
-        # A scenario may give the filters another R than the one that readings are drawn with.
-        believed_R, true_R = (
-            block_diagonal(
-                [self._scenario.noise_covariance(p.entry, believed=believed) for p in placed]
-            )
-            for believed in (True, False)
-        )
+        sensors = [scenario.slot_path(self._streams, self._run.nodes[i], p) for p in placed]
+        laws = [
+            [scenario.noise_covariance(p.entry, believed=b) for b in (True, False)] for p in placed
+        ]
         for k, slot, noise in zip(self._samples, self._slots, self._noise, strict=True):
             source = k - self._steps  # the sample that is, or is advanced to, the prediction
             if blurred[k] or blurred[source]:
                 continue
-            view = self._scenario.view(i)
-            H = np.concatenate([sensor.matrix(slot) for sensor in sensors])
-            last = (slot - 1, noise) if self._steps else None
-            e, P, Sigma = self._prediction(source, i, last)
-            # The innovation H e + noise: sensors read the error in place of the state.
-            whole = np.zeros(H.shape[1])
-            whole[view] = e
-            v, H = np.concatenate([sensor.reading(slot, whole) for sensor in sensors]), H[:, view]
-            S = H @ P @ H.T + believed_R
-            expected = np.nan
-            if Sigma is not None:
-                expected = float(np.trace(np.linalg.solve(S, H @ Sigma @ H.T + true_R)))
-            yield float(v @ np.linalg.solve(S, v)), expected
+            predicted = self._prediction(source, i, (slot - 1, noise) if self._steps else None)
+            zero, pairs = np.zeros(scenario.plant.n), zip(sensors, laws, strict=True)
+            rows = [(sensor.matrix(slot), sensor.reading(slot, zero), *R) for sensor, R in pairs]
+            yield nis_of(rows, scenario.view(i), predicted)
 
     def _prediction(
         self, k: int, i: int, last: tuple[int, FloatArray] | None

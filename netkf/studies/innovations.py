@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,25 @@ class JudgedBlock(NamedTuple):
     block: str
     entries: np.ndarray
     states: np.ndarray
+
+
+Row = tuple[FloatArray, ...]
+"""Of a reading H (p, n), the noise (p,), the R that filters believe, and that of the noise."""
+
+
+def nis_of(
+    readings: Sequence[Row], view: Any, predicted: tuple[FloatArray, FloatArray, Any]
+) -> tuple[float, float]:
+    """Return NIS of ``readings`` and its expected value (nan: unknown), from the error, P and E[e
+    e'] (None: unknown) of the prediction of the states of a ``view``.
+    """
+    parts, (e, P, Sigma) = list(zip(*readings, strict=True)), predicted
+    H, (believed, R) = np.concatenate(parts[0])[:, view], map(block_diagonal, parts[2:])
+    # The innovation: sensors read the error in place of the state.
+    v, S, expected = H @ e + np.concatenate(parts[1]), H @ P @ H.T + believed, np.nan
+    if Sigma is not None:
+        expected = float(np.trace(np.linalg.solve(S, H @ Sigma @ H.T + R)))
+    return float(v @ np.linalg.solve(S, v)), expected
 
 
 def readings_of_block(scenario: Scenario, block: JudgedBlock) -> tuple[Any, ...]:
@@ -105,27 +124,18 @@ class ClockedInnovations:
             if time not in readings or now >= len(run.times) or blurred[last]:
                 continue
             (F,), (root,) = self._moves.laws(np.array([time - start]))
-            moved, e, square = x[now] - F @ x[last], np.zeros(len(F)), np.ix_(own, own)
+            moved, square = (x[now] - F @ x[last])[view], np.ix_(own, own)
             F, Q = F[view][:, view], (root @ root.T)[view][:, view]
-            e[view] = F @ run.error[last, i, own] + moved[view]
             P = F @ run.P[last, i][square] @ F.T + Q
             if ROUNDING * abs(x[last]).max() * BLUR > np.sqrt(np.diag(P).min()):
                 continue
-            parts = list(zip(*readings[time], strict=True))
-            H, noise = (np.concatenate(part) for part in parts[:2])
-            believed, R = (block_diagonal(part) for part in parts[2:])
-            v, H, expected = H @ e + noise, H[:, view], np.nan
-            S = H @ P @ H.T + believed
-            if self.sigma is not None:
-                Sigma = F @ self.sigma[last, i][square] @ F.T + Q
-                expected = float(np.trace(np.linalg.solve(S, H @ Sigma @ H.T + R)))
-            yield float(v @ np.linalg.solve(S, v)), expected
+            Sigma = None if self.sigma is None else F @ self.sigma[last, i][square] @ F.T + Q
+            e = F @ run.error[last, i, own] + moved
+            yield nis_of(readings[time], view, (e, P, Sigma))
 
-    def _readings(self, block: JudgedBlock) -> dict[float, list[tuple[FloatArray, ...]]]:
-        """Return by time, of each sensor that reads a block: H (p, n), the noise (p,), the R that
-        filters believe, and that of the noise.
-        """
-        scenario, found = self._scenario, dict[float, list[tuple[FloatArray, ...]]]()
+    def _readings(self, block: JudgedBlock) -> dict[float, list[Row]]:
+        """Return by time what each sensor reads of a block."""
+        scenario, found = self._scenario, dict[float, list[Row]]()
         node, zero = scenario.nodes[block.node], np.zeros(scenario.plant.n)
         for placed in readings_of_block(scenario, block):
             samples = scenario.sample_path(self._streams, node, placed)
