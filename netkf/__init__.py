@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from netkf.checks.check import check
     from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
     from netkf.logs.exporting import export_log
+    from netkf.logs.fitting import fit_log
     from netkf.logs.importing import import_log
     from netkf.runs.run import save
     from netkf.runs.simulate import simulate
@@ -48,6 +49,7 @@ _MODULE_OF = {
     "consistency": "netkf.studies.consistency",
     "export_log": "netkf.logs.exporting",
     "first_difference": "netkf.trace.run",
+    "fit_log": "netkf.logs.fitting",
     "import_log": "netkf.logs.importing",
     "load": "netkf.scenario.reading",
     "check": "netkf.checks.check",
@@ -84,6 +86,7 @@ __all__ = [
     "consistency",
     "export_log",
     "first_difference",
+    "fit_log",
     "import_log",
     "load",
     "monte_carlo",

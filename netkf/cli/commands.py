@@ -388,6 +388,20 @@ COMMANDS = (
         module="import_log",
     ),
     Command(
+        "fit",
+        "fit laws of losses to a recorded network, and look for its replay among their runs",
+        (
+            _option("directory", "folder that import wrote", type=Path, metavar="DIR"),
+            _runs("runs of each law, with parameters drawn from their posterior", 200),
+            _flag("--no-runs", "estimates and tests only"),
+            _confidence(0.95, "that all intervals of links hold, and that no test is wrong"),
+            POOL[0],
+            _trust("DIR"),
+            JSON,
+        ),
+        takes_scenario=False,
+    ),
+    Command(
         "export",
         "write a run as a packet log, which import replays to the bit",
         (

@@ -33,6 +33,8 @@ MAX_SKIP = 1000
 """Numbers skipped at once beyond which a counter began again: nothing is known of what lies
 between.
 """
+TOLD, UNREPORTED = "no report tells", "nobody reported it"
+"""Reasons for which outcomes are not known."""
 LATE = 2
 """A number may be that much smaller than the one before because reports are out of order."""
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)_(\d\d)[.:](\d\d)[.:](\d\d)")
@@ -196,7 +198,8 @@ def spread_equal(sends: pd.DataFrame, resolution: float, notes: list[str]) -> No
 
 def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
     """Return one outcome for each transmission and node that could hear it, as those of a log:
-    columns send, receiver, heard (1, 0, nan), delay, rssi, in the order of time.
+    columns send, receiver, heard (1, 0, nan), delay, rssi, why (it is not known), in the order of
+    time.
 
     A node could hear those that the log says it did, or did not, at least once. A transmission
     without a row is lost, or unknown where ``log.absent`` says so, in a hole of the receiver's log
@@ -210,22 +213,23 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
     whole = base.merge(pairs, on="sender")
     whole = whole[(whole["to"] == "") | (whole["to"] == whole["receiver"])]
     whole = whole.merge(told.assign(told=True), on=["send", "receiver"], how="left")
-    missing = whole["told"].isna().to_numpy()
-    send = whole["send"].to_numpy()
-    fill = np.full(len(whole), np.nan if log.absent == "unknown" else 0.0)
+    missing, send = whole["told"].isna().to_numpy(), whole["send"].to_numpy()
+    why = np.where(whole["heard"].isna(), TOLD, "").astype(object)
     if log.absent == "lost":
-        silent = ~sends["sent"].to_numpy(dtype=bool)[send]
-        fill[silent & (unreported == "unknown")] = np.nan
-        fill[_in_holes(log, whole, hole)] = np.nan
-        count = int(silent[missing].sum())
-        if count:
+        why[missing] = ""
+        silent = missing & ~sends["sent"].to_numpy(dtype=bool)[send]
+        if unreported == "unknown":
+            why[silent] = UNREPORTED
+        if silent.any():
             log.notes.append(
-                f"not known: {count_phrase(count, 'outcome')} of transmissions that nobody "
-                f"reported, of which only their numbers tell; taken as {unreported}"
+                f"not known: {count_phrase(int(silent.sum()), 'outcome')} of transmissions that "
+                f"nobody reported, of which only their numbers tell; taken as {unreported}"
             )
-    heard = np.where(missing, fill, whole["heard"].to_numpy(dtype=float))
-    whole["heard"] = heard
-    columns = ["send", "receiver", "heard", "delay", "rssi"]
+        why[_in_holes(log, whole, hole)] = "the receiver's log has a hole"
+    whole["heard"] = np.where(missing, 0.0, whole["heard"].to_numpy(dtype=float))
+    whole.loc[why != "", "heard"] = np.nan
+    whole["why"] = why
+    columns = ["send", "receiver", "heard", "delay", "rssi", "why"]
     return whole.sort_values(["send"], kind="stable")[columns].reset_index(drop=True)
 
 

@@ -20,7 +20,7 @@ from netkf.scenario.writing import resolve_defaults, to_toml, toml_text
 
 LAG = 10
 """Readings between the two of a pair whose differences tell how the state moves."""
-TABLES = ("outcomes.csv", "accounts.csv", "delays.csv")
+TABLES = ("outcomes.csv", "unknown.csv", "accounts.csv", "delays.csv")
 Files = dict[str, str | Path]
 """Texts, or files to copy, by name."""
 
@@ -88,11 +88,13 @@ def write_network(
     if outcomes.empty:
         raise ScenarioError(name, "has no packet that anybody could hear", None, "check the log")
     account = accounts(log.sends, outcomes)
-    table = _outcome_table(log, outcomes)
+    table, unknown = _outcome_tables(log, outcomes)
     files: Files = {
         "outcomes.csv": table.to_csv(index=False),
         "accounts.csv": account.to_csv(index=False),
     }
+    if len(unknown):
+        files["unknown.csv"] = unknown.to_csv(index=False)
     channel: dict[str, Any] = {
         "loss": {"kind": "recorded", "path": "outcomes.csv", "after": "lose"},
         "symmetric": False,
@@ -114,7 +116,7 @@ def write_network(
     )
     if total["unknown"]:
         log.notes.append(
-            "replay: outcomes that are not known are in no table and count as lost; "
+            "replay: outcomes that are not known (unknown.csv) count as lost; "
             'network.channel.loss.after = "deliver" makes them heard'
         )
     log.notes.insert(0, f"origin: simulated 0 is {log.origin} in the log")
@@ -153,8 +155,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _outcome_table(log: PacketLog, outcomes: pd.DataFrame) -> pd.DataFrame:
-    """Return the known outcomes, with the number of each message of its direction."""
+def _outcome_tables(log: PacketLog, outcomes: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the outcomes that are known, with the number of each message of its direction, and
+    those that are not, with the reason.
+    """
     sends = log.sends.iloc[outcomes["send"]].reset_index(drop=True)
     table = pd.DataFrame({"sender": sends["sender"], "receiver": outcomes["receiver"]})
     table["message"] = table.groupby(["sender", "receiver"]).cumcount()
@@ -163,9 +167,12 @@ def _outcome_table(log: PacketLog, outcomes: pd.DataFrame) -> pd.DataFrame:
     table["channel"], table["rssi"] = sends["channel"], outcomes["rssi"]
     # A message that is heard after the end of the log is never heard in a run.
     delay = outcomes["delay"].replace(np.inf, 2.0 * float(log.sends["t"].max()) + 1.0)
-    table["delay"] = delay
-    table = table[table["delivered"].notna()].astype({"delivered": int})
-    return table.drop(columns=[c for c in ("rssi", "channel") if not _is_told(table[c])])
+    table["delay"], table["why"] = delay, outcomes["why"]
+    is_known = table["delivered"].notna()
+    unknown = table[~is_known].drop(columns=["delivered", "rssi", "delay"])
+    table = table[is_known].drop(columns="why").astype({"delivered": int})
+    untold = [c for c in ("rssi", "channel") if not _is_told(table[c])]
+    return table.drop(columns=untold), unknown.drop(columns=[c for c in untold if c == "channel"])
 
 
 def _is_told(column: pd.Series) -> bool:

@@ -1,0 +1,214 @@
+"""The replay of a log among runs of the laws that were fitted to it."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.sparse.csgraph import connected_components
+
+from netkf.ensembles.pools import PoolOptions
+from netkf.ensembles.replicas import Progress, replicate
+from netkf.linalg.arrays import FloatArray
+from netkf.logs.outcomes import Chain
+from netkf.runs.simulate import simulate
+from netkf.scenario.scenario import Scenario
+from netkf.trace.messages import DELIVERED, by_link, join_messages
+from netkf.trace.run import Run
+
+RECENT = 5.0
+"""A link is up while its last packet heard is no older than so many intervals of its sender."""
+STREAM = 0x6C617773
+"""Seeds the posterior draws apart from the streams of the runs."""
+
+
+class Law(NamedTuple):
+    """A law of losses fitted to a log.
+
+    values : bernoulli: its delivery; per-link: those of the L ``links``; gilbert-elliott: to_bad,
+             to_good, deliver_good, deliver_bad; distance: half, width
+    counts : packets and those heard, (1, 2) or (L, 2), as independent ones: deliveries have the
+             posterior Beta(heard + 1/2, lost + 1/2)
+    cov    : of the other laws: covariance of the logits of a chain, or of half and width, whose
+             posterior is Gaussian
+    """
+
+    kind: str
+    values: FloatArray
+    likelihood: float
+    counts: FloatArray | None = None
+    cov: FloatArray | None = None
+    links: tuple[tuple[str, str], ...] = ()
+
+    def draw(self, random: np.random.Generator) -> FloatArray:
+        """Return parameters drawn from their posterior."""
+        if self.counts is not None:
+            count, heard = self.counts.T
+            return random.beta(heard + 0.5, count - heard + 0.5)
+        assert self.cov is not None
+        if self.kind == "gilbert-elliott":
+            return Chain(self.values, self.cov, 0.0).draw(random)
+        while True:  # a width is above 0
+            half, width = random.multivariate_normal(self.values, self.cov)
+            if half >= 0.0 and width > 0.0:
+                return np.array([half, width])
+
+    def describe(self) -> str:
+        """Return the parameters as text."""
+        values = [f"{value:.3g}" for value in self.values]
+        if self.kind == "per-link":
+            return f"{min(self.values):.3g} to {max(self.values):.3g} on {len(values)} links"
+        names = {
+            "bernoulli": ("delivery",),
+            "gilbert-elliott": CHAIN,
+            "distance": ("half", "width"),
+        }[self.kind]
+        return ", ".join(f"{a} {b}" for a, b in zip(names, values, strict=True))
+
+    def loss_table(self, values: FloatArray | None = None) -> dict[str, Any]:
+        """Return the table network.channel.loss with these ``values``, by default the estimates."""
+        own = [float(value) for value in (self.values if values is None else values)]
+        if self.kind == "bernoulli":
+            return {"kind": "bernoulli", "delivery": own[0]}
+        if self.kind == "gilbert-elliott":
+            return {"kind": "gilbert-elliott", **dict(zip(CHAIN, own, strict=True))}
+        if self.kind == "distance":
+            delivery = {"kind": "logistic", "half": own[0], "width": own[1]}
+            return {"kind": "distance", "delivery": delivery}
+        return {"kind": "per-link"}
+
+    def changes(self, scenario: Scenario, values: FloatArray) -> dict[str, Any]:
+        """Return the keys of a scenario that make its losses those of the law with ``values``."""
+        changed: dict[str, Any] = {"network.channel.loss": self.loss_table(values)}
+        if self.kind == "per-link":
+            changed["network.graph"] = edges_with(
+                scenario, dict(zip(self.links, values, strict=True))
+            )
+        return changed
+
+
+CHAIN = ("to_bad", "to_good", "deliver_good", "deliver_bad")
+
+
+def edges_with(scenario: Scenario, deliveries: dict[tuple[str, str], float]) -> dict[str, Any]:
+    """Return the graph of a scenario as edges with these deliveries; a link without one has their
+    mean, and that of an undirected graph the mean of its directions.
+    """
+    topology, mean = scenario.topology, float(np.mean([*deliveries.values()]))
+    name = {node: getattr(node, "name", int(node)) for node in topology.nodes}
+    table: dict[str, Any] = {"kind": "edges", "nodes": [name[node] for node in topology.nodes]}
+    table["edges"] = [[name[i], name[j]] for i, j in topology.links]
+    table["directed"] = topology.directed
+    ends = [(str(i), str(j)) for i, j in topology.links]
+    forth = [deliveries.get(link, mean) for link in ends]
+    back = [deliveries.get((j, i), a) for (i, j), a in zip(ends, forth, strict=True)]
+    pairs = zip(forth, forth if topology.directed else back, strict=True)
+    table["delivery"] = [float(0.5 * (a + b)) for a, b in pairs]
+    if topology.positions is not None:
+        table["positions"] = [[*map(float, topology.positions[node])] for node in topology.nodes]
+    return table
+
+
+def compare_with_laws(
+    scenario: Scenario,
+    laws: list[Law],
+    delay: dict[str, Any],
+    runs: int,
+    confidence: float,
+    pool: PoolOptions,
+    progress: Progress | None,
+) -> pd.DataFrame:
+    """Return a row for each law and quantity: the value of the replay, which is replica 0, and the
+    range of ``runs`` runs of the law, replicas 1 to ``runs``, whose parameters are drawn anew.
+
+    If a law is true its runs and the replay are exchangeable: p is twice the smaller rank of the
+    replay among all of them, over their number. Ranges and verdicts of a law hold together.
+    """
+    replay = measure_run(scenario, simulate(scenario, scenario.seed, 0))
+    level = (1.0 - confidence) / len(replay)
+    rows = []
+    for number, law in enumerate(laws):
+
+        def advance(done: int, _: int, before: int = number * runs) -> None:
+            if progress is not None:
+                progress(before + done, len(laws) * runs)
+
+        task = partial(law_run, law=law, delay=delay)
+        found = replicate(task, scenario, runs, first=1, pool=pool, progress=advance)
+        for name, value in replay.items():
+            drawn = np.array([one[name] for one in found])
+            rank = 1 + min(int((drawn <= value).sum()), int((drawn >= value).sum()))
+            low, median, high = np.quantile(drawn, [level / 2, 0.5, 1.0 - level / 2])
+            p = min(1.0, 2.0 * rank / (runs + 1))
+            row = {"law": law.kind, "quantity": name, "replay": value, "low": low, "median": median}
+            rows.append({**row, "high": high, "p": p, "inside": p >= level})
+    return pd.DataFrame(rows)
+
+
+def law_run(
+    scenario: Scenario, seed: int, replica: int, law: Law, delay: dict[str, Any]
+) -> dict[str, float]:
+    """Return the quantities of one run of a law with parameters drawn from their posterior."""
+    random = np.random.default_rng([STREAM, seed, replica])
+    changes = law.changes(scenario, law.draw(random))
+    if delay:
+        changes["network.channel.delay"] = delay
+    drawn = scenario.replace(changes)
+    return measure_run(drawn, simulate(drawn, seed, replica))
+
+
+def measure_run(scenario: Scenario, run: Run) -> dict[str, float]:
+    """Return error over all nodes and times and at the worst instant (of P where there is no
+    truth), mean age of what nodes have heard of their senders, messages heard, and the share of
+    samples at which recent packets connect all nodes.
+    """
+    later = run.times > 0.0
+    squares = run.sq_error if run.truth_known else np.trace(run.P, axis1=2, axis2=3)
+    by_time = squares[later].mean(axis=1)
+    kind = "error" if run.truth_known else "deviation by P"
+    messages = join_messages(run.log)
+    heard = messages[messages["outcome"] == DELIVERED]
+    ages, connected = measure_network(scenario, run.times[later], messages)
+    return {
+        f"RMS {kind}": float(np.sqrt(by_time.mean())),
+        f"{kind} at the worst instant": float(np.sqrt(by_time.max())),
+        "mean age (s)": ages,
+        "messages heard": float(len(heard)),
+        "time connected": connected,
+    }
+
+
+def measure_network(
+    scenario: Scenario, times: FloatArray, messages: np.ndarray
+) -> tuple[float, float]:
+    """Return the mean age in seconds, over links and sample ``times`` (T,), of the newest message
+    heard, and the share of times at which links whose newest is recent connect the network.
+
+    It is connected if every node hears every other one along some links, or if the graph never
+    allows that, along links in either direction.
+    """
+    index, size = scenario.topology.index, len(scenario.topology.nodes)
+    links = scenario.topology.directions
+    newest = np.full((len(times), len(links)), 0.0)
+    order = {link: k for k, link in enumerate(links)}
+    for rows in by_link(messages):
+        arrived = rows[rows["outcome"] == DELIVERED]
+        arrived = arrived[np.argsort(arrived["ended"], kind="stable")]
+        place = np.searchsorted(arrived["ended"], times, side="right")
+        sent = np.concatenate([[0.0], np.maximum.accumulate(arrived["sent"])])
+        newest[:, order[int(rows["sender"][0]), int(rows["receiver"][0])]] = sent[place]
+    age = times[:, None] - newest
+    per_link = len(messages) / max(len(links), 1)
+    is_up = (age <= RECENT * scenario.horizon / max(per_link, 1.0)) & (newest > 0.0)
+    ends = np.array([[index[i], index[j]] for i, j in links])
+    whole = np.zeros((size, size))
+    whole[ends[:, 0], ends[:, 1]] = 1.0
+    kind = "strong" if connected_components(whole, connection="strong")[0] == 1 else "weak"
+    together = 0
+    for flags in is_up:
+        graph = np.zeros((size, size))
+        graph[ends[flags, 0], ends[flags, 1]] = 1.0
+        together += connected_components(graph, connection=kind)[0] == 1
+    return float(age.mean()), together / max(len(times), 1)

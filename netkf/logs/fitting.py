@@ -1,0 +1,443 @@
+"""``netkf fit``: laws of losses fitted to a recorded network, and what it says against them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.special import expit, xlog1py, xlogy
+
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import SourceFile, as_path, number
+from netkf.core.notebook import NotebookTable
+from netkf.ensembles.pools import PoolOptions
+from netkf.ensembles.replicas import Progress
+from netkf.linalg.arrays import FloatArray
+from netkf.logs import outcomes as stats
+from netkf.logs.envelope import Law, compare_with_laws
+from netkf.logs.outcomes import Outcomes, Test, make_outcomes
+from netkf.logs.packets import UNREPORTED
+from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.runs.files import write_text
+from netkf.scenario.reading import load
+from netkf.scenario.scenario import Scenario
+from netkf.scenario.writing import as_table, to_toml
+
+ASSUMPTIONS = {
+    "time": "packets are independent in time",
+    "memory": "the last outcome is the state",
+    "fate": "hearers are independent",
+    "constancy": "quality does not change in time",
+    "links": "all links have one delivery",
+    "channel": "channels have one delivery",
+    "directions": "both directions have one delivery",
+    "distance": "the distance decides the delivery",
+}
+NEEDS = {
+    "bernoulli": ("links", "time", "fate", "constancy", "channel"),
+    "per-link": ("time", "fate", "constancy", "channel"),
+    "gilbert-elliott": ("links", "fate", "constancy", "channel"),
+    "distance": ("distance", "time", "fate", "constancy", "channel"),
+}
+"""What each law of losses assumes."""
+MAKERS = {
+    "time": "gilbert-elliott",
+    "links": "per-link, distance",
+    "directions": "per-link",
+    "distance": "per-link",
+    "memory": "gilbert-elliott with deliver_good and deliver_bad",
+}
+"""Laws of netkf that do without an assumption; none does without the others yet."""
+MAYBE = 0.05
+"""Below this p a departure is allowed for in other tests, whether it is there or not."""
+KEY = ["sender", "receiver", "message"]
+UNKNOWN, REPLAY = "unknown.csv", "fit_replay.csv"
+FILES = ("fit_links.csv", "fit_tests.csv", "fit_laws.csv", "fit_envelope.csv")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LogFit(NotebookTable):
+    """The laws of a recorded network.
+
+    links : a row for each link: packets, heard, unknown, delivery with its interval, bursts
+    tests : a row for each assumption: departure, what is detectable, p, verdict
+    laws  : a row for each law: parameters, log-likelihood, what rejects it
+    envelope : a row for each quantity and law: value of the replay, range of the law, p; empty
+               without runs
+    scenarios : the files of the laws, by law
+    """
+
+    scenario: Scenario
+    links: pd.DataFrame
+    tests: pd.DataFrame
+    laws: pd.DataFrame
+    envelope: pd.DataFrame
+    confidence: float
+    notes: tuple[str, ...] = ()
+    scenarios: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The table ``laws``."""
+        return self.laws
+
+    def __repr__(self) -> str:
+        """Return one line: the log, its links, and the laws that are not rejected."""
+        kept = ", ".join(self.laws["law"][self.laws["rejected_by"] == ""]) or "none"
+        return (
+            f"<netkf fit of {self.scenario.name!r}: {len(self.links)} links, not rejected: {kept}>"
+        )
+
+
+def fit_log(
+    directory: str | Path,
+    runs: int = 200,
+    *,
+    confidence: float = 0.95,
+    trust: bool = True,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> LogFit:
+    """Fit laws of losses to the recorded outcomes of ``directory``, as ``netkf import`` leaves it,
+    and write ``fit_links.csv``, ``fit_tests.csv``, ``fit_laws.csv``, ``fit_envelope.csv`` and a
+    scenario of each law beside its scenario.toml.
+
+    runs       : of each law, in which the replay is looked for; 0 for none. Each run draws the
+                 parameters of its law from their posterior
+    confidence : with which all intervals of links hold together, and none of the tests rejects
+                 what is true
+    Raises ScenarioError unless the scenario's loss is recorded.
+    """
+    folder = as_path("directory", directory)
+    confidence = float(number(above=0.0, below=1.0)("confidence", confidence))
+    scenario = load(folder / "scenario.toml", trust=trust)
+    table, notes = read_outcomes(scenario)
+    outcomes = make_outcomes(table)
+    distance = _distances(scenario, outcomes)
+    tests, share, time = run_tests(outcomes, distance)
+    level = (1.0 - confidence) / max(sum(np.isfinite(t.p) for t in tests.values()), 1)
+    test_table = _test_table(tests, level)
+    rejected = {key for key, test in tests.items() if test.p < level}
+    # Packets count for less where the next one has the fate of the last.
+    shrink = time if "time" in rejected else 1.0
+    links = _link_table(outcomes, table, 1.0 - confidence, shrink, distance)
+    bursty = min(tests["time"].p, tests["constancy"].p) < MAYBE
+    if not bursty:
+        notes.append("no bursts are to be seen: gilbert-elliott is not fitted")
+    laws = _fit_laws(outcomes, links, distance, shrink, bursty)
+    law_table = _law_table(laws, rejected, len(table))
+    if np.isfinite(share.value):
+        notes.append(
+            f"shared fate of hearers: {share.value:.3f} +- {share.error:.3f}; {share.lasting:.3f} "
+            "of it lasts to the next transmission (slow changes, or shared bursts)"
+        )
+    envelope, delay = pd.DataFrame(), _delay_table(scenario, notes)
+    if runs:
+        replay = _complete_replay(folder, scenario, table, links, notes)
+        pool = PoolOptions(workers=workers)
+        envelope = compare_with_laws(replay, laws, delay, runs, confidence, pool, progress)
+        need = math.ceil(2.0 * envelope["quantity"].nunique() / (1.0 - confidence))
+        if runs < need - 1:
+            notes.append(f"too few runs to put the replay outside an envelope: it takes {need - 1}")
+    scenarios = _write(folder, scenario, (links, test_table, law_table, envelope), laws, delay)
+    fields = (links, test_table, law_table, envelope, confidence, tuple(notes), scenarios)
+    return LogFit(scenario, *fields)
+
+
+def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
+    """Return the recorded outcomes of a scenario, a row for each message that is listed, and notes.
+    Raises ScenarioError.
+
+    Packets that nobody reported count as lost: without them those that are left were all heard by
+    somebody, which would bias deliveries and make hearers look dependent.
+    """
+    loss = scenario.network.channel.loss
+    if not isinstance(loss, RecordedLoss):
+        rule, remedy = "must be recorded to be fitted", "name a folder that netkf import left"
+        raise ScenarioError("network.channel.loss.kind", rule, type(loss).__name__, remedy)
+    table = _read_table(loss.path.full)
+    table["unreported"] = False
+    path = loss.path.full.with_name(UNKNOWN)
+    if path.is_file():
+        silent = _read_table(path)
+        silent = silent[silent["why"] == UNREPORTED].assign(delivered=0, unreported=True)
+        table = pd.concat([table, silent]).drop_duplicates(KEY)
+    if "t" not in table:
+        table["t"] = table["message"].astype(float)
+    if "transmission" not in table:
+        table["transmission"] = table["sender"] + " " + table["message"].astype(str)
+    sent = int((table.groupby(["sender", "receiver"])["message"].max() + 1).sum())
+    notes = [f"{len(table):,} of {sent:,} outcomes are known"]
+    count = int(table["unreported"].sum())
+    if count:
+        notes.append(
+            f"{count:,} of them are of packets that nobody reported and count as lost; at_least "
+            "and at_most in fit_links.csv say what else they may have been"
+        )
+    if len(table) < sent and loss.after == "deliver":
+        notes.append("messages that are not listed count as unknown, not as delivered")
+    return table, notes
+
+
+def _read_table(path: Path) -> pd.DataFrame:
+    table = pd.read_csv(path, comment="#", dtype={"sender": str, "receiver": str})
+    return table.drop_duplicates(KEY)
+
+
+def _complete_replay(
+    folder: Path,
+    scenario: Scenario,
+    table: pd.DataFrame,
+    links: pd.DataFrame,
+    notes: list[str],
+) -> Scenario:
+    """Return the scenario with outcomes in place of those that are not known, drawn once by the
+    deliveries of their links: else the replay would have more losses than any law.
+    """
+    missing = int(links["unknown"].sum())
+    if not missing:
+        return scenario
+    random, parts = np.random.default_rng(scenario.seed), [table[[*KEY, "delivered"]]]
+    listed = table.groupby(["sender", "receiver"])["message"]
+    heard = links.set_index(["sender", "receiver"])["delivery_probability"]
+    for link, messages in listed:
+        unknown = np.setdiff1d(np.arange(messages.max() + 1), messages)
+        part = pd.DataFrame({"message": unknown}).assign(sender=link[0], receiver=link[1])
+        parts.append(part.assign(delivered=(random.random(len(unknown)) < heard[link]).astype(int)))
+    write_text(folder / REPLAY, pd.concat(parts).astype({"delivered": int}).to_csv(index=False))
+    notes.append(
+        f"in the envelope {missing:,} outcomes of the replay that are not known are drawn, once, "
+        f"by the deliveries of their links ({REPLAY})"
+    )
+    loss = RecordedLoss(path=SourceFile(REPLAY, folder), after="lose")
+    return scenario.replace({"network.channel.loss": loss})
+
+
+def run_tests(
+    outcomes: Outcomes, distance: FloatArray | None
+) -> tuple[dict[str, Test], stats.Share, float]:
+    """Return a test of each assumption that the log can tell of, the shared fate, and the
+    correlation time in packets.
+    """
+    time = stats.correlation_time(outcomes)
+    test_time = stats.test_time(outcomes)
+    lags = min(30, math.ceil(3.0 * time)) if test_time.p < MAYBE else 0
+    share, fate = stats.shared_fate(outcomes, lags)
+    slack = time if test_time.p < MAYBE else 1.0
+    counts = outcomes.counts.astype(float)
+    spread = stats.residual_spread(outcomes, share.value, slack)
+    pooled = np.full(len(counts), counts[:, 1].sum() / counts[:, 0].sum())
+    found = {
+        "time": test_time,
+        "memory": stats.test_memory(outcomes),
+        "fate": fate,
+        "constancy": stats.test_constancy(outcomes, time),
+        "links": stats.test_alike(ASSUMPTIONS["links"], counts, pooled, spread, 1),
+    }
+    parts = outcomes.by_channel.astype(float)
+    if len(parts) > 1:
+        own = np.tile(counts[:, 1] / np.maximum(counts[:, 0], 1.0), (len(parts), 1)).ravel()
+        name, flat = ASSUMPTIONS["channel"], parts.reshape(-1, 2)
+        spreads = np.tile(spread, len(parts))
+        found["channel"] = stats.test_alike(name, flat, own, spreads, len(counts))
+    found |= _direction_test(outcomes, counts, slack)
+    if distance is not None and len(counts) > 2:
+        values, _ = stats.fit_distance(distance, counts[:, 0], counts[:, 1], slack)
+        curve = expit((values[0] - distance) / values[1])
+        found["distance"] = stats.test_alike(ASSUMPTIONS["distance"], counts, curve, spread, 2)
+    return found, share, time
+
+
+def _direction_test(outcomes: Outcomes, counts: FloatArray, slack: float) -> dict[str, Test]:
+    """Return the test that both directions of pairs have one delivery, if any have two."""
+    index = {link: k for k, link in enumerate(outcomes.links)}
+    both = [(k, index[j, i]) for (i, j), k in index.items() if i < j and (j, i) in index]
+    if not both:
+        return {}
+    order = np.array(both).T.ravel()
+    pairs = counts[order].reshape(2, -1, 2)
+    together = pairs.sum(axis=0)
+    expected = np.tile(together[:, 1] / np.maximum(together[:, 0], 1.0), 2)
+    spread = np.full(len(order), slack)
+    name = ASSUMPTIONS["directions"]
+    return {
+        "directions": stats.test_alike(name, counts[order], expected, spread, len(both)),
+    }
+
+
+def _test_table(tests: Mapping[str, Test], level: float) -> pd.DataFrame:
+    rows = []
+    for key, test in tests.items():
+        verdict = "rejected" if test.p < level else "not rejected"
+        rows.append(
+            {
+                "key": key,
+                "assumption": ASSUMPTIONS[key],
+                "departure": test.what,
+                "estimate": test.estimate,
+                "detectable": test.detectable(level),
+                "p": test.p,
+                "verdict": verdict if np.isfinite(test.p) else "not tested",
+                "made_by": MAKERS.get(key, "no law of netkf yet"),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _distances(scenario: Scenario, outcomes: Outcomes) -> FloatArray | None:
+    """Return the distances (L,) of the ends of links; None if nodes move or are nowhere."""
+    points = scenario.topology.positions
+    if scenario.positions.moving or points is None:
+        return None
+    at = {str(node): np.array(point) for node, point in points.items()}
+    return np.array([np.hypot(*(at[i] - at[j])) for i, j in outcomes.links])
+
+
+def _link_table(
+    outcomes: Outcomes,
+    table: pd.DataFrame,
+    level: float,
+    shrink: float,
+    distance: FloatArray | None,
+) -> pd.DataFrame:
+    """Return a row for each link; intervals hold together with probability 1 - ``level``."""
+    count, heard = outcomes.counts.T.astype(float)
+    each = level / len(count)
+    low, high = stats.binomial_interval(heard / shrink, count / shrink, each)
+    sent = table.groupby(["sender", "receiver"])["message"].max() + 1
+    rows = pd.DataFrame(outcomes.links, columns=["sender", "receiver"])
+    rows["packets"], rows["heard"] = count.astype(int), heard.astype(int)
+    rows["unknown"] = [int(sent[link]) for link in outcomes.links] - rows["packets"]
+    rows["delivery_probability"], rows["low"], rows["high"] = heard / count, low, high
+    silent = table.groupby(["sender", "receiver"])["unreported"].sum()
+    rows["unreported"] = [int(silent[link]) for link in outcomes.links]
+    whole = rows["packets"] + rows["unknown"]
+    rows["at_least"] = heard / whole
+    rows["at_most"] = (heard + rows["unknown"] + rows["unreported"]) / whole
+    moves = _transitions(outcomes)
+    for k, name in enumerate(("to_bad", "to_good")):
+        tries, turns = moves[:, 2 * k], moves[:, 2 * k + 1]
+        with np.errstate(invalid="ignore"):
+            rows[name] = np.where(tries > 0, turns / tries, np.nan)
+        rows[f"{name}_low"], rows[f"{name}_high"] = stats.binomial_interval(turns, tries, each / 2)
+    with np.errstate(divide="ignore"):
+        rows["mean_burst"] = 1.0 / rows["to_good"]
+    if distance is not None:
+        rows["distance"] = distance
+    return rows
+
+
+def _transitions(outcomes: Outcomes) -> FloatArray:
+    """Return, of each link, packets heard that have a next one, those of them whose next is lost,
+    packets lost that have one, and those whose next is heard, (L, 4).
+    """
+    moves = np.zeros((len(outcomes.links), 4))
+    for group in outcomes.groups:
+        last, now = group.x[:-1], group.x[1:]
+        both = np.isfinite(last + now) & group.follows[1:, None]
+        for k, flags in enumerate((last == 1, (last == 1) & (now == 0), last == 0)):
+            moves[group.links, k] += (both & flags).sum(axis=0)
+        moves[group.links, 3] += (both & (last == 0) & (now == 1)).sum(axis=0)
+    return moves
+
+
+def _fit_laws(
+    outcomes: Outcomes,
+    links: pd.DataFrame,
+    distance: FloatArray | None,
+    shrink: float,
+    bursty: bool,
+) -> list[Law]:
+    count, heard = outcomes.counts.T.astype(float)
+    total = np.array([count.sum(), heard.sum()])
+    laws = [
+        Law(
+            "bernoulli", total[1:] / total[0], _likelihood(total[1], total[0]), total[None] / shrink
+        ),
+        Law(
+            "per-link",
+            heard / count,
+            _likelihood(heard, count),
+            np.stack([count, heard], 1) / shrink,
+        ),
+    ]
+    if bursty:
+        chain = stats.fit_chain(outcomes)
+        laws.append(Law("gilbert-elliott", chain.values, chain.likelihood, cov=chain.cov))
+    if distance is not None and len(count) > 2:
+        values, cov = stats.fit_distance(distance, count, heard, shrink)
+        p = expit((values[0] - distance) / values[1])
+        fit = float((xlogy(heard, p) + xlog1py(count - heard, -p)).sum())
+        if values[1] > 0.0 and values[0] >= 0.0:
+            laws.append(Law("distance", values, fit, cov=cov))
+    pairs = tuple(links[["sender", "receiver"]].itertuples(index=False, name=None))
+    return [law._replace(links=pairs) for law in laws]
+
+
+def _likelihood(heard: Any, count: Any) -> float:
+    p = heard / count
+    return float(np.sum(xlogy(heard, p) + xlog1py(count - heard, -p)))
+
+
+def _law_table(laws: list[Law], rejected: set[str], count: int) -> pd.DataFrame:
+    rows = []
+    for law in laws:
+        failed = [ASSUMPTIONS[key] for key in NEEDS[law.kind] if key in rejected]
+        size = len(law.values)
+        rows.append(
+            {
+                "law": law.kind,
+                "parameters": law.describe(),
+                "log_likelihood": law.likelihood,
+                "bic": size * math.log(count) - 2.0 * law.likelihood,
+                "rejected_by": "; ".join(failed),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _delay_table(scenario: Scenario, notes: list[str]) -> dict[str, Any]:
+    """Return a delay law in place of a recorded one: that of a lost message is in no record."""
+    delay = scenario.network.channel.delay
+    if not isinstance(delay, RecordedDelay):
+        return {}
+    listed = [
+        v for link in delay.table.values.values() for v in link.values() if v < scenario.horizon
+    ]
+    seconds = np.array([v for v in listed if v > 0.0])
+    if not len(seconds):
+        return {"kind": "none"}
+    sigma = float(np.log(seconds).std())
+    notes.append(f"delays: fitted as lognormal with mean {seconds.mean():.3g} s, sigma {sigma:.3g}")
+    return {"kind": "lognormal", "mean": float(seconds.mean()), "sigma": sigma}
+
+
+def _write(
+    folder: Path,
+    scenario: Scenario,
+    tables: tuple[pd.DataFrame, ...],
+    laws: list[Law],
+    delay: dict[str, Any],
+) -> dict[str, Path]:
+    """Write the tables, and a scenario for each law; return the paths of these by law."""
+    for name, table in zip(FILES, tables, strict=True):
+        if len(table):
+            write_text(folder / name, table.to_csv(index=False))
+    base, paths = as_table(scenario), {}
+    for law in laws:
+        document = {**base, "name": f"{scenario.name}-{law.kind}"}
+        document["claim"] = f"losses by the law {law.kind}, fitted to the log of {scenario.name}"
+        network = {**base["network"]}
+        channel = {**network["channel"], "loss": law.loss_table()}
+        network["channel"] = channel | ({"delay": delay} if delay else {})
+        if law.kind == "per-link":
+            network["graph"] = {"kind": "csv", "path": FILES[0]}
+            network["graph"]["directed"] = scenario.topology.directed
+        paths[law.kind] = folder / f"fit_{law.kind.replace('-', '_')}.toml"
+        write_text(paths[law.kind], to_toml({**document, "network": network}))
+    return paths

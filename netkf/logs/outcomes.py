@@ -1,0 +1,501 @@
+"""Statistics of the outcomes of packets: deliveries, bursts, shared fate, and tests of what laws
+of losses assume.
+
+Senders are taken as independent of each other. What hearers share, and what follows in time, is
+kept in all variances: sums go over transmissions, which are the units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import brentq, minimize
+from scipy.special import expit, logit
+from scipy.stats import beta, chi2, ncx2, norm
+
+from netkf.linalg.arrays import FloatArray
+
+POWER = 0.9
+"""The probability with which a departure of the size ``detectable`` is found."""
+BLOCKS = 48
+"""Parts of a log whose means tell of slow changes."""
+LAGS = 4
+"""Lags of these means that are tested together."""
+MIN_PACKETS = 10
+"""Packets of a link below which no test is made of it."""
+
+
+class Test(NamedTuple):
+    """One assumption about outcomes and what the log says of it.
+
+    estimate : of the departure, in the words of ``what``
+    p        : of a departure as large or larger by chance; nan where nothing can be tested
+    unit     : of the departure: its standard error, or for a chi-square with ``freedom`` degrees
+               of freedom what makes the noncentrality 1 if it is raised to ``power``
+    """
+
+    assumption: str
+    what: str
+    estimate: float
+    p: float
+    unit: float
+    freedom: float = 0.0
+    power: int = 2
+
+    def detectable(self, level: float) -> float:
+        """Return the departure that a test of this level finds with probability POWER."""
+        if not self.freedom or not np.isfinite(self.unit):
+            return self.unit * float(norm.isf(level / 2.0) + norm.ppf(POWER))
+        limit = float(chi2.isf(level, self.freedom))
+
+        def miss(noncentrality: float) -> float:
+            return float(ncx2.sf(limit, self.freedom, noncentrality)) - POWER
+
+        return self.unit * brentq(miss, 1e-6, 100.0 * (limit + 10.0)) ** (1.0 / self.power)
+
+
+class Group(NamedTuple):
+    """The transmissions of one sender on one channel in the order of time: outcomes x (T, h) of its
+    h hearers, 1, 0 or nan; times (T,); which row follows the one before in one stretch (T,); and
+    the indices (h,) of the links.
+    """
+
+    x: FloatArray
+    t: FloatArray
+    follows: np.ndarray
+    links: np.ndarray
+
+    @property
+    def mean(self) -> FloatArray:
+        """Deliveries (h,) of the hearers in the group."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.nansum(self.x, axis=0) / np.isfinite(self.x).sum(axis=0))
+
+    @property
+    def residuals(self) -> FloatArray:
+        """The outcomes less their mean (T, h), 0 where it is not known."""
+        return np.nan_to_num(self.x - self.mean)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """The outcomes of a log: L ``links`` (sender, receiver), and the ``groups``."""
+
+    links: tuple[tuple[str, str], ...]
+    groups: tuple[Group, ...]
+    channels: tuple[str, ...]
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Known outcomes and packets heard of each link, (L, 2)."""
+        return self._sum(self.groups)
+
+    def _sum(self, groups: tuple[Group, ...]) -> np.ndarray:
+        total = np.zeros((len(self.links), 2), dtype=int)
+        for group in groups:
+            total[group.links, 0] += np.isfinite(group.x).sum(axis=0)
+            total[group.links, 1] += np.nansum(group.x, axis=0).astype(int)
+        return total
+
+    @cached_property
+    def by_channel(self) -> np.ndarray:
+        """``counts`` for each channel, (C, L, 2)."""
+        names = sorted(set(self.channels))
+        return np.stack(
+            [
+                self._sum(
+                    tuple(g for g, c in zip(self.groups, self.channels, strict=True) if c == n)
+                )
+                for n in names
+            ]
+        )
+
+
+def make_outcomes(table: pd.DataFrame) -> Outcomes:
+    """Return outcomes from a table sender, receiver, message, t, transmission, delivered (nan where
+    it is not known), and maybe channel, with a row for each message of each link.
+    """
+    pairs = table[["sender", "receiver"]].drop_duplicates().sort_values(["sender", "receiver"])
+    links = [(str(i), str(j)) for i, j in pairs.itertuples(index=False)]
+    index = {link: k for k, link in enumerate(links)}
+    channel = (
+        table["channel"].fillna("").astype(str)
+        if "channel" in table
+        else pd.Series("", table.index)
+    )
+    groups, channels = [], []
+    # Hearers of one broadcast belong together; other messages only with those of their link.
+    is_broadcast = table.duplicated("transmission").any()
+    parts = ["sender", *([] if is_broadcast else ["receiver"]), "channel"]
+    for (sender, *_, name), rows in table.assign(channel=channel).groupby(parts):
+        wide = rows.pivot_table("delivered", "transmission", "receiver", "max", dropna=False)
+        order = rows.drop_duplicates("transmission").set_index("transmission")
+        order = (
+            order.loc[wide.index].assign(at=np.arange(len(wide))).sort_values("t", kind="stable")
+        )
+        wide = wide.iloc[order["at"].to_numpy()]
+        follows = np.concatenate([[False], np.diff(order["message"]) == 1])
+        ids = np.array([index[str(sender), str(receiver)] for receiver in wide.columns])
+        groups.append(Group(wide.to_numpy(dtype=float), order["t"].to_numpy(), follows, ids))
+        channels.append(str(name))
+    return Outcomes(tuple(links), tuple(groups), tuple(channels))
+
+
+def binomial_interval(
+    heard: FloatArray, count: FloatArray, level: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of exact (Clopper-Pearson) intervals of error ``level``; counts need not be
+    integers.
+    """
+    with np.errstate(invalid="ignore"):
+        low = np.where(heard > 0.0, beta.ppf(level / 2, heard, count - heard + 1.0), 0.0)
+        high = np.where(heard < count, beta.ppf(1 - level / 2, heard + 1.0, count - heard), 1.0)
+    return low, high
+
+
+def _z_test(assumption: str, what: str, units: FloatArray, scale: float, lags: int = 0) -> Test:
+    """Return a test that the ``units`` (T,), sums of products of residuals, have mean 0; they are
+    as large as ``scale`` in all if the departure is 1. ``lags`` of their own correlation are in the
+    variance.
+    """
+    variance = long_run_sum(units, lags)
+    if scale <= 0.0 or variance <= 0.0 or len(units) < MIN_PACKETS:
+        return Test(assumption, what, np.nan, np.nan, np.nan)
+    deviation = math.sqrt(variance)
+    p = 2.0 * float(norm.sf(abs(units.sum()) / deviation))
+    return Test(assumption, what, float(units.sum() / scale), p, deviation / scale)
+
+
+def long_run_sum(units: FloatArray, lags: int) -> float:
+    """Return the variance of the sum of ``units`` (T,) of mean 0, correlated up to ``lags``
+    (Bartlett weights).
+    """
+    total = float(units @ units)
+    for lag in range(1, min(lags, len(units) - 1) + 1):
+        total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(units[lag:] @ units[:-lag])
+    return max(total, 0.0)
+
+
+def autocorrelation(outcomes: Outcomes, lag: int) -> tuple[FloatArray, float]:
+    """Return sums over hearers of products of residuals ``lag`` transmissions apart, one for each
+    transmission (T,), and what they are in all for a correlation of 1.
+    """
+    units, scale = [], 0.0
+    for group in outcomes.groups:
+        z, known = group.residuals, np.isfinite(group.x)
+        if len(z) <= lag:
+            continue
+        unbroken = _unbroken(group.follows, lag)
+        both = known[lag:] & known[:-lag] & unbroken[:, None]
+        size = group.mean * (1.0 - group.mean)
+        size = np.nan_to_num(size)
+        # The mean is that of the same packets: products are smaller by its variance.
+        lift = size / np.maximum(known.sum(axis=0), 1)
+        units.append((z[lag:] * z[:-lag] * both + both * lift).sum(axis=1))
+        scale += float((both * size).sum())
+    return np.concatenate([*units, np.empty(0)]), scale
+
+
+def _unbroken(follows: np.ndarray, lag: int) -> np.ndarray:
+    """Return flags (T - lag,): all of the ``lag`` steps up to a transmission are in one stretch."""
+    steps = np.cumsum(np.concatenate([[0], follows]))
+    return np.asarray(steps[lag + 1 :] - steps[1:-lag] == lag)
+
+
+def correlation_time(outcomes: Outcomes) -> float:
+    """Return 1 + 2 sum of autocorrelations, cut where they are noise: by so much fewer independent
+    packets there are than packets.
+    """
+    total = 1.0
+    longest = max(len(group.t) for group in outcomes.groups)
+    for lag in range(1, longest // 4):
+        units, scale = autocorrelation(outcomes, lag)
+        if scale <= 0.0 or units.sum() < 2.0 * math.sqrt(long_run_sum(units, 0)):
+            break
+        total += 2.0 * float(units.sum() / scale)
+    return total
+
+
+def test_time(outcomes: Outcomes) -> Test:
+    """Test that a packet's outcome does not depend on that of the one before."""
+    units, scale = autocorrelation(outcomes, 1)
+    return _z_test("packets are independent in time", "correlation with the next", units, scale)
+
+
+def test_memory(outcomes: Outcomes) -> Test:
+    """Test that bursts are those of a chain whose state is the last outcome: given it, the one
+    before says nothing.
+    """
+    units, scale = [], 0.0
+    for group in outcomes.groups:
+        if len(group.t) < 3:
+            continue
+        x, unbroken = group.x, _unbroken(group.follows, 2)
+        now, last, first = x[2:], x[1:-1], x[:-2]
+        known = np.isfinite(now + last + first) & unbroken[:, None]
+        part = np.zeros_like(now)
+        for state in (0.0, 1.0):
+            chosen = known & (last == state)
+            n = np.maximum(chosen.sum(axis=0), 1)
+            a, b = (np.where(chosen, v, 0.0).sum(axis=0) / n for v in (now, first))
+            size = np.sqrt(a * (1 - a) * b * (1 - b))
+            part += np.where(chosen, (now - a) * (first - b) + size / n, 0.0)
+            scale += float((chosen.sum(axis=0) * size).sum())
+        units.append(part.sum(axis=1))
+    whole = np.concatenate([*units, np.empty(0)])
+    return _z_test("the last outcome is the state", "correlation given the last", whole, scale)
+
+
+class Share(NamedTuple):
+    """How far hearers share one fate, 0 (none) to 1, with its standard error; ``lasting`` is what
+    remains of it from one transmission to the next: slow changes, or bursts that are shared.
+    """
+
+    value: float
+    error: float
+    lasting: float
+
+
+def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
+    """Return the share of transmissions whose hearers have one fate, by the covariances of hearers:
+    share c makes that of two hearers c (min(p, q) - p q); and the test that it is 0.
+    """
+    sums, sizes, slopes, lasting = [], [], [], 0.0
+    shrink = _shrinkage(outcomes)
+    for group in outcomes.groups:
+        z, m, p = group.residuals, np.isfinite(group.x).astype(float), np.nan_to_num(group.mean)
+        p = p.mean() + shrink * (p - p.mean())
+        least = np.minimum(p[:, None], p) - np.outer(p, p)
+        np.fill_diagonal(least, 0.0)
+        # By p of a row, of min(p, q) - p q.
+        slope = (p[:, None] < p) + 0.5 * (p[:, None] == p) - p
+        np.fill_diagonal(slope, 0.0)
+        sums.append(0.5 * (z.sum(axis=1) ** 2 - (z**2).sum(axis=1)))
+        sizes.append(0.5 * np.einsum("ti,ij,tj->t", m, least, m))
+        slopes.append(np.einsum("ti,ij,tj->t", z, slope, m))
+        near = group.follows[1:]
+        lasting += float(((z[1:].sum(1) * z[:-1].sum(1) - (z[1:] * z[:-1]).sum(1)) * near).sum())
+    S, D, G = (np.concatenate([*part, np.empty(0)]) for part in (sums, sizes, slopes))
+    what = "share of one fate"
+    if D.sum() <= 0.0:
+        return Share(np.nan, np.nan, np.nan), Test("hearers are independent", what, *[np.nan] * 3)
+    share = float(S.sum() / D.sum())
+    error = math.sqrt(long_run_sum(S - share * (D + G), lags)) / float(D.sum())
+    found = _z_test("hearers are independent", what, S, float(D.sum()), lags)
+    return Share(share, error, 0.5 * lasting / float(D.sum())), found
+
+
+def _shrinkage(outcomes: Outcomes) -> float:
+    """Return by how much deliveries of the hearers of a sender differ, as a share of how much their
+    estimates do: the smaller of two estimates of one delivery is too small.
+    """
+    between = noise = 0.0
+    for group in outcomes.groups:
+        p, n = group.mean, np.isfinite(group.x).sum(axis=0)
+        if len(p) > 1 and np.isfinite(p).all():
+            between += float(p.var(ddof=1)) * (len(p) - 1)
+            together = np.nan_to_num(np.corrcoef(group.residuals.T)).clip(0.0, 1.0)
+            alone = 1.0 - (together.sum() - np.trace(together)) / (len(p) * (len(p) - 1))
+            noise += alone * float((p * (1.0 - p) / n).mean()) * (len(p) - 1)
+    return max(0.0, 1.0 - noise / between) if between > 0.0 else 0.0
+
+
+def test_constancy(outcomes: Outcomes, time: float) -> Test:
+    """Test that deliveries do not change slowly, by correlations of the means of BLOCKS parts of
+    the log, each long against the correlation ``time`` (packets).
+    """
+    name, what = "quality does not change in time", "deviation of delivery over time"
+    t = np.concatenate([group.t for group in outcomes.groups])
+    z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])
+    n = np.concatenate([np.isfinite(group.x).sum(axis=1) for group in outcomes.groups])
+    longest = max(len(group.t) for group in outcomes.groups)
+    blocks = int(min(BLOCKS, len(t) // 8, longest / (5.0 * time)))
+    if blocks < 3 * LAGS:
+        return Test(name, what, np.nan, np.nan, np.nan)
+    rank = np.argsort(np.argsort(t, kind="stable"), kind="stable")
+    block = rank * blocks // len(t)
+    sums, packets = np.bincount(block, z, blocks), np.bincount(block, n, blocks)
+    r = sums / np.sqrt(np.maximum(packets, 1.0))
+    r = r - r.mean()
+    square = float(r @ r)
+    if square <= 0.0:
+        return Test(name, what, 0.0, 1.0, np.nan)
+    lag = np.arange(1, LAGS + 1)
+    # Residuals of a mean sum to 0, which makes each correlation -1 / blocks by chance.
+    rho = np.array([r[k:] @ r[:-k] for k in lag]) / square + 1.0 / blocks
+    statistic = blocks * (blocks + 2.0) * float((rho**2 / (blocks - lag)).sum())
+    deviation = math.sqrt(square / blocks / packets.mean())
+    slow = max(float(rho[0]), 0.0)
+    # Slow changes that are the share s of the variance of blocks make each correlation s.
+    unit = deviation * (LAGS * blocks) ** -0.25
+    p = float(chi2.sf(statistic, LAGS))
+    return Test(name, what, deviation * math.sqrt(slow), p, unit, LAGS, 4)
+
+
+def test_alike(
+    assumption: str, counts: FloatArray, expected: FloatArray, spread: FloatArray, used: int
+) -> Test:
+    """Test that deliveries of K links, or parts of links, are the ``expected`` ones (K,), where
+    ``counts`` (K, 2) has packets and those heard.
+
+    ``spread`` (K,) are the eigenvalues of the covariance of their standardised residuals, of which
+    ``used`` are taken by estimated parameters.
+    """
+    what = "deviation of deliveries"
+    variance = expected * (1.0 - expected) / np.maximum(counts[:, 0], 1.0)
+    usable = (variance > 0.0) & (counts[:, 0] > 0.0)
+    if usable.sum() <= used:
+        return Test(assumption, what, np.nan, np.nan, np.nan)
+    off = counts[usable, 1] / counts[usable, 0] - expected[usable]
+    square, size = float((off**2 / variance[usable]).sum()), float(variance[usable].mean())
+    share = (usable.sum() - used) / len(spread)
+    mean, second = float(spread.sum() * share), float((spread**2).sum() * share)
+    # Satterthwaite: a weighted sum of chi-squares is nearly one of fewer degrees of freedom.
+    scale, freedom = second / mean, mean**2 / second
+    excess = max(square - mean, 0.0) / usable.sum()
+    unit = math.sqrt(scale * size / usable.sum())
+    p = float(chi2.sf(square / scale, freedom))
+    return Test(assumption, what, math.sqrt(excess * size), p, unit, freedom)
+
+
+def residual_spread(outcomes: Outcomes, share: float, time: float) -> FloatArray:
+    """Return the eigenvalues (L,) of the covariance of standardised residuals of links, whose
+    hearers have that ``share`` of one fate, and packets that correlation ``time``.
+    """
+    share = min(max(share, 0.0), 1.0) if np.isfinite(share) else 0.0
+    senders = pd.Series([sender for sender, _ in outcomes.links]).value_counts().to_numpy()
+    parts = [np.append(np.full(n - 1, 1.0 - share), 1.0 + share * (n - 1)) for n in senders]
+    return time * np.concatenate(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A Gilbert-Elliott chain that all links follow: ``values`` to_bad, to_good, deliver_good,
+    deliver_bad; ``cov`` (4, 4) of their logits; ``likelihood`` the logarithm.
+    """
+
+    values: FloatArray
+    cov: FloatArray
+    likelihood: float
+
+    def draw(self, random: np.random.Generator) -> FloatArray:
+        """Return values drawn from their posterior, which is Gaussian in logits."""
+        return expit(random.multivariate_normal(logit(self.values), self.cov))
+
+
+def fit_chain(outcomes: Outcomes) -> Chain:
+    """Return the chain of two states that makes the outcomes likeliest, links alike."""
+    stretches = _pad_stretches(outcomes)
+    count, heard = outcomes.counts.sum(axis=0)
+    p = (heard + 0.5) / (count + 1.0)
+    first = [_sum_of(outcomes, lag) for lag in (1, 2)]
+    keep = min(max(first[1] / first[0] if first[0] > 0.0 else 0.5, 0.1), 0.99)
+    best = None
+    for good, bad in ((0.98, 0.02), (min(p + 0.1, 0.98), max(p - 0.3, 0.02))):
+        share = min(max((good - p) / (good - bad), 0.02), 0.98)
+        start = logit(
+            np.clip([(1 - keep) * share, (1 - keep) * (1 - share), good, bad], 1e-3, 0.999)
+        )
+        found = minimize(
+            _surprise, start, args=(stretches,), method="L-BFGS-B", bounds=[(-9, 9)] * 4
+        )
+        if best is None or found.fun < best.fun:
+            best = found
+    assert best is not None
+    values, x = expit(best.x), best.x
+    if values[2] < values[3]:  # the states changed their names
+        x = x[[1, 0, 3, 2]]
+    return Chain(expit(x), _inverse_curvature(x, stretches), -float(best.fun))
+
+
+def _sum_of(outcomes: Outcomes, lag: int) -> float:
+    units, scale = autocorrelation(outcomes, lag)
+    return float(units.sum() / scale) if scale > 0.0 else 0.0
+
+
+def _pad_stretches(outcomes: Outcomes) -> np.ndarray:
+    """Return outcomes of all unbroken stretches of all links, (S, T) codes 0, 1, or 2 for unknown
+    and 3 beyond the end.
+    """
+    parts = [
+        np.where(np.isfinite(part), part, 2.0)
+        for group in outcomes.groups
+        for x in np.split(group.x, np.flatnonzero(~group.follows[1:]) + 1)
+        for part in x.T
+    ]
+    longest = max(map(len, parts))
+    whole = np.full((len(parts), 1 << max(longest - 1, 0).bit_length()), 3, dtype=np.int64)
+    for k, part in enumerate(parts):
+        whole[k, : len(part)] = part
+    return whole
+
+
+def _surprise(x: FloatArray, stretches: np.ndarray) -> float:
+    """Return minus the log-likelihood: products of 2 x 2 matrices in a tree over time."""
+    to_bad, to_good, good, bad = expit(x)
+    move = np.array([[1.0 - to_bad, to_bad], [to_good, 1.0 - to_good]])
+    emit = np.array([[1.0 - good, 1.0 - bad], [good, bad], [1.0, 1.0]])
+    # Row vectors of states are multiplied from the right by each step: move, then emit.
+    steps = np.concatenate([move * emit[:, None, :], np.eye(2)[None]])
+    start = np.array([to_good, to_bad]) / (to_bad + to_good)
+    product, total = steps[stretches], 0.0
+    while product.shape[1] > 1:
+        product = np.matmul(product[:, ::2], product[:, 1::2])
+        size = product.max(axis=(2, 3), keepdims=True)
+        total += float(np.log(size).sum())
+        product = product / size
+    # The stationary law is that of the state before the first step too.
+    return -total - float(np.log((start @ product[:, 0]).sum(axis=-1)).sum())
+
+
+def _inverse_curvature(x: FloatArray, stretches: np.ndarray) -> FloatArray:
+    """Return the inverse of the second derivatives (4, 4) of the surprise, whose directions that
+    say nothing have the variance 4 of a wide prior.
+    """
+    step, size = 0.02, len(x)
+    H = np.zeros((size, size))
+    base, unit = _surprise(x, stretches), step * np.eye(size)
+    ahead = [_surprise(x + unit[i], stretches) for i in range(size)]
+    for i, j in _pairs(size):
+        if i == j:
+            H[i, i] = (ahead[i] - 2.0 * base + _surprise(x - unit[i], stretches)) / step**2
+        else:
+            both = _surprise(x + unit[i] + unit[j], stretches)
+            H[i, j] = H[j, i] = (both - ahead[i] - ahead[j] + base) / step**2
+    values, vectors = np.linalg.eigh(H)
+    return np.asarray((vectors / (np.maximum(values, 0.0) + 0.25)) @ vectors.T)
+
+
+def _pairs(size: int) -> Iterator[tuple[int, int]]:
+    return ((i, j) for i in range(size) for j in range(i + 1))
+
+
+def fit_distance(
+    distance: FloatArray, count: FloatArray, heard: FloatArray, spread: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return half and width of the logistic function of the distance that makes deliveries
+    likeliest, and their covariance (2, 2), ``spread`` times that of independent packets.
+    """
+    X = np.stack([np.ones_like(distance), -distance], axis=1)
+    slopes = np.array([0.0, 1.0 / max(float(distance.std()), 1e-9)])
+    slopes[0] = slopes[1] * float(distance.mean())
+    scale = np.array([1.0, max(float(distance.std()), 1e-9)])
+    information = np.eye(2)
+    for _ in range(100):
+        p = np.clip(expit(X @ slopes), 1e-9, 1.0 - 1e-9)
+        information = (X * (count * p * (1.0 - p))[:, None]).T @ X + np.diag(1e-6 * scale**2)
+        step = np.linalg.solve(information, X.T @ (heard - count * p))
+        size = float(np.abs(step * scale).max())
+        slopes = slopes + step * min(1.0, 2.0 / max(size, 1e-12))
+        if size < 1e-10:
+            break
+    a, b = slopes
+    jacobian = np.array([[1.0 / b, -a / b**2], [0.0, -1.0 / b**2]])
+    cov = jacobian @ np.linalg.inv(information) @ jacobian.T
+    return np.array([a / b, 1.0 / b]), spread * cov
