@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -46,7 +46,7 @@ class Law(NamedTuple):
         """Return parameters drawn from their posterior."""
         if self.counts is not None:
             count, heard = self.counts.T
-            return random.beta(heard + 0.5, count - heard + 0.5)
+            return np.asarray(random.beta(heard + 0.5, count - heard + 0.5))
         assert self.cov is not None
         if self.kind == "gilbert-elliott":
             return Chain(self.values, self.cov, 0.0).draw(random)
@@ -205,7 +205,9 @@ def measure_network(
     ends = np.array([[index[i], index[j]] for i, j in links])
     whole = np.zeros((size, size))
     whole[ends[:, 0], ends[:, 1]] = 1.0
-    kind = "strong" if connected_components(whole, connection="strong")[0] == 1 else "weak"
+    kind: Literal["strong", "weak"] = (
+        "strong" if connected_components(whole, connection="strong")[0] == 1 else "weak"
+    )
     together = 0
     for flags in is_up:
         graph = np.zeros((size, size))

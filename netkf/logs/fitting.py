@@ -203,12 +203,13 @@ def _complete_replay(
     if not missing:
         return scenario
     random, parts = np.random.default_rng(scenario.seed), [table[[*KEY, "delivered"]]]
-    listed = table.groupby(["sender", "receiver"])["message"]
-    heard = links.set_index(["sender", "receiver"])["delivery_probability"]
-    for link, messages in listed:
+    for sender, receiver, delivery in links[[*KEY[:2], "delivery_probability"]].to_numpy().tolist():
+        own = (table["sender"] == sender) & (table["receiver"] == receiver)
+        messages = table["message"][own].to_numpy()
         unknown = np.setdiff1d(np.arange(messages.max() + 1), messages)
-        part = pd.DataFrame({"message": unknown}).assign(sender=link[0], receiver=link[1])
-        parts.append(part.assign(delivered=(random.random(len(unknown)) < heard[link]).astype(int)))
+        drawn = (random.random(len(unknown)) < delivery).astype(int)
+        part = {"sender": sender, "receiver": receiver, "message": unknown, "delivered": drawn}
+        parts.append(pd.DataFrame(part))
     write_text(folder / REPLAY, pd.concat(parts).astype({"delivered": int}).to_csv(index=False))
     notes.append(
         f"in the envelope {missing:,} outcomes of the replay that are not known are drawn, once, "

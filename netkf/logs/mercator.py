@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from netkf.core.errors import ScenarioError
+from netkf.logs.packet_tables import find_extra, read_positions
 from netkf.logs.packets import (
     PacketLog,
     choose_origin,
@@ -36,6 +37,8 @@ def read_mercator(log: Path) -> PacketLog:
     Raises ScenarioError, with file and line, for a file that is none.
     """
     paths = sorted([*log.glob("*.csv"), *log.glob("*.csv.gz")]) if log.is_dir() else [log]
+    places = find_extra(log, "positions")
+    paths = [path for path in paths if path != places]
     if not paths:
         raise ScenarioError(str(log), "has no .csv file", None, "check the folder")
     notes: list[str] = []
@@ -68,7 +71,10 @@ def read_mercator(log: Path) -> PacketLog:
     outcomes = outcomes.assign(receiver=rows["mac"].to_numpy(), heard=1.0, delay=np.nan)
     outcomes["rssi"] = rows["rssi"].to_numpy()
     sends = sends[["sender", "t", "channel", "to", "sent", "logged"]]
-    return PacketLog(sends, outcomes, origin, 1.0, "lost", notes)
+    result = PacketLog(sends, outcomes, origin, 1.0, "lost", notes)
+    if places is not None:
+        result.positions = read_positions(places)
+    return result
 
 
 def _read(path: Path, notes: list[str]) -> tuple[pd.DataFrame, list[Decimal]]:

@@ -38,6 +38,7 @@ class Test(NamedTuple):
     p        : of a departure as large or larger by chance; nan where nothing can be tested
     unit     : of the departure: its standard error, or for a chi-square with ``freedom`` degrees
                of freedom what makes the noncentrality 1 if it is raised to ``power``
+    rise     : by how much the variance grows with the departure, as a share of that without one
     """
 
     assumption: str
@@ -47,17 +48,23 @@ class Test(NamedTuple):
     unit: float
     freedom: float = 0.0
     power: int = 2
+    rise: float = 0.0
 
     def detectable(self, level: float) -> float:
         """Return the departure that a test of this level finds with probability POWER."""
         if not self.freedom or not np.isfinite(self.unit):
-            return self.unit * float(norm.isf(level / 2.0) + norm.ppf(POWER))
+            limit, found = float(norm.isf(level / 2.0)), 0.0
+            for _ in range(30):
+                spread = math.sqrt(1.0 + self.rise * found)
+                found = self.unit * (limit + spread * float(norm.ppf(POWER)))
+            return found
         limit = float(chi2.isf(level, self.freedom))
 
         def miss(noncentrality: float) -> float:
             return float(ncx2.sf(limit, self.freedom, noncentrality)) - POWER
 
-        return self.unit * brentq(miss, 1e-6, 100.0 * (limit + 10.0)) ** (1.0 / self.power)
+        noncentrality = float(brentq(miss, 1e-6, 100.0 * (limit + 10.0)))
+        return self.unit * float(noncentrality ** (1.0 / self.power))
 
 
 class Group(NamedTuple):
@@ -159,12 +166,11 @@ def binomial_interval(
     return low, high
 
 
-def _z_test(assumption: str, what: str, units: FloatArray, scale: float, lags: int = 0) -> Test:
+def _z_test(assumption: str, what: str, units: FloatArray, scale: float) -> Test:
     """Return a test that the ``units`` (T,), sums of products of residuals, have mean 0; they are
-    as large as ``scale`` in all if the departure is 1. ``lags`` of their own correlation are in the
-    variance.
+    as large as ``scale`` in all if the departure is 1.
     """
-    variance = long_run_sum(units, lags)
+    variance = long_run_sum(units, 0)
     if scale <= 0.0 or variance <= 0.0 or len(units) < MIN_PACKETS:
         return Test(assumption, what, np.nan, np.nan, np.nan)
     deviation = math.sqrt(variance)
@@ -267,9 +273,11 @@ def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
     share c makes that of two hearers c (min(p, q) - p q); and the test that it is 0.
     """
     sums, sizes, slopes, lasting = [], [], [], 0.0
+    alone = together = 0.0
     shrink = _shrinkage(outcomes)
     for group in outcomes.groups:
         z, m, p = group.residuals, np.isfinite(group.x).astype(float), np.nan_to_num(group.mean)
+        size = p * (1.0 - p)
         p = p.mean() + shrink * (p - p.mean())
         least = np.minimum(p[:, None], p) - np.outer(p, p)
         np.fill_diagonal(least, 0.0)
@@ -279,16 +287,25 @@ def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
         sums.append(0.5 * (z.sum(axis=1) ** 2 - (z**2).sum(axis=1)))
         sizes.append(0.5 * np.einsum("ti,ij,tj->t", m, least, m))
         slopes.append(np.einsum("ti,ij,tj->t", z, slope, m))
+        # Mean squares of these sums if all are independent, and if all have one fate.
+        alone += 0.5 * float(((m @ size) ** 2 - m @ size**2).sum())
+        pairs, mean = 0.5 * m.sum(axis=1) * (m.sum(axis=1) - 1.0), float(size.mean())
+        together += float((pairs**2).sum()) * mean * (1.0 - 3.0 * mean)
         near = group.follows[1:]
         lasting += float(((z[1:].sum(1) * z[:-1].sum(1) - (z[1:] * z[:-1]).sum(1)) * near).sum())
     S, D, G = (np.concatenate([*part, np.empty(0)]) for part in (sums, sizes, slopes))
-    what = "share of one fate"
-    if D.sum() <= 0.0:
-        return Share(np.nan, np.nan, np.nan), Test("hearers are independent", what, *[np.nan] * 3)
-    share = float(S.sum() / D.sum())
-    error = math.sqrt(long_run_sum(S - share * (D + G), lags)) / float(D.sum())
-    found = _z_test("hearers are independent", what, S, float(D.sum()), lags)
-    return Share(share, error, 0.5 * lasting / float(D.sum())), found
+    name, what, scale = "hearers are independent", "share of one fate", float(D.sum())
+    if scale <= 0.0 or alone <= 0.0 or len(S) < MIN_PACKETS:
+        return Share(np.nan, np.nan, np.nan), Test(name, what, np.nan, np.nan, np.nan)
+    share = float(S.sum()) / scale
+    error = math.sqrt(long_run_sum(S - share * (D + G), lags)) / scale
+    # Without shared fate; with bursts of each link neighbouring sums are correlated all the same.
+    slack = long_run_sum(S, lags) / max(long_run_sum(S, 0), 1e-300) if lags else 1.0
+    unit = math.sqrt(alone * max(slack, 1.0)) / scale
+    p_value = 2.0 * float(norm.sf(abs(share) / unit))
+    rise = max(together / alone - 1.0, 0.0)
+    found = Test(name, what, share, p_value, unit, rise=rise)
+    return Share(share, error, 0.5 * lasting / scale), found
 
 
 def _shrinkage(outcomes: Outcomes) -> float:
@@ -300,7 +317,9 @@ def _shrinkage(outcomes: Outcomes) -> float:
         p, n = group.mean, np.isfinite(group.x).sum(axis=0)
         if len(p) > 1 and np.isfinite(p).all():
             between += float(p.var(ddof=1)) * (len(p) - 1)
-            together = np.nan_to_num(np.corrcoef(group.residuals.T)).clip(0.0, 1.0)
+            products = group.residuals.T @ group.residuals
+            size = np.sqrt(np.outer(np.diag(products), np.diag(products)))
+            together = (products / np.where(size > 0.0, size, 1.0)).clip(0.0, 1.0)
             alone = 1.0 - (together.sum() - np.trace(together)) / (len(p) * (len(p) - 1))
             noise += alone * float((p * (1.0 - p) / n).mean()) * (len(p) - 1)
     return max(0.0, 1.0 - noise / between) if between > 0.0 else 0.0

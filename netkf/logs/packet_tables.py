@@ -76,7 +76,7 @@ def read_tables(log: Path) -> PacketLog:
         raise ScenarioError(str(log), "has no table of packets", None, "check the folder")
     notes: list[str] = []
     rows = _join([_read_rows(path, notes) for path in paths])
-    extras = {name: _find_extra(log, name) for name in EXTRAS}
+    extras = {name: find_extra(log, name) for name in EXTRAS}
     resolution = find_resolution(rows.stamps)
     # A run counts from 0.
     is_run = (log / "scenario.toml").is_file()
@@ -105,7 +105,8 @@ def read_tables(log: Path) -> PacketLog:
     return result
 
 
-def _find_extra(log: Path, name: str) -> Path | None:
+def find_extra(log: Path, name: str) -> Path | None:
+    """Return the table of this name in the folder of a log, or beside its file; None without."""
     folder = log if log.is_dir() else log.parent
     if (folder / "scenario.toml").is_file():
         return None  # a run: its tables are those of its scenario

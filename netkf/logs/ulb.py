@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from netkf.core.errors import ScenarioError
-from netkf.logs.packet_tables import find_column, read_readings
+from netkf.logs.packet_tables import find_column, find_extra, read_positions, read_readings
 from netkf.logs.packets import (
     PacketLog,
     count_phrase,
@@ -86,6 +86,9 @@ def read_ulb(log: Path) -> PacketLog:
         notes,
     )
     result.readings = readings
+    places = find_extra(log, "positions")
+    if places is not None:
+        result.positions = read_positions(places)
     return result
 
 

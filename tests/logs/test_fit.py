@@ -1,0 +1,248 @@
+"""Laws of losses against synthetic logs whose laws are known."""
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import netkf
+from netkf.cli.main import main
+from netkf.core.errors import ScenarioError
+from netkf.logs.envelope import Law
+from netkf.logs.fitting import run_tests
+from netkf.logs.outcomes import (
+    Group,
+    Outcomes,
+    binomial_interval,
+    fit_chain,
+    fit_distance,
+    make_outcomes,
+    shared_fate,
+)
+from netkf.logs.outcomes import test_time as time_test
+from tests.conftest import SCENARIOS
+
+LEVEL = 0.05
+
+
+def drawn(random, T=150, share=0.0, chain=None, p=0.8, senders=3, hearers=3, wave=0.0):
+    """Outcomes of broadcasts by a law: share of one fate, a chain (to_bad, to_good, good, bad), one
+    delivery p or one for each link, and a wave of it over time.
+    """
+    groups, links = [], []
+    deliveries = np.broadcast_to(p, (senders, hearers))
+    for s in range(senders):
+        ids = np.arange(hearers) + len(links)
+        links += [(str(s), f"{s}{j}") for j in range(hearers)]
+        uniform, one = random.random((T, hearers)), random.random(T) < share
+        uniform[one] = random.random((one.sum(), 1))
+        q = deliveries[s] + wave * np.sin(6.0 * math.pi * np.arange(T) / T)[:, None]
+        if chain is not None:
+            to_bad, to_good, good, bad = chain
+            state, q = random.random(hearers) < to_bad / (to_bad + to_good), np.empty((T, hearers))
+            for t in range(T):
+                u = random.random(hearers)
+                state = np.where(state, u >= to_good, u < to_bad)
+                q[t] = np.where(state, bad, good)
+        follows = np.arange(T) > 0
+        groups.append(Group((uniform < q).astype(float), np.arange(T) + s / 9, follows, ids))
+    return Outcomes(tuple(links), tuple(groups), ("",) * senders)
+
+
+def seeds(count, offset=0):
+    return (np.random.default_rng([offset, seed]) for seed in range(count))
+
+
+def rate(flags):
+    return np.mean(list(flags))
+
+
+def binomial_range(count, p):
+    """Four standard deviations around ``p``."""
+    width = 4.0 * math.sqrt(p * (1.0 - p) / count)
+    return p - width, p + width
+
+
+def test_true_laws_are_kept_and_parameters_lie_in_their_intervals():
+    """200 logs of links of their own that share a fate of 0.4: intervals of 95 % hold them, and
+    true assumptions are rejected at the level of the test.
+    """
+    p = np.array([[0.5, 0.6, 0.7], [0.8, 0.85, 0.9], [0.65, 0.75, 0.95]])
+    inside, together, rejected = [], [], {"time": [], "memory": [], "constancy": []}
+    for random in seeds(200):
+        outcomes = drawn(random, share=0.4, p=p)
+        tests, share, _ = run_tests(outcomes, None)
+        inside.append(abs(share.value - 0.4) < 1.96 * share.error)
+        count, heard = outcomes.counts.T.astype(float)
+        low, high = binomial_interval(heard, count, LEVEL / len(count))
+        together.append(((low <= p.ravel()) & (p.ravel() <= high)).all())
+        assert tests["fate"].p < 1e-3
+        for name, flags in rejected.items():
+            flags.append(tests[name].p < LEVEL)
+    low, high = binomial_range(200, 0.95)
+    assert low < rate(inside) <= 1.0
+    assert rate(together) > low
+    for flags in rejected.values():
+        assert rate(flags) < binomial_range(200, LEVEL)[1]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
+def test_the_share_of_one_fate_from_none_to_all(share):
+    found = [shared_fate(drawn(random, share=share), 0)[0] for random in seeds(100, 1)]
+    errors = np.array([f.value - share for f in found])
+    assert abs(errors.mean()) < 4.0 * max(errors.std(), 1e-12) / 10.0 + 0.005
+    covered = [abs(e) <= 1.96 * f.error + 1e-9 for e, f in zip(errors, found, strict=True)]
+    assert rate(covered) > binomial_range(100, 0.95)[0]
+
+
+def test_departures_of_the_stated_size_are_found_with_the_stated_power():
+    """Of bursts (a chain whose outcomes are correlated by r), and of shared fate."""
+    unit = time_test(drawn(np.random.default_rng(0))).detectable(LEVEL)
+    p = 0.8
+    chain = ((1.0 - p) * (1.0 - unit), p * (1.0 - unit), 1.0, 0.0)
+    found = [time_test(drawn(random, chain=chain)).p < LEVEL for random in seeds(200, 2)]
+    low, high = binomial_range(200, 0.9)
+    assert low < rate(found) < high
+    share = shared_fate(drawn(np.random.default_rng(0)), 0)[1].detectable(LEVEL)
+    found = [shared_fate(drawn(r, share=share), 0)[1].p < LEVEL for r in seeds(200, 3)]
+    assert low < rate(found) < high
+    spread = [run_tests(drawn(r), None)[0]["links"].p < LEVEL for r in seeds(60, 4)]
+    assert rate(spread) < binomial_range(60, LEVEL)[1]
+    size = run_tests(drawn(np.random.default_rng(0)), None)[0]["links"].detectable(LEVEL)
+    other = [
+        run_tests(drawn(r, p=0.8 + size * r.choice([-1, 1], (3, 3))), None)[0]["links"].p < LEVEL
+        for r in seeds(100, 5)
+    ]
+    assert rate(other) > 0.75
+
+
+def test_slow_changes_are_found():
+    tests, _, _ = run_tests(drawn(np.random.default_rng(3), T=600, wave=0.15), None)
+    assert tests["constancy"].p < 1e-4
+    assert 0.05 < tests["constancy"].estimate < 0.15  # 0.15 / sqrt 2 = 0.106
+
+
+def test_the_chain_of_two_states():
+    """Its parameters lie within their errors, and outcomes that one chain makes are not Markov."""
+    true = np.array([0.05, 0.2, 0.95, 0.1])
+    off = []
+    for random in seeds(6, 6):
+        outcomes = drawn(random, T=500, chain=true)
+        chain = fit_chain(outcomes)
+        logits = np.log(chain.values / (1.0 - chain.values)) - np.log(true / (1.0 - true))
+        off += (logits / np.sqrt(np.diag(chain.cov))).tolist()
+        assert run_tests(outcomes, None)[0]["memory"].p < LEVEL
+    assert np.mean(np.square(off)) < 2.0  # a mean of 24 squares of standard normals, nearly
+    assert np.abs(off).max() < 4.0
+    # The likelihood, written plainly for one link: the forward algorithm.
+    outcomes = drawn(np.random.default_rng(1), T=40, chain=true, senders=1, hearers=1)
+    chain = fit_chain(outcomes)
+    to_bad, to_good, good, bad = chain.values
+    move = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
+    law, total = np.array([to_good, to_bad]) / (to_bad + to_good), 0.0
+    for x in outcomes.groups[0].x[:, 0]:
+        law = law @ move * (np.array([good, bad]) if x else 1.0 - np.array([good, bad]))
+        total, law = total + math.log(law.sum()), law / law.sum()
+    assert chain.likelihood == pytest.approx(total, abs=1e-9)
+
+
+def test_the_logistic_function_of_the_distance():
+    inside = []
+    for random in seeds(200, 7):
+        d, n = random.uniform(5.0, 50.0, 30), np.full(30, 40.0)
+        heard = random.binomial(40, 1.0 / (1.0 + np.exp((d - 25.0) / 6.0))).astype(float)
+        values, cov = fit_distance(d, n, heard, 1.0)
+        inside.append(np.abs(values - [25.0, 6.0]) < 1.96 * np.sqrt(np.diag(cov)))
+    assert (np.mean(inside, axis=0) > binomial_range(200, 0.95)[0]).all()
+
+
+def test_runs_draw_parameters_from_their_posterior():
+    """Beta(heard + 1/2, lost + 1/2): ten packets leave a spread that mean and variance tell."""
+    law = Law("per-link", np.array([0.7]), 0.0, np.array([[10.0, 7.0]]))
+    values = np.array([law.draw(random)[0] for random in seeds(2000, 8)])
+    a, b = 7.5, 3.5
+    assert values.mean() == pytest.approx(a / (a + b), abs=0.01)
+    assert values.var() == pytest.approx(a * b / (a + b) ** 2 / (a + b + 1), rel=0.1)
+
+
+def log_of(path, random, count=60, share=0.0):
+    rows = ["t,src,dst,seq,channel,heard"]
+    for k in range(count):
+        for i in range(3):
+            one, fate = random.random() < share, random.random()
+            for j in range(3):
+                if i != j:
+                    luck, p = fate if one else random.random(), 0.95 if k % 2 else 0.5
+                    rows.append(f"{k + 0.2 * i + 1},{i},{j},{k},{11 + k % 2},{int(luck < p)}")
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_fit_writes_laws_that_run_and_says_what_fails(tmp_path, capsys):
+    log = log_of(tmp_path / "log.csv", np.random.default_rng(1))
+    (tmp_path / "positions.csv").write_text("node,x,y\n0,0,0\n1,1,0\n2,0,2\n")
+    netkf.import_log(log, "csv", tmp_path / "out")
+    arguments = ["fit", str(tmp_path / "out"), "--runs", "10", "--workers", "1"]
+    assert main([*arguments, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    tests = {row["key"]: row for row in document["tests"]}
+    assert tests["channel"]["verdict"] == "rejected"
+    assert tests["channel"]["made_by"] == "no law of netkf yet"
+    links = pd.read_csv(tmp_path / "out" / "fit_links.csv")
+    outcomes = pd.read_csv(tmp_path / "out" / "outcomes.csv")
+    mean = outcomes.groupby(["sender", "receiver"])["delivered"].mean().to_numpy()
+    np.testing.assert_allclose(links["delivery_probability"], mean)
+    assert {"per-link", "bernoulli"} <= set(document["scenarios"])
+    heard = [row for row in document["envelope"] if row["quantity"] == "messages heard"]
+    assert all(row["replay"] == outcomes["delivered"].sum() for row in heard)
+    assert all(row["p"] > 0.1 for row in heard)
+    for path in document["scenarios"].values():
+        run = netkf.simulate(netkf.load(path))
+        assert (run.events["kind"] == "send").sum() == len(outcomes)
+    assert any("too few runs" in note for note in document["notes"])
+
+
+def test_what_nobody_reported_counts_as_lost_and_holes_do_not(tmp_path):
+    """Without the packets that nobody heard, hearers would look dependent."""
+    random, rows = np.random.default_rng(2), ["t,src,dst,seq"]
+    for k in range(300):
+        for i in range(3):
+            heard = [j for j in range(3) if i != j and random.random() < 0.6]
+            rows += [f"{k + 0.2 * i + 1},{i},{j},{k}" for j in heard]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    fit = netkf.fit_log(tmp_path / "out", runs=0)
+    unknown = pd.read_csv(tmp_path / "out" / "unknown.csv")
+    assert fit.links["unreported"].sum() == len(unknown) > 100
+    assert fit.links["unknown"].sum() == 0
+    assert (fit.links["low"] < 0.6).all()
+    assert (fit.links["high"] > 0.6).all()
+    assert fit.tests.set_index("key").loc["fate", "verdict"] == "not rejected"
+    assert fit.envelope.empty
+    assert "per-link" in repr(fit)
+
+
+def test_channels_and_stretches_are_kept_apart():
+    rows = [
+        {"sender": "a", "receiver": r, "message": k, "t": k, "transmission": k, "delivered": 1.0}
+        | {"channel": 11 + (k // 3) % 2}
+        for k in range(9)
+        for r in ("b", "c")
+        if (k, r) != (4, "b")
+    ]
+    outcomes = make_outcomes(pd.DataFrame(rows))
+    assert outcomes.channels == ("11", "12")
+    assert [group.follows.tolist() for group in outcomes.groups] == [
+        [False, True, True, False, True, True],
+        [False, True, True],
+    ]
+    assert np.isnan(outcomes.groups[1].x[1]).tolist() == [True, False]
+    assert outcomes.counts.tolist() == [[8, 8], [9, 9]]
+
+
+def test_only_a_record_can_be_fitted(tmp_path):
+    (tmp_path / "scenario.toml").write_text((SCENARIOS / "poisson_ring.toml").read_text())
+    with pytest.raises(ScenarioError, match=r"network.channel.loss.kind: must be recorded"):
+        netkf.fit_log(tmp_path)
