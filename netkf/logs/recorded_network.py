@@ -26,7 +26,7 @@ Files = dict[str, str | Path]
 
 HEAD = """\
 # Made by netkf import of {log}: {told}.
-# The network is the log's. Choose a plant, sensors and a filter of your own.
+# The network is the log's: choose plant, sensors and filter to go with it.
 format = 1
 name = "{name}"
 claim = "the packets of a log, replayed"
