@@ -24,14 +24,22 @@ STREAM = 0x6C617773
 """Seeds the posterior draws apart from the streams of the runs."""
 
 
+NAMES: dict[str, tuple[str, ...]] = {
+    "bernoulli": ("delivery",),
+    "gilbert-elliott": ("to_bad", "to_good", "deliver_good", "deliver_bad"),
+    "distance": ("half", "width"),
+    "shared": ("delivery", "share"),
+}
+"""The parameters of each law but that of links."""
+
+
 class Law(NamedTuple):
     """A law of losses fitted to a log.
 
-    values : bernoulli: its delivery; per-link: those of the L ``links``; gilbert-elliott: to_bad,
-             to_good, deliver_good, deliver_bad; distance: half, width
+    values : of NAMES; per-link: the deliveries of the L ``links``
     counts : packets and those heard, (1, 2) or (L, 2), as independent ones: deliveries have the
              posterior Beta(heard + 1/2, lost + 1/2)
-    cov    : of the other laws: covariance of the logits of a chain, or of half and width, whose
+    cov    : of the other laws: covariance of the values, of a chain of their logits, whose
              posterior is Gaussian
     """
 
@@ -50,34 +58,28 @@ class Law(NamedTuple):
         assert self.cov is not None
         if self.kind == "gilbert-elliott":
             return Chain(self.values, self.cov, 0.0).draw(random)
-        while True:  # a width is above 0
-            half, width = random.multivariate_normal(self.values, self.cov)
-            if half >= 0.0 and width > 0.0:
-                return np.array([half, width])
+        while True:
+            one, two = random.multivariate_normal(self.values, self.cov)
+            if self.kind == "shared":
+                return np.asarray(np.clip([one, two], 0.0, 1.0))
+            if one >= 0.0 and two > 0.0:  # a width is above 0
+                return np.array([one, two])
 
     def describe(self) -> str:
         """Return the parameters as text."""
         values = [f"{value:.3g}" for value in self.values]
         if self.kind == "per-link":
             return f"{min(self.values):.3g} to {max(self.values):.3g} on {len(values)} links"
-        names = {
-            "bernoulli": ("delivery",),
-            "gilbert-elliott": CHAIN,
-            "distance": ("half", "width"),
-        }[self.kind]
-        return ", ".join(f"{a} {b}" for a, b in zip(names, values, strict=True))
+        pairs = zip(NAMES[self.kind], values, strict=True)
+        return ", ".join(f"{name} {value}" for name, value in pairs)
 
     def loss_table(self, values: FloatArray | None = None) -> dict[str, Any]:
         """Return the table network.channel.loss with these ``values``, by default the estimates."""
         own = [float(value) for value in (self.values if values is None else values)]
-        if self.kind == "bernoulli":
-            return {"kind": "bernoulli", "delivery": own[0]}
-        if self.kind == "gilbert-elliott":
-            return {"kind": "gilbert-elliott", **dict(zip(CHAIN, own, strict=True))}
+        table = {} if self.kind == "per-link" else dict(zip(NAMES[self.kind], own, strict=True))
         if self.kind == "distance":
-            delivery = {"kind": "logistic", "half": own[0], "width": own[1]}
-            return {"kind": "distance", "delivery": delivery}
-        return {"kind": "per-link"}
+            return {"kind": "distance", "delivery": {"kind": "logistic", **table}}
+        return {"kind": self.kind, **table}
 
     def changes(self, scenario: Scenario, values: FloatArray) -> dict[str, Any]:
         """Return the keys of a scenario that make its losses those of the law with ``values``."""
@@ -87,9 +89,6 @@ class Law(NamedTuple):
                 scenario, dict(zip(self.links, values, strict=True))
             )
         return changed
-
-
-CHAIN = ("to_bad", "to_good", "deliver_good", "deliver_bad")
 
 
 def edges_with(scenario: Scenario, deliveries: dict[tuple[str, str], float]) -> dict[str, Any]:

@@ -42,17 +42,21 @@ NEEDS = {
     "bernoulli": ("links", "time", "fate", "constancy", "channel"),
     "per-link": ("time", "fate", "constancy", "channel"),
     "gilbert-elliott": ("links", "fate", "constancy", "channel"),
+    "shared": ("links", "time", "constancy", "channel"),
     "distance": ("distance", "time", "fate", "constancy", "channel"),
 }
 """What each law of losses assumes."""
 MAKERS = {
     "time": "gilbert-elliott",
+    "memory": "gilbert-elliott with deliver_good and deliver_bad",
+    "fate": "shared",
+    "constancy": "scheduled",
     "links": "per-link, distance",
+    "channel": "channels = { hopping = ... }",
     "directions": "per-link",
     "distance": "per-link",
-    "memory": "gilbert-elliott with deliver_good and deliver_bad",
 }
-"""Laws of netkf that do without an assumption; none does without the others yet."""
+"""Laws of netkf that do without an assumption, of which bernoulli to shared are fitted."""
 MAYBE = 0.05
 """Below this p a departure is allowed for in other tests, whether it is there or not."""
 KEY = ["sender", "receiver", "message"]
@@ -130,6 +134,11 @@ def fit_log(
     if not bursty:
         notes.append("no bursts are to be seen: gilbert-elliott is not fitted")
     laws = _fit_laws(outcomes, links, distance, shrink, bursty)
+    if tests["fate"].p < MAYBE and share.value > 0.0:
+        delivery, part = laws[0].values[0], min(share.value, 1.0)
+        likelihood, variance = stats.shared_law(outcomes, delivery, part)
+        cov = np.diag([variance * shrink, share.error**2])
+        laws.append(Law("shared", np.array([delivery, part]), likelihood, cov=cov))
     law_table = _law_table(laws, rejected, len(table))
     if np.isfinite(share.value):
         notes.append(
@@ -284,7 +293,7 @@ def _test_table(tests: Mapping[str, Test], level: float) -> pd.DataFrame:
                 "detectable": test.detectable(level),
                 "p": test.p,
                 "verdict": verdict if np.isfinite(test.p) else "not tested",
-                "made_by": MAKERS.get(key, "no law of netkf yet"),
+                "made_by": MAKERS[key],
             }
         )
     return pd.DataFrame(rows)

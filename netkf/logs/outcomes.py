@@ -308,6 +308,21 @@ def shared_fate(outcomes: Outcomes, lags: int) -> tuple[Share, Test]:
     return Share(share, error, 0.5 * lasting / scale), found
 
 
+def shared_law(outcomes: Outcomes, delivery: float, share: float) -> tuple[float, float]:
+    """Return the log-likelihood of one delivery and share for all, and the variance of the mean
+    delivery, whose units are transmissions.
+    """
+    likelihood = spread = 0.0
+    for group in outcomes.groups:
+        n, k = np.isfinite(group.x).sum(axis=1), np.nansum(group.x, axis=1)
+        alone = delivery**k * (1.0 - delivery) ** (n - k)
+        one = np.where(k == n, delivery, 0.0) + np.where(k == 0, 1.0 - delivery, 0.0)
+        mixed = np.where(n > 1, (1.0 - share) * alone + share * one, alone)
+        likelihood += float(np.log(np.maximum(mixed, 1e-300)).sum())
+        spread += float(((k - n * delivery) ** 2).sum())
+    return likelihood, spread / float(outcomes.counts[:, 0].sum()) ** 2
+
+
 def _shrinkage(outcomes: Outcomes) -> float:
     """Return by how much deliveries of the hearers of a sender differ, as a share of how much their
     estimates do: the smaller of two estimates of one delivery is too small.
