@@ -191,7 +191,7 @@ class ConstantGain(Filter):
         """Its demands on a scenario."""
         return Needs(
             one_way=True,
-            one_model_under_clocks=True,
+            one_model_of_increments=True,
             fixed_sensors=True,
             linear_plant=True,
             every_reading=True,

@@ -19,7 +19,8 @@ class Needs:
     inverts_under_clocks : the same, in continuous time only
     one_model : it computes with the matrices of the plant before a run, so that it cannot follow
                 changes of them
-    one_model_under_clocks : the same, in continuous time only
+    one_model_under_clocks, one_model_of_increments : the same, in continuous time only, and where
+                                                      sensors give increments
     samples : it cannot use increment sensors
     fixed_sensors : it computes with H before there are readings, so H must not vary: no nonlinear
                     sensors, regressors or columns phi
@@ -54,6 +55,7 @@ class Needs:
     inverts_under_clocks: bool = False
     one_model: bool = False
     one_model_under_clocks: bool = False
+    one_model_of_increments: bool = False
     samples: bool = False
     fixed_sensors: bool = False
     linear_plant: bool = False

@@ -34,7 +34,9 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     the key, the filter, the value and a remedy.
     """
     needs = scenario.node_filter.needs
-    if needs.one_model or (needs.one_model_under_clocks and not scenario.slotted):
+    before_clocks = needs.one_model_under_clocks and not scenario.slotted
+    before_increments = needs.one_model_of_increments and bool(scenario.increment_sensors)
+    if needs.one_model or before_clocks or before_increments:
         _check_one_model(scenario)
     if scenario.views is not None:
         _check_blocks(scenario)

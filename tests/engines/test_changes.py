@@ -247,6 +247,25 @@ def test_under_clocks_local_filters_follow_the_changes(tmp_path, engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_constant_gains_of_samples_follow_the_changes(engine):
+    """P by Joseph's form at the samples, and Van Loan over each piece between them."""
+    L = np.array([[0.4], [0.2]])
+    sampling = {"kind": "periodic", "period": 0.7}
+    options = {"sensor": {"sampling": sampling}, "filter": {"gain": L.tolist()}}
+    silent = {"activation": {"kind": "poisson", "at": "nodes", "rate": 1e-9}}
+    run = netkf.simulate(clocks("constant-gain", network=silent, **options), engine=engine)
+    P, now, kept = np.eye(2), 0.0, np.eye(2) - L @ H
+    instants = [round(0.7 * k, 10) for k in range(1, 9)]
+    for t in sorted({*instants, *run.times.tolist()}):
+        P, now = flow(np.zeros(2), P, now, t)[1], t
+        if t in instants:
+            P = kept @ P @ kept.T + L @ R @ L.T
+        if t in run.times:
+            found = run.P[run.times.tolist().index(t)]
+            np.testing.assert_allclose(found, np.broadcast_to(P, found.shape), rtol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_late_readings_are_used_exactly_across_changes(tmp_path, engine):
     # Messages take 1.1 s, and all changes lie between a reading and its arrival.
     instants = [0.3, 1.9, 2.1, 3.9, 4.05]
@@ -332,8 +351,9 @@ CLOCK_FILTERS = {
     "kcf": {},
     "intermittent": {},
     "track-fusion": {"rule": "ici"},
+    "constant-gain": {"gain": [[0.4], [0.2]]},
 }
-SAMPLES_ONLY = ("kcf", "intermittent")
+SAMPLES_ONLY = ("kcf", "intermittent", "constant-gain")
 INCREMENTS = {"sampling": "continuous"}
 DELAYS = {"none": {"kind": "none"}, "random": {"kind": "exponential", "mean": 0.4}}
 CASES = [
@@ -553,6 +573,22 @@ def test_filters_that_compute_before_a_run_refuse(kind):
     ):
         slots(kind, filter=REFUSED[kind], plant=plant)
     assert slots(kind, filter={**REFUSED[kind], "model": {"schedule": False}}, plant=plant)
+
+
+UNDER_CLOCKS = {
+    "push-sum": {"sampling": {"kind": "poisson", "rate": 2.0}},
+    "belief-propagation": {"sampling": {"kind": "poisson", "rate": 2.0}},
+    "constant-gain": INCREMENTS,
+}
+
+
+@pytest.mark.parametrize("kind", UNDER_CLOCKS)
+def test_filters_that_compute_before_a_run_refuse_under_clocks(kind):
+    gain = {"gain": [[0.4], [0.2]]} if kind == "constant-gain" else {}
+    with pytest.raises(ScenarioError, match=r"plant.schedule: cannot be followed by the") as caught:
+        clocks(kind, filter=gain, sensor=UNDER_CLOCKS[kind])
+    assert "computes with the matrices of the plant before a run" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_schedule_in_milliseconds_has_the_same_events():
