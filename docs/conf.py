@@ -84,6 +84,7 @@ TABLES = {
     "graph": "network.graph",
     "activation": "network.activation",
     "slot activation": "network.activation",
+    "life": "[[network.lives]]",
     "loss": "network.channel.loss",
     "delay": "network.channel.delay",
     "filter": "[filter]",

@@ -85,6 +85,7 @@ from netkf.network.graphs import (
     Star,
     Topology,
 )
+from netkf.network.lives import Change, Crashes, DutyCycle, Life, RecordedLife
 from netkf.network.losses import (
     Bernoulli,
     DistanceLoss,
@@ -160,6 +161,7 @@ __all__ = [
     "Broadcast",
     "Central",
     "Chain",
+    "Change",
     "Channel",
     "Clock",
     "Complete",
@@ -169,6 +171,7 @@ __all__ = [
     "ConstantInput",
     "Contacts",
     "CovarianceIntersection",
+    "Crashes",
     "CsvGraph",
     "Cycle",
     "Delay",
@@ -176,6 +179,7 @@ __all__ = [
     "DiffusionFilter",
     "DiffusionKalman",
     "DistanceLoss",
+    "DutyCycle",
     "EdgelistGraph",
     "Edges",
     "ErdosRenyi",
@@ -203,6 +207,7 @@ __all__ = [
     "InverseIntersection",
     "Kcf",
     "Lattice",
+    "Life",
     "LinearPlant",
     "LinearSensor",
     "LinkClock",
@@ -241,6 +246,7 @@ __all__ = [
     "RecordedDelay",
     "RecordedDiffusion",
     "RecordedInput",
+    "RecordedLife",
     "RecordedLoss",
     "RecordedPlant",
     "RecordedSampling",

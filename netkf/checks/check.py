@@ -59,6 +59,7 @@ from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
 from netkf.theory.common.blocks import have_one_view, run_of_view, scenario_of_view
+from netkf.theory.common.evidence import CONSISTENCY, LIVES
 from netkf.trace.nees import without_padding
 from netkf.trace.run import Run
 
@@ -465,6 +466,8 @@ def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, run
 
 def _require_laws(scenario: Scenario) -> None:
     find_checks(scenario)
+    if scenario.network.lives:
+        raise TheoryError(f"{LIVES}, so nothing is promised; {CONSISTENCY}")
     if not scenario.is_random:
         raise TheoryError(
             "the state or the readings are recorded: there is one run, and no law to check; "

@@ -15,8 +15,9 @@ import itertools
 import math
 import zlib
 from array import array
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -109,10 +110,11 @@ def read_columns(
     optional: tuple[str, ...] = (),
     gaps: Collection[str] = (),
     nodes: Collection[str] = NODES,
+    words: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
 ) -> Columns:
     """Return the named columns, optional ones only if they are there. Entries of columns in
     ``gaps`` may be empty or nan, and are nan then; those of columns in ``nodes`` may be names, and
-    are ids then.
+    are ids then; those of a column in ``words`` are one of these, and its index then.
 
     Raises ScenarioError, with the file and the line, for a missing column, a row of another length
     than the header, or an entry that is not a finite number, or no stamp in a column of STAMPS.
@@ -130,11 +132,14 @@ def read_columns(
             (sheet.header.index(name), name in nodes, name in STAMPS, name in gaps)
             for name in names
         ]
+        named = {sheet.header.index(name): words[name] for name in names if name in words}
         for line, row in sheet.rows:
             entries.begin(line, row)
             lines.append(line)
             for column, is_node, is_stamp, may_miss in places:
-                if is_node:
+                if column in named:
+                    numbers.append(entries.word(column, named[column]))
+                elif is_node:
                     numbers.append(entries.node(column, may_miss))
                 elif is_stamp:
                     numbers.append(entries.stamp(column))
@@ -202,6 +207,16 @@ class _Entries:
             remedy = "write a decimal point, no commas" if "," in text else "correct the entry"
             raise self._refusal(column, "must be a finite number", remedy)
         return self._limited(column, value)
+
+    def word(self, column: int, words: tuple[str, ...]) -> int:
+        """Return the index in ``words`` of the entry in the column with this index; raises
+        ScenarioError if it is none of them.
+        """
+        word = self._row[column].strip()
+        if word not in words:
+            remedy = f"{suggest_nearest(word, words)}correct the entry"
+            raise self._refusal(column, f"must be {', '.join(words[:-1])} or {words[-1]}", remedy)
+        return words.index(word)
 
     def node(self, column: int, may_miss: bool) -> float:
         """Return the id of the node in the column with this index, or the negative number that

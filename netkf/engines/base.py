@@ -26,18 +26,20 @@ from netkf.trace.recorder import Recorder
 class Rank(IntEnum):
     """The order of the kinds of events at one instant.
 
-    The origin of coordinates moves first. Sensors read, and nodes use all samples of the instant.
-    Then clocks tick, and senders take a snapshot of their state; then delayed messages arrive;
-    then every node with messages absorbs all of them at once. Probes see the result.
+    The origin of coordinates moves first. Nodes go down and up. Sensors read, and nodes use all
+    samples of the instant. Then clocks tick, and senders take a snapshot of their state; then
+    delayed messages arrive; then every node with messages absorbs all of them at once. Probes see
+    the result.
     """
 
     REBASE = 0
-    SENSE = 1
-    UPDATE = 2
-    TICK = 3
-    DELIVER = 4
-    ABSORB = 5
-    PROBE = 6
+    LIFE = 1
+    SENSE = 2
+    UPDATE = 3
+    TICK = 4
+    DELIVER = 5
+    ABSORB = 6
+    PROBE = 7
 
 
 MIN_GAP_SHARE, LONGER = 1e-9, 1.02

@@ -221,16 +221,36 @@ def _list_ids(nodes: tuple[int, ...]) -> str:
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
+def _check_lives(scenario: DerivedScenario) -> None:
+    owners: dict[int, int] = {}
+    for k, life in enumerate(scenario.network.lives):
+        for node in life.nodes:
+            if owners.setdefault(node, k) != k:
+                rule = f"must not have a node of network.lives[{owners[node]}]"
+                remedy = "give each node one entry"
+                raise ScenarioError(f"network.lives[{k}].nodes", rule, node, remedy)
+            if not scenario.slotted and node in scenario.increment_sensors:
+                rule = "cannot have a life where sensors give increments, only where they sample"
+                remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
+                raise ScenarioError(f"network.lives[{k}].nodes", rule, node, remedy)
+    if owners and scenario.node_filter.timing.pooled:
+        rule = f"has no meaning for the {filter_name(scenario)}, which is in no node"
+        raise ScenarioError("network.lives", rule, sorted(owners), "remove it")
+
+
 def _check_network(scenario: DerivedScenario) -> None:
     network, topology, node_filter = scenario.network, scenario.topology, scenario.node_filter
     for key, part in (
         ("network.activation", network.activation),
         ("network.channel.loss", network.channel.loss),
         ("network.channel.delay", network.channel.delay),
+        ("network.channel.channels", network.channel.channels),
+        *((f"network.lives[{k}]", life) for k, life in enumerate(network.lives)),
     ):
         if part is not None:
             with errors_under(key):
                 part.check(topology)
+    _check_lives(scenario)
     if not node_filter.timing.talks:
         return
     name = filter_name(scenario)

@@ -543,7 +543,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def unknown(self) -> np.ndarray:
-        """A mask (n,) of the states that nobody knows."""
+        """A mask (n,) of the states that are unknown."""
         states = self.plant.record
         if isinstance(states, StackedStates):
             return states.unknown
@@ -551,7 +551,7 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def unknown_samples(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """``unknown``, and a mask (N, n') of the errors of nodes that nobody knows; None if all
+        """``unknown``, and a mask (N, n') of the errors of nodes that are unknown; None if all
         states are known.
         """
         if not self.unknown.any():
@@ -657,6 +657,9 @@ class DerivedScenario(ScenarioModel):
         """
         # Nonlinear readings depend on the absolute state.
         if not self.is_random or not self.is_linear or not commutes(self.node_filter):
+            return False
+        # A node that begins again does so with a mean that does not move along.
+        if self.network.lives:
             return False
         # A frame would have to end where the plant changes.
         if self.views is not None or len(self.plant.changes):

@@ -42,6 +42,7 @@ from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
 from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, RangeGraph, Topology
+from netkf.network.lives import Life
 from netkf.network.losses import Transmission
 from netkf.network.matchings import SlotActivation
 from netkf.network.positions import Positions, PositionTable
@@ -66,6 +67,7 @@ class Network(Component):
                 the next of its node; nodes whose plant says it are left out
     activation  when links, directions or nodes send; only filters that do not talk need none
     channel     losses and delays of messages
+    lives       when nodes are down: crashes, duty cycles, tables; others are always up
     """
 
     graph: Graph = field(graph_rule)
@@ -74,6 +76,7 @@ class Network(Component):
     )
     channel: Channel = field(instance_of(Channel), default=Channel())
     positions: SourceFile | None = field(source_file, default=None)
+    lives: tuple[Life, ...] = field(list_of(instance_of(Life), "lives", min_length=0), default=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,6 +341,11 @@ class ScenarioModel(Component):
         return self.topology.radius is not None or (follows and self.positions.moving)
 
     @property
+    def network_changes(self) -> bool:
+        """True if it changes in a run who can hear whom, or how well: nodes move or are down."""
+        return self.links_move or bool(self.network.lives)
+
+    @property
     def links_follow_state(self) -> bool:
         """True if the true state says who hears whom, or how well."""
         return self.links_move and self.positions.of_state
@@ -496,7 +504,7 @@ class ScenarioModel(Component):
         """Return the fraction of messages of a directed link that arrive in the long run, nan if it
         is unknown before a run.
         """
-        if self.topology.radius is not None:
+        if self.topology.radius is not None or self.network.lives:
             return math.nan
         return self.network.channel.mean_delivery(self.transmission(link))
 

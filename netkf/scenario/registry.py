@@ -18,6 +18,7 @@ from netkf.network import (
     delays,
     graph_files,
     graphs,
+    lives,
     losses,
     matchings,
     recorded,
@@ -56,6 +57,7 @@ FAMILIES: dict[str, type[Component]] = {
     "sampling": Clock,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
+    "life": lives.Life,
     "loss": losses.Loss,
     "delay": delays.Delay,
     "filter": Filter,
@@ -119,6 +121,11 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "recorded": clocks.RecordedClock,
         "contacts": contacts.Contacts,
         "readings": clocks.OnReadings,
+    },
+    "life": {
+        "crashes": lives.Crashes,
+        "duty": lives.DutyCycle,
+        "recorded": lives.RecordedLife,
     },
     "loss": {
         "none": losses.NoLoss,

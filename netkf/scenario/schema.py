@@ -18,6 +18,7 @@ from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
+from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
@@ -47,6 +48,8 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Network, "graph"): {"$ref": "#/$defs/graph"},
     (Network, "activation"): {"$ref": "#/$defs/activation"},
     (Network, "channel"): {"$ref": "#/$defs/channel"},
+    (Network, "lives"): {"type": "array", "items": {"$ref": "#/$defs/life"}},
+    (Channel, "channels"): {"$ref": "#/$defs/hopping"},
     (Channel, "loss"): {"$ref": "#/$defs/loss"},
     (Channel, "delay"): {"$ref": "#/$defs/delay"},
     (Filtering, "model"): {"$ref": "#/$defs/model"},
@@ -62,6 +65,7 @@ FAMILIES = {
     "sampling": ("sampling",),
     "graph": ("graph",),
     "activation": ("activation", "slot activation"),
+    "life": ("life",),
     "loss": ("loss",),
     "delay": ("delay",),
     "filter": ("filter",),
@@ -101,6 +105,7 @@ def scenario_schema() -> Schema:
     definitions["block"] = _block_schema()
     definitions["network"] = _table_schema(list_keys(Network))
     definitions["channel"] = _table_schema(list_keys(Channel))
+    definitions["hopping"] = _table_schema(list_keys(Hopping))
     definitions["time"] = _table_schema(list_keys(Time))
     definitions["model"] = _table_schema(list_keys(Belief))
     return {

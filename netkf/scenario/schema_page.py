@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from netkf.core.fields import Component
 from netkf.network.channels import Channel
+from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
@@ -20,6 +21,7 @@ TABLES: dict[str, type[Component]] = {
     "time": Time,
     "network": Network,
     "network.channel": Channel,
+    "network.channel.channels": Hopping,
     "filter, beside its kind": Filtering,
     "filter.model": Belief,
 }
@@ -35,6 +37,7 @@ SECTIONS = {
     "graph": "network.graph.kind",
     "activation": "network.activation.kind in continuous time",
     "slot activation": "network.activation.kind in slots",
+    "life": "network.lives.kind",
     "loss": "network.channel.loss.kind",
     "delay": "network.channel.delay.kind",
     "filter": "filter.kind",

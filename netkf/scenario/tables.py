@@ -351,8 +351,17 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
         "graph": lambda graph: _build_component("graph", origin, as_graph(graph)),
         "activation": partial(_build_activation, origin, time),
         "channel": partial(_build_channel, origin),
+        "lives": partial(_build_lives, origin),
     }
     return _build_object(Network, _build_inner(_as_dict(value), builders), origin)
+
+
+def _build_lives(origin: Origin, value: Any) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ScenarioError("", "must be a list of tables", value, "write [[network.lives]]")
+    tables = {f"[{k}]": item for k, item in enumerate(value)}
+    build = partial(_build_component, "life", origin)
+    return tuple(_build_inner(tables, dict.fromkeys(tables, build)).values())
 
 
 def _build_activation(origin: Origin, time: str, value: Any) -> Any:

@@ -192,14 +192,14 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
     # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
     # fixed delay only shifts it; a random delay or dependent losses do neither.
     fixed, symmetric = channel.delay.fixed, has_balanced_rates(scenario)
-    is_unknown = isinstance(channel.loss, RecordedLoss) or scenario.links_move
+    is_unknown = isinstance(channel.loss, RecordedLoss) or scenario.network_changes
     return [
         (
             "losses are independent of each other and of the past",
             "H Theorem 2, derived",
             None if is_unknown else channel.independent,
             NO_CHANNEL_LAW
-            if scenario.links_move
+            if scenario.network_changes
             else "arrivals are Poisson processes of lower rates"
             if channel.independent
             else "losses are recorded or depend on earlier ones: H(12) is not promised",

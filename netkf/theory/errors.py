@@ -27,7 +27,7 @@ from netkf.theory.common.blocks import (
 )
 from netkf.theory.common.clock_columns import ClockColumns
 from netkf.theory.common.columns import ErrorColumns, has_columns
-from netkf.theory.common.evidence import require_linear
+from netkf.theory.common.evidence import CONSISTENCY, LIVES, require_linear
 from netkf.theory.common.slot_columns import SlotColumns
 from netkf.theory.folders import theory_of
 from netkf.trace.run import Run
@@ -124,6 +124,8 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     require_linear(scenario)
+    if scenario.network.lives:
+        raise TheoryError(f"{LIVES}, of which exact errors know nothing; {CONSISTENCY}")
     if scenario.links_follow_state:
         raise TheoryError("the true state says who hears whom: events tell of it")
     if scenario.slotted:

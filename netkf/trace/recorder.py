@@ -97,7 +97,7 @@ class Recorder:
         """Counts that the engine keeps of its own work, such as SimPy processes and events."""
         self._exact_errors = False
         self.unknown: tuple[np.ndarray, np.ndarray] | None = None
-        """Masks (n,) and (N, n) of states and of errors that nobody knows; an engine sets it."""
+        """Masks (n,) and (N, n) of states and of errors that are unknown; an engine sets it."""
 
     @property
     def exact_errors(self) -> bool:

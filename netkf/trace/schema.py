@@ -20,6 +20,8 @@ KINDS = (
     "diverged",
     "transmit",
     "link",
+    "join",
+    "leave",
 )
 """Event kinds; a row stores the index of its kind in this tuple.
 
@@ -34,12 +36,14 @@ absorb   node used all messages of t in one reset; ``age`` is that of the oldest
 swap     node replaced its estimate and covariance by those of peer
 round    a step of exchange number ``phase`` of the slot begins, in which every node sends
 stop     node has permanently frozen its network estimate in exchange number ``phase``
-crash, restart  recorded by no engine; they keep the codes of the kinds after them as they were
+crash    node is down from now on (network.lives): what arrives meanwhile is lost
+restart  it is up again
 diverged the estimate of node or its squared error was no longer finite, or its covariance no longer
          finite and positive semidefinite
 transmit node transmitted once, as its transmission number ``message``, to all that may hear it
 link     the link node - peer of a range graph is up (``message`` 1) or down (0), and was not when
          it was looked at last; it is down before the first look
+join, leave  as restart and crash, of a node that a table lets join and leave the network
 """
 
 CODES = {kind: code for code, kind in enumerate(KINDS)}

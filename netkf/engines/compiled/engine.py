@@ -72,6 +72,8 @@ class CompiledEngine(Engine):
         if unknown:
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
+        if scenario.network.lives:
+            return f'engine "compiled" cannot run nodes that are down at times; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)
             return (

@@ -108,13 +108,18 @@ def _link_activations(
     """Return for each link what happens at a tick: both ends exchange."""
 
     def activate(exchange: LinkExchange, i: int, j: int, now: float) -> None:
-        recorder.append((now, TICK, i, j, -1, -1, NAN))
+        if transmitter.up(i, j):
+            recorder.append((now, TICK, i, j, -1, -1, NAN))
         # The channel takes its step even where nothing is sent.
         transmitter.begin((i,) if scenario.topology.directed else (i, j))
         payloads: tuple[Any, Any] = (None, None)
-        if transmitter.connects(i, j):
+        if transmitter.up(i, j) and transmitter.connects(i, j):
             # Both payloads are computed before either end receives.
-            payloads = nodes[i].emit(now, (j,)), nodes[j].emit(now, (i,))
+            first, second = (
+                nodes[sender].emit(now, (receiver,)) if transmitter.up(sender) else None
+                for sender, receiver in ((i, j), (j, i))
+            )
+            payloads = first, second
         exchange.exchange(payloads)
 
     # The index of a link orders simultaneous arrivals.
@@ -134,11 +139,12 @@ def _direction_activations(
 
     def activate(direction: DirectedLink, now: float) -> None:
         i, j = direction.link
-        recorder.append((now, TICK, i, j, -1, -1, NAN))
+        if transmitter.up(i):
+            recorder.append((now, TICK, i, j, -1, -1, NAN))
         # Drawn in any case: even if nothing is sent, the channel takes its step.
         outcome = direction.sampler.draw()
         transmitter.begin((i,))
-        if transmitter.connects(i, j):
+        if transmitter.up(i) and transmitter.connects(i, j):
             transmitter.send(direction, nodes[i].emit(now, (j,)), outcome)
 
     links = _directed_links(scenario, transmitter, nodes)
@@ -174,6 +180,8 @@ def broadcasts(
         # Drawn even if the filter sends nothing, so that the network does not depend on it.
         outcomes = [direction.sampler.draw() for direction in directions[node]]
         transmitter.begin((node,))
+        if not transmitter.up(node):
+            return
         heard = [transmitter.connects(*direction.link) for direction in directions[node]]
         receivers = tuple(d.link[1] for d in itertools.compress(directions[node], heard))
         payload = nodes[node].emit(now, receivers)
@@ -200,7 +208,8 @@ def _node_activations(
 
     def activate(node: int, now: float) -> None:
         # The tick has its own row; transmit() adds that of the broadcast if there is one.
-        recorder.append((now, TICK, node, -1, -1, -1, NAN))
+        if transmitter.up(node):
+            recorder.append((now, TICK, node, -1, -1, -1, NAN))
         transmit[node](now)
 
     return [((node,), partial(activate, node)) for node in scenario.nodes]

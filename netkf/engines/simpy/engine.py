@@ -18,6 +18,7 @@ from netkf.engines.base import Engine, Progress, Rank, broken
 from netkf.engines.reach import Reach
 from netkf.engines.simpy.clocks import clock_processes
 from netkf.engines.simpy.driven import DrivenModel
+from netkf.engines.simpy.membership import Membership
 from netkf.engines.simpy.nodes import ClockedNode, Node, View, distinct
 from netkf.engines.simpy.sensors import increment_sensors, sensor_processes
 from netkf.engines.simpy.slots import (
@@ -95,7 +96,10 @@ class _Simulation:
         self.timeline = Timeline()
         self._scenario, self._streams = scenario, streams
         self._recorder, self._progress = recorder, progress
-        self._transmitter = Transmitter(scenario, streams, self.timeline, recorder)
+        self._membership = Membership(scenario, streams, recorder)
+        self._transmitter = Transmitter(
+            scenario, streams, self.timeline, recorder, self._membership.up
+        )
         recorder.exact_errors, recorder.unknown = scenario.exact_errors, scenario.unknown_samples
 
     def clocks(self) -> list[Process]:
@@ -119,7 +123,8 @@ class _Simulation:
             self._sampling(truth, nodes, sums),
             self._moving_origin(truth, nodes),
             *([self._changing(nodes)] if len(scenario.followed_changes) else []),
-            *sensor_processes(*shared, truth, nodes),
+            *self._membership.processes(timeline, nodes),
+            *sensor_processes(*shared, truth, nodes, self._membership.up),
             *clock_processes(*shared, self._transmitter, nodes),
         ]
 
@@ -172,6 +177,7 @@ class _Simulation:
         nodes = _nodes(scenario, make)
         # Filters, readers and the clock are processes that meet by time and rank only.
         processes = [node.run_process(self.timeline) for node in distinct(nodes)]
+        processes += self._membership.processes(self.timeline, nodes)
         for node, placed in scenario.placed_sensors.items():
             sensors = [
                 (
@@ -181,7 +187,7 @@ class _Simulation:
                 for sensor in placed
             ]
             entity = scenario.topology.index[node]
-            reader = Reader(recorder, schedule, node, entity, nodes[node])
+            reader = Reader(recorder, schedule, node, entity, nodes[node], self._membership.up)
             processes.append(reader.run_process(self.timeline, truth, sensors))
         if scenario.node_filter.timing.talks:
             shared = (scenario, streams, recorder, schedule, self._transmitter, nodes)

@@ -195,9 +195,14 @@ class Node:
         """The model in which matrices may change."""
         self.algorithm, self._timing = algorithm, algorithm.timing
         self._interval = interval_rule(algorithm)
+        self._start = start
         self.state = algorithm.init(model, *start, info)
         # By sender: absorption is in the order of senders, whatever the order of arrival.
         self.inbox: dict[int, list[Envelope]] = {}
+
+    def restart(self, time: float) -> None:
+        """Begin again with the estimate of the start, at ``time`` seconds."""
+        self.state = self.algorithm.init(self.model, *self._start, self.info)
 
     def _advance(self, start: float, gap: float) -> None:
         """Predict the filter over ``gap`` seconds from ``start`` on."""
@@ -296,6 +301,11 @@ class ClockedNode(Node):
         """Function called with the time in seconds once the node has used its samples of an
         instant; None unless readings make the node transmit.
         """
+
+    def restart(self, time: float) -> None:
+        """Begin again with the estimate of the start, at ``time`` seconds."""
+        super().restart(time)
+        self._now = time
 
     def predict_to(self, time: float) -> None:
         """Predict the filter to ``time`` (seconds), using the increments since its last event."""

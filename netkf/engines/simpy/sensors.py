@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,8 +32,11 @@ def sensor_processes(
     recorder: Recorder,
     truth: Any,
     nodes: dict[int, ClockedNode],
+    up: Callable[[int], bool],
 ) -> list[Process]:
-    """Return a process for each node with increment sensors and for each sampled sensor."""
+    """Return a process for each node with increment sensors and for each sampled sensor, which a
+    node reads while it is ``up(node)``.
+    """
     index = scenario.topology.index
     processes = [
         # One process for all increment sensors of a node: they are read at the same times.
@@ -47,7 +50,7 @@ def sensor_processes(
             # The filters' R, which may differ from that of the readings.
             R = scenario.noise_covariance(placed_sensor.entry, believed=True)
             sensor = SamplingProcess(node, entity, times[node, placed_sensor.ordinal], samples, R)
-            processes.append(sensor.run(timeline, truth, nodes[node]))
+            processes.append(sensor.run(timeline, truth, nodes[node], up))
             # Entities number sampled sensors over all nodes: they order samples of one instant.
             entity += 1
     return processes
@@ -85,13 +88,18 @@ class SamplingProcess:
     samples: Samples
     R: FloatArray
 
-    def run(self, timeline: Timeline, truth: Any, receiver: ClockedNode) -> Process:
-        """Read the ``truth`` at the sample times, and pass each sample to ``receiver``."""
+    def run(
+        self, timeline: Timeline, truth: Any, receiver: ClockedNode, up: Callable[[int], bool]
+    ) -> Process:
+        """Read the ``truth`` at the sample times, and pass each sample to ``receiver`` if the node
+        is ``up``.
+        """
         for k, time in enumerate(self.times.tolist()):
             yield timeline.at(time, Rank.SENSE, self.entity)
             # Relative to the moving origin, like the estimates.
             y, H = self.samples.reading(k, truth.local(time))
-            receiver.sample(self.node, y, H, covariance_of(self.samples, k, self.R))
+            if up(self.node):
+                receiver.sample(self.node, y, H, covariance_of(self.samples, k, self.R))
 
 
 def increment_sensors(

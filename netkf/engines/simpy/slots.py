@@ -7,7 +7,7 @@ matching) transmit at once.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -262,8 +262,16 @@ class Reader:
     """The sensors of one node: a process that reads the truth once a slot."""
 
     def __init__(
-        self, recorder: Recorder, schedule: SlotSchedule, node: int, entity: int, carrier: SlotNode
+        self,
+        recorder: Recorder,
+        schedule: SlotSchedule,
+        node: int,
+        entity: int,
+        carrier: SlotNode,
+        up: Callable[[int], bool],
     ) -> None:
+        """``up(node)`` says whether a node is up now: then it reads."""
+        self._up = up
         self._recorder, self._schedule = recorder, schedule
         self._node, self._entity, self._carrier = node, entity, carrier
 
@@ -276,12 +284,15 @@ class Reader:
             for stage in self._schedule.stages(slot):
                 if stage.kind == "read":
                     yield timeline.at(stage.time, stage.rank, self._entity)
-                    self._recorder.append((stage.time, SENSE, self._node, -1, -1, -1, NAN))
+                    up = self._up(self._node)
+                    if up:
+                        self._recorder.append((stage.time, SENSE, self._node, -1, -1, -1, NAN))
                     # In the coordinates of the estimates, as H x is.
                     x = truth.local(slot)
                     for sensor, R in sensors:
                         y, H = sensor.reading(slot, x), sensor.matrix(slot)
-                        self._carrier.read(y, H, covariance_of(sensor, slot, R))
+                        if up:
+                            self._carrier.read(y, H, covariance_of(sensor, slot, R))
             slot += 1
 
 
@@ -343,12 +354,15 @@ class SlotClock:
             senders = sorted({node for pair in connected for node in pair})
         exchange = Exchange(now, phase, stage.step, slot)
         # All payloads are computed before any message arrives: the order of nodes does not matter.
-        payloads = {node: self._nodes[node].emit(exchange) for node in senders}
+        awake = self._transmitter.up
+        payloads = {
+            node: self._nodes[node].emit(exchange) if awake(node) else None for node in senders
+        }
         # Held links keep their outcome for all steps of an exchange.
         fresh = self._timing.redraws(phase, stage.step)
         self._transmitter.begin(senders_of_pairs(pairs, self._scenario.topology.directed), fresh)
         for i, j in pairs:
-            if not broadcast:
+            if not broadcast and awake(i, j):
                 self._recorder.append((now, TICK, i, j, -1, phase, NAN))
             # A recorded link that is down loses its messages, but its channel draws all the same.
             is_up = up is None or (i, j) in up

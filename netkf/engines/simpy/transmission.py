@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Protocol
 
@@ -71,8 +71,15 @@ class Transmitter:
     """Sends and delivers all messages of a run; a message that takes time is an event."""
 
     def __init__(
-        self, scenario: Scenario, streams: Streams, timeline: Timeline, recorder: Recorder
+        self,
+        scenario: Scenario,
+        streams: Streams,
+        timeline: Timeline,
+        recorder: Recorder,
+        up: Callable[..., bool],
     ) -> None:
+        """``up(*nodes)`` says whether one of some nodes is up now."""
+        self.up = up
         self._scenario, self._streams = scenario, streams
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
@@ -155,6 +162,10 @@ class Transmitter:
             # The stored envelope may have been shifted since it was sent.
             envelope = self._under_way.pop((direction.link, envelope.number))
             envelope = envelope._replace(age=self._instant(now - envelope.sent))
+        if not self.up(receiver):
+            if now < self._horizon or envelope.sent == now:
+                self._recorder.append((now, LOST, sender, receiver, envelope.number, phase, NAN))
+            return
         arrives_in_time = direction.receiver.in_time(envelope)
         # After the horizon the last slot is finished for its sample, without recording events.
         if now < self._horizon or envelope.sent == now:

@@ -14,7 +14,11 @@ AssumptionRow = tuple[str, str, bool | None, str]
 
 UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
 FOLLOWS_DATA = "not linear in the state: gains, P and errors follow the data"
-NO_CHANNEL_LAW = "losses or delays are recorded, or nodes move: what arrives has no known law"
+NO_CHANNEL_LAW = (
+    "losses or delays are recorded, or nodes move or sleep: what arrives has no known law"
+)
+LIVES = "nodes are down at times (network.lives)"
+CONSISTENCY = "netkf consistency compares P with the errors of many runs"
 TRUE_MODEL = "the filters know the plant and the sensors"
 
 
@@ -35,10 +39,10 @@ def require_linear(scenario: Scenario) -> None:
 
 
 def lacks_channel_law(scenario: Scenario) -> bool:
-    """Return True if losses or delays are read from a table, or follow nodes that move."""
+    """Return True if losses or delays are read from a table, or nodes move or are down."""
     channel = scenario.network.channel
     recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
-    return recorded or scenario.links_move
+    return recorded or scenario.network_changes
 
 
 def true_model_row(scenario: Scenario, source: str, matrices: str) -> AssumptionRow:

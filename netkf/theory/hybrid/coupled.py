@@ -122,9 +122,9 @@ def reason_without_bound(scenario: Scenario) -> str | None:
     if network.channel.delay.fixed is None:
         return "not promised: Tanwani's H(12) holds for no or fixed delays, and the delay is random"
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
-    if scenario.links_move:
+    if scenario.network_changes:
         dependent = f"not promised: {NO_CHANNEL_LAW}"
-    independent = network.channel.independent and not scenario.links_move
+    independent = network.channel.independent and not scenario.network_changes
     return _reason_of_samples(scenario) if independent else dependent
 
 

@@ -36,7 +36,7 @@ def second_moment_rate(scenario: Scenario) -> float:
         raise TheoryError("the second moments of P are known for Poisson clocks only")
     if scenario.network.activation.at != "links" or scenario.sampled_sensors:
         raise TheoryError("the second moments of P are known for clocks of links and increments")
-    if scenario.links_move:
+    if scenario.network_changes:
         raise TheoryError(NO_CHANNEL_LAW)
     if not channel.independent or channel.delay.fixed != 0.0:
         raise TheoryError("the second moments of P are known without bursts and delays only")

@@ -1,0 +1,204 @@
+"""When nodes are up: crashes, duty cycles, and tables of who joins and leaves."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.core.csv_files import read_columns
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import (
+    Component,
+    SourceFile,
+    field,
+    list_of,
+    node_id,
+    number,
+    of_time,
+    one_of,
+    positive,
+    source_file,
+)
+from netkf.network.graphs import Topology
+
+UP, DOWN = ("restart", "join"), ("crash", "leave")
+"""Kinds of the events with which a node is up, and down."""
+
+
+class Change(NamedTuple):
+    """A node goes up or down at ``time`` (seconds), by an event of this ``kind``."""
+
+    time: float
+    kind: str
+
+    @property
+    def up(self) -> bool:
+        """True if the node is up from now on."""
+        return self.kind in UP
+
+
+@dataclass(frozen=True, eq=False)
+class Life(Component):
+    """The contract of lives: when each of ``nodes`` is up. A node that is down neither senses,
+    ticks, sends nor hears; a message that arrives then is lost.
+
+    memory  kept: a node goes on with the estimate it had; lost: it begins again with the mean and
+            the covariance of its filter
+    """
+
+    nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"))
+    memory: str = field(one_of("kept", "lost"), default="kept")
+
+    @abstractmethod
+    def changes(
+        self, node: int, random: Callable[[], np.random.Generator], horizon: float
+    ) -> Sequence[Change]:
+        """Return the changes of ``node`` before the ``horizon`` (seconds), in the order of time and
+        up and down in turn; ``random()`` is its stream. If the first one is up the node is down
+        until then.
+        """
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError unless all nodes are in the graph."""
+        for k, node in enumerate(self.nodes):
+            if node not in topology.index:
+                raise ScenarioError(f"nodes[{k}]", "must be a node of the graph", node, "remove it")
+
+
+@dataclass(frozen=True, eq=False)
+class Crashes(Life):
+    """A node is up for exponential times of mean ``mean_up`` seconds, and down for ``mean_down``,
+    in turn; it is up at first.
+    """
+
+    mean_up: float = field(positive)
+    mean_down: float = field(positive)
+
+    def changes(
+        self, node: int, random: Callable[[], np.random.Generator], horizon: float
+    ) -> Sequence[Change]:
+        """Return crashes and restarts in turn."""
+        generator, found, now = random(), list[Change](), 0.0
+        for mean, kind in itertools.cycle(((self.mean_up, "crash"), (self.mean_down, "restart"))):
+            now += mean * float(generator.standard_exponential())
+            if now >= horizon:
+                return found
+            found.append(Change(now, kind))
+        raise AssertionError
+
+
+@dataclass(frozen=True, eq=False)
+class DutyCycle(Life):
+    """In each ``period`` of seconds a node is up for ``up`` seconds, from ``phase`` on."""
+
+    period: float = field(of_time(positive))
+    up: float = field(of_time(positive))
+    phase: float = field(of_time(number(low=0.0)), default=0.0)
+
+    def __post_init__(self) -> None:
+        """Check the fields; raises ScenarioError if a node would never be down."""
+        super().__post_init__()
+        if self.up >= self.period:
+            remedy = "shorten it, or leave these nodes out"
+            raise ScenarioError("up", "must be below the period", self.up, remedy)
+
+    def changes(
+        self, node: int, random: Callable[[], np.random.Generator], horizon: float
+    ) -> Sequence[Change]:
+        """Return restarts and crashes in turn, at times counted from ``phase``."""
+        found, first = [], -math.ceil(self.phase / self.period) - 1
+        for k in itertools.count(first):
+            begin = self.phase + k * self.period
+            if begin >= horizon:
+                break
+            found += [Change(begin, "restart"), Change(begin + self.up, "crash")]
+        # A node that is up at time 0 has not gone up in the run.
+        return [change for change in found if 0.0 < change.time < horizon]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLife(Life):
+    """Changes by a table ``t,node,what`` with what = up, down, join or leave."""
+
+    path: SourceFile = field(source_file)
+
+    def __post_init__(self) -> None:
+        """Check the fields and read the table; raises ScenarioError for a mistake in either."""
+        super().__post_init__()
+        _ = self._table  # a mistake in the file is found on construction
+
+    @cached_property
+    def _table(self) -> dict[int, list[Change]]:
+        kinds = {"up": "restart", "down": "crash", "join": "join", "leave": "leave"}
+        table = read_columns(self.path, ("t", "node", "what"), words={"what": tuple(kinds)})
+        what = [list(kinds.values())[int(index)] for index in table["what"]]
+        rows: dict[int, list[tuple[float, int, str]]] = {}
+        for row, node in enumerate(table.integers("node")):
+            rows.setdefault(node, []).append((float(table["t"][row]), row, what[row]))
+        found = {}
+        for node, listed in rows.items():
+            changes = [Change(time, kind) for time, _, kind in sorted(listed)]
+            for (first, second), (_, row, _) in zip(
+                itertools.pairwise(changes), sorted(listed)[1:], strict=True
+            ):
+                if first.up == second.up or first.time == second.time:
+                    state = "up" if first.up else "down"
+                    rule = f"{table.where(row)}: node {node} is {state} already, or changes twice"
+                    raise ScenarioError("path", rule, second.time, "correct the rows of the node")
+            found[node] = changes
+        return found
+
+    def changes(
+        self, node: int, random: Callable[[], np.random.Generator], horizon: float
+    ) -> Sequence[Change]:
+        """Return the rows of the node; those at time 0 or before say how it begins."""
+        listed = self._table.get(node, [])
+        before = [change for change in listed if change.time <= 0.0]
+        after = [change for change in listed if 0.0 < change.time < horizon]
+        # A first change to what it is anyway, or a missing one, says how the node begins.
+        if before and not before[-1].up and (not after or not after[0].up):
+            return [Change(math.inf, "restart")]
+        return after
+
+    def check(self, topology: Topology) -> None:
+        """Raise ScenarioError unless all nodes of the table are in the entry."""
+        super().check(topology)
+        missing = sorted(set(self._table) - set(self.nodes))
+        if missing:
+            rule = f"{self.path.name} has rows of nodes that are not in nodes"
+            raise ScenarioError("path", rule, missing, "add them to nodes, or remove the rows")
+
+
+class Lifetime(NamedTuple):
+    """The changes of a node in a run, in canonical form; ``up`` at first; whether its ``memory`` is
+    lost when it goes down.
+    """
+
+    up: bool
+    changes: tuple[Change, ...]
+    forgets: bool
+
+
+def lifetimes(scenario: Any, streams: Any) -> dict[int, Lifetime]:
+    """Return the lives of a run by the ids of the nodes that have one."""
+    found = {}
+    for life in scenario.network.lives:
+        for node in life.nodes:
+
+            def random(node: int = node) -> np.random.Generator:
+                generator: np.random.Generator = streams.generator("life", node)
+                return generator
+
+            changes = life.changes(node, random, scenario.horizon)
+            up = not changes or not changes[0].up
+            instants = [c._replace(time=scenario.time_grid.instant(c.time)) for c in changes]
+            kept = tuple(c for c in instants if c.time < scenario.horizon)
+            found[node] = Lifetime(up, kept, life.memory == "lost")
+    return found

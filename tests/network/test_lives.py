@@ -1,0 +1,262 @@
+"""Nodes that crash, sleep, join and leave."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import netkf
+from netkf.network.lives import Crashes, DutyCycle
+from netkf.trace.schema import CODES
+
+CLOCKS = """
+format = 1
+name = "lives"
+horizon = {horizon}
+probe = 0.25
+[plant]
+kind = "diffusion"
+A = [[-0.1, 1.0], [0.0, -0.3]]
+B = [[0.2, 0.0], [0.0, 1.0]]
+mean = [1.0, -2.0]
+cov = [[1.0, 0.2], [0.2, 2.0]]
+[[sensors]]
+nodes = [0, 1, 2]
+H = [[1.0, 0.0]]
+R = [[0.3]]
+sampling = {{ kind = "periodic", period = 0.5 }}
+[network]
+graph = {{ kind = "path", nodes = 3 }}
+activation = {{ kind = "poisson", rate = 3.0, at = "{at}" }}
+{lives}
+[network.channel]
+loss = {{ kind = "bernoulli", delivery = 0.8 }}
+delay = {{ kind = "constant", seconds = 0.1 }}
+[filter]
+kind = "{filter}"
+"""
+SLOTS = """
+format = 1
+name = "lives"
+horizon = {horizon}
+probe = 1.0
+[plant]
+kind = "linear"
+period = 1.0
+F = [[1.1]]
+Q = [[0.4]]
+cov = [[2.0]]
+[[sensors]]
+nodes = [0, 1, 2]
+H = [[1.0]]
+R = [[0.5]]
+[network]
+graph = {{ kind = "path", nodes = 3 }}
+activation = {{ kind = "broadcast" }}
+{lives}
+[filter]
+kind = "{filter}"
+"""
+TABLE = "t,node,what\n1.5,1,down\n4.5,1,up\n6,1,leave\n7.25,1,join\n0,2,down\n3,2,up\n"
+
+
+@pytest.fixture
+def scenario_of(tmp_path):
+    def make(text, lives, files=(), horizon=10.0, at="nodes", filter_="local"):
+        for name, rows in dict(files).items():
+            (tmp_path / name).write_text(rows)
+        path = tmp_path / "lives.toml"
+        more = "epsilon = 0.4\n" if filter_ == "hybrid" else ""
+        path.write_text(text.format(lives=lives, horizon=horizon, at=at, filter=filter_) + more)
+        return netkf.load(path)
+
+    return make
+
+
+def recorded(memory="kept"):
+    return (
+        '[[network.lives]]\nkind = "recorded"\nnodes = [1, 2]\npath = "l.csv"\n'
+        f'memory = "{memory}"',
+        {"l.csv": TABLE},
+    )
+
+
+def is_down(t, node):
+    intervals = {1: [(1.5, 4.5), (6.0, 7.25)], 2: [(0.0, 3.0)]}
+    return any(begin <= t < end for begin, end in intervals.get(node, ()))
+
+
+def expected_covariances(times, node, lost):
+    """The Kalman filter of a node alone, written plainly: it predicts from sample to sample that it
+    takes, and begins again where its memory is lost.
+    """
+    A, B = np.array([[-0.1, 1.0], [0.0, -0.3]]), np.diag([0.2, 1.0])
+    prior = np.array([[1.0, 0.2], [0.2, 2.0]])
+    H, R = np.array([[1.0, 0.0]]), np.array([[0.3]])
+
+    def predict(P, gap):
+        nested = np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]])
+        big = scipy.linalg.expm(nested * gap)
+        Phi = big[2:, 2:].T
+        return Phi @ P @ Phi.T + Phi @ big[:2, 2:]
+
+    ups = {1: [4.5, 7.25], 2: [3.0]}.get(node, []) if lost else []
+    events = sorted(
+        [(t, 2, "probe") for t in times]
+        + [(0.5 * k, 1, "sample") for k in range(1, 20) if not is_down(0.5 * k, node)]
+        + [(t, 0, "restart") for t in ups]
+    )
+    P, now, found = prior, 0.0, []
+    for t, _, what in events:
+        P, now = predict(P, t - now), t
+        if what == "restart":
+            P = prior
+        elif what == "sample":
+            P = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
+        else:
+            found.append(P)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("memory", ["kept", "lost"])
+def test_covariances_are_those_of_the_plain_recursion(scenario_of, memory):
+    run = netkf.simulate(scenario_of(CLOCKS, *recorded(memory)), seed=1)
+    for k in range(3):
+        expected = expected_covariances(run.times.tolist(), k, memory == "lost")
+        np.testing.assert_allclose(run.P[:, k], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("at", ["nodes", "links", "directions"])
+@pytest.mark.parametrize("memory", ["kept", "lost"])
+def test_who_is_down_does_nothing(scenario_of, at, memory):
+    scenario = scenario_of(CLOCKS, *recorded(memory), at=at, filter_="hybrid")
+    log = netkf.simulate(scenario, seed=3).log
+    for kind in ("sense", "send", "absorb", "transmit"):
+        rows = log[log["kind"] == CODES[kind]]
+        assert not any(is_down(t, n) for t, n in zip(rows["t"], rows["node"], strict=True))
+    delivered = log[log["kind"] == CODES["deliver"]]
+    assert not any(is_down(t, n) for t, n in zip(delivered["t"], delivered["node"], strict=True))
+    ticks = log[log["kind"] == CODES["tick"]]
+    for t, node, peer in zip(ticks["t"], ticks["node"], ticks["peer"], strict=True):
+        assert not (is_down(t, node) and (at != "links" or is_down(t, peer)))
+    names = {code: kind for kind, code in CODES.items()}
+    told = [
+        (float(t), int(n), names[int(k)])
+        for t, n, k in zip(log["t"], log["node"], log["kind"], strict=True)
+        if names[int(k)] in ("crash", "restart", "join", "leave")
+    ]
+    assert told == [
+        (1.5, 1, "crash"),
+        (3.0, 2, "restart"),
+        (4.5, 1, "restart"),
+        (6.0, 1, "leave"),
+        (7.25, 1, "join"),
+    ]
+    # Accounts balance: what is sent arrives, is lost, or is under way at the end.
+    count = {kind: int((log["kind"] == CODES[kind]).sum()) for kind in ("send", "deliver", "lost")}
+    under_way = (log["t"][log["kind"] == CODES["send"]] > 9.9).sum()
+    assert count["deliver"] + count["lost"] <= count["send"]
+    assert count["send"] - count["deliver"] - count["lost"] <= under_way
+
+
+def test_draws_of_others_do_not_depend_on_who_is_up(scenario_of):
+    with_lives = netkf.simulate(scenario_of(CLOCKS, *recorded(), filter_="hybrid"), seed=3).log
+    without = netkf.simulate(scenario_of(CLOCKS, "", filter_="hybrid"), seed=3, engine="simpy").log
+    for kind in ("tick", "sense"):
+        rows = [
+            {(float(t), int(n)) for t, n in zip(log["t"], log["node"], strict=True)}
+            for log in (one[one["kind"] == CODES[kind]] for one in (with_lives, without))
+        ]
+        assert rows[0] == {(t, n) for t, n in rows[1] if not is_down(t, n)}
+
+
+@pytest.mark.parametrize("filter_", ["local", "intermittent"])
+def test_slots(scenario_of, filter_):
+    lives, files = recorded("lost")
+    scenario = scenario_of(SLOTS, lives, files, filter_=filter_)
+    log = netkf.simulate(scenario, seed=1).log
+    sense = log[log["kind"] == CODES["sense"]]
+    slots = {n: {float(t) for t in sense["t"][sense["node"] == n]} for n in range(3)}
+    every = {float(k) for k in range(10)} & slots[0]
+    for node in (1, 2):
+        assert slots[node] == {t for t in every if not is_down(t, node)}
+
+
+def test_crashes_have_their_law():
+    life = Crashes(nodes=(0,), mean_up=3.0, mean_down=1.0)
+    changes = life.changes(0, lambda: np.random.default_rng(4), 20_000.0)
+    t = np.array([0.0, *(change.time for change in changes)])
+    gaps = np.diff(t)
+    assert gaps[::2].mean() == pytest.approx(3.0, abs=4.5 * 3.0 / np.sqrt(len(gaps) / 2))
+    assert gaps[1::2].mean() == pytest.approx(1.0, abs=4.5 * 1.0 / np.sqrt(len(gaps) / 2))
+    assert [change.up for change in changes[:3]] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("phase", "expected"),
+    [
+        (0.0, [(2.0, False), (5.0, True), (7.0, False)]),
+        (1.0, [(1.0, True), (3.0, False), (6.0, True), (8.0, False)]),
+        (4.0, [(1.0, False), (4.0, True), (6.0, False), (9.0, True)]),
+        (9.0, [(1.0, False), (4.0, True), (6.0, False), (9.0, True)]),
+    ],
+)
+def test_duty_cycles(phase, expected):
+    life = DutyCycle(nodes=(0,), period=5.0, up=2.0, phase=phase)
+    changes = life.changes(0, lambda: None, 10.0)
+    assert [(change.time, change.up) for change in changes] == expected
+
+
+def test_no_lives_is_todays_run(scenario_of):
+    # A cycle that never ends within the run: everybody is up all the time.
+    life = '[[network.lives]]\nkind = "duty"\nnodes = [0, 1, 2]\nperiod = 100.0\nup = 99.0'
+    prints = [
+        netkf.simulate(
+            scenario_of(CLOCKS, lives, filter_="hybrid"), seed=2, engine="simpy"
+        ).fingerprint
+        for lives in (life, "")
+    ]
+    assert prints[0] == prints[1]
+
+
+def test_theory_and_check_say_that_nothing_is_promised(scenario_of):
+    scenario = scenario_of(CLOCKS, *recorded(), filter_="hybrid")
+    with pytest.raises(netkf.TheoryError, match=r"network\.lives.*consistency"):
+        netkf.check(scenario, runs=10)
+    with pytest.raises(netkf.TheoryError, match=r"network\.lives.*consistency"):
+        netkf.theory.error_covariance(scenario, netkf.simulate(scenario, seed=1))
+    with pytest.raises(netkf.TheoryError):
+        netkf.theory.covariance_bound(scenario, [1.0])
+
+
+REFUSALS = {
+    "word": ("t,node,what\n1,1,dwn\n", "l.csv line 2: what must be up, down, join or leave"),
+    "twice": ("t,node,what\n1,1,down\n2,1,down\n", "l.csv line 3: node 1 is down already"),
+    "other node": ("t,node,what\n1,0,down\n", "has rows of nodes that are not in nodes"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_refusals(scenario_of, case):
+    rows, words = REFUSALS[case]
+    with pytest.raises(netkf.ScenarioError) as caught:
+        scenario_of(CLOCKS, recorded()[0], {"l.csv": rows})
+    assert words in str(caught.value)
+    assert "network.lives[0].path" in str(caught.value)
+
+
+def test_a_node_has_one_life(scenario_of):
+    life = '[[network.lives]]\nkind = "crashes"\nnodes = [1]\nmean_up = 2.0\nmean_down = 1.0\n'
+    with pytest.raises(netkf.ScenarioError, match=r"network\.lives\[1\]\.nodes: must not have"):
+        scenario_of(CLOCKS, life + life)
+    with pytest.raises(netkf.ScenarioError, match=r"network\.lives\[0\]\.nodes.*node of the graph"):
+        scenario_of(CLOCKS, life.replace("[1]", "[1, 9]"))
+    scenario = scenario_of(CLOCKS, life)
+    assert netkf.load(write(scenario)).network.lives == scenario.network.lives
+
+
+def write(scenario):
+    from netkf.scenario.writing import as_table, to_toml
+
+    path = scenario._folder / "again.toml"
+    path.write_text(to_toml(as_table(scenario)))
+    return path
