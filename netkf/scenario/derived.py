@@ -270,16 +270,6 @@ class DerivedScenario(ScenarioModel):
         pooled: SlotModel = self._pooled_model
         return pooled
 
-    @property
-    def pooled_model(self) -> FlowModel:
-        """The believed model of a central filter, which reads the increments of all nodes, in
-        continuous time; raises TheoryError if the plant changes.
-        """
-        self._require_one_piece()
-        _ = self.diffusion
-        pooled: FlowModel = self._pooled_model
-        return pooled
-
     @cached_property
     def _pooled_model(self) -> Any:
         """The first believed model of a central filter."""

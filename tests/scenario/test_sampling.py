@@ -75,7 +75,8 @@ def test_what_is_written_reads_as_the_same_scenario(clock, make, tmp_path):
 def test_models_hold_the_sensors_of_increments_only(make):
     mixed = make([SAMPLED, INCREMENTS])
     assert [len(model.H) for model in mixed.models] == [0, 1, 0]
-    assert len(mixed.pooled_model.H) == 1
+    pooled = mixed.replace({"filter": {"kind": "central"}})
+    assert len(pooled.model_pieces[0][0].H) == 1
     assert {n: [p.entry for p in places] for n, places in mixed.increment_sensors.items()} == {
         1: [1]
     }
