@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from netkf.core.fields import field, matrix, seconds
+from netkf.core.fields import boolean, field, matrix, seconds
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
 from netkf.linalg.vector_functions import VectorFunction
@@ -40,7 +40,8 @@ class NonlinearDiffusion(RecordedStates):
           path, and filters integrate mean and covariance in steps that are no longer, by one of
           order 4
 
-    Headings are not wrapped: they count whole turns. With a ``path`` the states are recorded.
+    Headings are not wrapped: they count whole turns. With a ``path`` the states are recorded, and
+    with ``unknown`` there are none but those that filters assume.
     """
 
     linear: ClassVar[bool] = False
@@ -48,6 +49,7 @@ class NonlinearDiffusion(RecordedStates):
     f: Any = field(dynamics)
     B: FloatArray = field(matrix)
     step: float = field(seconds)
+    unknown: bool = field(boolean, default=False)  # type: ignore[misc]
 
     @property
     def n(self) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from netkf.core.contracts import place_of_error
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import covariance, field, seconds
+from netkf.core.fields import boolean, covariance, field, seconds
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import apply
 from netkf.linalg.vector_functions import VectorFunction
@@ -30,7 +30,8 @@ class NonlinearPlant(RecordedStates, SlotPlant):
     Q       (n, n)
     period  seconds
 
-    Headings are not wrapped: they count whole turns. With a ``path`` the states are recorded.
+    Headings are not wrapped: they count whole turns. With a ``path`` the states are recorded, and
+    with ``unknown`` there are none but those that filters assume.
     """
 
     linear: ClassVar[bool] = False
@@ -38,6 +39,7 @@ class NonlinearPlant(RecordedStates, SlotPlant):
     f: Any = field(dynamics)
     Q: FloatArray = field(covariance)
     period: float = field(seconds)
+    unknown: bool = field(boolean, default=False)  # type: ignore[misc]
 
     @property
     def n(self) -> int:

@@ -11,13 +11,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from netkf.core.csv_files import Columns, read_columns
 from netkf.core.errors import ScenarioError
-from netkf.core.fields import SourceFile, boolean, field, one_of, source_file
+from netkf.core.fields import SourceFile, field, one_of, source_file
 from netkf.core.repeated_rows import RowUse, count_rows, first_rows
 from netkf.linalg.arrays import FloatArray
 from netkf.plants.dynamics import MOTIONS
@@ -186,12 +186,14 @@ class RecordedStates(Plant):
     """A plant whose states are drawn or, with a ``path``, those of a table ``t,x0,x1,...``, t in
     seconds: then the plant is what filters assume. With ``interpolate`` states are known between
     rows too, "linear" or "hold", that of the last row. Rows of a column ``node`` are those of the
-    blocks of nodes. With ``unknown`` there are no states but those that filters assume.
+    blocks of nodes.
     """
+
+    unknown: ClassVar[bool] = False
+    """True if there are no states but those that filters assume."""
 
     path: SourceFile | StackedStates | None = field(state_file, default=None)
     interpolate: str | None = field(one_of(*INTERPOLATIONS), default=None)
-    unknown: bool = field(boolean, default=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
