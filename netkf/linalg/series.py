@@ -70,7 +70,7 @@ def fill_series(
     ``out`` (>= width,); ``series`` is (terms, >= width).
 
     ``reach`` (terms, ...) has in ``column`` the longest abs(gap) for which the terms up to each k
-    suffice.
+    suffice. Widths that are multiples of the lanes take the least time.
     """
     terms, distance = len(reach), abs(gap)
     # A number of terms known at compile time keeps the sums of entries in registers.
@@ -92,8 +92,13 @@ def horner(
     Horner's scheme; ``order`` is a tuple of length K, which is then known when the kernel is
     compiled, and ``series`` is (> K, >= width).
     """
-    # Entries are the outer loop, which LLVM vectorises.
-    for j in range(width):
+    whole = width - width % LANES
+    for j in range(0, whole, LANES):
+        block = load(MANY, series, len(order), j)
+        for k in range(len(order) - 1, -1, -1):
+            block = load(MANY, series, k, j) + gap * block
+        store(MANY, out, j, block)
+    for j in range(whole, width):
         total = series[len(order), j]
         for k in range(len(order) - 1, -1, -1):
             total = series[k, j] + gap * total

@@ -24,6 +24,7 @@ import numpy as np
 
 from netkf.algorithms.kernels.riccati import exponential_series, hamiltonian
 from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.lanes import LANES, aligned
 from netkf.linalg.legendre import MOMENTS, backward_coefficients
 from netkf.linalg.series import exponential_terms, with_reach
 from netkf.linalg.structs import Struct
@@ -63,7 +64,9 @@ def stack_gains(gains: Sequence[GainTable]) -> Gains:
     """Return the tables of M models as one struct."""
     terms, width = np.max([gain.series.shape for gain in gains], axis=0)
     # The padding is never read: the last reach of a table is infinite.
-    series, reach = np.zeros((len(gains), terms, width - 1)), np.zeros((len(gains), terms, 1))
+    # A multiple of the lanes, see series.fill_series.
+    width = -(-(width - 1) // LANES) * LANES
+    series, reach = aligned((len(gains), terms, width)), np.zeros((len(gains), terms, 1))
     for k, gain in enumerate(gains):
         count, entries = len(gain.series), gain.series.shape[1] - 1
         series[k, :count, :entries], reach[k, :count] = gain.series[:, :-1], gain.series[:, -1:]

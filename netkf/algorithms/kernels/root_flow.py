@@ -123,7 +123,7 @@ def flow_scratch(table: FlowTable, unrolled: bool = False) -> FlowScratch:
     # ``values`` also takes the n n entries of a level, which are fewer.
     return cls(
         size=sized(n) if unrolled else np.zeros(n),
-        values=np.zeros(table.series.shape[3]),
+        values=aligned((table.series.shape[3],)),
         S=np.zeros((n, n)),
         wide=np.zeros((n, n)),
         T=np.zeros((n, n)),
@@ -473,7 +473,7 @@ def propagate_root(
     """
     # The cells cover 2^octaves units (column 4 of sizes). Of a longer gap, first take whole steps
     # of the level of that length.
-    octaves, n, values = table.sizes[m, 4], len(scratch.size), scratch.values
+    octaves, values = table.sizes[m, 4], scratch.values
     if gap >= table.unit[m] * (1 << octaves):
         gap = propagate_by_levels(table, m, octaves, root, x, k, gap, scratch)
     if not gap > 0.0:
@@ -483,7 +483,7 @@ def propagate_root(
     trace = trace_of_root(ONE, scratch.size, root[k]) if observed else 0.0
     if is_narrow(table, m, gap, trace):
         cell, since = cell_of(table.unit[m], gap)
-        width = width_of(n, observed)
+        width = table.series.shape[3]
         fill_series(values, width, table.series[m, cell], table.reach[m, cell], 0, since)
         propagate_by_series(table, m, root, x, k, True, scratch)
         return
@@ -492,7 +492,7 @@ def propagate_root(
     gap = propagate_by_levels(table, m, 0, root, x, k, gap, scratch)
     if gap > 0.0:
         use_information(table, m, root, k, gap, scratch)
-        width = n * (n + 1) // 2 + 2 * n * n
+        width = table.series.shape[3]
         fill_series(values, width, table.series[m, 0], table.reach[m, 0], 0, gap)
         propagate_by_series(table, m, root, x, k, False, scratch)
 
@@ -846,7 +846,7 @@ def gain_root(
     of a GainTable; ``reach[:, column]`` (terms,) is the longest gap for which the terms so far
     suffice. ``values`` (>= row length) is scratch.
     """
-    fill_series(values, 3 * len(size) * len(moments), series, reach, column, gap)
+    fill_series(values, min(series.shape[1], len(values)), series, reach, column, gap)
     use_moments(ONE, size, root[k], x[k], values, moments)
 
 

@@ -222,11 +222,13 @@ def batch_size(scenario: Scenario) -> int:
 @once_per_scenario
 def quick_runs(scenario: Scenario) -> int:
     """Return the number of runs, a power of two, that take some thirty milliseconds."""
-    if not (drawn_together(scenario) and is_immediate(scenario) and uses_grid(scenario)):
+    if not drawn_together(scenario):
         return 1
-    steps, nodes = steps_to_the_end(scenario), len(scenario.nodes)
-    visits = steps * len(scenario.increment_sensors) + nodes * len(scenario.times)
-    max_runs = int(QUICK_VISITS / (visits + _expected_ticks(scenario)))
+    visits = len(scenario.nodes) * len(scenario.times) + _expected_ticks(scenario)
+    if uses_grid(scenario):
+        visits += steps_to_the_end(scenario) * len(scenario.increment_sensors)
+    # Those of the other loop are not computed side by side.
+    max_runs = int(QUICK_VISITS / (visits if is_immediate(scenario) else ALONE * visits))
     return 1 << max(0, min(max_runs, batch_size(scenario)).bit_length() - 1)
 
 
