@@ -26,6 +26,8 @@ from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
 NO_CLOCKS = ClockGroup((), np.empty(0), (), ())
+MAX_BASE = 1 << 31
+"""Ids beyond which two do not fit into one integer."""
 
 
 @lru_cache(maxsize=8)
@@ -86,15 +88,14 @@ def ticks_of(scenario: Scenario, run: Run) -> TickCounts | None:
         return None
     clock: Any = scenario.network.activation
     rows = run.log[run.log["kind"] == CODES["tick"]]
-    columns = ("node",) if clock.at == "nodes" else ("node", "peer")
-    ids = list(zip(*(rows[name].tolist() for name in columns), strict=True))
+    columns = [rows[name] for name in (("node",) if clock.at == "nodes" else ("node", "peer"))]
     if clock.at == "links":
         # Both nodes share the clock of a link, whose entity has the smaller id first.
-        ids = [tuple(sorted(pair)) for pair in ids]
-    index = {entity: k for k, entity in enumerate(group.entities)}
-    owners = np.array([index.get(entity, -1) for entity in ids], dtype=np.int64)
+        columns = [np.minimum(*columns), np.maximum(*columns)]
+    owners = _places(group.entities, columns)
     if not isinstance(clock, Contacts):
         return count_ticks(group, rows["t"], owners, scenario.horizon)
+    ids = list(zip(*(column.tolist() for column in columns), strict=True))
     off, inner, inner_owners = 0.0, [np.empty(0)], [np.empty(0, dtype=np.int64)]
     for entity in set(ids):
         off = max(off, clock.distance(entity, rows["t"][[e == entity for e in ids]]))
@@ -158,20 +159,15 @@ def count_drawn_samples(scenario: Scenario, seed: int, replica: int) -> np.ndarr
 
 
 @lru_cache(maxsize=8)
-def direction_indices(scenario: Scenario) -> dict[tuple[int, int], int]:
-    """Return the index of each direction (sender, receiver) in the topology."""
-    return {direction: k for k, direction in enumerate(scenario.topology.directions)}
-
-
-@lru_cache(maxsize=8)
 def loss_law(scenario: Scenario) -> LossLaw:
     """Return what a scenario states of losses on its directions."""
     channel, clock = scenario.network.channel, scenario.network.activation
     loss, links = stated_part(channel.loss, "loss"), scenario.topology.directions
     stated = dataclasses.replace(channel, loss=loss)
     delivery = [stated.mean_delivery(scenario.transmission(link)) for link in links]
-    indices, at_once = direction_indices(scenario), getattr(clock, "at", "links") == "links"
-    opposite = np.array([indices.get((j, i), -1) for i, j in links], dtype=np.int64)
+    at_once = getattr(clock, "at", "links") == "links"
+    senders, receivers = np.array(links, dtype=np.int64).reshape(-1, 2).T
+    opposite = _places(links, [receivers, senders])
     # Broadcasts of two nodes at different times would both step a chain that they share.
     one_step = isinstance(clock, Matching) or (
         isinstance(clock, LinkClock) and (clock.at == "links" or not channel.symmetric)
@@ -205,13 +201,14 @@ def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
     """Return the counts of sent and lost messages of a run, in windows of it and for each of D
     directions, and of losses that follow or accompany each other; None without links.
     """
-    indices, log = direction_indices(scenario), run.log
+    directions, log = scenario.topology.directions, run.log
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
-    if not indices:
+    if not directions:
         return None
-    size, number = len(indices), losses["message"]
-    lost_at = _in_direction(losses["node"], losses["peer"], indices)
-    sent_at = _in_direction(sends["node"], sends["peer"], indices)
+    size, number = len(directions), losses["message"]
+    lost_at, sent_at = (
+        _places(directions, [rows["node"], rows["peer"]]) for rows in (losses, sends)
+    )
     sent = count_by_window(sends["t"], sent_at, size, scenario.horizon)
     lost = count_by_window(losses["t"], lost_at, size, scenario.horizon)
     # One integer for each message: the message before it in its direction has that integer less 1,
@@ -238,11 +235,22 @@ def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray
     return [np.array(float((k * (k - 1) // 2).sum())) for k in (sizes, gone)]
 
 
-def _in_direction(
-    senders: np.ndarray, receivers: np.ndarray, indices: dict[tuple[int, int], int]
-) -> IntArray:
-    ids = zip(senders.tolist(), receivers.tolist(), strict=True)
-    return np.array([indices[direction] for direction in ids], dtype=np.int64)
+def _places(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArray:
+    """Return the index among ``entities`` of each row of the ``columns`` of ids, -1 for none."""
+    # -1 stands for no node.
+    known = np.array(entities, dtype=np.int64).reshape(-1, len(columns)).T + 1
+    rows = np.stack(columns).astype(np.int64) + 1
+    base = 1 + max(int(known.max(initial=0)), int(rows.max(initial=0)))
+    if base > MAX_BASE:
+        ids = np.unique(np.concatenate([known.ravel(), rows.ravel()]))
+        known, rows, base = np.searchsorted(ids, known), np.searchsorted(ids, rows), len(ids)
+    # One integer for each entity, and for each row.
+    keys, wanted = known[0], rows[0]
+    for own, column in zip(known[1:], rows[1:], strict=True):
+        keys, wanted = keys * base + own, wanted * base + column
+    order = np.argsort(keys)
+    found = order[np.minimum(np.searchsorted(keys[order], wanted), len(order) - 1)]
+    return np.where(keys[found] == wanted, found, -1).astype(np.int64)
 
 
 def pairs_of(scenario: Scenario, run: Run) -> PairCounts | None:
@@ -281,27 +289,27 @@ def delays_of(scenario: Scenario, run: Run) -> DelayCounts | None:
 
     Messages that have not arrived when the run ends take longer than that.
     """
-    (fixed, law), indices = stated_delay(scenario), direction_indices(scenario)
+    (fixed, law), count = stated_delay(scenario), len(scenario.topology.directions)
     rows = run.log[np.isin(run.log["kind"], (CODES["deliver"], CODES["late"]))]
-    if not indices or (fixed is None and law is None):
+    if not count or (fixed is None and law is None):
         return None
     if fixed is not None:
-        return count_fixed(rows["age"], fixed, len(indices))
+        return count_fixed(rows["age"], fixed, count)
     sent, directions, ages = _follow_messages(scenario, run, rows)
-    return count_delays(law, sent, ages, directions, len(indices), scenario.horizon)
+    return count_delays(law, sent, ages, directions, count, scenario.horizon)
 
 
 def _follow_messages(
     scenario: Scenario, run: Run, arrivals: np.ndarray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Return times of sending, directions and ages (K,) of messages that are not lost."""
-    indices, log, law = direction_indices(scenario), run.log, loss_law(scenario)
+    log, law = run.log, loss_law(scenario)
     sends, losses = (log[log["kind"] == CODES[kind]] for kind in ("send", "lost"))
     width = int(sends["message"].max(initial=0)) + 1
 
     def keys(rows: np.ndarray, sender: str, receiver: str) -> IntArray:
         """Return one integer for each message: its direction, and its number in that."""
-        codes: IntArray = _in_direction(rows[sender], rows[receiver], indices) * width
+        codes: IntArray = _places(law.links, [rows[sender], rows[receiver]]) * width
         return codes + np.asarray(rows["message"], dtype=np.int64)
 
     sent = keys(sends, "node", "peer")

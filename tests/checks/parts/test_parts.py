@@ -12,6 +12,7 @@ import scipy.stats
 import netkf
 from netkf.checks.evidence import BROKEN, HOLDS, judge
 from netkf.checks.laws import find
+from netkf.checks.parts.events import _places
 from netkf.checks.parts.noises import start_states
 from netkf.checks.parts.rows import part_promises
 from netkf.checks.parts.samples import stack_parts, summarise_parts
@@ -428,3 +429,16 @@ def test_the_detectable_scale_is_found_nine_times_of_ten(freedom):
     lower = law.ppf(level / 2.0)
     up, down = law.sf(upper / (1.0 + size)), law.cdf(lower / (1.0 - size)) if size < 1.0 else 1.0
     assert min(up, down) == pytest.approx(0.9, abs=1e-6)
+
+
+def test_rows_of_ids_find_their_entities():
+    random = np.random.default_rng(1)
+    for shift, missing in ((0, -1), (1 << 50, 7)):
+        pairs = sorted({(int(i) + shift, int(j)) for i, j in random.integers(0, 9, (40, 2))})
+        entities = [pairs[k] for k in random.permutation(len(pairs))]
+        rows = random.integers(0, 12, (2, 500)) + np.array([[shift], [0]])
+        rows[:, ::50] = missing
+        known = {entity: k for k, entity in enumerate(entities)}
+        expected = [known.get((int(i), int(j)), -1) for i, j in rows.T]
+        np.testing.assert_array_equal(_places(entities, list(rows)), expected)
+    np.testing.assert_array_equal(_places([(3,), (9,)], [np.array([9, 4, 3])]), [1, -1, 0])
