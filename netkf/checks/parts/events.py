@@ -228,9 +228,9 @@ def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
 def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
     """Return the number of pairs of messages (K,) of one broadcast, and of those both lost."""
     order = np.lexsort((sends["node"], sends["phase"], sends["t"]))
-    group = sends[["t", "phase", "node"]][order]
-    begins = np.flatnonzero(np.append(True, group[1:] != group[:-1]) if len(group) else [])
-    sizes = np.diff(np.append(begins, len(group)))
+    changes = [np.diff(sends[name][order]) != 0 for name in ("t", "phase", "node")]
+    begins = np.flatnonzero(np.append(True, np.any(changes, axis=0)) if len(order) else [])
+    sizes = np.diff(np.append(begins, len(order)))
     gone = np.add.reduceat(is_lost[order].astype(np.int64), begins) if len(begins) else sizes
     return [np.array(float((k * (k - 1) // 2).sum())) for k in (sizes, gone)]
 
