@@ -194,7 +194,9 @@ def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    table = pd.read_csv(path, comment="#", dtype={"sender": str, "receiver": str})
+    table = pd.read_csv(
+        path, comment="#", dtype=dict.fromkeys(("sender", "receiver", "channel"), str)
+    )
     return table.drop_duplicates(KEY)
 
 

@@ -315,6 +315,7 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
     for (sender, to), rows in sends.groupby(["sender", "to"], sort=True):
         own = rows.sort_values("counter")
         counters, times = own["counter"].to_numpy(), own["t"].to_numpy()
+        channels = own["channel"].tolist()
         for k in np.flatnonzero(np.diff(counters) > 1).tolist():
             count = int(counters[k + 1] - counters[k])
             # A jump that the time does not explain is a counter that began again.
@@ -322,7 +323,8 @@ def _skipped(sends: pd.DataFrame, notes: list[str]) -> pd.DataFrame:
                 continue
             for j in range(1, count):
                 t = times[k] + (times[k + 1] - times[k]) * j / count
-                row = {"sender": sender, "t": round(t, 9), "channel": "", "to": to}
+                channel = channels[k] if channels[k] == channels[k + 1] else ""
+                row = {"sender": sender, "t": round(t, 9), "channel": channel, "to": to}
                 row |= {"counter": counters[k] + j, "sent": False, "logged": False}
                 found.append(row)
     if found:
