@@ -620,7 +620,8 @@ class DerivedScenario(ScenarioModel):
         without a state where the truth is recorded.
         """
         if self.plant.is_random or self.input_responses is None:
-            return np.asarray(x - local)
+            # A state that is not known has no coordinates but those of the filters.
+            return np.where(np.isnan(x), 0.0, x - local)
         believed = self.input_responses.believed
         return np.zeros(x.shape) if believed is None else believed.states(times)
 
