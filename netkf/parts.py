@@ -31,6 +31,7 @@ from netkf.algorithms.filter import (
     Reading,
     State,
 )
+from netkf.algorithms.gates import Gate
 from netkf.algorithms.gossip import Gossip
 from netkf.algorithms.hybrid import Hybrid
 from netkf.algorithms.information_consensus import Hcmci, Icf
@@ -189,6 +190,7 @@ __all__ = [
     "ExponentialDelay",
     "Filter",
     "Filtering",
+    "Gate",
     "Geometric",
     "GilbertElliott",
     "GmlGraph",

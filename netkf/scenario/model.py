@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.algorithms.filter import Filter
+from netkf.algorithms.gates import Gate
 from netkf.algorithms.kernels.maps import METHODS
 from netkf.core.errors import ScenarioError, TheoryError, errors_under
 from netkf.core.fields import (
@@ -127,6 +128,7 @@ class Filtering(Component):
                kappa = 0) or cubature
     estimates  with [[plants]], which blocks a node estimates: "all" (default), "own",
                "own+neighbours", "shared", or a list of names of blocks that it owns or shares
+    gate       which readings they refuse, as too far from what they expect
     """
 
     algorithm: Filter = field(instance_of(Filter))
@@ -140,6 +142,7 @@ class Filtering(Component):
     model: Belief = field(instance_of(Belief), default=Belief())
     linearise: str = field(one_of(*METHODS), default=METHODS[0])
     estimates: str | tuple[str, ...] = field(_estimates, default="all")
+    gate: Gate | None = field(instance_of(Gate), default=None)
 
 
 class PlacedSensor(NamedTuple):
@@ -357,8 +360,8 @@ class ScenarioModel(Component):
 
     @property
     def is_linear(self) -> bool:
-        """True if the dynamics and all readings are linear in the state."""
-        return self.plant.linear and self.has_linear_sensors
+        """True if the dynamics and all readings are linear in the state, and all are used."""
+        return self.plant.linear and self.has_linear_sensors and self.filter.gate is None
 
     @property
     def has_linear_sensors(self) -> bool:

@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from netkf.algorithms.filter import Filter
+from netkf.algorithms.gates import Gate
 from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
@@ -53,6 +54,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Channel, "loss"): {"$ref": "#/$defs/loss"},
     (Channel, "delay"): {"$ref": "#/$defs/delay"},
     (Filtering, "model"): {"$ref": "#/$defs/model"},
+    (Filtering, "gate"): {"$ref": "#/$defs/gate"},
     (Filter, "inner"): {"$ref": "#/$defs/filter"},
     (Contacts, "clock"): {"$ref": "#/$defs/activation"},
 }
@@ -105,6 +107,7 @@ def scenario_schema() -> Schema:
     definitions["block"] = _block_schema()
     definitions["network"] = _table_schema(list_keys(Network))
     definitions["channel"] = _table_schema(list_keys(Channel))
+    definitions["gate"] = _table_schema(list_keys(Gate))
     definitions["hopping"] = _table_schema(list_keys(Hopping))
     definitions["time"] = _table_schema(list_keys(Time))
     definitions["model"] = _table_schema(list_keys(Belief))

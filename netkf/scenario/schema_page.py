@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from netkf.algorithms.gates import Gate
 from netkf.core.fields import Component
 from netkf.network.channels import Channel
 from netkf.network.scheduled import Hopping
@@ -24,6 +25,7 @@ TABLES: dict[str, type[Component]] = {
     "network.channel.channels": Hopping,
     "filter, beside its kind": Filtering,
     "filter.model": Belief,
+    "filter.gate": Gate,
 }
 """Classes of the tables without a kind, by heading."""
 INNER = ((Filtering, "algorithm"), (Block, "plant"))

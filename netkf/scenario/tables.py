@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from netkf.algorithms.gates import Gate
 from netkf.core.contracts import ContractError, is_netkf_class, place_of_error
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
@@ -37,7 +38,7 @@ UNKNOWN = "is not a key here"
 TABLES = ("plant", "network", "filter")
 BLOCK_KEYS = ("name", "nodes", "coupling", "position", "means")
 """Keys in one of [[plants]], beside those of its plant."""
-FILTERING_KEYS = ("mean", "cov", "model", "linearise", "estimates")
+FILTERING_KEYS = ("mean", "cov", "model", "linearise", "estimates", "gate")
 """Keys of the table of a filter, beside those of its kind."""
 
 NOT_IMPORTED = object()
@@ -391,6 +392,9 @@ def _build_channel(origin: Origin, value: Any) -> Any:
 def _build_filtering(origin: Origin, value: Any) -> Any:
     table = _as_dict(value)
     values = {key: table.pop(key) for key in FILTERING_KEYS if key in table}
-    values = _build_inner(values, {"model": partial(_build_table, Belief, origin)})
+    tables = {"model": Belief, "gate": Gate}
+    values = _build_inner(
+        values, {key: partial(_build_table, cls, origin) for key, cls in tables.items()}
+    )
     algorithm = _build_component("filter", origin, table)
     return _build_object(Filtering, {"algorithm": algorithm, **values}, origin)

@@ -330,6 +330,7 @@ def _identify(scenario: Scenario, node: int, entity: int) -> tuple[Any, ...]:
         scenario.node_infos[entity],
         spread_of(scenario.filter.linearise, scenario.plant.n if view is None else len(view)),
         None if view is None else View(view, scenario.layout.places, common),
+        scenario.filter.gate,
     )
 
 

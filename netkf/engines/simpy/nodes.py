@@ -19,6 +19,7 @@ from netkf.algorithms.filter import (
     Reading,
     interval_rule,
 )
+from netkf.algorithms.gates import Gate
 from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
 from netkf.algorithms.models import ChangingFlowModel, MapModel, RateModel, first_root
@@ -33,7 +34,7 @@ from netkf.plants.readings import Stacked
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
-SENSE, ABSORB = CODES["sense"], CODES["absorb"]
+SENSE, ABSORB, REFUSE = CODES["sense"], CODES["absorb"], CODES["refuse"]
 Sample = tuple[FloatArray, Any, FloatArray]
 """A sample y (p,), its H (p, n), or a function that linearises it, and R (p, p)."""
 
@@ -182,13 +183,14 @@ class Node:
         info: NodeInfo,
         points: Spread,
         view: View | None = None,
+        gate: Gate | None = None,
     ) -> None:
         """Set up the filter with its ``model`` and its estimate ``start`` = (xhat (n,), P (n, n))
         at time 0, and an empty inbox; ``node`` is an id, ``entity`` an index, ``points`` are those
         by which nonlinear sensors are linearised, and ``view`` says which states it estimates, if
         not all.
         """
-        self._points, self.view = points, view
+        self._points, self.view, self._gate = points, view, gate
         self.node, self.entity, self.info, self.model = node, entity, info, model
         self.width = len(model.information) if view is None else len(view.entries)
         self.moving_model = model.undriven if isinstance(model, DrivenModel) else model
@@ -268,6 +270,23 @@ class Node:
         y, H, extra = linearise_by_points(stacked, y, xhat, root, self._points)
         linear = [sample for sample in samples if isinstance(sample[1], np.ndarray)]
         return [*linear, (y, H, block_diagonal([R for *_, R in functions]) + extra)]
+
+    def gated(self, samples: Sequence[Sample]) -> tuple[Sequence[Sample], int]:
+        """Return the linearised samples that the gate lets pass, with the R that it gives them, and
+        how many it refused; entries of a sample that are nan do not count.
+        """
+        if self._gate is None or not samples:
+            return samples, 0
+        xhat, P = self.algorithm.estimate(self.state)
+        passed, refused = [], 0
+        for y, H, R in samples:
+            present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
+            z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
+            factor = self._gate.factor(z, J @ P @ J.T, C)
+            refused += factor != 1.0
+            if np.isfinite(factor):
+                passed.append((y, H, factor * R))
+        return passed, refused
 
     def shift(self, offset: FloatArray) -> None:
         """Add ``offset`` (n,) to the estimate, after the origin of the coordinates has moved."""
@@ -367,7 +386,10 @@ class ClockedNode(Node):
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
-        known = self.linearise([sample[1:] for sample in samples])
+        known, refused = self.gated(self.linearise([sample[1:] for sample in samples]))
+        rows = refused * [(time, REFUSE, self.node, -1, -1, -1, NAN)]
+        for row in rows:
+            self._recorder.append(row)
         nothing = np.empty(0), np.empty((0, self.width))
         y, H = (
             np.concatenate([nothing[part], *(sample[part] for sample in known)])
