@@ -19,15 +19,17 @@ import numpy as np
 from netkf.algorithms.filter import Filter, NodeInfo
 from netkf.algorithms.kernels.constant_gains import correct_by_moments
 from netkf.algorithms.kernels.estimates import copy_vector, transform_root
+from netkf.algorithms.kernels.gains import stack_gains
 from netkf.algorithms.kernels.neighbours import combine_convex
-from netkf.algorithms.kernels.root_flow import (
-    FlowScratch,
-    FlowTable,
-    flow_scratch,
-    propagate_root,
-    stack_tables,
+from netkf.algorithms.kernels.root_flow import FlowTable, stack_tables
+from netkf.algorithms.kernels.run import (
+    ClockTables,
+    carry_mean,
+    clock_tables,
+    move,
+    predict_estimate,
+    usable,
 )
-from netkf.algorithms.kernels.run import carry_mean, predict_estimate, usable
 from netkf.algorithms.kernels.square_root import lower_root
 from netkf.algorithms.models import FlowModel
 from netkf.algorithms.records import Kernels, Record
@@ -35,7 +37,7 @@ from netkf.algorithms.registry import built_in
 from netkf.algorithms.traits import Analysis, Needs
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import SourceFile, either, field, has_depth, list_of, matrix
-from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.compiling import kernel
 from netkf.linalg.generic import drop_lane
 from netkf.linalg.lanes import load, store
@@ -48,8 +50,8 @@ class ClosedLoops(Struct):
     A : the plant (n, n)
     L, H : gains (H, n, p) and rows (H, p, n)
     closed, rate : A - L H (H, n, n), and the rate (H,) in 1/s at which its error changes
-    table, models : A - L H tabulated, and the row (H,) of each node in it, -1: no increments
-    scratch, maps : scratch of predictions, and (6, n, n)
+    tables : A - L H tabulated, and in ``models`` the row (H,) of each node, -1: no increments
+    maps : scratch (6, n, n)
     """
 
     A: FloatArray
@@ -57,9 +59,7 @@ class ClosedLoops(Struct):
     H: FloatArray
     closed: FloatArray
     rate: FloatArray
-    table: FlowTable
-    models: IntArray
-    scratch: FlowScratch
+    tables: ClockTables
     maps: FloatArray
 
 
@@ -90,14 +90,14 @@ def predict_closed_loop(record: Any, h: int, run: Any) -> None:
     """Predict node ``h``: with increments the estimate moves open loop, and P by ``A - L H``, which
     counts their noise already.
     """
-    loops = record.loops
-    if loops.models[h] < 0:
+    tables = record.loops.tables
+    if tables.models[h] < 0:
         predict_estimate(run.model, run, record.xhat, record.root, h, h)
         return
     copy_vector(run.lanes, run.size, record.mean, 0, record.xhat, h, True)
     carry_mean(run.model, run, record.mean, 0, run.gap)
     root, x = drop_lane(record.root), drop_lane(record.xhat)
-    propagate_root(loops.table, loops.models[h], root, x, h, run.gap, loops.scratch)
+    move(tables, run, tables.models[h], root, x, h, run.gap)
     copy_vector(run.lanes, run.size, record.xhat, h, record.mean, 0, True)
 
 
@@ -257,9 +257,7 @@ def _closed_loops(models: Sequence[FlowModel], gains: Sequence[FloatArray]) -> C
         H=H,
         closed=closed,
         rate=rate,
-        table=table,
-        models=rows,
-        scratch=flow_scratch(table),
+        tables=clock_tables(np.zeros(n), table, rows, stack_gains([models[0].gains])),
         maps=np.zeros((6, n, n)),
     )
 
