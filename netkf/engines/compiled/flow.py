@@ -50,6 +50,7 @@ from netkf.engines.compiled.state import (
 from netkf.engines.compiled.ticks import Schedule
 from netkf.engines.compiled.truth import PathStates
 from netkf.engines.compiled.visits import Visits, empty_visits
+from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
 from netkf.plants.driven import DrivenTruth
@@ -179,6 +180,16 @@ class Workspace:
             self._visits = empty_visits(self._start, weights, capacity, series)
         return self._visits
 
+    def _begin_estimates(self, instants: Instants, together: int) -> tuple[FloatArray, FloatArray]:
+        if self.clocked is not None:
+            self.clocked.begin(instants)
+            return self.clocked.estimates
+        nodes, n = self._start.xhat.shape
+        xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
+        xhat[:] = np.tile(self._start.xhat, (together, 1))
+        root[:] = np.tile(self._start.root, (together, 1, 1))
+        return xhat, root
+
     def begin(
         self, draws: Any, traced: bool, buffer: SampleBuffer | None = None, together: int = 1
     ) -> Simulation:
@@ -199,21 +210,15 @@ class Workspace:
                 start.table, start.gains, self._unrolled, self._scenario.plant.n
             )
         scratch, flow_arrays = self._scratch
-        nodes, n = start.xhat.shape
-        if self.clocked is not None:
-            self.clocked.begin(instants)
-            xhat, root = self.clocked.estimates
-        else:
-            xhat, root = with_spare((together * nodes, n)), with_spare((together * nodes, n, n))
-            xhat[:] = np.tile(start.xhat, (together, 1))
-            root[:] = np.tile(start.root, (together, 1, 1))
+        n = start.xhat.shape[1]
+        xhat, root = self._begin_estimates(instants, together)
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
             plant=sized(n) if self._unrolled else np.zeros(self._scenario.plant.n),
             nodes=start.nodes.copy(),
             xhat=xhat,
             root=root,
-            now=np.zeros(together * nodes),
+            now=np.zeros(len(xhat)),
             table=start.table,
             gains=start.gains,
             entities=entities,
