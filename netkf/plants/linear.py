@@ -156,8 +156,10 @@ class LinearPath:
         frame_slots: int | None = None,
         changes: Mapping[int, tuple[FloatArray, FloatArray]] = MappingProxyType({}),
     ) -> None:
-        self._F, self._root, self._noise = F, root, Blocks(random, root.shape[1])
+        self._F, self._root, self._random = F, root, random
         self._changes = changes
+        # Normals drawn at once, the noises that they give, and how many slots have had theirs.
+        self._normals, self._noises, self._used = np.zeros((0, root.shape[1])), root[:0], 0
         self.frame_slots = frame_slots
         # The present slot, its local state and the origin of that, both before a rebase.
         self._slot, self._x, self._origin = 0, start, np.zeros(len(start))
@@ -169,12 +171,17 @@ class LinearPath:
             for k in range(self._slot, slot):
                 if k in self._changes:
                     self._F, self._root = self._changes[k]
+                    self._noises = apply(self._root, self._normals)
                 # The origin moves to the state where a frame begins.
                 if self.frame_slots and k and k % self.frame_slots == 0:
                     self._origin, self._x = self._origin + self._x, np.zeros(len(self._x))
-                self._x = apply(self._F, self._x) + apply(self._root, self._noise.draw())
+                if self._used == len(self._noises):
+                    self._normals = self._random.standard_normal((BLOCK, self._root.shape[1]))
+                    self._noises, self._used = apply(self._root, self._normals), 0
+                self._x = apply(self._F, self._x) + self._noises[self._used]
+                self._used += 1
                 # An origin at 0 stays there.
-                if self._origin.any():
+                if self.frame_slots and self._origin.any():
                     self._origin = apply(self._F, self._origin)
         self._slot = slot
 
