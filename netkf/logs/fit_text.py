@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+
+import pandas as pd
 
 from netkf.logs.fitting import LogFit
 from netkf.runs.tables import format_number, format_table, shorten_rows
 
 MAX_LINKS = 12
+LINKS = {
+    **{name: name for name in ("link", "packets", "heard", "unknown")},
+    "delivery_probability": "delivery",
+    **{"low": "low", "high": "high", "mean_burst": "mean burst"},
+}
+TESTS = {
+    **{name: name for name in ("assumption", "departure", "estimate", "detectable", "p")},
+    **{"verdict": "verdict", "law": "law without it"},
+}
+LAWS = {
+    **{"law": "law", "parameters": "parameters", "log_likelihood": "log-likelihood", "bic": "BIC"},
+    "rejected_by": "rejected: not true that",
+}
+ENVELOPE = {name: name for name in ("law", "quantity", "replay", "low", "median", "high", "p", "")}
+"""Headings of the columns of each table."""
 
 
 def format_fit(fit: LogFit) -> str:
@@ -16,64 +33,28 @@ def format_fit(fit: LogFit) -> str:
 
 
 def _lines(fit: LogFit) -> Iterator[str]:
-    worst = fit.links.sort_values("delivery_probability", kind="stable")
-    columns = ("packets", "heard", "unknown", "delivery_probability", "low", "high", "mean_burst")
-    header = ["link", "packets", "heard", "unknown", "delivery", "low", "high", "mean burst"]
-    rows = [
-        [f"{row['sender']} -> {row['receiver']}", *(format_number(row[c]) for c in columns)]
-        for row in worst.to_dict("records")
-    ]
-    yield format_table(header, shorten_rows(rows, MAX_LINKS), 1)
-    yield ""
-    header = ["assumption", "departure", "estimate", "detectable", "p", "verdict", "law without it"]
-    cells = [
-        [
-            row["assumption"],
-            row["departure"],
-            *(format_number(row[c]) for c in ("estimate", "detectable", "p")),
-            row["verdict"],
-            row["made_by"] if row["verdict"] == "rejected" else "",
-        ]
-        for row in fit.tests.to_dict("records")
-    ]
-    yield format_table(header, cells, 2)
-    yield ""
-    header = ["law", "parameters", "log-likelihood", "BIC", "rejected: not true that"]
-    cells = [
-        [
-            row["law"],
-            row["parameters"],
-            f"{row['log_likelihood']:.1f}",
-            f"{row['bic']:.1f}",
-            row["rejected_by"] or "-",
-        ]
-        for row in fit.laws.to_dict("records")
-    ]
-    yield format_table(header, cells, 2)
+    links = fit.links.sort_values("delivery_probability", kind="stable")
+    yield _text(links.assign(link=links["sender"] + " -> " + links["receiver"]), LINKS, 1)
+    made_by = fit.tests["made_by"].where(fit.tests["verdict"] == "rejected", "")
+    yield _text(fit.tests.assign(law=made_by), TESTS, 2)
+    yield _text(fit.laws.assign(rejected_by=fit.laws["rejected_by"].replace("", "-")), LAWS, 2)
     if len(fit.envelope):
+        mark = fit.envelope["inside"].map({True: "", False: "OUTSIDE"})
+        yield _text(fit.envelope.assign(**{"": mark}), ENVELOPE, 2)
+        for law, rows in fit.envelope.groupby("law", sort=False):
+            outside = ", ".join(rows["quantity"][~rows["inside"]])
+            fails = f"{law} fails: it does not make the replay's {outside}"
+            yield fails if outside else f"{law}: the replay lies in its envelope"
         yield ""
-        yield from _envelope_lines(fit)
-    yield ""
     yield from (f"note: {note}" for note in fit.notes)
     yield f"written: {', '.join(str(path) for path in fit.scenarios.values())}"
 
 
-def _envelope_lines(fit: LogFit) -> Iterator[str]:
-    header = ["law", "quantity", "replay", "low", "median", "high", "p", ""]
-    rows = [
-        [
-            row["law"],
-            row["quantity"],
-            *(format_number(row[c]) for c in ("replay", "low", "median", "high", "p")),
-            "" if row["inside"] else "OUTSIDE",
-        ]
-        for row in fit.envelope.to_dict("records")
+def _text(table: pd.DataFrame, headings: Mapping[str, str], left: int) -> str:
+    """Return the columns of a table with these headings as text, and an empty line."""
+    cells = [
+        [value if isinstance(value, str) else format_number(value) for value in row]
+        for row in table[[*headings]].to_numpy().tolist()
     ]
-    yield format_table(header, rows, 2)
-    yield ""
-    for law, rows_of_law in fit.envelope.groupby("law", sort=False):
-        outside = rows_of_law["quantity"][~rows_of_law["inside"]]
-        if len(outside):
-            yield f"{law} fails: it does not make the replay's {', '.join(outside)}"
-        else:
-            yield f"{law}: the replay lies in its envelope"
+    rows = shorten_rows(cells, MAX_LINKS) if headings is LINKS else cells
+    return format_table([*headings.values()], rows, left) + "\n"

@@ -283,22 +283,23 @@ def _direction_test(outcomes: Outcomes, counts: FloatArray, slack: float) -> dic
 
 
 def _test_table(tests: Mapping[str, Test], level: float) -> pd.DataFrame:
+    columns = [
+        "key",
+        "assumption",
+        "departure",
+        "estimate",
+        "detectable",
+        "p",
+        "verdict",
+        "made_by",
+    ]
     rows = []
     for key, test in tests.items():
         verdict = "rejected" if test.p < level else "not rejected"
-        rows.append(
-            {
-                "key": key,
-                "assumption": ASSUMPTIONS[key],
-                "departure": test.what,
-                "estimate": test.estimate,
-                "detectable": test.detectable(level),
-                "p": test.p,
-                "verdict": verdict if np.isfinite(test.p) else "not tested",
-                "made_by": MAKERS[key],
-            }
-        )
-    return pd.DataFrame(rows)
+        verdict = verdict if np.isfinite(test.p) else "not tested"
+        told = (test.what, test.estimate, test.detectable(level), test.p)
+        rows.append((key, ASSUMPTIONS[key], *told, verdict, MAKERS[key]))
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _distances(scenario: Scenario, outcomes: Outcomes) -> FloatArray | None:
@@ -399,18 +400,11 @@ def _likelihood(heard: Any, count: Any) -> float:
 def _law_table(laws: list[Law], rejected: set[str], count: int) -> pd.DataFrame:
     rows = []
     for law in laws:
-        failed = [ASSUMPTIONS[key] for key in NEEDS[law.kind] if key in rejected]
-        size = len(law.values)
-        rows.append(
-            {
-                "law": law.kind,
-                "parameters": law.describe(),
-                "log_likelihood": law.likelihood,
-                "bic": size * math.log(count) - 2.0 * law.likelihood,
-                "rejected_by": "; ".join(failed),
-            }
-        )
-    return pd.DataFrame(rows)
+        failed = "; ".join(ASSUMPTIONS[key] for key in NEEDS[law.kind] if key in rejected)
+        bic = len(law.values) * math.log(count) - 2.0 * law.likelihood
+        rows.append((law.kind, law.describe(), law.likelihood, bic, failed))
+    columns = ["law", "parameters", "log_likelihood", "bic", "rejected_by"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _delay_table(scenario: Scenario, notes: list[str]) -> dict[str, Any]:

@@ -134,6 +134,9 @@ def _read_rows(path: Path, notes: list[str]) -> _Rows:
         raw["sender"] = own.where(is_tx, other)
         raw["receiver"] = pd.Series(other, index=raw.index).where(is_tx, own)
         names |= {"sender": "sender", "receiver": "receiver"}
+    elif names["node"] and not (names["sender"] and names["receiver"]):
+        # The node whose log it is: of what it sent, or of what it heard from a sender.
+        names["receiver" if names["sender"] else "sender"] = names["node"]
     for name in ("t", "sender"):
         if not names[name]:
             rule = f"must have a column {name} ({', '.join(SYNONYMS[name])})"

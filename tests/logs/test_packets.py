@@ -103,6 +103,13 @@ def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
     accounts = table(tmp_path / "events", "accounts.csv")
     assert accounts[["sent", "heard", "lost"]].to_numpy().tolist() == [[2, 1, 1], [2, 1, 1]]
     assert table(tmp_path / "events", "transmissions.csv")["t"].tolist() == [1.0, 2.0]
+    (tmp_path / "tables").mkdir()
+    write(tmp_path / "tables" / "sent.csv", ["t,node,seq", "1,a,0", "2,a,1", "3,a,2"])
+    write(tmp_path / "tables" / "heard.csv", ["t,node,src,seq", "1.1,b,a,0", "3.2,b,a,2"])
+    netkf.import_log(tmp_path / "tables", "csv", tmp_path / "joined")
+    assert table(tmp_path / "joined", "accounts.csv").to_numpy().tolist() == [
+        ["a", "b", 3, 2, 1, 0]
+    ]
     two = write(tmp_path / "two.csv", [*told, "1000,1,2,0,0"])
     assert main(["import", str(two), "--kind", "csv", "--out", str(tmp_path / "no")]) == 2
     error = capsys.readouterr().err
