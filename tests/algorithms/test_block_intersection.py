@@ -403,3 +403,9 @@ def test_late_estimates_of_neighbours_are_used_and_none_is_below_the_truth(tmp_p
         for least in (exact[:, k, :n, :n], central.P[:, 0][:, view][:, :, view]):
             assert np.linalg.eigvalsh(P - least).min() > -1e-9
         assert np.trace(P[-1]) < np.trace(alone.P[-1, k, :n, :n]) * (0.9 if k == 2 else 1.0)
+
+
+def test_the_naive_rule_says_that_P_is_too_small(tmp_path: Path) -> None:
+    (note,) = load(ROBOTS, tmp_path, filter__rule="naive").notes
+    assert "P is overconfident" in note
+    assert load(ROBOTS, tmp_path).notes == ()
