@@ -199,7 +199,7 @@ def test_a_fit_writes_laws_that_run_and_says_what_fails(tmp_path, capsys):
     assert all(row["replay"] == outcomes["delivered"].sum() for row in heard)
     assert all(row["p"] > 0.1 for row in heard)
     for path in document["scenarios"].values():
-        run = netkf.simulate(netkf.load(path))
+        run = netkf.simulate(netkf.load(path), engine="simpy")
         assert (run.events["kind"] == "send").sum() == len(outcomes)
     assert any("too few runs" in note for note in document["notes"])
 

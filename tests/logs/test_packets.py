@@ -63,7 +63,7 @@ def test_a_log_of_receptions_with_short_numbers_and_coarse_stamps_balances(tmp_p
     sent = table(out, "transmissions.csv")
     assert not sent.duplicated().any()  # none is merged
     assert set(sent.groupby("node").size()) <= {299, 300}  # the last may be heard by nobody
-    run = netkf.simulate(netkf.load(out / "scenario.toml"))
+    run = netkf.simulate(netkf.load(out / "scenario.toml"), engine="simpy")
     kinds = run.events["kind"].value_counts()
     assert kinds["send"] == accounts["sent"].sum()
     assert kinds["deliver"] == sum(heard.values())
