@@ -392,7 +392,11 @@ COMMANDS = (
         "fit laws of losses to a recorded network, and look for its replay among their runs",
         (
             _option("directory", "folder that import wrote", type=Path, metavar="DIR"),
-            _runs("runs of each law, with parameters drawn from their posterior", 200),
+            _runs(
+                "runs of each law, with parameters drawn from their posterior (default: 200, or "
+                "fewer if these take minutes)",
+                None,
+            ),
             _flag("--no-runs", "estimates and tests only"),
             _confidence(0.95, "that all intervals of links hold, and that no test is wrong"),
             POOL[0],

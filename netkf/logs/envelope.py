@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import time
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy.sparse.csgraph import connected_components
+from scipy.stats import t as student_t
 
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate
@@ -18,6 +21,8 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.messages import DELIVERED, by_link, join_messages
 from netkf.trace.run import Run
 
+COLUMNS = ["law", "quantity", "replay", "low", "median", "high", "p", "inside", "runs"]
+RUNS, FEW_RUNS, BUDGET = 200, 20, 180.0
 RECENT = 5.0
 """A link is up while its last packet heard is no older than so many intervals of its sender."""
 STREAM = 0x6C617773
@@ -114,18 +119,25 @@ def compare_with_laws(
     scenario: Scenario,
     laws: list[Law],
     delay: dict[str, Any],
-    runs: int,
+    runs: int | None,
     confidence: float,
     pool: PoolOptions,
     progress: Progress | None,
 ) -> pd.DataFrame:
     """Return a row for each law and quantity: the value of the replay, which is replica 0, and the
-    range of ``runs`` runs of the law, replicas 1 to ``runs``, whose parameters are drawn anew.
+    range of ``runs`` runs of the law, replicas 1 to ``runs``, whose parameters are drawn anew; by
+    default as many as take about BUDGET seconds, RUNS at most.
 
     If a law is true its runs and the replay are exchangeable: p is twice the smaller rank of the
-    replay among all of them, over their number. Ranges and verdicts of a law hold together.
+    replay among all of them, over their number. Where so few runs can reject nothing by ranks, p is
+    by Student's t, as of a normal quantity. Ranges and verdicts of a law hold together.
     """
+    simulate(scenario, scenario.seed, 0)  # what is compiled, or read, is so once
+    begin = time.perf_counter()
     replay = measure_run(scenario, simulate(scenario, scenario.seed, 0))
+    if runs is None:
+        affordable = BUDGET / (time.perf_counter() - begin) / len(laws)
+        runs = int(min(max(affordable, FEW_RUNS), RUNS))
     level = (1.0 - confidence) / len(replay)
     rows = []
     for number, law in enumerate(laws):
@@ -140,10 +152,14 @@ def compare_with_laws(
             drawn = np.array([one[name] for one in found])
             rank = 1 + min(int((drawn <= value).sum()), int((drawn >= value).sum()))
             low, median, high = np.quantile(drawn, [level / 2, 0.5, 1.0 - level / 2])
-            p = min(1.0, 2.0 * rank / (runs + 1))
-            row = {"law": law.kind, "quantity": name, "replay": value, "low": low, "median": median}
-            rows.append({**row, "high": high, "p": p, "inside": p >= level})
-    return pd.DataFrame(rows)
+            p, spread = min(1.0, 2.0 * rank / (runs + 1)), float(drawn.std(ddof=runs > 1))
+            if 2.0 / (runs + 1) > level and spread > 1e-9 * abs(value):
+                off = (value - drawn.mean()) / (spread * math.sqrt(1.0 + 1.0 / runs))
+                p = 2.0 * float(student_t.sf(abs(off), runs - 1))
+                half = spread * float(student_t.isf(level / 2, runs - 1))
+                low, high = drawn.mean() - half, drawn.mean() + half
+            rows.append((law.kind, name, value, low, median, high, p, p >= level, runs))
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def law_run(

@@ -100,7 +100,7 @@ class LogFit(NotebookTable):
 
 def fit_log(
     directory: str | Path,
-    runs: int = 200,
+    runs: int | None = None,
     *,
     confidence: float = 0.95,
     trust: bool = True,
@@ -111,8 +111,9 @@ def fit_log(
     and write ``fit_links.csv``, ``fit_tests.csv``, ``fit_laws.csv``, ``fit_envelope.csv`` and a
     scenario of each law beside its scenario.toml.
 
-    runs       : of each law, in which the replay is looked for; 0 for none. Each run draws the
-                 parameters of its law from their posterior
+    runs       : of each law, in which the replay is looked for; 0 for none, by default 200, or
+                 fewer where these take long. Each draws the parameters of its law from their
+                 posterior
     confidence : with which all intervals of links hold together, and none of the tests rejects
                  what is true
     Raises ScenarioError unless the scenario's loss is recorded.
@@ -146,13 +147,14 @@ def fit_log(
             "of it lasts to the next transmission (slow changes, or shared bursts)"
         )
     envelope, delay = pd.DataFrame(), _delay_table(scenario, notes)
-    if runs:
+    if runs is None or runs > 0:
         replay = _complete_replay(folder, scenario, table, links, notes)
         pool = PoolOptions(workers=workers)
         envelope = compare_with_laws(replay, laws, delay, runs, confidence, pool, progress)
-        need = math.ceil(2.0 * envelope["quantity"].nunique() / (1.0 - confidence))
-        if runs < need - 1:
-            notes.append(f"too few runs to put the replay outside an envelope: it takes {need - 1}")
+        runs = int(envelope["runs"].iloc[0])
+        need = math.ceil(2.0 * envelope["quantity"].nunique() / (1.0 - confidence)) - 1
+        if runs < need:
+            notes.append(f"{runs} runs of each law: p by Student's t, since ranks take {need}")
     scenarios = _write(folder, scenario, (links, test_table, law_table, envelope), laws, delay)
     fields = (links, test_table, law_table, envelope, confidence, tuple(notes), scenarios)
     return LogFit(scenario, *fields)
