@@ -99,6 +99,7 @@ from netkf.network.losses import (
     Transmission,
 )
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
+from netkf.network.radio import Radio
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.network.scheduled import Hopping, ScheduledLoss
 from netkf.plants.blocks import Block
@@ -240,6 +241,7 @@ __all__ = [
     "Plant",
     "Poisson",
     "PushSum",
+    "Radio",
     "RangeBearingSensor",
     "RangeGraph",
     "RangeSensor",

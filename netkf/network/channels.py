@@ -59,13 +59,19 @@ class Channel(Component):
         """Return the fraction of messages that arrive in the long run on the link of ``sent``, its
         message 0 at time 0; nan if it is unknown before a run.
         """
+        if sent.frames > 1 and (self.loss.stateful or self.channels is not None):
+            return math.nan
         factor = 1.0 if self.channels is None else self.channels.mean(sent.link)
-        return self.loss.mean_delivery(sent) * factor
+        mean: float = (self.loss.mean_delivery(sent) * factor) ** sent.frames
+        return mean
 
     def deliveries(self, sent: Transmission) -> FloatArray:
         """Return the probabilities (K,) that K messages ``sent`` on one link arrive."""
         values = delivery_probabilities(self.loss, sent)
-        return values if self.channels is None else values * self.channels.delivery(sent)
+        if self.channels is not None:
+            values = values * self.channels.delivery(sent)
+        # With one number: all of k independent frames arrive with the k-th power.
+        return values if sent.frames == 1 else np.asarray(values**sent.frames)
 
 
 class BroadcastDraw(NamedTuple):
@@ -279,6 +285,6 @@ def transit_time(channel: Channel, sent: Transmission, draw: ChannelDraw) -> flo
     delivery = checked_delivery_probability(channel.loss, sent)
     if channel.channels is not None:
         delivery *= channel.channels.delivery(sent)
-    if draw.uniform >= delivery:
+    if draw.uniform >= delivery**sent.frames:
         return math.nan
     return checked_delay(channel.delay, sent, draw.delay)

@@ -44,7 +44,8 @@ class Transmission(NamedTuple):
     table_probability : entry of the graph's table for that direction, 1 without one
     distance : of the two nodes; nan unless the loss follows it
     hearers : ids of all nodes that the sender reaches with this transmission
-    size : bytes of the payload, nan if they are not known beforehand
+    size : bytes of the payload
+    frames : number of frames of the message, all of which must arrive
     conditions : what ``Loss.conditions`` has drawn for this run
 
     Of K messages on one link ``number``, ``time``, ``bad`` and ``distance`` are arrays (K,).
@@ -58,6 +59,7 @@ class Transmission(NamedTuple):
     distance: Any = math.nan
     hearers: tuple[int, ...] = ()
     size: float = math.nan
+    frames: int = 1
     conditions: Any = None
 
 

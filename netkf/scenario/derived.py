@@ -358,7 +358,7 @@ class DerivedScenario(ScenarioModel):
         for sender, receiver in self.topology.directions:
             receiver_counts[sender] += 1
             senders[receiver].append(sender)
-        max_delay = 0.0 if self.slotted else self.network.channel.delay.longest
+        max_delay = 0.0 if self.slotted else self.longest_delay
         degrees, own_weights, network = self.topology.degrees, self.own_weights, self._network_info
         rows = [
             sum(self.most_rows(node, placed) for placed in sensors)

@@ -47,6 +47,7 @@ from netkf.network.lives import Life
 from netkf.network.losses import Transmission
 from netkf.network.matchings import SlotActivation
 from netkf.network.positions import Positions, PositionTable
+from netkf.network.radio import Radio
 from netkf.plants.blocks import Block, Layout, stack
 from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor
@@ -69,6 +70,7 @@ class Network(Component):
     activation  when links, directions or nodes send; only filters that do not talk need none
     channel     losses and delays of messages
     lives       when nodes are down: crashes, duty cycles, tables; others are always up
+    radio       how long nodes send a message, and in how many frames
     """
 
     graph: Graph = field(graph_rule)
@@ -78,6 +80,7 @@ class Network(Component):
     channel: Channel = field(instance_of(Channel), default=Channel())
     positions: SourceFile | None = field(source_file, default=None)
     lives: tuple[Life, ...] = field(list_of(instance_of(Life), "lives", min_length=0), default=())
+    radio: Radio | None = field(instance_of(Radio), default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,8 +348,12 @@ class ScenarioModel(Component):
 
     @property
     def network_changes(self) -> bool:
-        """True if it changes in a run who can hear whom, or how well: nodes move or are down."""
-        return self.links_move or bool(self.network.lives)
+        """True if it changes in a run who can hear whom, when or how well: nodes move or are down,
+        or messages wait for each other.
+        """
+        radio = self.network.radio
+        busy = radio is not None and radio.bits_per_second is not None
+        return self.links_move or bool(self.network.lives) or busy
 
     @property
     def links_follow_state(self) -> bool:
@@ -494,7 +501,30 @@ class ScenarioModel(Component):
         if self.network.channel.loss.follows_distance and not self.positions.moving:
             distance = self.positions.distance(link)
         table = 1.0 if delivery is None else delivery.get(link, 0.0)
-        return Transmission(link, table_probability=table, distance=distance)
+        size = self.message_size(link[0], 0 if self.slotted else -1)
+        frames = 1 if self.network.radio is None else self.network.radio.frames(size)
+        hearers = self._hearers[link[0]] if self.has_broadcasts else link[1:]
+        return Transmission(
+            link, table_probability=table, distance=distance, hearers=hearers, size=size,
+            frames=frames,
+        )  # fmt: skip
+
+    @cached_property
+    def _hearers(self) -> dict[int, tuple[int, ...]]:
+        found: dict[int, tuple[int, ...]] = {}
+        for sender, receiver in self.topology.directions:
+            found[sender] = (*found.get(sender, ()), receiver)
+        return found
+
+    def message_size(self, node: int, phase: int) -> float:
+        """Return the bytes of a message that ``node`` (id) sends in an exchange number ``phase`` of
+        a slot, -1 under clocks.
+        """
+        radio, index = self.network.radio or Radio(), self.topology.index[node]
+        # Some filters send their readings.
+        rows = sum(len(self.sensors[p.entry].R) for p in self.placed_sensors.get(node, ()))
+        numbers = self.node_filter.analysis.payload_numbers(int(self.sizes[index]), rows, phase)
+        return float(radio.bytes_per_number * numbers)
 
     @property
     def has_broadcasts(self) -> bool:
@@ -503,11 +533,27 @@ class ScenarioModel(Component):
             return not self.node_filter.timing.pairwise
         return getattr(self.network.activation, "at", "links") in ("nodes", "readings")
 
+    @property
+    def longest_delay(self) -> float:
+        """The largest number of seconds that a message may take; inf if there is no bound."""
+        radio, longest = self.network.radio, float(self.network.channel.delay.longest)
+        if radio is None or radio.bits_per_second is None:
+            return longest
+        if radio.queue == "wait":
+            return math.inf
+        phases = range((self.node_filter.timing.schedule or ()).count("exchange"))
+        largest = max(
+            self.message_size(node, phase)
+            for node in self.nodes
+            for phase in (phases if self.slotted else (-1,))
+        )
+        return longest + radio.seconds(largest)
+
     def mean_delivery(self, link: Link) -> float:
         """Return the fraction of messages of a directed link that arrive in the long run, nan if it
         is unknown before a run.
         """
-        if self.topology.radius is not None or self.network.lives:
+        if self.topology.radius is not None or self.network_changes:
             return math.nan
         return self.network.channel.mean_delivery(self.transmission(link))
 

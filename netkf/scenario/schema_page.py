@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from netkf.algorithms.gates import Gate
 from netkf.core.fields import Component
 from netkf.network.channels import Channel
+from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.scenario.model import Belief, Filtering, Network
@@ -23,6 +24,7 @@ TABLES: dict[str, type[Component]] = {
     "network": Network,
     "network.channel": Channel,
     "network.channel.channels": Hopping,
+    "network.radio": Radio,
     "filter, beside its kind": Filtering,
     "filter.model": Belief,
     "filter.gate": Gate,

@@ -21,6 +21,7 @@ from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
+from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
 from netkf.plants.states import state_file
@@ -353,6 +354,7 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
         "activation": partial(_build_activation, origin, time),
         "channel": partial(_build_channel, origin),
         "lives": partial(_build_lives, origin),
+        "radio": partial(_build_table, Radio, origin),
     }
     return _build_object(Network, _build_inner(_as_dict(value), builders), origin)
 

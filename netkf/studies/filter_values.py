@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -19,8 +20,6 @@ from netkf.trace.batch import RunBatch
 from netkf.trace.nees import without_padding
 from netkf.trace.schema import CODES
 
-BYTES = 8
-"""Bytes of a number in a message."""
 ROUNDING = 1e-9
 """Relative difference up to which two filters count as equal."""
 
@@ -87,19 +86,10 @@ def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
         sent = np.unique(sent[["t", "phase", "node"]])
     elif (log["kind"] == CODES["transmit"]).any():
         sent = log[log["kind"] == CODES["transmit"]]
-    # Number of readings of each node, which some filters send.
-    rows = {
-        node: sum(len(scenario.sensors[placed_sensor.entry].R) for placed_sensor in placed)
-        for node, placed in scenario.placed_sensors.items()
-    }
     # The exchange of the slot, by which some filters send different things; -1 under clocks.
     phases = sent["phase"].tolist() if slotted else [-1] * len(sent)
-    sizes = dict(zip(scenario.nodes, scenario.sizes.tolist(), strict=True))
-    numbers = sum(
-        scenario.node_filter.analysis.payload_numbers(sizes[node], rows.get(node, 0), phase)
-        for node, phase in zip(sent["node"].tolist(), phases, strict=True)
-    )
-    return Traffic(len(sent), BYTES * numbers)
+    pairs = zip(sent["node"].tolist(), phases, strict=True)
+    return Traffic(len(sent), sum(itertools.starmap(scenario.message_size, pairs)))
 
 
 class Quantity(NamedTuple):

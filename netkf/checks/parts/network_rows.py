@@ -293,6 +293,8 @@ def loss_assumptions(scenario: Scenario) -> list[Assumption]:
     elif delay_depends_on_message(channel.delay):
         # Such a delay may lose a message (nan), which the law of losses does not state.
         drawn, why = False, "delays depend on the message, and may lose it"
+    elif scenario.network.radio is not None and scenario.network.radio.queue == "drop":
+        drawn, why = False, "a radio that is busy loses messages"
     elif has_recorded_broadcasts(scenario):
         drawn, why = False, "a table lists the links that are up; others lose their messages"
     source, name = "the scenario", type(channel.loss).__name__

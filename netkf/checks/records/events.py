@@ -173,7 +173,7 @@ def _decided(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
             f"message was sent in phase {sent['phase'][k]}, not {age[k]:.9g} s"
         )
     waiting = sends["t"][~np.isin(every, keys)]
-    longest = float(scenario.network.channel.delay.longest)
+    longest = scenario.longest_delay
     limit = scenario.horizon * (1.0 - TIME_TOLERANCE)
     if run.status == "complete" and (waiting + longest < limit).any():
         yield (

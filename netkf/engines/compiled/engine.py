@@ -72,8 +72,9 @@ class CompiledEngine(Engine):
         if unknown:
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
-        if scenario.network.lives or scenario.filter.gate is not None:
-            rule = "nodes that are down at times, or a gate"
+        changing = scenario.network.lives or scenario.network.radio is not None
+        if changing or scenario.filter.gate is not None:
+            rule = "nodes that are down at times, a radio or a gate"
             return f'engine "compiled" cannot run {rule}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)

@@ -25,6 +25,7 @@ from netkf.network.channels import (
 )
 from netkf.network.graphs import Link
 from netkf.network.losses import Transmission
+from netkf.network.radio import Airtime
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -85,6 +86,8 @@ class Transmitter:
         self._channel = scenario.network.channel
         self._follows_distance = self._channel.loss.follows_distance
         self._conditions = conditions_of(self._channel.loss, streams, scenario.horizon)
+        radio = scenario.network.radio
+        self._airtime = None if radio is None else Airtime(radio)
         # What hearers share is drawn for each transmission of a sender.
         self.broadcasts = broadcasts_of(scenario, streams)
         self._horizon, self._until = scenario.horizon, scenario.end_time
@@ -104,9 +107,12 @@ class Transmitter:
         return self._scenario.transmission(link)._replace(conditions=self._conditions)
 
     def begin(self, senders: Iterable[int], fresh: bool = True) -> None:
-        """Draw what the hearers of the next transmission of each of these ``senders`` share; unless
-        it is ``fresh`` they keep what they have.
+        """Begin another transmission of each of these ``senders``: draw what its hearers share;
+        unless it is ``fresh`` they keep what they have.
         """
+        if self._airtime is not None:
+            for sender in senders:
+                self._airtime.begin(sender)
         if self.broadcasts is not None:
             self.broadcasts.begin(senders, fresh)
 
@@ -137,8 +143,14 @@ class Transmitter:
         sent = direction.first._replace(number=number, time=now, bad=outcome.bad)
         if self._follows_distance and self.reach is not None:
             sent = sent._replace(distance=self.reach.distance(*direction.link, now))
+        waits = 0.0
+        if self._airtime is not None:
+            if phase > 0:
+                size = self._scenario.message_size(sender, phase)
+                sent = sent._replace(size=size, frames=self._airtime.radio.frames(size))
+            waits = self._airtime.end(sender, sent.size, now) - now
         # nan: the message is lost.
-        delay = self._instant(transit_time(self._channel, sent, outcome))
+        delay = self._instant(waits + transit_time(self._channel, sent, outcome))
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return

@@ -16,7 +16,8 @@ AssumptionRow = tuple[str, str, bool | None, str]
 UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
 FOLLOWS_DATA = "not linear in the state: gains, P and errors follow the data"
 NO_CHANNEL_LAW = (
-    "losses or delays are recorded, or nodes move or sleep: what arrives has no known law"
+    "losses or delays are recorded, nodes move or sleep, or messages queue: "
+    "what arrives has no known law"
 )
 LIVES = "nodes are down at times (network.lives)"
 CONSISTENCY = "netkf consistency compares P with the errors of many runs"

@@ -1,0 +1,62 @@
+"""The radio of a node: how long it sends a message, and in how many frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from netkf.core.fields import Component, field, integer, one_of, positive
+
+
+@dataclass(frozen=True, eq=False)
+class Radio(Component):
+    """What it takes to send a message of many numbers.
+
+    bits_per_second   a transmission takes its bits over this rate, and arrives, after the delay of
+                      the channel, when its last bit is sent; infinite by default. A node sends one
+                      transmission at a time; a broadcast is one
+    queue             "wait": one that finds the radio busy waits until it is free; "drop": it is
+                      lost
+    frame_bytes       longer messages are sent as several frames, all of which must arrive: with k
+                      frames a message arrives with the k-th power of its probability
+    bytes_per_number  of the numbers in a message
+    """
+
+    bits_per_second: float | None = field(positive, default=None)
+    queue: str = field(one_of("wait", "drop"), default="wait")
+    frame_bytes: int | None = field(integer(low=1), default=None)
+    bytes_per_number: int = field(integer(low=1), default=8)
+
+    def seconds(self, size: float) -> float:
+        """Return how long a message of ``size`` bytes is sent."""
+        return 0.0 if self.bits_per_second is None else 8.0 * size / self.bits_per_second
+
+    def frames(self, size: float) -> int:
+        """Return the number of frames of a message of ``size`` bytes."""
+        return 1 if self.frame_bytes is None else max(1, math.ceil(size / self.frame_bytes))
+
+
+class Airtime:
+    """When the radios of nodes send, in one run."""
+
+    def __init__(self, radio: Radio) -> None:
+        self.radio = radio
+        self._free: dict[int, float] = {}
+        # The end of the present transmission of each node, nan if it is dropped.
+        self._end: dict[int, float] = {}
+
+    def begin(self, sender: int) -> None:
+        """Let a node begin another transmission, if it sends anything."""
+        self._end.pop(sender, None)
+
+    def end(self, sender: int, size: float, now: float) -> float:
+        """Return when the last bit of the present transmission of ``sender``, of ``size`` bytes, is
+        sent; nan if it is dropped.
+        """
+        if sender not in self._end:
+            free = self._free.get(sender, 0.0)
+            if free > now and self.radio.queue == "drop":
+                self._end[sender] = math.nan
+            else:
+                self._end[sender] = self._free[sender] = max(now, free) + self.radio.seconds(size)
+        return self._end[sender]

@@ -1,0 +1,115 @@
+"""Radios: queues, dropped transmissions and frames against closed forms."""
+
+import numpy as np
+import pytest
+
+import netkf
+from netkf.trace.schema import CODES
+
+SCENARIO = """
+format = 1
+name = "radio"
+horizon = {horizon}
+probe = 20.0
+[plant]
+kind = "diffusion"
+A = [[-0.2]]
+B = [[1.0]]
+cov = [[1.0]]
+[[sensors]]
+nodes = [0]
+H = [[1.0]]
+R = [[0.1]]
+sampling = {{ kind = "periodic", period = 10.0 }}
+[network]
+graph = {{ kind = "star", nodes = 4 }}
+activation = {{ kind = "poisson", rate = 1.0, at = "nodes" }}
+channel = {{ symmetric = false, loss = {{ {loss} }} }}
+{radio}
+[filter]
+kind = "hybrid"
+epsilon = 0.2
+"""
+
+
+@pytest.fixture
+def scenario_of(tmp_path):
+    def make(radio, horizon=100.0, loss='kind = "none"'):
+        path = tmp_path / "radio.toml"
+        table = f"radio = {{ {radio} }}" if radio else ""
+        path.write_text(SCENARIO.format(radio=table, horizon=horizon, loss=loss))
+        return netkf.load(path)
+
+    return make
+
+
+def waits(run):
+    """The ages of all messages that arrived from node 0, and the share of those it lost."""
+    log = run.log
+    arrived = log[(log["kind"] == CODES["deliver"]) & (log["peer"] == 0)]
+    sent = ((log["kind"] == CODES["send"]) & (log["node"] == 0)).sum()
+    lost = ((log["kind"] == CODES["lost"]) & (log["node"] == 0)).sum()
+    return arrived["age"], lost / sent, sent
+
+
+# A message of the hybrid filter is an estimate and its covariance: 2 numbers, 16 bytes, 128 bits.
+AIR = 0.6
+
+
+def test_waiting_is_that_of_the_queue(scenario_of):
+    # Poisson arrivals, constant service: the mean waiting time is D rho / (2 (1 - rho)).
+    run = netkf.simulate(scenario_of(f"bits_per_second = {128 / AIR}", 8000.0), seed=1)
+    ages, lost, _ = waits(run)
+    assert lost == 0.0
+    assert ages.min() == pytest.approx(AIR, abs=1e-9)
+    # The three hearers of a broadcast hear it at one time.
+    waiting = np.sort(ages)[::3] - AIR
+    expected = AIR * AIR / (2.0 * (1.0 - AIR))
+    # Neighbours wait alike: batches of 500 are nearly independent.
+    order = (
+        run.log[(run.log["kind"] == CODES["deliver"]) & (run.log["peer"] == 0)]["age"][::3] - AIR
+    )
+    batches = order[: len(order) // 500 * 500].reshape(-1, 500).mean(axis=1)
+    deviation = batches.std(ddof=1) / np.sqrt(len(batches))
+    assert waiting.mean() == pytest.approx(expected, abs=4.5 * deviation)
+    assert expected > 9.0 * deviation
+
+
+def test_a_busy_radio_drops(scenario_of):
+    # Of Poisson arrivals at a single server the share rho / (1 + rho) finds it busy.
+    radio = f'bits_per_second = {128 / AIR}, queue = "drop"'
+    run = netkf.simulate(scenario_of(radio, 8000.0), seed=1)
+    ages, lost, sent = waits(run)
+    assert np.ptp(ages) < 1e-9
+    expected = AIR / (1.0 + AIR)
+    assert lost == pytest.approx(
+        expected, abs=4.5 * np.sqrt(expected * (1 - expected) / (sent / 3))
+    )
+
+
+def test_an_infinite_rate_is_no_radio(scenario_of):
+    prints = [
+        netkf.simulate(scenario_of(radio), seed=2, engine="simpy").fingerprint
+        for radio in ("", "frame_bytes = 16", "bits_per_second = 1e18")
+    ]
+    assert len(set(prints)) == 1
+
+
+def test_all_frames_must_arrive(scenario_of):
+    # 2 numbers of 10 bytes in frames of 8 bytes: 3 frames.
+    loss = 'kind = "bernoulli", delivery = 0.8'
+    radio = "frame_bytes = 8, bytes_per_number = 10"
+    scenario = scenario_of(radio, 5000.0, loss)
+    assert scenario.mean_delivery((0, 1)) == pytest.approx(0.8**3)
+    assert scenario.transmission((0, 1)).hearers == (1, 2, 3)
+    _, lost, sent = waits(netkf.simulate(scenario, seed=3))
+    assert 1.0 - lost == pytest.approx(0.8**3, abs=4.5 * 0.5 / np.sqrt(sent))
+    table = netkf.check(scenario_of(radio, 60.0, loss), runs=20, seed=1).table
+    assert "broken" not in set(table["verdict"])
+
+
+def test_check_of_a_busy_radio_promises_nothing_of_arrivals(scenario_of):
+    for queue in ("wait", "drop"):
+        radio = f'bits_per_second = {128 / AIR}, queue = "{queue}"'
+        table = netkf.check(scenario_of(radio, 60.0), runs=20, seed=1).table
+        assert "broken" not in set(table["verdict"]), table[table["verdict"] == "broken"]
