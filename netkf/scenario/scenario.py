@@ -84,4 +84,14 @@ class Scenario(DerivedScenario):
             *sampling_notes(self),
             *stamp_notes(self),
             *grid_notes(self),
+            *self._share_notes,
+        )
+
+    @property
+    def _share_notes(self) -> tuple[str, ...]:
+        if self.network.channel.loss.fate_share == 0.0 or self.has_broadcasts:
+            return ()
+        return (
+            "network.channel.loss: no fate is shared, because each transmission has one hearer; "
+            'broadcasts are those of activation.at = "nodes", or of slots',
         )

@@ -183,6 +183,11 @@ def test_one_fate_for_all_hearers(scenario_of):
     assert served + gone == pairs > 1000
 
 
+def test_a_note_says_that_nothing_is_shared(scenario_of):
+    told = [scenario_of(CLOCKS, *KINDS["shared"], at=at).notes for at in ("links", "nodes")]
+    assert ["no fate is shared" in " ".join(notes) for notes in told] == [True, False]
+
+
 def test_a_shared_chain_is_one_state_for_all_hearers(scenario_of):
     loss = (
         'loss = { kind = "gilbert-elliott", mean_loss = 0.4, mean_burst = 5.0, shared = true }, '
