@@ -108,6 +108,16 @@ def write_network(
         files |= _own_scenario(log, name, account, channel)
     else:
         files |= _scenario_like(like, log, table, channel)
+        if len(log.positions) or len(log.readings):
+            log.notes.append(
+                "not used: positions and readings beside the log; the scenario's count"
+            )
+    nodes = len({*account["sender"], *account["receiver"]})
+    apart = nodes * (nodes - 1) - len(account)
+    if apart:
+        log.notes.append(
+            f"used: {count_phrase(apart, 'pair')} that never heard each other: no link"
+        )
     total = account[["sent", "heard", "lost", "unknown"]].sum()
     log.notes.append(
         f"outcomes: {total['sent']:,} = {total['heard']:,} heard + {total['lost']:,} lost + "
