@@ -192,6 +192,8 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
     # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
     # fixed delay only shifts it; a random delay or dependent losses do neither.
     fixed, symmetric = channel.delay.fixed, has_balanced_rates(scenario)
+    radio = scenario.network.radio
+    queues = radio is not None and radio.bits_per_second is not None
     is_unknown = isinstance(channel.loss, RecordedLoss) or scenario.network_changes
     return [
         (
@@ -207,8 +209,10 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "messages take no time, or one fixed time",
             "H (7), derived",
-            None if isinstance(channel.delay, RecordedDelay) else fixed is not None,
-            "random or recorded delay: H(12) is not promised"
+            None if isinstance(channel.delay, RecordedDelay) else fixed is not None and not queues,
+            "messages wait for those before them: H(12) is not promised"
+            if queues
+            else "random or recorded delay: H(12) is not promised"
             if fixed is None
             else "no delay"
             if fixed == 0.0
