@@ -16,7 +16,7 @@ from netkf.linalg.portable import apply
 from netkf.linalg.vector_functions import VectorFunction
 from netkf.plants.dynamics import MOTIONS, StackedDynamics, dynamics, functions_of
 from netkf.plants.linear import BLOCK, Blocks, SlotPlant
-from netkf.plants.states import RecordedPath, RecordedStates
+from netkf.plants.states import RecordedStates
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +75,8 @@ class NonlinearPlant(RecordedStates, SlotPlant):
         """Raise ScenarioError if f does not fit the state or the input, or fails at the mean."""
         check_dynamics(self, self.functions)
 
-    def truth(self, random: np.random.Generator, frames: bool = False) -> MapPath | RecordedPath:
-        """Return the true states of one run, drawn from ``random`` or recorded; ``frames`` are for
-        linear plants only.
-        """
-        if not self.draws:
-            return RecordedPath(self.recorded_truth, self.period)
+    def truth(self, random: np.random.Generator, frames: bool = False) -> MapPath:
+        """Return the true states of one run, drawn from ``random``; frames are of linear plants."""
         start = self.start_mean + apply(self.start_root, random.standard_normal(self.n))
         return MapPath(self, start, random)
 

@@ -17,6 +17,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root, product
 from netkf.plants.changes import matrices_of_pieces
 from netkf.plants.inputs import Input, RecordedInput
+from netkf.plants.truth import RecordedTruth
 from netkf.rng.normals import Normals
 
 
@@ -51,6 +52,14 @@ class Plant(Component, OnGrid):
         if plant is not self and plant.input is not None:
             object.__setattr__(plant, "input", plant.input.on_grid(grid))
         return plant
+
+    @property
+    def recorded_truth(self) -> RecordedTruth:
+        """The states of its table as engines read them; nan at all times without one."""
+        if self.record is None:
+            return RecordedTruth(np.empty(0), np.empty((0, self.n)), self.n)
+        truth: RecordedTruth = self.record.truth
+        return truth
 
     def owned_by(self, node: int | None) -> Self:
         """Return the plant as the block of ``node`` (id), whose rows count in its tables."""

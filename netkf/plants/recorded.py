@@ -37,10 +37,7 @@ from netkf.plants.readings import (
     take_from_record,
 )
 from netkf.plants.sensors import Sensor
-from netkf.plants.states import RecordedPath, RecordedStates, state_file
-from netkf.plants.truth import RecordedTruth
-
-NO_TIMES = np.empty(0)
+from netkf.plants.states import RecordedStates, state_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +49,6 @@ class UnknownPlant(LinearPlant):
 
     is_random: ClassVar[bool] = False
     truth_known: ClassVar[bool] = False
-
-    def truth(self, random: np.random.Generator, frames: bool = False) -> RecordedPath:
-        """Return a path of nan (n,) in all slots; nothing is drawn from ``random``."""
-        return RecordedPath(RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n), self.period)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +62,6 @@ class RecordedPlant(RecordedStates, LinearPlant):
 
     path: SourceFile = field(state_file)
 
-    def truth(self, random: np.random.Generator, frames: bool = False) -> Any:
-        """Return the states of the table, nan in slots without one; where blocks are drawn, those
-        of all drawn from ``random``.
-        """
-        if self.draws:
-            return super().truth(random)
-        return RecordedPath(self.recorded_truth, self.period)
-
 
 @dataclass(frozen=True, eq=False)
 class UnknownDiffusion(Diffusion):
@@ -86,11 +71,6 @@ class UnknownDiffusion(Diffusion):
 
     is_random: ClassVar[bool] = False
     truth_known: ClassVar[bool] = False
-
-    @property
-    def recorded_truth(self) -> RecordedTruth:
-        """The true state of a run as engines read it: nan at all times."""
-        return RecordedTruth(NO_TIMES, np.empty((0, self.n)), self.n)
 
 
 @dataclass(frozen=True, eq=False)

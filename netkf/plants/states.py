@@ -252,11 +252,3 @@ class RecordedStates(Plant):
         if not isinstance(self.path, SourceFile):
             return self.path
         return StateTable(self, self._columns.of_node(self.node))
-
-    @property
-    def recorded_truth(self) -> RecordedTruth:
-        """The recorded states as engines read them; nan where they are unknown."""
-        if self.record is None:
-            return RecordedTruth(np.empty(0), np.empty((0, self.n)), self.n)
-        truth: RecordedTruth = self.record.truth
-        return truth

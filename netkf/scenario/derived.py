@@ -42,11 +42,10 @@ from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.driven import InputResponses, MovedReadings, driven
 from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.maps import NonlinearPlant
-from netkf.plants.recorded import RecordedDiffusion, UnknownDiffusion
 from netkf.plants.response import Difference, FlowResponse, Response, SlotResponse
 from netkf.plants.sampling import Samples
 from netkf.plants.sensors import Sensor
-from netkf.plants.states import PartlyDrawnTruth, StackedStates
+from netkf.plants.states import PartlyDrawnTruth, RecordedPath, StackedStates
 from netkf.plants.transitions import frame_period, frame_slots
 from netkf.rng.streams import Streams
 from netkf.scenario.block_sensors import support_of
@@ -496,7 +495,7 @@ class DerivedScenario(ScenarioModel):
         random, probes = streams.generator("plant"), self.times
         times, responses = np.union1d(sampled, probes), self.input_responses
         truth: Any
-        if isinstance(plant, RecordedDiffusion | UnknownDiffusion) and not plant.draws:
+        if not plant.draws:
             truth = plant.recorded_truth
         elif not on_grid:
             truth = plant.sampled_truth(random, times, horizon, frames)
@@ -519,7 +518,9 @@ class DerivedScenario(ScenarioModel):
         """
         frames = self.exact_errors if frames is None else frames
         plant, responses = self.slot_plant, self.input_responses
-        truth = plant.truth(streams.generator("plant"), frames)
+        truth: Any = RecordedPath(plant.recorded_truth, plant.period)
+        if plant.draws:
+            truth = plant.truth(streams.generator("plant"), frames)
         if responses is not None:
             truth = driven(truth, responses, not plant.draws)
         return self._with_given_states(truth, plant.period)
