@@ -192,7 +192,7 @@ class ClockFilters:
     def advance(self, state: Simulation) -> int:
         """Run the event loop until it needs something from Python; return its request."""
         request = int(clock_loop(state, any_struct(self.record), self._run, self._verbs))
-        for one in (*self._rates, self._readings):
+        for one in (*self._rates, self._readings and self._readings.setup):
             if one is not None:
                 one.raise_error()
         return request

@@ -136,20 +136,6 @@ def clock_verbs(
     """Return the verbs of a filter for its record and its run; ``increments``: some nodes read;
     ``linear``: all samples are. Of a run with other than ClockTables nodes may have own ``models``.
     """
-    key = kernels, type(record), type(run), increments, linear
-    # Those of a filter that remembers are of one record, and models are of one run.
-    if key not in _verbs or kernels.remembers or len(models):
-        _verbs[key] = _compiled_verbs(kernels, record, run, increments, linear)
-        _verbs[key].models = models
-    return _verbs[key]
-
-
-_verbs: dict[tuple[Any, ...], ClockVerbs] = {}
-
-
-def _compiled_verbs(
-    kernels: Kernels, record: Any, run: Any, increments: bool, linear: bool
-) -> ClockVerbs:
     observes = kernels.observe is not standard.observe
     return ClockVerbs(
         predict=address_of(kernels.predict, record, run),
@@ -165,7 +151,7 @@ def _compiled_verbs(
         **{name: getattr(kernels, name) for name in FLAGS},
         room=record.room if kernels.remembers else 0,
         kept=record.kept if kernels.remembers else np.zeros((0, 1), dtype=np.int64),
-        models=NO_MODELS,
+        models=models,
     )
 
 

@@ -37,11 +37,10 @@ from netkf.scenario.scenario import Scenario
 class NonlinearTable(Struct):
     """What the S samples of a run need of sensors that are not linear.
 
-    sensor, noise : (S,), the number of the sensor of a sample, -1 if it is linear, and of its R
+    sensor, noise : (S,), the number of a sample in ``known``, -1 if it is linear, and of its R
     R : (M, p, p), covariances of noise
     origin : (S or 1, N), where the states of the plant are counted from at each sample
-    own, pairs : NonlinearRows of all sensors, read in what their filter estimates, and in that and
-                 another block
+    known : NonlinearRows of all sensors
     first, block, matrix, values, matrices : fields of the samples' Instants, of which ``values``
         and ``matrices`` are y and H
     rows, size, y, H, first_y : scratch for the samples of one instant: one filter, with as many
@@ -52,8 +51,7 @@ class NonlinearTable(Struct):
     noise: IntArray
     R: FloatArray
     origin: FloatArray
-    own: NonlinearRows
-    pairs: NonlinearRows
+    known: NonlinearRows
     first: IntArray
     block: IntArray
     matrix: IntArray
@@ -76,7 +74,7 @@ def linearise_instant(record: Any, h: int, instant: int, table: NonlinearTable) 
         rows.kind[0, i] = LINEAR
     for s in range(table.first[instant], table.first[instant + 1]):
         if table.sensor[s] >= 0 and table.block[s] == -1:
-            count = copy_sensor(rows, 0, p, table.own, table.sensor[s])
+            count = copy_sensor(rows, 0, p, table.known, table.sensor[s])
             for i in range(count):
                 table.y[0, p + i, 0] = table.values[s, i]
                 for j in range(len(table.size)):
@@ -92,8 +90,8 @@ def linearise_instant(record: Any, h: int, instant: int, table: NonlinearTable) 
     p = 0
     for s in range(table.first[instant], table.first[instant + 1]):
         if table.sensor[s] >= 0 and table.block[s] == -1:
-            for i in range(table.own.kind.shape[1]):
-                if table.own.kind[table.sensor[s], i] != LINEAR:
+            for i in range(table.known.kind.shape[1]):
+                if table.known.kind[table.sensor[s], i] != LINEAR:
                     table.values[s, i] = table.y[0, p, 0]
                     for j in range(len(table.size)):
                         table.matrices[table.matrix[s], i, j] = table.H[0, p, j, 0]
@@ -114,7 +112,7 @@ def copy_origin(rows: NonlinearRows, table: NonlinearTable, s: int) -> None:
 def set_pair(pairs: Pairs, k: int, table: NonlinearTable, s: int) -> None:
     """Make pair number ``k`` of a run what sample ``s`` reads, which is not linear."""
     rows, matrix = pairs.rows, table.matrix[s]
-    count = copy_sensor(rows, k, 0, table.pairs, table.sensor[s])
+    count = copy_sensor(rows, k, 0, table.known, table.sensor[s])
     for i in range(count):
         for j in range(count):
             rows.R[0, k, i, j] = table.R[table.noise[s], i, j]
@@ -133,23 +131,17 @@ def set_linear(pairs: Pairs, k: int) -> None:
 
 
 class NonlinearSensors(NamedTuple):
-    """What kernels know of the S sampled sensors of a scenario: rows of those that are not linear,
-    in the states of their filter and in these and another block, the ``R`` (S, p, p) that filters
-    believe, the sensors, each with its node (id) and the index of its filter, and of which anchor
-    the other block in ``pairs`` is, where it is another one that the filter does not estimate.
+    """What kernels know of the S sampled sensors of a scenario: of number k those of its readings
+    that are of what its filter estimates, of number S + k those that are of another block too. With
+    the ``R`` (S, p, p) that filters believe, the sensors, each with its node (id) and the index of
+    its filter, and the anchor of which such a block is; where there are more they are alike.
     """
 
-    own: NonlinearSetup
-    pairs: NonlinearSetup
+    setup: NonlinearSetup
     columns: BlockColumns
     R: FloatArray
     sensors: list[tuple[Any, int, int]]
     anchors: list[int]
-
-    def raise_error(self) -> None:
-        """Raise the error of a user's sensor, if a call has failed."""
-        self.own.raise_error()
-        self.pairs.raise_error()
 
 
 @once_per_scenario
@@ -158,32 +150,27 @@ def nonlinear_sensors(scenario: Scenario) -> NonlinearSensors:
     index, pooled = scenario.topology.index, scenario.node_filter.timing.pooled
     placed = [(node, p) for node, many in scenario.sampled_sensors.items() for p in many]
     columns = BlockColumns(scenario, entries_of(scenario))
+    believed = [scenario.noise_covariance(p.entry, believed=True) for _, p in placed]
+    count, p, w = len(placed), max(map(len, believed), default=1), columns.entries.shape[1]
     sensors = [
         (scenario.located_sensors[p.entry], node, 0 if pooled else index[node])
         for node, p in placed
     ]
-    believed = [scenario.noise_covariance(p.entry, believed=True) for _, p in placed]
-    count, p, w = len(placed), max(map(len, believed), default=1), columns.entries.shape[1]
-    entries = np.full((count, columns.width), -1)
-    for k, (_, _, h) in enumerate(sensors):
-        entries[k, :w] = columns.entries[h]
-    own = NonlinearSetup(count, p, entries[:, :w].copy())
     others = [columns.others(h, sensor, node) for sensor, node, h in sensors]
-    for k, other in enumerate(others):
-        for place in list(other.values())[:1]:
-            entries[k, w : w + place.n] = np.arange(place.first, place.first + place.n)
-    pairs, R = NonlinearSetup(count, p, entries), np.zeros((count, p, p))
-    for k, ((sensor, _, _), other, noise) in enumerate(zip(sensors, others, believed, strict=True)):
-        R[k, : len(noise), : len(noise)] = noise
-        if sensor.linear:
-            continue
+    entries, R = np.full((2 * count, columns.width), -1), np.zeros((count, p, p))
+    for k, (noise, (_, _, h)) in enumerate(zip(believed, sensors, strict=True)):
+        entries[[k, count + k], :w], R[k, : len(noise), : len(noise)] = columns.entries[h], noise
+        for place in list(others[k].values())[:1]:
+            entries[count + k, w : w + place.n] = np.arange(place.first, place.first + place.n)
+    setup = NonlinearSetup(2 * count, p, entries)
+    for k, (sensor, _, _) in enumerate(sensors):
         # In a record each row may be about another block.
-        if not other or sensor.record is not None:
-            own.add(sensor, k, 0, noise)
-        if other:
-            pairs.add(sensor, k, 0, noise)
+        if not sensor.linear and (not others[k] or sensor.record is not None):
+            setup.add(sensor, k, 0, believed[k])
+        if not sensor.linear and others[k]:
+            setup.add(sensor, count + k, 0, believed[k])
     anchors = [next(iter(other), -1) for other in others]
-    return NonlinearSensors(own, pairs, columns, R, sensors, anchors)
+    return NonlinearSensors(setup, columns, R, sensors, anchors)
 
 
 def nonlinear_table(
@@ -195,27 +182,27 @@ def nonlinear_table(
     if all(one.linear for one in scenario.sensors):
         return no_table()
     known, method = nonlinear_sensors(scenario), scenario.filter.linearise
+    tables = known.setup.tables(method, 1)
     is_linear = np.array([one.linear for one, _, _ in known.sensors], dtype=bool)
     responses = scenario.input_responses
     believed = None if responses is None else responses.believed
-    n, w = scenario.plant.n, known.columns.entries.shape[1]
+    n, w, width = scenario.plant.n, known.columns.entries.shape[1], known.columns.width
     most = max(1, known.R.shape[1] * int(np.diff(instants["first"]).max(initial=1)))
-    rows = linear_rows(1, most, np.full((1, w), -1))
+    rows = linear_rows(1, most, np.full((1, width), -1))
+    rows.center, rows.origin = tables.center, np.zeros((1, n))
     made = NonlinearTable(
         sensor=np.where(is_linear[sensor], -1, sensor),
         noise=sensor.copy(),
         R=known.R,
         origin=np.zeros((1, n)) if believed is None else np.array(believed.states(t), order="C"),
-        own=known.own.tables(method, 1),
-        pairs=known.pairs.tables(method, 1),
+        known=tables,
         rows=rows,
         size=np.zeros(w),
         y=np.zeros((1, most, 1)),
-        H=np.zeros((1, most, w, 1)),
+        H=np.zeros((1, most, width, 1)),
         first_y=0,
         **instants,
     )
-    rows.center, rows.origin = made.own.center, np.zeros((1, n))
     for k in np.flatnonzero(~is_linear).tolist():
         _fill(made, known, k, np.flatnonzero(sensor == k))
     return made
@@ -227,7 +214,7 @@ def no_table() -> NonlinearTable:
     none = np.zeros(0, dtype=np.int64)
     fields: dict[str, Any] = {
         **dict.fromkeys(("sensor", "noise", "first", "block", "matrix"), none),
-        **dict.fromkeys(("own", "pairs", "rows"), no_nonlinear()),
+        **dict.fromkeys(("known", "rows"), no_nonlinear()),
         **dict.fromkeys(("R", "y", "matrices"), np.zeros((0, 0, 0))),
         **dict.fromkeys(("origin", "values"), np.zeros((0, 0))),
     }
@@ -243,9 +230,11 @@ def _fill(table: NonlinearTable, known: NonlinearSensors, k: int, samples: IntAr
         anchor = -1 if rows is None else int(rows.anchors[m])
         place = columns.of_reading(h, sensor, anchor)
         table.block[s] = block_of(columns, place)
-        # The other block comes behind the filter's own states, whichever it is.
-        setup, anchor = (known.own, anchor) if place is None else (known.pairs, known.anchors[k])
-        of = setup.reference(sensor, node if anchor < 0 else anchor, k)
+        if place is not None:
+            # The other block comes behind the filter's own states, whichever it is.
+            table.sensor[s], anchor = len(known.sensors) + k, known.anchors[k]
+        of = known.setup.reference(sensor, node if anchor < 0 else anchor, table.sensor[s])
+        of = of[: table.matrices.shape[2]]
         table.matrices[table.matrix[s], :p, : len(of)] = of
         if rows is not None:
             noise, there = known.R[k].copy(), np.flatnonzero(np.isfinite(rows.y[m]))
