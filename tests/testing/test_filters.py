@@ -154,9 +154,12 @@ class TransposedKalman(parts.DiffusionKalman):
         return super().absorb(state, messages, exchange)
 
 
-@pytest.mark.parametrize("cls", [Transposed, TransposedKalman])
 @pytest.mark.parametrize(
-    "settings", [{}, {"weights": [[0.6, 0.1, 0.3], [0.3, 0.6, 0.1], [0.1, 0.3, 0.6]]}]
+    ("cls", "settings"),
+    [
+        (Transposed, {}),
+        (TransposedKalman, {"weights": [[0.6, 0.1, 0.3], [0.3, 0.6, 0.1], [0.1, 0.3, 0.6]]}),
+    ],
 )
 def test_weights_by_rows_in_place_of_columns_are_a_mistake(cls, settings):
     """Whatever weights the class is made with, and whatever else it defines anew."""
