@@ -419,35 +419,28 @@ def _move_by_address(
 @kernel
 def move_mean(model: ClockTables, m: int, _same: ClockTables) -> None:
     """Predict the estimate ``model.mean`` over ``model.gap`` seconds up to ``model.now``."""
-    move_in_pieces(model, model.now, m, model.mean_root, model.mean, 0, model.gap)
-
-
-@kernel
-def _move_unrolled(
-    model: ClockTables, run: Any, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
-) -> None:
-    move_in_pieces(model, run.now, m, root, x, k, gap)
-
-
-for _n in range(2, MAX_UNROLLED + 1):
-    move.register(ClockTables.of_size(_n))(_move_unrolled)
+    move_in_pieces(model, model, m, model.mean_root, model.mean, 0, model.gap)
 
 
 @kernel(inlined=True)
 def move_in_pieces(
-    model: ClockTables, now: float, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
+    model: ClockTables, run: Any, m: int, root: FloatArray, x: FloatArray, k: int, gap: float
 ) -> None:
-    """Predict an estimate over the ``gap`` seconds up to ``now``, cut where the plant changes."""
+    """Predict an estimate by ``gap`` seconds up to ``run.now``, cut where the plant changes."""
     piece, rest = model.piece, gap
-    while piece > 0 and (now - gap) * (1.0 + CLOSE) < model.changes[piece - 1]:
+    while piece > 0 and (run.now - gap) * (1.0 + CLOSE) < model.changes[piece - 1]:
         piece -= 1
     while rest > 0.0:
         length = rest
         if piece < model.piece:
-            length = min(rest, model.changes[piece] - (now - rest))
+            length = min(rest, model.changes[piece] - (run.now - rest))
         propagate_root(model.table, piece * model.stride + m, root, x, k, length, model.scratch)
         rest -= length
         piece += 1
+
+
+for _n in range(2, MAX_UNROLLED + 1):
+    move.register(ClockTables.of_size(_n))(move_in_pieces)
 
 
 @update_estimate.register(ClockTables)

@@ -134,7 +134,7 @@ class AnySlotRun(Struct):
 
 
 def any_slot_run(run: Struct) -> Any:
-    """Return a SlotRun, or what stands for one, as the loop takes it."""
+    """Return a SlotRun, or what stands for one, as an AnySlotRun."""
     return seen_as(AnySlotRun, run, size=(np.dtype(np.float64), 1), model=AnyStruct)
 
 
@@ -159,13 +159,9 @@ def slot_verbs(kernels: Kernels, record: Any, run: Any, talks: bool, linear: boo
 
 @kernel
 def slot_loop(
-    record: Any,
-    memories: np.ndarray,
-    run: AnySlotRun,
-    plan: SlotPlan,
-    samples: SlotSamples,
+    record: Any, memories: np.ndarray, run: AnySlotRun, plan: SlotPlan, samples: SlotSamples,
     verbs: SlotVerbs,
-) -> None:
+) -> None:  # fmt: skip
     """Simulate the slots of a ``plan``: ``memories`` (B, words) hold the record of each block, of
     which ``record`` is the first.
     """
@@ -243,21 +239,18 @@ def exchange(
 
 @kernel
 def sample_slot(
-    record: Any,
-    run: AnySlotRun,
-    plan: SlotPlan,
-    samples: SlotSamples,
-    verbs: SlotVerbs,
-    b: int,
-    s: int,
-) -> None:
+    record: Any, run: AnySlotRun, plan: SlotPlan, samples: SlotSamples, verbs: SlotVerbs,
+    b: int, s: int,
+) -> None:  # fmt: skip
     """Take the sample of slot ``s``, if it has one, and move the origin, if it moves there."""
     if plan.sample[s] >= 0:
         for h in range(len(record.xhat) if verbs.observe != NOTHING else 0):
             call_at(verbs.observe, record, h, run)
         store_sample(record.xhat, record.root, run, plan, samples, b, s)
     if plan.rebased[s]:
-        set_offset(run, samples, b, s)
+        # The true state becomes the origin.
+        for i in range(len(run.size)):
+            store(run.lanes, run.offset, i, -load(run.lanes, samples.local, b, s, i))
         for h in range(len(record.xhat)):
             call_at(verbs.shift, record, h, run)
 
@@ -302,22 +295,10 @@ def drop_silent(run: AnySlotRun, plan: SlotPlan, b: int, s: int, e: int) -> None
 
 
 @kernel
-def set_offset(run: AnySlotRun, samples: SlotSamples, b: int, s: int) -> None:
-    """Make the true state of slot ``s`` the origin: write its negative into ``run.offset``."""
-    for i in range(len(run.size)):
-        store(run.lanes, run.offset, i, -load(run.lanes, samples.local, b, s, i))
-
-
-@kernel
 def store_sample(
-    xhat: FloatArray,
-    root: FloatArray,
-    run: AnySlotRun,
-    plan: SlotPlan,
-    samples: SlotSamples,
-    b: int,
-    s: int,
-) -> None:
+    xhat: FloatArray, root: FloatArray, run: AnySlotRun, plan: SlotPlan, samples: SlotSamples,
+    b: int, s: int,
+) -> None:  # fmt: skip
     """Write the sample of slot ``s`` of block ``b``: ``xhat`` (H, n, L), ``root`` (H, n, n, L)."""
     k, lanes, entries = plan.sample[s], run.lanes, samples.entries
     n, first, all_local, all_absolute = (
