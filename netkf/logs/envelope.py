@@ -153,7 +153,9 @@ def compare_with_laws(
             rank = 1 + min(int((drawn <= value).sum()), int((drawn >= value).sum()))
             low, median, high = np.quantile(drawn, [level / 2, 0.5, 1.0 - level / 2])
             p, spread = min(1.0, 2.0 * rank / (runs + 1)), float(drawn.std(ddof=runs > 1))
-            if 2.0 / (runs + 1) > level and spread > 1e-9 * abs(value):
+            # A quantity of few values, such as a share of time that is nearly 1, is not normal.
+            is_normal = spread > 0.0 and len(np.unique(drawn)) > runs // 2
+            if 2.0 / (runs + 1) > level and is_normal:
                 off = (value - drawn.mean()) / (spread * math.sqrt(1.0 + 1.0 / runs))
                 p = 2.0 * float(student_t.sf(abs(off), runs - 1))
                 half = spread * float(student_t.isf(level / 2, runs - 1))

@@ -126,28 +126,7 @@ def find_column(table: pd.DataFrame, name: str) -> str:
 def _read_rows(path: Path, notes: list[str]) -> _Rows:
     """Return the packets of one table; notes say which columns were taken for what."""
     raw = read_texts(path)
-    names = {name: find_column(raw, name) for name in SYNONYMS}
-    if names["event"] and not names["sender"] and names["node"]:
-        events = raw[names["event"]].str.lower()
-        is_tx = events.isin(SENT)
-        own, other = raw[names["node"]], raw[names["peer"]] if names["peer"] else ""
-        raw["sender"] = own.where(is_tx, other)
-        raw["receiver"] = pd.Series(other, index=raw.index).where(is_tx, own)
-        names |= {"sender": "sender", "receiver": "receiver"}
-    elif names["node"] and not (names["sender"] and names["receiver"]):
-        # The node whose log it is: of what it sent, or of what it heard from a sender.
-        names["receiver" if names["sender"] else "sender"] = names["node"]
-    for name in ("t", "sender"):
-        if not names[name]:
-            rule = f"must have a column {name} ({', '.join(SYNONYMS[name])})"
-            raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
-    used = {name: column for name, column in names.items() if column}
-    listed = ", ".join(f"{a} from {b}" if a != b else a for a, b in used.items())
-    unused = [column for column in raw.columns if column not in used.values()]
-    notes.append(
-        f"used: {path.name}: {count_phrase(len(raw), 'row')}, columns {listed}"
-        + (f"; not used: {', '.join(unused)}" if unused else "")
-    )
+    names = _find_columns(path, raw, notes)
     empty = pd.Series("", index=raw.index)
     table = pd.DataFrame(
         {
@@ -171,6 +150,35 @@ def _read_rows(path: Path, notes: list[str]) -> _Rows:
         raise ScenarioError(str(path), rule, table["number"].iloc[wrong[0]], "correct the entry")
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
     return _Rows(table, parse_stamps(path, raw, names["t"]), _read_arrivals(path, raw, names))
+
+
+def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, str]:
+    """Return the column that each of SYNONYMS has, "" if none; where rows are of a node's own log
+    columns sender and receiver are added. A note tells which were used.
+    """
+    names = {name: find_column(raw, name) for name in SYNONYMS}
+    if names["event"] and not names["sender"] and names["node"]:
+        events = raw[names["event"]].str.lower()
+        is_tx = events.isin(SENT)
+        own, other = raw[names["node"]], raw[names["peer"]] if names["peer"] else ""
+        raw["sender"] = own.where(is_tx, other)
+        raw["receiver"] = pd.Series(other, index=raw.index).where(is_tx, own)
+        names |= {"sender": "sender", "receiver": "receiver"}
+    elif names["node"] and not (names["sender"] and names["receiver"]):
+        # The node whose log it is: of what it sent, or of what it heard from a sender.
+        names["receiver" if names["sender"] else "sender"] = names["node"]
+    for name in ("t", "sender"):
+        if not names[name]:
+            rule = f"must have a column {name} ({', '.join(SYNONYMS[name])})"
+            raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
+    used = {name: column for name, column in names.items() if column}
+    listed = ", ".join(f"{a} from {b}" if a != b else a for a, b in used.items())
+    unused = [column for column in raw.columns if column not in used.values()]
+    notes.append(
+        f"used: {path.name}: {count_phrase(len(raw), 'row')}, columns {listed}"
+        + (f"; not used: {', '.join(unused)}" if unused else "")
+    )
+    return names
 
 
 def _read_arrivals(path: Path, raw: pd.DataFrame, names: dict[str, str]) -> list[Decimal | None]:

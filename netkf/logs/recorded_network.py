@@ -292,30 +292,16 @@ def _scenario_like(
     network = resolved["network"]
     network["channel"] = {**channel, "symmetric": scenario.network.channel.symmetric}
     activation, files = scenario.network.activation, Files()
-    sends = log.sends
-    if isinstance(activation, Matching):
-        slots = np.floor(sends["t"] / scenario.slot_plant.period + 1e-9).astype(int)
-        ids = {str(node): int(node) for node in scenario.nodes}
-        pairs = np.sort(sends[["sender", "to"]].replace(ids).to_numpy(dtype=int), axis=1)
-        rows = pd.DataFrame({"slot": slots, "node": pairs[:, 0], "peer": pairs[:, 1]})
-        files["transmissions.csv"] = rows.drop_duplicates().to_csv(index=False)
-        network["activation"] = {"kind": "recorded", "path": "transmissions.csv"}
-        if activation.phase is not None:
-            network["activation"]["phase"] = activation.phase
-    elif isinstance(activation, LinkClock) and not isinstance(activation, OnReadings):
-        at, is_broadcast = activation.at, bool((sends["to"] == "").any())
-        if log.ticks is None and is_broadcast != (at == "nodes"):
-            at = "nodes" if is_broadcast else "directions"
-            log.notes.append(f'used: clocks at = "{at}", by what the log says of packets')
-        files["transmissions.csv"] = log.ticks or _clock_rows(sends, at)
-        network["activation"] = {"kind": "recorded", "at": at, "path": "transmissions.csv"}
+    replaced = source_files(scenario.network.channel)
+    found = _recorded_activation(scenario, log)
+    if found is not None:
+        network["activation"], files["transmissions.csv"] = found
+        replaced += source_files(activation)
     else:
         log.notes.append(
             f"used: nodes send when the scenario says ({network['activation']['kind']}); outcomes "
             "are those of the log, message by message"
         )
-    replaced = source_files(scenario.network.channel)
-    replaced += source_files(activation) if files else []
     for source in source_files(scenario):
         if source not in replaced:
             if source.name in (*TABLES, *files):
@@ -324,6 +310,30 @@ def _scenario_like(
             files[source.name] = source.full
     files["scenario.toml"] = to_toml(resolved)
     return files
+
+
+def _recorded_activation(
+    scenario: Scenario, log: PacketLog
+) -> tuple[dict[str, Any], str | Path] | None:
+    """Return the table network.activation that makes nodes of a scenario send as in the log, and
+    the file that it names; None where nodes send after their samples, or all in every slot.
+    """
+    activation, sends = scenario.network.activation, log.sends
+    table: dict[str, Any] = {"kind": "recorded", "path": "transmissions.csv"}
+    if isinstance(activation, Matching):
+        slots = np.floor(sends["t"] / scenario.slot_plant.period + 1e-9).astype(int)
+        ids = {str(node): int(node) for node in scenario.nodes}
+        pairs = np.sort(sends[["sender", "to"]].replace(ids).to_numpy(dtype=int), axis=1)
+        rows = pd.DataFrame({"slot": slots, "node": pairs[:, 0], "peer": pairs[:, 1]})
+        table |= {} if activation.phase is None else {"phase": activation.phase}
+        return table, rows.drop_duplicates().to_csv(index=False)
+    if not isinstance(activation, LinkClock) or isinstance(activation, OnReadings):
+        return None
+    at, is_broadcast = activation.at, bool((sends["to"] == "").any())
+    if log.ticks is None and is_broadcast != (at == "nodes"):
+        at = "nodes" if is_broadcast else "directions"
+        log.notes.append(f'used: clocks at = "{at}", by what the log says of packets')
+    return {**table, "at": at}, log.ticks or _clock_rows(sends, at)
 
 
 def _clock_rows(sends: pd.DataFrame, at: str) -> str:
