@@ -7,6 +7,7 @@ import pytest
 
 import netkf
 from netkf import theory
+from netkf.engines.compiled.slot_loop import slot_loop
 from netkf.scenario.reading import from_table
 from netkf.trace.schema import CODES
 from tests.cases import FOLDER
@@ -271,3 +272,11 @@ def test_parts_that_do_not_go_together_are_refused(changes, words):
     with pytest.raises(netkf.ScenarioError) as caught:
         scenario.replace(changes)
     assert words in str(caught.value)
+
+
+def test_the_loop_of_slots_is_compiled_once_for_all_filters():
+    """Whatever the number of states."""
+    for file in ("gossip_ring.toml", "intermittent_scalar.toml"):
+        scenario = netkf.load(SCENARIOS / file, {"horizon": 8.0})
+        netkf.simulate(scenario, engine="compiled")
+    assert len(slot_loop._python_dispatcher.signatures) == 1
