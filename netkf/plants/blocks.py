@@ -290,7 +290,7 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
         plant = block.copies[0]
         for key, given in (("coupling", block.coupling), ("schedule", plant.changes)):
             if len(given):
-                rule = "must be left out where blocks are not linear"
+                rule = "must be left out where blocks are not linear, whose f says it with x and t"
                 raise ScenarioError(f"[{k}].{key}", rule, None, "write one f for all of it")
         if plant.linear:
             _check_gain(k, plant.input, plant.n)

@@ -223,6 +223,23 @@ def test_mistakes_in_blocks_are_refused_in_one_line(scenario, key, value, words)
     assert words in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("schedule", [{"from": 1.0, "F": [[0.5]]}]),
+        ("coupling", [{"from": "pose", "A": [[0.1, 0.0, 0.0]]}]),
+    ],
+)
+def test_changes_and_coupling_beside_curved_blocks_are_refused_in_one_line(scenario, key, value):
+    plants = poses(period=0.5, Q=Q_POSE.tolist())
+    target = {"name": "target", "F": [[1.0]], "Q": [[1.0]], "period": 0.5, key: value}
+    with pytest.raises(netkf.ScenarioError) as caught:
+        scenario.replace({"plants": [*plants, target]})
+    wanted = f"plants[{len(plants)}].{key}: must be left out where blocks are not linear"
+    assert str(caught.value).startswith(wanted)
+    assert "\n" not in str(caught.value)
+
+
 def test_the_derivative_of_a_prediction_is_taken_at_the_estimate(tmp_path):
     made = {
         "format": 1, "name": "arc", "horizon": 3.0, "probe": 1.0, "sensors": [],
