@@ -21,7 +21,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.logs import outcomes as stats
 from netkf.logs.envelope import Law, compare_with_laws
 from netkf.logs.outcomes import Outcomes, Test, make_outcomes
-from netkf.logs.packets import UNREPORTED
+from netkf.logs.packets import UNREPORTED, parse_numbers, read_texts
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.runs.files import write_text
 from netkf.scenario.reading import load
@@ -176,8 +176,9 @@ def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
     path = loss.path.full.with_name(UNKNOWN)
     if path.is_file():
         silent = _read_table(path)
-        silent = silent[silent["why"] == UNREPORTED].assign(delivered=0, unreported=True)
-        table = pd.concat([table, silent]).drop_duplicates(KEY)
+        silent = silent[[why == UNREPORTED for why in silent.get("why", [""] * len(silent))]]
+        table = pd.concat([table, silent.assign(delivered=0, unreported=True)])
+        table = table.drop_duplicates(KEY).reset_index(drop=True)
     if "t" not in table:
         table["t"] = table["message"].astype(float)
     if "transmission" not in table:
@@ -196,10 +197,15 @@ def read_outcomes(scenario: Scenario) -> tuple[pd.DataFrame, list[str]]:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    table = pd.read_csv(
-        path, comment="#", dtype=dict.fromkeys(("sender", "receiver", "channel"), str)
-    )
-    return table.drop_duplicates(KEY)
+    """Return a table of messages, one row each; raises ScenarioError, with the line."""
+    table = read_texts(path)
+    for name in [*KEY, "t", "transmission", "delivered"]:
+        if name in table and name not in KEY[:2]:
+            table[name] = parse_numbers(path, table, name)
+        elif name not in table and name in KEY:
+            rule = f"must have a column {name}"
+            raise ScenarioError(str(path), rule, list(table.columns), "import the log again")
+    return table.astype({"message": int}).drop_duplicates(KEY)
 
 
 def _complete_replay(
