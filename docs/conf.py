@@ -48,7 +48,8 @@ nitpick_ignore_regex = [
     (r"py:class", r"netkf\.(algorithms|core|linalg|rng|network|plants|engines|trace|scenario)\..*"),
     (
         r"py:class",
-        r"netkf\.theory\..*|.*\.(ReplicaResult|PromisedTraces|Probe|Target|MessageKey|Quantity)",
+        r"netkf\.theory\..*|.*\.(ReplicaResult|PromisedTraces|Probe|Target|MessageKey|Quantity)"
+        r"|.*\.LogFit",
     ),
 ]
 

@@ -23,6 +23,7 @@ HEADINGS = {
     "sampling": "sensors.sampling.kind",
     "graph": "network.graph.kind",
     "activation": "network.activation.kind in continuous time",
+    "life": "network.lives.kind",
     "loss": "network.channel.loss.kind",
     "delay": "network.channel.delay.kind",
     "filter": "filter.kind",
