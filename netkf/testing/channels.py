@@ -19,7 +19,7 @@ from netkf.laws.losses import (
 )
 from netkf.laws.noise import compare_with
 from netkf.laws.stating import stated_law, stated_part
-from netkf.network.channels import Channel, ChannelSampler, conditions_of
+from netkf.network.channels import BroadcastSampler, Channel, ChannelSampler, conditions_of
 from netkf.network.delays import Delay
 from netkf.network.delays import delay_depends_on_message as overrides_message_delay
 from netkf.network.graphs import Complete, Link, Topology
@@ -291,6 +291,12 @@ def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndar
         for k, (link, table_probability) in enumerate(links.items()):
             sampler = ChannelSampler(channel, link, partial(_stream, streams, link))
             uniform, bad, _ = sampler.draws(LENGTH)
+            if part.state_of == "sender":
+                bad = (
+                    BroadcastSampler(part, link, False, partial(_stream, streams, link[:1]))
+                    .draws(LENGTH)
+                    .bad
+                )
             sent = Transmission(
                 link, np.arange(LENGTH), times, bad, table_probability, DISTANCES[0],
                 conditions=conditions,
@@ -299,7 +305,7 @@ def _simulate_losses(part: Loss, links: dict[Link, float], seed: int) -> np.ndar
     return lost
 
 
-def _stream(streams: Streams, link: Link, purpose: str) -> np.random.Generator:
+def _stream(streams: Streams, link: tuple[int, ...], purpose: str) -> np.random.Generator:
     return streams.generator(purpose, *link)
 
 

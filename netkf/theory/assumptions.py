@@ -11,10 +11,10 @@ from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.registry import name_of
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import (
-    NO_CHANNEL_LAW,
     TRUE_MODEL,
     AssumptionRow,
     judge_plant,
+    no_channel_law,
     nonlinear_rows,
     true_model_row,
 )
@@ -200,7 +200,7 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
             "losses are independent of each other and of the past",
             "H Theorem 2, derived",
             None if is_unknown else channel.independent,
-            NO_CHANNEL_LAW
+            no_channel_law(scenario)
             if scenario.network_changes
             else "arrivals are Poisson processes of lower rates"
             if channel.independent

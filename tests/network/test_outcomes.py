@@ -10,7 +10,6 @@ import pytest
 
 import netkf
 from netkf.network.losses import Bernoulli, GilbertElliott, Loss, SharedLoss
-from netkf.network.scheduled import ScheduledLoss
 from netkf.trace.schema import CODES
 
 CLOCKS = """
@@ -327,15 +326,6 @@ def test_refusals(scenario_of, case):
         scenario_of(CLOCKS, channel, {"s.csv": rows})
     assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
-
-
-def test_parts_keep_their_contract(tmp_path):
-    from netkf.testing import check_channel
-
-    check_channel(SharedLoss(delivery=0.7, share=0.5))
-    path = tmp_path / "s.csv"
-    path.write_text(SCHEDULE)
-    check_channel(ScheduledLoss(path=str(path)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -18,18 +18,24 @@ def tables(tmp_path):
     (tmp_path / "lost.csv").write_text("sender,receiver,message,delivered\n0,1,2,0\n0,1,3,1\n")
     (tmp_path / "ticks.csv").write_text("t,node,peer\n0.5,0,1\n0.75,1,0\n0.75,1,2\n")
     (tmp_path / "delays.csv").write_text("sender,receiver,message,seconds\n0,1,2,0.25\n")
-    return {name: SourceFile(f"{name}.csv", tmp_path) for name in ("lost", "ticks", "delays")}
+    rows = "from,until,sender,receiver,delivery\n0,20,0,1,0.25\n20,40,0,1,0.75\n"
+    (tmp_path / "schedule.csv").write_text(rows)
+    names = ("lost", "ticks", "delays", "schedule")
+    return {name: SourceFile(f"{name}.csv", tmp_path) for name in names}
 
 
 def losses(tables):
     return {
         "none": [parts.NoLoss()],
         "bernoulli": [parts.Bernoulli(0.7), parts.Bernoulli(1.0), parts.Bernoulli(0.0)],
+        "shared": [parts.SharedLoss(delivery=0.7, share=0.5)],
+        "scheduled": [parts.ScheduledLoss(tables["schedule"])],
         "per-link": [parts.PerLink()],
         "gilbert-elliott": [
             parts.GilbertElliott(to_bad=0.1, to_good=0.3, deliver_bad=0.2),
             parts.GilbertElliott(to_bad=0.3, to_good=0.7),
             parts.GilbertElliott(mean_loss=0.1, mean_burst=50.0),
+            parts.GilbertElliott(mean_loss=0.3, mean_burst=4.0, shared=True),
         ],
         "recorded": [parts.RecordedLoss(tables["lost"])],
         "distance": [

@@ -15,10 +15,6 @@ AssumptionRow = tuple[str, str, bool | None, str]
 
 UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
 FOLLOWS_DATA = "not linear in the state: gains, P and errors follow the data"
-NO_CHANNEL_LAW = (
-    "losses or delays are recorded, nodes move or sleep, or messages queue: "
-    "what arrives has no known law"
-)
 LIVES = "nodes are down at times (network.lives)"
 CONSISTENCY = "netkf consistency compares P with the errors of many runs"
 TRUE_MODEL = "the filters know the plant and the sensors"
@@ -61,6 +57,14 @@ def require_linear(scenario: Scenario) -> None:
     """Raise TheoryError if dynamics or readings are not linear, or readings may be refused."""
     for *_, evidence in nonlinear_rows(scenario):
         raise TheoryError(evidence)
+
+
+def no_channel_law(scenario: Scenario) -> str:
+    """Return why it is not known how often messages arrive, where :func:`lacks_channel_law`."""
+    reason = "losses or delays are recorded, or nodes move"
+    if scenario.network_changes and not scenario.links_move:
+        reason = "nodes are down at times, or messages wait for each other"
+    return f"{reason}: what arrives has no known law"
 
 
 def lacks_channel_law(scenario: Scenario) -> bool:

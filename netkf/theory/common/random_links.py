@@ -25,7 +25,7 @@ from netkf.network.losses import (
 )
 from netkf.network.matchings import RecordedSlots
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import NO_CHANNEL_LAW, lacks_channel_law
+from netkf.theory.common.evidence import lacks_channel_law, no_channel_law
 
 MAX_CHAINS = 10
 """Independent chains of bursty links whose joint states are enumerated."""
@@ -160,7 +160,7 @@ def directions_of(
     channel = scenario.network.channel
     loss, delay = channel.loss, channel.delay.fixed
     if lacks_channel_law(scenario) or has_recorded_broadcasts(scenario):
-        raise TheoryError(NO_CHANNEL_LAW)
+        raise TheoryError(no_channel_law(scenario))
     if delay is None:
         raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
     if not has_constant_losses(scenario):

@@ -12,10 +12,10 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import is_definite
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import (
-    NO_CHANNEL_LAW,
     UNKNOWN_LAW,
     AssumptionRow,
     lacks_channel_law,
+    no_channel_law,
 )
 from netkf.theory.common.plant_assumptions import start_rows
 from netkf.theory.common.random_links import all_messages_arrive
@@ -153,7 +153,7 @@ def _information_row(scenario: Scenario) -> AssumptionRow:
 
 def _arrival_row(scenario: Scenario) -> AssumptionRow:
     if lacks_channel_law(scenario):
-        return ("every message arrives", "D (8)", None, NO_CHANNEL_LAW)
+        return ("every message arrives", "D (8)", None, no_channel_law(scenario))
     all_arrive = all_messages_arrive(scenario)
     algorithm: Any = scenario.filter.algorithm
     evidence = (

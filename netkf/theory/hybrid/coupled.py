@@ -25,7 +25,7 @@ from netkf.network.clocks import LinkClock
 from netkf.plants.transitions import Transitions
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import NO_CHANNEL_LAW, nonlinear_rows
+from netkf.theory.common.evidence import no_channel_law, nonlinear_rows
 from netkf.theory.common.observations import increment_observations
 from netkf.theory.hybrid.samples import (
     PoissonSamples,
@@ -123,7 +123,7 @@ def reason_without_bound(scenario: Scenario) -> str | None:
         return "not promised: Tanwani's H(12) holds for no or fixed delays, and the delay is random"
     dependent = "not promised: losses depend on earlier ones, so arrivals are not Poisson processes"
     if scenario.network_changes:
-        dependent = f"not promised: {NO_CHANNEL_LAW}"
+        dependent = f"not promised: {no_channel_law(scenario)}"
     independent = network.channel.independent and not scenario.network_changes
     return _reason_of_samples(scenario) if independent else dependent
 

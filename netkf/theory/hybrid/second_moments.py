@@ -18,7 +18,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, block_diagonal
 from netkf.network.clocks import Poisson
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import NO_CHANNEL_LAW
+from netkf.theory.common.evidence import no_channel_law
 from netkf.theory.common.jumps import ClockJumps
 from netkf.theory.common.random_links import directions_of, poisson_ticks
 from netkf.theory.hybrid.steady import steady_covariance_bound
@@ -37,7 +37,7 @@ def second_moment_rate(scenario: Scenario) -> float:
     if scenario.network.activation.at != "links" or scenario.sampled_sensors:
         raise TheoryError("the second moments of P are known for clocks of links and increments")
     if scenario.network_changes:
-        raise TheoryError(NO_CHANNEL_LAW)
+        raise TheoryError(no_channel_law(scenario))
     if not channel.independent or channel.delay.fixed != 0.0:
         raise TheoryError("the second moments of P are known without bursts and delays only")
     nodes, n = len(scenario.nodes), scenario.plant.n

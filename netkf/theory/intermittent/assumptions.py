@@ -10,7 +10,7 @@ from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.spectra import contracts
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import NO_CHANNEL_LAW, AssumptionRow, lacks_channel_law
+from netkf.theory.common.evidence import AssumptionRow, lacks_channel_law, no_channel_law
 from netkf.theory.common.plant_assumptions import slot_plant_rows, start_rows
 from netkf.theory.intermittent.riccati import (
     contraction_radius,
@@ -71,7 +71,7 @@ def _arrival_rows(scenario: Scenario) -> list[AssumptionRow]:
     evidence = f"delivery from {smallest:g}" if channel.independent else "losses come in bursts"
     if lacks_channel_law(scenario):
         # A recording has no probabilities: the assumption is neither true nor false.
-        holds, evidence = None, NO_CHANNEL_LAW
+        holds, evidence = None, no_channel_law(scenario)
     rows: list[AssumptionRow] = [
         (
             "arrivals are independent of each other and of the past, and not impossible",

@@ -18,7 +18,7 @@ from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.spectra import growth_factor
 from netkf.network.matchings import Broadcast
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import NO_CHANNEL_LAW, lacks_channel_law
+from netkf.theory.common.evidence import lacks_channel_law, no_channel_law
 from netkf.theory.common.random_links import arrival_of
 from netkf.theory.intermittent.riccati import steady_gain
 
@@ -34,7 +34,7 @@ def tracks_in_slots(scenario: Scenario) -> tuple[float, FloatArray]:
     if not isinstance(scenario.network.activation, Broadcast):
         raise TheoryError("the exchanges are recorded: one outcome, not a law")
     if lacks_channel_law(scenario):
-        raise TheoryError(NO_CHANNEL_LAW)
+        raise TheoryError(no_channel_law(scenario))
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters' model is not the true one")
     joint, radius = steady_tracks(scenario)
