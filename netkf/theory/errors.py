@@ -124,8 +124,12 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     require_linear(scenario)
-    if scenario.network.lives:
-        raise TheoryError(f"{LIVES}, of which exact errors know nothing; {CONSISTENCY}")
+    forgets = any(life.memory == "lost" for life in scenario.network.lives)
+    if scenario.network.lives and (scenario.slotted or forgets):
+        raise TheoryError(
+            f"{LIVES}: exact errors are known under clocks, of nodes that keep their memory; "
+            f"{CONSISTENCY}"
+        )
     if scenario.links_follow_state:
         raise TheoryError("the true state says who hears whom: events tell of it")
     if scenario.slotted:

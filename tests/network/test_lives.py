@@ -158,6 +158,64 @@ def test_who_is_down_does_nothing(scenario_of, at, memory):
     assert count["send"] - count["deliver"] - count["lost"] <= under_way
 
 
+def laws_of_gap(gap):
+    A, B = np.array([[-0.1, 1.0], [0.0, -0.3]]), np.diag([0.2, 1.0])
+    big = scipy.linalg.expm(np.block([[-A, B @ B.T], [np.zeros((2, 2)), A.T]]) * gap)
+    Phi = big[2:, 2:].T
+    return Phi, Phi @ big[:2, 2:]
+
+
+def joint_moments(run, weight):
+    """P of each node, and the joint covariance of all errors, by time: the linear recursion that
+    the events of a run without delays say, written plainly.
+    """
+    H, R, prior = np.array([[1.0, 0.0]]), 0.3, np.array([[1.0, 0.2], [0.2, 2.0]])
+    P, joint, now = [prior] * 3, np.kron(np.ones((3, 3)), prior), 0.0
+    names, heard, found = {code: kind for kind, code in CODES.items()}, {}, []
+    rows = [
+        (t, 0, names[k], n, p) for t, k, n, p in run.log[["t", "kind", "node", "peer"]].tolist()
+    ]
+    for t, _, kind, node, peer in sorted(
+        [*rows, *((t, 1, "probe", 0, 0) for t in run.times.tolist())], key=lambda r: r[:2]
+    ):
+        if t > now:
+            Phi, Q = laws_of_gap(t - now)
+            P = [Phi @ one @ Phi.T + Q for one in P]
+            move, now = np.kron(np.eye(3), Phi), t
+            joint = move @ joint @ move.T + np.kron(np.ones((3, 3)), Q)
+        D, noise = np.eye(6), np.zeros((6, 6))
+        own = slice(2 * node, 2 * node + 2)
+        if kind == "sense":
+            K = P[node] @ H.T / (H @ P[node] @ H.T + R)
+            D[own, own] -= K @ H
+            noise[own, own] = R * K @ K.T
+            P[node] = P[node] - K @ H @ P[node]
+        elif kind == "deliver":
+            heard.setdefault(node, []).append(peer)
+        elif kind == "absorb":
+            before = list(P)
+            for sender in heard.pop(node):
+                D[own, own] -= weight * np.eye(2)
+                D[own, 2 * sender : 2 * sender + 2] += weight * np.eye(2)
+                P[node] = P[node] + weight * (before[sender] - before[node])
+        elif kind == "probe":
+            found.append((P, joint))
+            continue
+        joint = D @ joint @ D.T + noise
+    return found
+
+
+def test_errors_given_the_events_are_exact(scenario_of):
+    lives, files = recorded()
+    no_delay = CLOCKS.replace('delay = {{ kind = "constant", seconds = 0.1 }}', "")
+    scenario = scenario_of(no_delay, lives, files, filter_="hybrid")
+    run = netkf.simulate(scenario, seed=4)
+    Sigma = netkf.theory.error_covariance(scenario, run, stacked=True)
+    for k, (P, joint) in enumerate(joint_moments(run, 0.4)):
+        np.testing.assert_allclose(run.P[k], P, rtol=1e-9)
+        np.testing.assert_allclose(Sigma[k], joint, rtol=1e-9, atol=1e-12)
+
+
 def test_draws_of_others_do_not_depend_on_who_is_up(scenario_of):
     with_lives = netkf.simulate(scenario_of(CLOCKS, *recorded(), filter_="hybrid"), seed=3).log
     without = netkf.simulate(scenario_of(CLOCKS, "", filter_="hybrid"), seed=3, engine="simpy").log
@@ -222,8 +280,9 @@ def test_theory_and_check_say_that_nothing_is_promised(scenario_of):
     scenario = scenario_of(CLOCKS, *recorded(), filter_="hybrid")
     with pytest.raises(netkf.TheoryError, match=r"network\.lives.*consistency"):
         netkf.check(scenario, runs=10)
+    forgetful = scenario_of(CLOCKS, *recorded("lost"), filter_="hybrid")
     with pytest.raises(netkf.TheoryError, match=r"network\.lives.*consistency"):
-        netkf.theory.error_covariance(scenario, netkf.simulate(scenario, seed=1))
+        netkf.theory.error_covariance(forgetful, netkf.simulate(forgetful, seed=1))
     with pytest.raises(netkf.TheoryError):
         netkf.theory.covariance_bound(scenario, [1.0])
 
