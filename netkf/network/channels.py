@@ -11,7 +11,13 @@ import numpy as np
 
 from netkf.core.fields import Component, boolean, field, instance_of
 from netkf.linalg.arrays import FloatArray
-from netkf.network.delays import Delay, NoDelay, checked_delay, draw_delays
+from netkf.network.delays import (
+    Delay,
+    NoDelay,
+    checked_delay,
+    delay_depends_on_message,
+    draw_delays,
+)
 from netkf.network.graphs import Link, Topology
 from netkf.network.losses import (
     GilbertElliott,
@@ -21,6 +27,7 @@ from netkf.network.losses import (
     checked_delivery_probability,
     delivery_probabilities,
     has_conditions,
+    identical_per_link,
 )
 from netkf.network.scheduled import Hopping
 from netkf.rng.streams import Streams
@@ -132,6 +139,14 @@ def draws_per_link(channel: Channel) -> bool:
     loss = channel.loss
     one_chain = not isinstance(loss, GilbertElliott) or loss.path is None
     return one_chain and channel.channels is None and not channel.draws_for_senders
+
+
+def are_alike(channel: Channel) -> bool:
+    """Return True if neither fate nor delay of a message depends on its number, its time or the
+    state of its link.
+    """
+    same_fate = identical_per_link(channel.loss) and channel.channels is None
+    return same_fate and not delay_depends_on_message(channel.delay)
 
 
 class ChannelDraw(NamedTuple):

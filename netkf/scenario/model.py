@@ -298,7 +298,7 @@ class ScenarioModel(Component):
         views = self.views or [entries] * len(self.nodes)
         return np.array([entries < len(view) for view in views])
 
-    @property
+    @cached_property
     def sizes(self) -> np.ndarray:
         """The numbers (N,) of states that nodes estimate."""
         return np.asarray(self.is_estimated.sum(axis=1))
@@ -351,9 +351,13 @@ class ScenarioModel(Component):
         """True if it changes in a run who can hear whom, when or how well: nodes move or are down,
         or messages wait for each other.
         """
+        return self.links_move or bool(self.network.lives) or self.messages_queue
+
+    @property
+    def messages_queue(self) -> bool:
+        """True if a node sends one message after the other, each for some time."""
         radio = self.network.radio
-        busy = radio is not None and radio.bits_per_second is not None
-        return self.links_move or bool(self.network.lives) or busy
+        return radio is not None and radio.bits_per_second is not None
 
     @property
     def links_follow_state(self) -> bool:
@@ -511,20 +515,26 @@ class ScenarioModel(Component):
 
     @cached_property
     def _hearers(self) -> dict[int, tuple[int, ...]]:
-        found: dict[int, tuple[int, ...]] = {}
+        found: dict[int, list[int]] = {}
         for sender, receiver in self.topology.directions:
-            found[sender] = (*found.get(sender, ()), receiver)
-        return found
+            found.setdefault(sender, []).append(receiver)
+        return {sender: tuple(receivers) for sender, receivers in found.items()}
 
     def message_size(self, node: int, phase: int) -> float:
         """Return the bytes of a message that ``node`` (id) sends in an exchange number ``phase`` of
         a slot, -1 under clocks.
         """
-        radio, index = self.network.radio or Radio(), self.topology.index[node]
-        # Some filters send their readings.
-        rows = sum(len(self.sensors[p.entry].R) for p in self.placed_sensors.get(node, ()))
-        numbers = self.node_filter.analysis.payload_numbers(int(self.sizes[index]), rows, phase)
-        return float(radio.bytes_per_number * numbers)
+        if (node, phase) not in self._message_sizes:
+            radio, index = self.network.radio or Radio(), self.topology.index[node]
+            # Some filters send their readings.
+            rows = sum(len(self.sensors[p.entry].R) for p in self.placed_sensors.get(node, ()))
+            numbers = self.node_filter.analysis.payload_numbers(int(self.sizes[index]), rows, phase)
+            self._message_sizes[node, phase] = float(radio.bytes_per_number * numbers)
+        return self._message_sizes[node, phase]
+
+    @cached_property
+    def _message_sizes(self) -> dict[tuple[int, int], float]:
+        return {}
 
     @property
     def has_broadcasts(self) -> bool:
@@ -537,7 +547,7 @@ class ScenarioModel(Component):
     def longest_delay(self) -> float:
         """The largest number of seconds that a message may take; inf if there is no bound."""
         radio, longest = self.network.radio, float(self.network.channel.delay.longest)
-        if radio is None or radio.bits_per_second is None:
+        if radio is None or not self.messages_queue:
             return longest
         if radio.queue == "wait":
             return math.inf

@@ -192,8 +192,6 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
     # Thinning a Poisson process by independent losses gives a Poisson process of lower rate, and a
     # fixed delay only shifts it; a random delay or dependent losses do neither.
     fixed, symmetric = channel.delay.fixed, has_balanced_rates(scenario)
-    radio = scenario.network.radio
-    queues = radio is not None and radio.bits_per_second is not None
     is_unknown = isinstance(channel.loss, RecordedLoss) or scenario.network_changes
     return [
         (
@@ -209,9 +207,11 @@ def _channel_rows(scenario: Scenario) -> list[AssumptionRow]:
         (
             "messages take no time, or one fixed time",
             "H (7), derived",
-            None if isinstance(channel.delay, RecordedDelay) else fixed is not None and not queues,
+            None
+            if isinstance(channel.delay, RecordedDelay)
+            else fixed is not None and not scenario.messages_queue,
             "messages wait for those before them: H(12) is not promised"
-            if queues
+            if scenario.messages_queue
             else "random or recorded delay: H(12) is not promised"
             if fixed is None
             else "no delay"

@@ -279,9 +279,7 @@ def pairs_of(scenario: Scenario, run: Run) -> PairCounts | None:
 @lru_cache(maxsize=8)
 def stated_delay(scenario: Scenario) -> tuple[float | None, Any]:
     """Return the constant that the scenario states for its delays, and their law, or None each."""
-    radio = scenario.network.radio
-    if radio is not None and radio.bits_per_second is not None:
-        # Messages wait for those before them.
+    if scenario.messages_queue:
         return None, None
     delay = scenario.network.channel.delay
     return stated_part(delay, "delay").fixed, stated_law(delay, "delay")

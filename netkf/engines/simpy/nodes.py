@@ -271,22 +271,23 @@ class Node:
         linear = [sample for sample in samples if isinstance(sample[1], np.ndarray)]
         return [*linear, (y, H, block_diagonal([R for *_, R in functions]) + extra)]
 
-    def gated(self, samples: Sequence[Sample]) -> tuple[Sequence[Sample], int]:
-        """Return the linearised samples that the gate lets pass, with the R that it gives them, and
-        how many it refused; entries of a sample that are nan do not count.
+    def gated(self, samples: Sequence[Sample], time: float, recorder: Recorder) -> Sequence[Sample]:
+        """Return the linearised samples of this ``time`` that the gate lets pass, with the R that
+        it gives them, and record those it refuses; entries of a sample that are nan do not count.
         """
         if self._gate is None or not samples:
-            return samples, 0
+            return samples
         xhat, P = self.algorithm.estimate(self.state)
-        passed, refused = [], 0
+        passed = []
         for y, H, R in samples:
             present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
             z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
             factor = self._gate.factor(z, J @ P @ J.T, C)
-            refused += factor != 1.0
+            if factor != 1.0:
+                recorder.append((time, REFUSE, self.node, -1, -1, -1, NAN))
             if np.isfinite(factor):
                 passed.append((y, H, factor * R))
-        return passed, refused
+        return passed
 
     def shift(self, offset: FloatArray) -> None:
         """Add ``offset`` (n,) to the estimate, after the origin of the coordinates has moved."""
@@ -386,10 +387,8 @@ class ClockedNode(Node):
         for node in sensing:
             self._recorder.append((time, SENSE, node, -1, -1, -1, NAN))
         # One update with all samples: R is block diagonal, since sensors have independent noise.
-        known, refused = self.gated(self.linearise([sample[1:] for sample in samples]))
-        rows = refused * [(time, REFUSE, self.node, -1, -1, -1, NAN)]
-        for row in rows:
-            self._recorder.append(row)
+        taken = self.linearise([sample[1:] for sample in samples])
+        known = self.gated(taken, time, self._recorder)
         nothing = np.empty(0), np.empty((0, self.width))
         y, H = (
             np.concatenate([nothing[part], *(sample[part] for sample in known)])

@@ -29,8 +29,8 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
-SENSE, TICK, ROUND, SWAP, ABSORB, STOP, REFUSE = (
-    CODES[kind] for kind in ("sense", "tick", "round", "swap", "absorb", "stop", "refuse")
+SENSE, TICK, ROUND, SWAP, ABSORB, STOP = (
+    CODES[kind] for kind in ("sense", "tick", "round", "swap", "absorb", "stop")
 )
 FIRST_RANK = Rank.PROBE + 1
 """The stages of a slot come after arrivals of the same instant; their ranks follow the schedule."""
@@ -197,9 +197,7 @@ class SlotNode(Node):
         self._samples.append((y, H, R))
 
     def _update(self, time: float) -> None:
-        samples, refused = self.gated(self.linearise(self._samples))
-        for _ in range(refused):
-            self._recorder.append((time, REFUSE, self.node, -1, -1, -1, NAN))
+        samples = self.gated(self.linearise(self._samples), time, self._recorder)
         # Empty arrays first, so that nodes without sensors concatenate too.
         y = np.concatenate([np.empty(0), *(y for y, *_ in samples)])
         H = np.concatenate([np.empty((0, self.width)), *(H for _, H, _ in samples)])

@@ -19,6 +19,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import (
     ChannelDraw,
     ChannelSampler,
+    are_alike,
     broadcasts_of,
     conditions_of,
     transit_time,
@@ -85,6 +86,7 @@ class Transmitter:
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
         self._follows_distance = self._channel.loss.follows_distance
+        self._alike = are_alike(self._channel)
         self._conditions = conditions_of(self._channel.loss, streams, scenario.horizon)
         radio = scenario.network.radio
         self._airtime = None if radio is None else Airtime(radio)
@@ -140,7 +142,9 @@ class Transmitter:
         append((now, SEND, sender, receiver, number, phase, NAN))
         if self.broadcasts is not None and outcome is not LINK_DOWN:
             outcome = self.broadcasts.over(sender, outcome)
-        sent = direction.first._replace(number=number, time=now, bad=outcome.bad)
+        sent = direction.first
+        if not self._alike:
+            sent = sent._replace(number=number, time=now, bad=outcome.bad)
         if self._follows_distance and self.reach is not None:
             sent = sent._replace(distance=self.reach.distance(*direction.link, now))
         waits = 0.0
