@@ -99,6 +99,7 @@ from netkf.network.losses import (
     Transmission,
 )
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
+from netkf.network.node_clocks import NodeClock
 from netkf.network.radio import Radio
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.network.scheduled import Hopping, ScheduledLoss
@@ -226,6 +227,7 @@ __all__ = [
     "NetworkInfo",
     "NoDelay",
     "NoLoss",
+    "NodeClock",
     "NodeInfo",
     "NonlinearDiffusion",
     "NonlinearPlant",

@@ -468,6 +468,9 @@ def _require_laws(scenario: Scenario) -> None:
     find_checks(scenario)
     if scenario.network.lives:
         raise TheoryError(f"{LIVES}, so nothing is promised; {CONSISTENCY}")
+    if scenario.network.clocks:
+        evidence = scenario.departures[0][1]
+        raise TheoryError(f"{evidence}, so nothing is promised; {CONSISTENCY}")
     if not scenario.is_random:
         raise TheoryError(
             "the state or the readings are recorded: there is one run, and no law to check; "

@@ -238,6 +238,33 @@ def _check_lives(scenario: DerivedScenario) -> None:
         raise ScenarioError("network.lives", rule, sorted(owners), "remove it")
 
 
+def _check_clocks(scenario: DerivedScenario) -> None:
+    owners: dict[int, int] = {}
+    for k, entry in enumerate(scenario.network.clocks):
+        key = f"network.clocks[{k}].nodes"
+        for node in entry.nodes:
+            if owners.setdefault(node, k) != k:
+                rule = f"must not have a node of network.clocks[{owners[node]}]"
+                raise ScenarioError(key, rule, node, "give each node one entry")
+            if node in scenario.increment_sensors:
+                rule = "cannot have a clock where sensors give increments, only where they sample"
+                remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
+                raise ScenarioError(key, rule, node, remedy)
+            placed = scenario.placed_sensors.get(node, ())
+            if any(scenario.sensors[p.entry].record is not None for p in placed):
+                rule = "cannot have a clock where readings are recorded, with the stamps they have"
+                raise ScenarioError(key, rule, node, "correct the times of the table instead")
+    why = None
+    if scenario.slotted:
+        why = "belongs to continuous time: slots begin for all nodes at once"
+    elif scenario.node_filter.timing.pooled:
+        why = f"has no meaning for the {filter_name(scenario)}, which is in no node"
+    elif scenario.input_responses is not None or len(scenario.followed_changes):
+        why = "cannot stand beside inputs or changes of a linear plant that filters know"
+    if owners and why is not None:
+        raise ScenarioError("network.clocks", why, sorted(owners), "remove it")
+
+
 def _check_network(scenario: DerivedScenario) -> None:
     network, topology, node_filter = scenario.network, scenario.topology, scenario.node_filter
     for key, part in (
@@ -246,11 +273,13 @@ def _check_network(scenario: DerivedScenario) -> None:
         ("network.channel.delay", network.channel.delay),
         ("network.channel.channels", network.channel.channels),
         *((f"network.lives[{k}]", life) for k, life in enumerate(network.lives)),
+        *((f"network.clocks[{k}]", clock) for k, clock in enumerate(network.clocks)),
     ):
         if part is not None:
             with errors_under(key):
                 part.check(topology)
     _check_lives(scenario)
+    _check_clocks(scenario)
     if not node_filter.timing.talks:
         return
     name = filter_name(scenario)

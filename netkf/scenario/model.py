@@ -46,6 +46,7 @@ from netkf.network.graphs import Graph, Link, RangeGraph, Topology
 from netkf.network.lives import Life
 from netkf.network.losses import Transmission
 from netkf.network.matchings import SlotActivation
+from netkf.network.node_clocks import NodeClock
 from netkf.network.positions import Positions, PositionTable
 from netkf.network.radio import Radio
 from netkf.plants.blocks import Block, Layout, stack
@@ -59,6 +60,9 @@ from netkf.scenario.positions import placed_nodes, positions_of, table_of_positi
 from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
 
+EVERY_READING = "every reading is used"
+"""An assumption of all filters, see ``ScenarioModel.departures``."""
+
 
 @dataclass(frozen=True, eq=False)
 class Network(Component):
@@ -70,6 +74,7 @@ class Network(Component):
     activation  when links, directions or nodes send; only filters that do not talk need none
     channel     losses and delays of messages
     lives       when nodes are down: crashes, duty cycles, tables; others are always up
+    clocks      what clocks of nodes show, where they are wrong
     radio       how long nodes send a message, and in how many frames
     """
 
@@ -80,6 +85,9 @@ class Network(Component):
     channel: Channel = field(instance_of(Channel), default=Channel())
     positions: SourceFile | None = field(source_file, default=None)
     lives: tuple[Life, ...] = field(list_of(instance_of(Life), "lives", min_length=0), default=())
+    clocks: tuple[NodeClock, ...] = field(
+        list_of(instance_of(NodeClock), "clocks", min_length=0), default=()
+    )
     radio: Radio | None = field(instance_of(Radio), default=None)
 
 
@@ -369,10 +377,31 @@ class ScenarioModel(Component):
         """The grid that every instant of a run lies on."""
         return choose_grid(self)
 
+    @cached_property
+    def departures(self) -> tuple[tuple[str, str], ...]:
+        """What filters assume, and why it is not so: clocks, readings and gates."""
+        found = []
+        if self.network.clocks:
+            evidence = (
+                "clocks of nodes are wrong and filters believe them: estimates are of another "
+                "time, and P does not count it"
+            )
+            found.append(("clocks of nodes are right", evidence))
+        if self.filter.gate is not None:
+            evidence = (
+                "a gate refuses a healthy reading of a consistent filter with probability "
+                f"{1.0 - self.filter.gate.probability:.4g}: gains, P and errors follow the data, "
+                "and P is too small after a healthy reading that was refused"
+            )
+            found.append((EVERY_READING, evidence))
+        return tuple(found)
+
     @property
     def is_linear(self) -> bool:
-        """True if the dynamics and all readings are linear in the state, and all are used."""
-        return self.plant.linear and self.has_linear_sensors and self.filter.gate is None
+        """True if the dynamics and all readings are linear in the state, and nothing departs from
+        what filters assume.
+        """
+        return self.plant.linear and self.has_linear_sensors and not self.departures
 
     @property
     def has_linear_sensors(self) -> bool:
@@ -547,6 +576,9 @@ class ScenarioModel(Component):
     def longest_delay(self) -> float:
         """The largest number of seconds that a message may take; inf if there is no bound."""
         radio, longest = self.network.radio, float(self.network.channel.delay.longest)
+        if self.network.clocks:
+            # Stamps may tell any age up to the time since the start, by the receiver's clock.
+            return 2.0 * self.horizon
         if radio is None or not self.messages_queue:
             return longest
         if radio.queue == "wait":

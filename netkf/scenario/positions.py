@@ -13,6 +13,7 @@ from netkf.core.errors import ScenarioError, errors_under
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.network.clocks import LinkClock
 from netkf.network.graphs import NamedNode
+from netkf.network.node_clocks import node_time, owner_of
 from netkf.network.positions import Positions, PositionTable, read_positions
 from netkf.rng.streams import Streams
 
@@ -124,7 +125,10 @@ def tick_times(scenario: Any, streams: Streams) -> FloatArray:
     for entity in clock.entities(scenario.topology) if isinstance(clock, LinkClock) else ():
         phase = partial(streams.generator, "phase", *entity)
         random = streams.generator("clock", *entity)
-        instants.append(generate_ticks(clock, entity, phase, random, scenario.horizon))
+        own = node_time(scenario, streams, owner_of(clock, entity))
+        ahead = own.ahead(clock)
+        until = own.until(scenario.horizon, ahead)
+        instants.append(own.instants(generate_ticks(clock, entity, phase, random, until), ahead))
     return np.asarray(
         scenario.time_grid.before(scenario.horizon, np.unique(np.concatenate(instants)))
     )

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from netkf.core.clock import Clock
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray
+from netkf.network.node_clocks import node_time
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.sampling import RecordedSampling, Samples
 from netkf.plants.sensors import LinearSensor, Sensor
@@ -43,9 +45,12 @@ def times_of_sensor(
     """Return the sample times (K,) in seconds of one sensor of a node, see ``sample_times``."""
     sensor = scenario.sensors[placed_sensor.entry]
     generator = _make_generator(streams, node, placed_sensor)
+    own, clock = node_time(scenario, streams, node), getattr(sensor, "sampling", None)
+    ahead = own.ahead(clock) if isinstance(clock, Clock) else 0.0
+    until = own.until(scenario.horizon, ahead)
     with errors_under(scenario.sensor_key(placed_sensor.entry)):
-        times = sensor.sample_times(node, placed_sensor.ordinal, generator, scenario.horizon)
-    times = scenario.time_grid.before(scenario.horizon, times)
+        times = sensor.sample_times(node, placed_sensor.ordinal, generator, until)
+    times = scenario.time_grid.before(scenario.horizon, own.instants(times, ahead))
     # Rows of one instant are one sample.
     is_recorded = isinstance(getattr(sensor, "sampling", None), RecordedSampling)
     return np.unique(times) if is_recorded else times

@@ -19,6 +19,7 @@ from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
+from netkf.network.node_clocks import NodeClock
 from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
@@ -51,6 +52,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Network, "activation"): {"$ref": "#/$defs/activation"},
     (Network, "channel"): {"$ref": "#/$defs/channel"},
     (Network, "lives"): {"type": "array", "items": {"$ref": "#/$defs/life"}},
+    (Network, "clocks"): {"type": "array", "items": {"$ref": "#/$defs/clock"}},
     (Network, "radio"): {"$ref": "#/$defs/radio"},
     (Channel, "channels"): {"$ref": "#/$defs/hopping"},
     (Channel, "loss"): {"$ref": "#/$defs/loss"},
@@ -110,6 +112,7 @@ def scenario_schema() -> Schema:
     definitions["network"] = _table_schema(list_keys(Network))
     definitions["channel"] = _table_schema(list_keys(Channel))
     definitions["gate"] = _table_schema(list_keys(Gate))
+    definitions["clock"] = _table_schema(list_keys(NodeClock))
     definitions["radio"] = _table_schema(list_keys(Radio))
     definitions["hopping"] = _table_schema(list_keys(Hopping))
     definitions["time"] = _table_schema(list_keys(Time))

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from netkf.algorithms.gates import Gate
 from netkf.core.fields import Component
 from netkf.network.channels import Channel
+from netkf.network.node_clocks import NodeClock
 from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
@@ -24,6 +25,7 @@ TABLES: dict[str, type[Component]] = {
     "network": Network,
     "network.channel": Channel,
     "network.channel.channels": Hopping,
+    "network.clocks": NodeClock,
     "network.radio": Radio,
     "filter, beside its kind": Filtering,
     "filter.model": Belief,

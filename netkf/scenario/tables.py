@@ -21,6 +21,7 @@ from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
+from netkf.network.node_clocks import NodeClock
 from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
@@ -162,7 +163,7 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
     if plant is NOT_IMPORTED:
         time = "unknown"
     builders = {
-        "sensors": partial(_build_sensors, origin),
+        "sensors": partial(_build_list, "sensors", partial(_build_sensor, origin)),
         "network": partial(_build_network, origin, time),
         "filter": partial(_build_filtering, origin),
     }
@@ -335,12 +336,11 @@ def _as_dict(value: Any) -> dict[str, Any]:
     return dict(value)
 
 
-def _build_sensors(origin: Origin, value: Any) -> tuple[Any, ...]:
+def _build_list(key: str, build: Callable[[Any], Any], value: Any) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
-        raise ScenarioError("", "must be a list of tables", value, "write [[sensors]]")
+        raise ScenarioError("", "must be a list of tables", value, f"write [[{key}]]")
     tables = {f"[{k}]": item for k, item in enumerate(value)}
-    builders = dict.fromkeys(tables, partial(_build_sensor, origin))
-    return tuple(_build_inner(tables, builders).values())
+    return tuple(_build_inner(tables, dict.fromkeys(tables, build)).values())
 
 
 def _build_sensor(origin: Origin, value: Any) -> Any:
@@ -353,18 +353,11 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
         "graph": lambda graph: _build_component("graph", origin, as_graph(graph)),
         "activation": partial(_build_activation, origin, time),
         "channel": partial(_build_channel, origin),
-        "lives": partial(_build_lives, origin),
+        "lives": partial(_build_list, "network.lives", partial(_build_component, "life", origin)),
+        "clocks": partial(_build_list, "network.clocks", partial(_build_table, NodeClock, origin)),
         "radio": partial(_build_table, Radio, origin),
     }
     return _build_object(Network, _build_inner(_as_dict(value), builders), origin)
-
-
-def _build_lives(origin: Origin, value: Any) -> tuple[Any, ...]:
-    if not isinstance(value, (list, tuple)):
-        raise ScenarioError("", "must be a list of tables", value, "write [[network.lives]]")
-    tables = {f"[{k}]": item for k, item in enumerate(value)}
-    build = partial(_build_component, "life", origin)
-    return tuple(_build_inner(tables, dict.fromkeys(tables, build)).values())
 
 
 def _build_activation(origin: Origin, time: str, value: Any) -> Any:

@@ -72,9 +72,10 @@ class CompiledEngine(Engine):
         if unknown:
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
-        changing = scenario.network.lives or scenario.network.radio is not None
+        network = scenario.network
+        changing = network.lives or network.clocks or network.radio is not None
         if changing or scenario.filter.gate is not None:
-            rule = "nodes that are down at times, a radio or a gate"
+            rule = "nodes that are down at times or have clocks of their own, a radio or a gate"
             return f'engine "compiled" cannot run {rule}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)

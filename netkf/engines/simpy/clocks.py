@@ -15,6 +15,7 @@ from netkf.engines.simpy.nodes import ClockedNode
 from netkf.engines.simpy.timeline import Timeline
 from netkf.engines.simpy.transmission import DirectedLink, LinkExchange, Transmitter, stream
 from netkf.network.clocks import LinkClock
+from netkf.network.node_clocks import node_time, owner_of
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -68,29 +69,30 @@ def _tick_process(
     tick_order: int,
     activate: Activation,
 ) -> Process:
-    clock, instant = scenario.network.activation, scenario.time_grid.instant
+    clock = scenario.network.activation
     assert isinstance(clock, LinkClock)
     # A stream of its own: the ticks of one entity never depend on those of another.
     random = streams.generator("clock", *entity)
+    own = node_time(scenario, streams, owner_of(clock, entity))
+    ahead = own.ahead(clock)
     # A random phase is drawn from a stream of its own, and only if the clock asks for one.
     origin = clock.origin(entity, partial(stream, streams, entity, "phase"))
     now, index, count = 0.0, 0, FIRST_BLOCK
     while True:
         # Ticks are drawn in blocks; their times do not depend on the length of a block.
-        times = next_ticks(clock, entity, ClockPosition(origin, index, now), random, count).tolist()
+        times = next_ticks(clock, entity, ClockPosition(origin, index, now), random, count)
         # The clock goes on from its own times, and the ticks are the instants nearest to them.
-        for now in times:
-            time = instant(now)
+        for time in own.instants(times, ahead).tolist():
             # Half open: a tick at the horizon does not happen.
             if time >= scenario.horizon:
                 return
             yield timeline.at(time, Rank.TICK, tick_order)
             activate(time)
         # An empty block: the clock has no more ticks.
-        if not times:
+        if not len(times):
             return
         recorder.flush_if_full()
-        index += len(times)
+        index, now = index + len(times), float(times[-1])
         # Blocks double in length: a slow clock wastes few numbers, a fast one soon draws many at
         # once.
         count = min(2 * count, MAX_BLOCK)

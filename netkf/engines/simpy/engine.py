@@ -33,6 +33,7 @@ from netkf.engines.simpy.transmission import Transmitter
 from netkf.engines.soundness import sound_mask, stack_estimates
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.plain import announce_plain
+from netkf.network.node_clocks import node_time
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
@@ -112,7 +113,8 @@ class _Simulation:
             # A pooled filter has the increment sensors of all nodes.
             placed = [(k, p) for k in sensing for p in scenario.increment_sensors.get(k, ())]
             sensors = increment_sensors(scenario, streams, placed)
-            common = (timeline, self._recorder, truth, sensors)
+            clock = node_time(scenario, streams, node)
+            common = (timeline, self._recorder, truth, sensors, clock)
             return ClockedNode(*common, *_identify(scenario, node, entity))
 
         nodes = _nodes(scenario, make_node)

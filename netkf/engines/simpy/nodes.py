@@ -29,6 +29,7 @@ from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
 from netkf.engines.simpy.driven import DrivenModel
 from netkf.engines.simpy.timeline import Timeline
 from netkf.linalg.arrays import FloatArray, block_diagonal
+from netkf.network.node_clocks import NodeTime
 from netkf.plants.nonlinear import linearise_by_points
 from netkf.plants.readings import Stacked
 from netkf.trace.recorder import NAN, Recorder
@@ -307,13 +308,14 @@ class ClockedNode(Node):
         recorder: Recorder,
         truth: Any,
         increments: list[Any],
+        clock: NodeTime,
         *arguments: Any,
     ) -> None:
         super().__init__(*arguments)
         self._timeline, self._recorder, self._truth = timeline, recorder, truth
-        self._increments = increments
-        # The time in seconds to which the filter is predicted.
-        self._now = 0.0
+        self._increments, self._clock = increments, clock
+        # The time in seconds by its clock, to which the filter is predicted.
+        self._now = clock.shows(0.0)
         # The samples of the present instant, until the update that uses all of them.
         self._samples: list[tuple[int, FloatArray, Any, FloatArray]] = []
         self._pairs: list[tuple[int, PairReading]] = []
@@ -325,10 +327,13 @@ class ClockedNode(Node):
     def restart(self, time: float) -> None:
         """Begin again with the estimate of the start, at ``time`` seconds."""
         super().restart(time)
-        self._now = time
+        self._now = self._clock.shows(time)
 
     def predict_to(self, time: float) -> None:
-        """Predict the filter to ``time`` (seconds), using the increments since its last event."""
+        """Predict the filter to ``time`` (seconds), using the increments since its last event; what
+        passes for it is time by its clock.
+        """
+        time = self._clock.shows(time)
         if self._now >= time:
             return
         if isinstance(self.moving_model, ChangingFlowModel | RateModel):
@@ -395,7 +400,7 @@ class ClockedNode(Node):
             for part in range(2)
         )
         R = block_diagonal([R for *_, R in known])
-        reading = Reading(y, H, R, time, tuple(pair for _, pair in pairs))
+        reading = Reading(y, H, R, self._now, tuple(pair for _, pair in pairs))
         self.state = self.algorithm.update(self.state, reading)
         # Under activation by readings the node transmits now.
         if self.after_sample is not None:
@@ -405,7 +410,7 @@ class ClockedNode(Node):
         """Return the payload that the node sends to ``receivers`` (ids) at ``time``, or None."""
         # The payload is of the present state, not of that at the last event.
         self.predict_to(time)
-        exchange = Exchange(time=time, receivers=receivers)
+        exchange = Exchange(time=self._now, receivers=receivers)
         self.state, payload = self.algorithm.emit(self.state, exchange)
         return payload
 
@@ -423,7 +428,7 @@ class ClockedNode(Node):
     def _absorb(self, _: simpy.Event) -> None:
         time = self._timeline.now
         self.predict_to(time)
-        exchange = Exchange(time=time)
+        exchange = Exchange(time=self._now)
         messages = self.take_messages(exchange)[1]
         self.state = self.algorithm.absorb(self.state, messages, exchange)
         oldest = max(message.age for message in messages)

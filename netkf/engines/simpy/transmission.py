@@ -26,6 +26,7 @@ from netkf.network.channels import (
 )
 from netkf.network.graphs import Link
 from netkf.network.losses import Transmission
+from netkf.network.node_clocks import node_times
 from netkf.network.radio import Airtime
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -92,6 +93,7 @@ class Transmitter:
         self._airtime = None if radio is None else Airtime(radio)
         # What hearers share is drawn for each transmission of a sender.
         self.broadcasts = broadcasts_of(scenario, streams)
+        self._clocks = node_times(scenario, streams)
         self._horizon, self._until = scenario.horizon, scenario.end_time
         self._instant = scenario.time_grid.instant
         # Of nodes that move: who hears whom. Set when the true state of the run is known.
@@ -177,7 +179,8 @@ class Transmitter:
         if arrival is not None:
             # The stored envelope may have been shifted since it was sent.
             envelope = self._under_way.pop((direction.link, envelope.number))
-            envelope = envelope._replace(age=self._instant(now - envelope.sent))
+        age = self._instant(now - envelope.sent)
+        envelope = envelope._replace(age=self._told_age(direction.link, envelope.sent, age))
         if not self.up(receiver):
             if now < self._horizon or envelope.sent == now:
                 self._recorder.append((now, LOST, sender, receiver, envelope.number, phase, NAN))
@@ -186,9 +189,19 @@ class Transmitter:
         # After the horizon the last slot is finished for its sample, without recording events.
         if now < self._horizon or envelope.sent == now:
             kind, number = DELIVER if arrives_in_time else LATE, envelope.number
-            self._recorder.append((now, kind, receiver, sender, number, phase, envelope.age))
+            self._recorder.append((now, kind, receiver, sender, number, phase, age))
         if arrives_in_time:
             direction.receiver.receive(envelope)
+
+    def _told_age(self, link: Link, sent: float, age: float) -> float:
+        """Return the age that the stamp of a message tells its receiver, whose filter believes it:
+        from 0 to the time since the start, both by the receiver's clock.
+        """
+        if not self._clocks:
+            return age
+        (sender, receiver), now = (self._clocks[node] for node in link), self._timeline.now
+        told = self._instant(receiver.shows(now) - sender.shows(sent))
+        return min(max(told, 0.0), self._instant(receiver.shows(now) - receiver.shows(0.0)))
 
     def shift(self, algorithm: Filter, offset: FloatArray) -> None:
         """Shift all messages under way by ``offset`` (n,), predicted back to the time of sending,

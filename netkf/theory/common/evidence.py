@@ -5,9 +5,9 @@ A record is one outcome and does not show the law that it came from: the verdict
 
 from __future__ import annotations
 
-from netkf.algorithms.gates import Gate
 from netkf.core.errors import TheoryError
 from netkf.network.recorded import RecordedDelay, RecordedLoss
+from netkf.scenario.model import EVERY_READING
 from netkf.scenario.scenario import Scenario
 
 AssumptionRow = tuple[str, str, bool | None, str]
@@ -21,8 +21,8 @@ TRUE_MODEL = "the filters know the plant and the sensors"
 
 
 def nonlinear_rows(scenario: Scenario) -> list[AssumptionRow]:
-    """Return a row for dynamics and one for readings that are not linear, and one for a gate; [] if
-    everything is linear.
+    """Return a row for dynamics and one for readings that are not linear, and one for each of
+    ``Scenario.departures``; [] if there is none of these.
     """
     parts = {"dynamics": scenario.plant.linear, "readings": scenario.has_linear_sensors}
     rows: list[AssumptionRow] = [
@@ -30,31 +30,31 @@ def nonlinear_rows(scenario: Scenario) -> list[AssumptionRow]:
         for part, is_linear in parts.items()
         if not is_linear
     ]
+    details = {EVERY_READING: _refused_spread}
+    return rows + [
+        (name, "all papers", False, evidence + (details[name](scenario) if name in details else ""))
+        for name, evidence in scenario.departures
+    ]
+
+
+def _refused_spread(scenario: Scenario) -> str:
     gate = scenario.filter.gate
-    if gate is not None:
-        rows.append(("every reading is used", "all papers", False, _gate_evidence(scenario, gate)))
-    return rows
-
-
-def _gate_evidence(scenario: Scenario, gate: Gate) -> str:
+    if gate is None or gate.then != "ignore":
+        return ""
     sizes = sorted(
         {len(scenario.noise_covariance(k, believed=True)) for k in range(len(scenario.sensors))}
     )
-    after = ""
-    if gate.then == "ignore":
-        spreads = ", ".join(f"{gate.refused_spread(p):.4g} for p = {p}" for p in sizes)
-        after = (
-            f"; after a healthy one that is ignored the error covariance is P + (g - 1) K S K', "
-            f"g = {spreads}"
-        )
+    spreads = ", ".join(f"{gate.refused_spread(p):.4g} for p = {p}" for p in sizes)
     return (
-        f"a gate refuses a healthy reading of a consistent filter with probability "
-        f"{1.0 - gate.probability:.4g}{after}: gains, P and errors follow the data"
+        f"; after a healthy one that is ignored the error covariance is P + (g - 1) K S K', "
+        f"g = {spreads}"
     )
 
 
 def require_linear(scenario: Scenario) -> None:
-    """Raise TheoryError if dynamics or readings are not linear, or readings may be refused."""
+    """Raise TheoryError if dynamics or readings are not linear, or the network departs from what
+    filters assume.
+    """
     for *_, evidence in nonlinear_rows(scenario):
         raise TheoryError(evidence)
 

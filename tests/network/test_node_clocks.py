@@ -1,0 +1,332 @@
+"""Clocks of nodes that are wrong: ticks, stamps, and what filters make of them."""
+
+import bisect
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import netkf
+from netkf.core.errors import EngineError, ScenarioError
+from netkf.core.instants import TimeGrid
+from netkf.network.clocks import Periodic, Poisson
+from netkf.network.node_clocks import NodeTime, node_time
+from netkf.rng.streams import Streams
+from netkf.trace.schema import CODES
+
+# Without noise estimates are a linear map of x(0), which a plain recursion gives to rounding.
+SCENARIO = """
+format = 1
+name = "clocks"
+horizon = {horizon}
+probe = 0.25
+[plant]
+kind = "diffusion"
+A = [[0.2, 1.0], [-1.0, -0.1]]
+B = [[0.0, 0.0], [0.0, 0.0]]
+mean = [2.0, -3.0]
+[[sensors]]
+nodes = [0, 1, 2]
+H = [[1.0, 0.0]]
+R = [[1e-22]]
+sampling = {{ kind = "periodic", period = 0.5 }}
+[network]
+graph = {{ kind = "path", nodes = 3 }}
+activation = {{ kind = "periodic", period = 0.3, at = "{at}" }}
+{clocks}
+[network.channel]
+delay = {{ kind = "constant", seconds = {delay} }}
+[filter]
+kind = "{filter}"
+mean = [0.5, 0.0]
+cov = [[1.0, 0.2], [0.2, 2.0]]
+[filter.model]
+B = [[0.2, 0.0], [0.0, 1.0]]
+R = [[0.3]]
+"""
+CLOCKS = """[[network.clocks]]
+nodes = [1]
+offset = 0.17
+drift = 0.01
+[[network.clocks]]
+nodes = [2]
+offset = -0.08
+drift = -0.02
+"""
+OFFSET, DRIFT = (0.0, 0.17, -0.08), (0.0, 0.01, -0.02)
+A, BB = np.array([[0.2, 1.0], [-1.0, -0.1]]), np.diag([0.04, 1.0])
+H, R = np.array([[1.0, 0.0]]), np.array([[0.3]])
+
+
+@pytest.fixture
+def scenario_of(tmp_path):
+    def make(clocks=CLOCKS, filter_="hybrid", at="nodes", delay=0.1, horizon=6.0):
+        path = tmp_path / "clocks.toml"
+        text = SCENARIO.format(clocks=clocks, filter=filter_, at=at, delay=delay, horizon=horizon)
+        if filter_ in ("hybrid", "covariance-intersection"):
+            text = text.replace("mean = [0.5", "epsilon = 0.3\nmean = [0.5")
+        path.write_text(text)
+        return netkf.load(path)
+
+    return make
+
+
+def predict(x, P, gap):
+    nested = np.block([[-A, BB], [np.zeros((2, 2)), A.T]])
+    big = scipy.linalg.expm(nested * gap)
+    F = big[2:, 2:].T
+    return F @ x, F @ P @ F.T + F @ big[:2, 2:]
+
+
+def local_lattice(node, period, horizon):
+    """All times in (0, horizon) at which the clock of a node shows a multiple of the period, but 0
+    of a clock that shows 0 at the start.
+    """
+    k = np.arange(-100, 1000)
+    t = (k * period - OFFSET[node]) / (1.0 + DRIFT[node])
+    return [float(one) for one in t if 1e-9 < one < horizon - 1e-9]
+
+
+def plain_run(times, horizon, delay):
+    """Estimates and covariances (T, 3, n) of the hybrid filter whose nodes measure time, and the
+    age of messages, by their own clocks.
+    """
+    shows = lambda node, t: OFFSET[node] + (1.0 + DRIFT[node]) * t  # noqa: E731
+    neighbours = {0: [1], 1: [0, 2], 2: [1]}
+    events = [(t, 4, "probe", 0, None) for t in times]
+    for i in range(3):
+        events += [(t, 0, "sample", i, None) for t in local_lattice(i, 0.5, horizon)]
+        events += [(t, 1, "tick", i, None) for t in local_lattice(i, 0.3, horizon)]
+    events.sort(key=lambda event: event[:2])
+    state = [(np.array([0.5, 0.0]), np.array([[1.0, 0.2], [0.2, 2.0]])) for _ in range(3)]
+    now, found = [shows(i, 0.0) for i in range(3)], []
+
+    def advance(i, t):
+        gap = shows(i, t) - now[i]
+        if gap > 0.0:
+            state[i], now[i] = predict(*state[i], gap), shows(i, t)
+
+    while events:
+        t, _, what, i, more = events.pop(0)
+        if what == "probe":
+            for k in range(3):
+                advance(k, t)
+            found.append([*state])
+            continue
+        advance(i, t)
+        x, P = state[i]
+        if what == "sample":
+            y = H @ scipy.linalg.expm(A * t) @ np.array([2.0, -3.0])
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+            state[i] = x + K @ (y - H @ x), P - K @ H @ P
+        elif what == "tick":
+            for j in neighbours[i]:
+                arrival = (t + delay, 2, "arrive", j, (i, shows(i, t), state[i]))
+                if arrival[0] < horizon:
+                    bisect.insort(events, arrival, key=lambda event: event[:2])
+        else:
+            # All messages of one instant together; here no two coincide at a node.
+            _, stamp, payload = more
+            age = min(max(shows(i, t) - stamp, 0.0), shows(i, t) - shows(i, 0.0))
+            told = predict(*payload, age) if age > 0.0 else payload
+            state[i] = 0.7 * x + 0.3 * told[0], 0.7 * P + 0.3 * told[1]
+    xhat, P = (np.array([[one[k] for one in row] for row in found]) for k in range(2))
+    return xhat, P
+
+
+@pytest.mark.parametrize("delay", [0.13, 0.0])
+def test_estimates_are_those_of_the_plain_recursion(scenario_of, delay):
+    run = netkf.simulate(scenario_of(delay=delay), seed=1)
+    xhat, P = plain_run(run.times.tolist(), 6.0, delay)
+    np.testing.assert_allclose(run.P, P, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.xhat, xhat, rtol=1e-9, atol=1e-9)
+    # Stamps are wrong by some seconds, so that errors do not fade.
+    assert np.abs(run.x[-1] - run.xhat[-1]).max() > 0.05
+
+
+def test_ticks_and_samples_are_at_local_times(scenario_of):
+    log = netkf.simulate(scenario_of(), seed=1).log
+    for kind, period in (("sense", 0.5), ("tick", 0.3)):
+        rows = log[log["kind"] == CODES[kind]]
+        for node in range(3):
+            expected = local_lattice(node, period, 6.0)
+            np.testing.assert_allclose(rows["t"][rows["node"] == node], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("at", ["nodes", "directions", "links"])
+@pytest.mark.parametrize(
+    "activation",
+    [
+        {"kind": "poisson", "rate": 3.0},
+        {"kind": "renewal", "distribution": "gamma", "shape": 2.0, "mean": 0.3},
+    ],
+    ids=["poisson", "renewal"],
+)
+def test_random_clocks_are_slower_by_the_drift_of_their_node(scenario_of, at, activation):
+    scenario = scenario_of(at=at).replace({"network.activation": {**activation, "at": at}})
+    log = netkf.simulate(scenario, seed=4).log
+    right = netkf.simulate(scenario.replace({"network.clocks": []}), seed=4).log
+    for node in range(3):
+        if at == "links" and node == 2:
+            continue
+        local, true = (
+            rows["t"][(rows["kind"] == CODES["tick"]) & (rows["node"] == node)]
+            for rows in (log, right)
+        )
+        if at == "directions" and node == 1:
+            peers = [rows["peer"][(rows["kind"] == CODES["tick"]) & (rows["node"] == 1)]
+                     for rows in (log, right)]  # fmt: skip
+            local, true = local[peers[0] == 0], true[peers[1] == 0]
+        # The gaps are drawn in local seconds, from time 0 on; a link belongs to no node.
+        pace = 1.0 if at == "links" else 1.0 + DRIFT[node]
+        count = min(len(local), len(true))
+        assert count > 5
+        np.testing.assert_allclose(local[:count], true[:count] / pace, rtol=1e-12)
+
+
+@pytest.mark.parametrize("clock", [Periodic(period=0.3), Periodic(period=0.3, phase=0.1)])
+@pytest.mark.parametrize("offset", [-7.4, -0.3, 0.0, 0.3, 0.45, 900.1])
+def test_lattices_are_of_local_times_whatever_the_clock_shows(clock, offset):
+    own, law = NodeTime(TimeGrid(), offset, 1.02), 0.1 * (clock.phase == 0.1) + 0.3 * np.arange(40)
+    ahead = own.ahead(clock)
+    times = own.instants(law[law > 0.0], ahead)
+    shown = (np.array([own.shows(t) for t in times]) - clock.phase) / 0.3
+    np.testing.assert_allclose(shown, np.rint(shown), atol=1e-8)
+    assert (times > 0.0).all()
+    assert times[0] < 0.6 / 1.02
+    assert own.until(5.0, ahead) == pytest.approx(5.0 * 1.02 - ahead)
+    assert NodeTime(TimeGrid(), offset, 1.02).ahead(Poisson(rate=1.0)) == 0.0
+
+
+@pytest.mark.parametrize("at", ["nodes", "directions", "links"])
+@pytest.mark.parametrize("kind", ["hybrid", "covariance-intersection"])
+def test_right_clocks_are_no_clocks(scenario_of, at, kind):
+    none = scenario_of(clocks="", filter_=kind, at=at)
+    right = none.replace({"network.clocks": [{"nodes": [0, 2]}]})
+    run, same = (netkf.simulate(s, seed=2, engine="simpy") for s in (none, right))
+    assert run.log.tobytes() == same.log.tobytes()
+    assert np.array_equal(run.xhat, same.xhat)
+    assert np.array_equal(run.P, same.P)
+
+
+EPSILON = {"epsilon": 0.3}
+MORE = {
+    "hybrid": EPSILON, "covariance-intersection": EPSILON, "kcf": EPSILON,
+    "track-fusion": {"rule": "ci"},
+}  # fmt: skip
+FILTERS = [
+    *[("hybrid", "nodes"), ("covariance-intersection", "readings"), ("gossip", "links")],
+    *[("intermittent", "readings"), ("diffusion", "nodes"), ("push-sum", "nodes")],
+    *[("kcf", "nodes"), ("track-fusion", "nodes"), ("local", "nodes")],
+]
+
+
+@pytest.mark.parametrize(("kind", "at"), FILTERS)
+@pytest.mark.parametrize("offset", [-50.0, 0.2, 50.0])
+def test_filters_take_any_stamp(scenario_of, kind, at, offset):
+    activation = {"kind": "periodic", "period": 0.3, "at": at}
+    scenario = scenario_of(clocks="", horizon=3.0).replace(
+        {
+            "filter": {"kind": kind, "cov": [[1.0, 0.2], [0.2, 2.0]]} | MORE.get(kind, {}),
+            "network.activation": {"kind": "readings"} if at == "readings" else activation,
+            "network.channel.delay": {"kind": "none"},
+            "plant.A": [[-0.1, 1.0], [-1.0, -0.1]],
+            "plant.B": [[0.2, 0.0], [0.0, 1.0]],
+            "sensors": [{"nodes": [0, 1, 2], "H": [[1.0, 0.0]], "R": [[0.3]],
+                         "sampling": {"kind": "periodic", "period": 0.5}}],
+            "network.clocks": [{"nodes": [1], "offset": offset}],
+        }
+    )  # fmt: skip
+    run = netkf.simulate(scenario, seed=1)
+    assert run.status == "complete"
+    assert np.isfinite(run.xhat).all()
+    assert (np.linalg.eigvalsh(run.P) > -1e-12).all()
+    # True ages are in the trace, whatever stamps say.
+    delivered = run.log[run.log["kind"] == CODES["deliver"]]
+    assert (delivered["age"] == 0.0).all()
+
+
+def test_late_readings_are_used_at_their_stamps(scenario_of):
+    """Two nodes, one sends its reading with a stamp that is 0.2 s old: the other uses it as the
+    filter would that had it then.
+    """
+    table = {
+        "network.activation": {"kind": "readings"},
+        "network.channel.delay": {"kind": "none"},
+        "filter": {"kind": "intermittent", "mean": [0.5, 0.0], "cov": [[1.0, 0.2], [0.2, 2.0]],
+                   "model": {"B": [[0.2, 0.0], [0.0, 1.0]], "R": [[0.3]]}},
+        "network.graph": {"kind": "path", "nodes": 2},
+        "sensors": [
+            {"nodes": [1], "H": [[1.0, 0.0]], "R": [[1e-22]],
+             "sampling": {"kind": "periodic", "period": 1.0, "phase": 0.7}},
+            {"nodes": [0], "H": [[1.0, 0.0]], "R": [[1e-22]],
+             "sampling": {"kind": "periodic", "period": 1.0}},
+        ],
+        "network.clocks": [{"nodes": [1], "offset": -0.2}],
+    }  # fmt: skip
+    run = netkf.simulate(scenario_of(clocks="").replace(table), seed=1)
+    truth = lambda t: H @ scipy.linalg.expm(A * t) @ np.array([2.0, -3.0])  # noqa: E731
+    # Its clock shows 0.7 + k at 0.9 + k; node 0 itself samples at 1 + k.
+    readings = [(0.7 + k, 0.9 + k, truth(0.9 + k)) for k in range(6)]
+    readings += [(1.0 + k, 1.0 + k, truth(1.0 + k)) for k in range(5)]
+    for t, xhat, P in zip(run.times, run.xhat[:, 0], run.P[:, 0], strict=True):
+        x, cov, now = np.array([0.5, 0.0]), np.array([[1.0, 0.2], [0.2, 2.0]]), 0.0
+        for stamp, came, y in sorted(readings):
+            if came <= t + 1e-9:
+                if stamp > now:
+                    (x, cov), now = predict(x, cov, stamp - now), stamp
+                K = cov @ H.T @ np.linalg.inv(H @ cov @ H.T + R)
+                x, cov = x + K @ (y - H @ x), cov - K @ H @ cov
+        if t > now + 1e-12:
+            x, cov = predict(x, cov, t - now)
+        np.testing.assert_allclose(xhat, x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(P, cov, rtol=1e-9)
+
+
+def test_drawn_clocks_differ_by_node_and_run_and_have_their_law(scenario_of):
+    scenario = scenario_of(
+        clocks="[[network.clocks]]\nnodes = [0, 1]\noffset = { sigma = 0.5 }\n"
+        "drift = { sigma = 0.001 }\n"
+    )
+    drawn = np.array([
+        [node_time(scenario, Streams(1, r), node)[1:] for node in (0, 1)] for r in range(400)
+    ])  # fmt: skip
+    z = (drawn - [0.0, 1.0]) / [0.5, 0.001]
+    assert len(np.unique(z)) == z.size
+    # Means and variances of 400 normal numbers, five deviations wide.
+    np.testing.assert_allclose(z.mean(axis=0), 0.0, atol=0.25)
+    np.testing.assert_allclose(z.var(axis=0), 1.0, atol=0.36)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"network.clocks": [{"nodes": [7]}]}, "network.clocks[0].nodes[0]"),
+        ({"network.clocks": [{"nodes": [1]}, {"nodes": [1]}]}, "network.clocks[1].nodes"),
+        ({"network.clocks": [{"nodes": [1], "drift": 0.7}]}, "network.clocks[0].drift"),
+        ({"network.clocks": [{"nodes": [1], "drift": {"sigma": 1.0}}]}, "clocks[0].drift.sigma"),
+        ({"network.clocks": [{"nodes": [1], "offset": {"s": 1.0}}]}, "network.clocks[0].offset"),
+        ({"network.clocks": {"nodes": [1]}}, "network.clocks"),
+        ({"filter": {"kind": "central"}}, "network.clocks"),
+        ({"sensors": [{"nodes": [1], "H": [[1.0, 0.0]], "R": [[1.0]]}]}, "network.clocks[0].nodes"),
+        ({"plant.input": {"kind": "constant", "G": [[1.0], [0.0]], "value": [1.0]}}, "clocks"),
+    ],
+)  # fmt: skip
+def test_what_has_no_meaning_is_refused(scenario_of, changes, key):
+    with pytest.raises(ScenarioError) as error:
+        scenario_of().replace(changes)
+    assert key in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_theory_and_check_say_that_nothing_is_promised(scenario_of):
+    scenario = scenario_of()
+    table = netkf.theory.assumptions(scenario)
+    row = table[table["assumption"] == "clocks of nodes are right"].iloc[0]
+    assert not row["holds"]
+    with pytest.raises(netkf.TheoryError, match="clocks of nodes are wrong"):
+        netkf.theory.error_covariance(scenario, netkf.simulate(scenario, seed=1))
+    with pytest.raises(netkf.TheoryError, match="clocks of nodes are wrong"):
+        netkf.check(scenario, runs=10)
+    with pytest.raises(EngineError, match="clocks of their own"):
+        netkf.simulate(scenario, engine="compiled")
