@@ -16,21 +16,39 @@ know their cross-covariance whatever is lost.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
-from netkf.algorithms.models import first_root
+from netkf.algorithms.blocks import block_tables
+from netkf.algorithms.filter import Filter, NodeInfo
+from netkf.algorithms.kernels.block_fusion import (
+    NAIVE,
+    fuse,
+    fusion_of,
+    semidefinite_root,
+    solve_gain,
+)
+from netkf.algorithms.kernels.pairs import block_of_pair, linearise_pair
+from netkf.algorithms.kernels.run import (
+    ALL,
+    predict_estimate,
+    shift_vector,
+    transition,
+    use_reading,
+)
+from netkf.algorithms.records import Kernels, Record
 from netkf.algorithms.registry import built_in
-from netkf.algorithms.rows import Rows, pair_rows, stacked, updated
 from netkf.algorithms.traits import Analysis, Needs, Timing
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import field, integer
-from netkf.core.places import Place
-from netkf.linalg.arrays import FloatArray, symmetric
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.lanes import load, store
+from netkf.linalg.small import copy_matrix, solve_inplace
 
 MAX_STEPS = 1000
 """More than any network needs: a larger value is a mistake."""
@@ -40,82 +58,479 @@ NEVER = -1.0
 """The time of the last update with a node that was never heard: errors are independent."""
 
 
-class Tie(NamedTuple):
-    """What a node keeps for a neighbour: the factors of their cross-covariance, A (n, n) of its own
-    and C (n, n') that both share, twice.
+@kernel
+def copy_block(A: FloatArray, first: int, out: FloatArray) -> None:
+    """Copy the square block of ``A`` that begins at ``first`` into ``out`` (n, n)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[0]):
+            out[i, j] = A[first + i, first + j]
 
-    base, core : A and C since the time ``since``, of the last update known to be that of both nodes
-    last, seen : A and C since the last update by this node, at the time ``when``
+
+@kernel
+def multiply(T: FloatArray, A: FloatArray, turned: bool, out: FloatArray) -> None:
+    """Write ``T A``, or ``T A'`` if ``turned``, into another matrix ``out`` (r, c)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = 0.0
+            for c in range(T.shape[1]):
+                total += T[i, c] * (A[j, c] if turned else A[c, j])
+            out[i, j] = total
+
+
+@kernel
+def move_factors(record: Any, h: int, run: Any, T: FloatArray, but: int, q: int) -> None:
+    """Multiply the factors of node ``h`` by ``T`` (n, n), but those of one link."""
+    for w in range(run.first[h], run.first[h + 1]):
+        if w != but:
+            move_factor(record.base, w, T, record.column, q)
+            move_factor(record.last, w, T, record.column, q)
+
+
+@kernel
+def move_factor(factors: FloatArray, w: int, T: FloatArray, column: FloatArray, q: int) -> None:
+    """Multiply the factor of link ``w`` by ``T`` (n, n); ``column`` is scratch."""
+    n = len(T)
+    for j in range(n):
+        for i in range(n):
+            column[i] = 0.0
+            for c in range(n):
+                column[i] += T[i, c] * factors[w, c, j, q]
+        for i in range(n):
+            factors[w, i, j, q] = column[i]
+
+
+@kernel
+def tell(record: Any, h: int, run: Any, q: int) -> None:
+    """Let node ``h`` send what it knows now, without own readings to use."""
+    n = len(run.size)
+    set_own(record, h, n, q)
+    for i in range(n):
+        record.told[h, i, q] = record.fusion.x[i]
+        for j in range(n):
+            record.told_P[h, i, j, q] = record.fusion.P[i, j]
+    record.own[h, q] = 0
+    for w in range(run.first[h], run.first[h + 1]):
+        for i in range(n):
+            for j in range(n):
+                record.told_base[w, i, j, q] = record.base[w, i, j, q]
+                record.told_last[w, i, j, q] = record.last[w, i, j, q]
+
+
+@kernel
+def set_own(record: Any, h: int, n: int, q: int) -> None:
+    """Make the estimate of node ``h`` (n states) the first part of the joint one."""
+    f = record.fusion
+    for i in range(n):
+        f.x[i] = record.xhat[h, i, q]
+        for j in range(n):
+            f.P[i, j] = 0.0
+            for c in range(min(i, j) + 1):
+                f.P[i, j] += record.root[h, i, c, q] * record.root[h, j, c, q]
+
+
+@kernel
+def predict(record: Any, h: int, run: Any) -> None:
+    """Predict node ``h``; the noise of the plant is the block's own."""
+    transition(run.model, run, record.xhat, h, run.noise)
+    for q in range(len(run.lanes)):
+        for i in range(len(run.size)):
+            for j in range(len(run.size)):
+                record.T[i, j] = run.noise[i, j, q]
+        move_factors(record, h, run, record.T, -1, q)
+    predict_estimate(run.model, run, record.xhat, record.root, h, h)
+    for q in range(len(run.lanes)):
+        tell(record, h, run, q)
+
+
+@kernel
+def update(record: Any, h: int, run: Any) -> None:
+    """Use the readings of the node's own block; those of pairs are kept for the exchange of this
+    instant.
     """
-
-    base: FloatArray
-    core: FloatArray
-    since: float
-    last: FloatArray
-    seen: FloatArray
-    when: float
-
-    def moved(self, T: FloatArray) -> Tie:
-        """Return the tie after the node's error was multiplied by ``T`` (n, n)."""
-        return self._replace(base=T @ self.base, last=T @ self.last)
-
-    def of(self, n: int) -> Tie:
-        """Return the tie with C (n, n') for a neighbour with a block of ``n`` states."""
-        if self.when != NEVER or self.core.shape[1] == n:
-            return self
-        nothing = np.zeros((len(self.base), n))
-        return self._replace(core=nothing, seen=nothing)
+    f = record.fusion
+    for q in range(len(run.lanes)):
+        f.x[:], f.P[:] = 0.0, 0.0
+        set_own(record, h, len(run.size), q)
+        if use_rows(record, run, run.reading, 0, q):
+            copy_block(f.stays, 0, record.T)
+            move_factors(record, h, run, record.T, -1, q)
+        record.own[h, q] = 1
+    use_reading(run, record.xhat, record.root, h, run.reading, True)
 
 
-class PairMessage(NamedTuple):
-    """What a node sends: the estimate ``xhat`` (n,) of its ``blocks`` with covariance P (n, n) and
-    ``ties`` by neighbour, all before the readings of this instant; and these, its ``own`` and those
-    of ``pairs``.
+@kernel
+def has_turn(record: Any, h: int, w: int, run: Any) -> bool:
+    """Return True if node ``h`` and the sender of link ``w`` exchange now; under clocks they do
+    whenever they can. Nodes that estimate the same blocks, as all do in one plant, are no pairs.
     """
-
-    xhat: FloatArray
-    P: FloatArray
-    ties: Mapping[int, Tie]
-    blocks: tuple[Place, ...]
-    own: Rows
-    pairs: tuple[PairReading, ...] = ()
+    turn = (record.node[h] + record.peer[w]) % record.steps == run.step
+    return bool(record.pairs[h] == 1 and (run.slot < 0 or turn))
 
 
-class PairState(NamedTuple):
-    """Estimate ``xhat`` (n,) of a ``node``, its covariance P (n, n), the ``ties`` by neighbour, and
-    what it sends at this instant.
+@kernel
+def emit(record: Any, h: int, m: int, run: Any) -> None:
+    """Send the estimate with the factors of the receiver's tie; nothing if no pair has its turn."""
+    first, talks = run.first[h], False
+    if run.receiver != ALL:
+        write_message(record, h, m, run, run.receiver)
+        return
+    for w in range(first, run.first[h + 1]):
+        talks = talks or has_turn(record, h, w, run)
+        write_message(record, h, m + w - first, run, w)
+    for q in range(len(run.lanes) if not talks else 0):
+        run.sends[q] = 0
+
+
+@kernel
+def write_message(record: Any, h: int, m: int, run: Any, w: int) -> None:
+    """Write payload ``m``, for the sender of link ``w``."""
+    lanes, n, p = run.lanes, len(run.size), record.payload
+    for i in range(n):
+        store(lanes, p.xhat, m, i, load(lanes, record.told, h, i))
+        for j in range(n):
+            store(lanes, p.P, m, i, j, load(lanes, record.told_P, h, i, j))
+    for q in range(len(lanes)):
+        p.own[m, q] = record.own[h, q]
+    if w < 0:
+        return
+    store(lanes, p.since, m, load(lanes, record.since, w))
+    store(lanes, p.when, m, load(lanes, record.when, w))
+    for i in range(n):
+        for j in range(n):
+            store(lanes, p.base, m, i, j, load(lanes, record.told_base, w, i, j))
+            store(lanes, p.last, m, i, j, load(lanes, record.told_last, w, i, j))
+        for j in range(record.core.shape[2]):
+            store(lanes, p.core, m, i, j, load(lanes, record.core, w, i, j))
+            store(lanes, p.seen, m, i, j, load(lanes, record.seen, w, i, j))
+
+
+@kernel
+def absorb(record: Any, h: int, run: Any) -> None:
+    """Use the messages of this instant one after the other, by sender; one that took time is used
+    for nothing.
     """
-
-    xhat: FloatArray
-    P: FloatArray
-    ties: Mapping[int, Tie]
-    model: Any
-    node: int
-    message: PairMessage
-
-    def moved(self, T: FloatArray, but: int | None = None) -> dict[int, Tie]:
-        """Return the ties after the node's error was multiplied by ``T`` (n, n), but for one."""
-        return {k: tie if k == but else tie.moved(T) for k, tie in self.ties.items()}
-
-    def told(self, pairs: tuple[PairReading, ...] = ()) -> PairState:
-        """Return the state that tells its estimate as it is, without own readings to use."""
-        own = stacked([], self.xhat)
-        message = PairMessage(self.xhat, self.P, self.ties, self.message.blocks, own, pairs)
-        return self._replace(message=message)
+    for q in range(len(run.lanes)):
+        met, n = False, len(run.size)
+        for i in range(n):
+            for j in range(n):
+                record.moved[i, j] = 1.0 if i == j else 0.0
+        for k in range(run.count):
+            is_here = run.arrived[k, q] == 1 and not run.age[k] > 0.0
+            if is_here and has_turn(record, h, run.link[k], run):
+                meet(record, h, run, k, q)
+                met = True
+        # Each pair has one turn: readings of pairs that are left are about others.
+        if met:
+            tell(record, h, run, q)
 
 
-class Joint(NamedTuple):
-    """Estimate ``x`` (n + n',) and covariance P of two nodes together before the readings of an
-    instant, as both know them: the ``own`` ones of the first, and the ``others``, those of the
-    second and of the pair; the ``tie`` of the first after all of them, and whether it may use them.
+@kernel
+def meet(record: Any, h: int, run: Any, k: int, q: int) -> None:
+    """Use message ``k``: both nodes compute the same from what both have sent, each for itself."""
+    f, n, m, w = record.fusion, len(run.size), run.message[k], run.link[k]
+    A, A_j, C, X, T, p = record.A, record.A_j, record.C, record.X, record.T, record.payload
+    v = len(A_j)
+    since = set_factors(record, m, w, q)
+    multiply(A, C, False, record.part)
+    multiply(record.part, A_j, True, X)
+    # Own readings are used by both nodes alone, if nothing else is.
+    seen = record.seen_now
+    copy_matrix(seen, X)
+    set_joint(record, h, m, q, False)
+    if record.own[h, q] == 1 and use_rows(record, run, run.reading, 0, q):
+        copy_block(f.stays, 0, T)
+        copy_matrix(record.L, A)
+        multiply(T, record.L, False, A)
+        copy_matrix(record.part, seen)
+        multiply(T, record.part, False, seen)
+    if p.own[m, q] == 1 and run.heard[k] >= 0 and use_rows(record, run, run.heard[k], n, q):
+        copy_block(f.stays, n, record.T_j)
+        copy_matrix(record.L_j, A_j)
+        multiply(record.T_j, record.L_j, False, A_j)
+        copy_matrix(record.part, seen)
+        multiply(record.part, record.T_j, True, seen)
+    usable = invert(A, record.sizes[h], record.L, record.inverse)
+    usable = invert(A_j, record.peer_sizes[w], record.L_j, record.inverse_j) and usable
+    if usable:
+        set_joint(record, h, m, q, True)
+        if record.own[h, q] == 1:
+            use_rows(record, run, run.reading, 0, q)
+        for j in range(v):
+            record.other[j] = f.x[n + j]
+            for i in range(n + v):
+                record.beside[i, j] = f.P[i, n + j]
+        use_others(record, h, run, k, q)
+        # An error does not correlate with the innovations that have updated it: so this is the
+        # cross-covariance, whether the other node hears them too or not.
+        for i in range(n):
+            for j in range(v):
+                seen[i, j] = f.P[i, n + j]
+        multiply(record.inverse, seen, False, record.part)
+        multiply(record.part, record.inverse_j, True, C)
+    copy_matrix(record.L, A)
+    multiply(record.moved, record.L, False, A)
+    for i in range(n):
+        for j in range(n):
+            record.base[w, i, j, q], record.last[w, i, j, q] = A[i, j], record.moved[i, j]
+        for j in range(v):
+            record.core[w, i, j, q], record.seen[w, i, j, q] = C[i, j], seen[i, j]
+    now = run.now if run.slot < 0 else float(run.slot * record.steps + run.step)
+    record.since[w, q], record.when[w, q] = since, now
+    if usable:
+        hear(record, h, run, k, q)
+
+
+@kernel
+def set_factors(record: Any, m: int, w: int, q: int) -> float:
+    """Write the factors A, C and A_j of link ``w`` that both nodes know; return since when."""
+    n, v, p = len(record.A), len(record.A_j), record.payload
+    since = max(record.since[w, q], p.since[m, q])
+    both = record.when[w, q] == p.when[m, q]
+    mine = not both and record.since[w, q] == since
+    theirs = not both and p.since[m, q] == since
+    for i in range(n):
+        for j in range(n):
+            factor = record.told_base[w, i, j, q] if mine else record.told_last[w, i, j, q]
+            record.A[i, j] = factor
+    for i in range(v):
+        for j in range(v):
+            record.A_j[i, j] = p.base[m, i, j, q] if theirs else p.last[m, i, j, q]
+    # Of two nodes one may know later that an update was that of both; the other has not been
+    # updated since.
+    for i in range(n):
+        for j in range(v):
+            if both:
+                record.C[i, j] = record.seen[w, i, j, q]
+            elif record.when[w, q] > p.when[m, q]:
+                record.C[i, j] = record.core[w, i, j, q]
+            else:
+                record.C[i, j] = p.core[m, j, i, q]
+    return float(record.when[w, q] if both else since)
+
+
+@kernel
+def set_joint(record: Any, h: int, m: int, q: int, crossed: bool) -> None:
+    """Write what node ``h`` and the sender of payload ``m`` have told, with the cross-covariance X
+    (n, n') if ``crossed``.
     """
+    f, n, v, p = record.fusion, len(record.A), len(record.A_j), record.payload
+    for i in range(n):
+        f.x[i] = record.told[h, i, q]
+        for j in range(n):
+            f.P[i, j] = record.told_P[h, i, j, q]
+        for j in range(v):
+            f.P[i, n + j] = f.P[n + j, i] = record.X[i, j] if crossed else 0.0
+    for i in range(v):
+        f.x[n + i] = p.xhat[m, i, q]
+        for j in range(v):
+            f.P[n + i, n + j] = p.P[m, i, j, q]
 
-    x: FloatArray
-    P: FloatArray
-    own: Rows
-    others: Rows
-    tie: Tie
-    usable: bool
+
+@kernel
+def use_rows(record: Any, run: Any, r: int, first: int, q: int) -> bool:
+    """Use reading number ``r`` of the node whose states begin at ``first``; False if it says
+    nothing.
+    """
+    f, n, place, matrix = record.fusion, len(run.size), run.first_y + r, run.first_H + run.matrix[r]
+    count, says = run.rows[r], False
+    f.noise[:] = 0.0
+    for c in range(count):
+        f.z[c], f.noise[c, c] = run.y[place, c, q], 1.0
+        f.H[c, :] = 0.0
+        for j in range(min(run.H.shape[2], len(record.A_j) if first > 0 else n)):
+            f.H[c, first + j] = run.H[matrix, c, j, q]
+            says = says or f.H[c, first + j] != 0.0
+    if says:
+        fuse(f, count, NAIVE)
+    return says
+
+
+@kernel
+def use_others(record: Any, h: int, run: Any, k: int, q: int) -> bool:
+    """Use the other node's readings and those of the pair; False if there are none."""
+    own, r = record.payload.own[run.message[k], q] == 1, run.heard[k]
+    says = bool(own and r >= 0 and use_rows(record, run, r, len(run.size), q))
+    says = use_pairs(record, h, run, k, True, q) or says
+    return use_pairs(record, h, run, k, False, q) or says
+
+
+@kernel
+def use_pairs(record: Any, h: int, run: Any, k: int, mine: bool, q: int) -> bool:
+    """Use the readings of a pair that node ``h`` has taken (``mine``), or the sender of message
+    ``k``, linearised at what both have told.
+    """
+    f, pairs, tables, n, v = (
+        record.fusion, run.pairs, record.tables, len(run.size), len(record.A_j)
+    )  # fmt: skip
+    r, w, says = run.reading if mine else run.heard[k], run.link[k], False
+    if r < 0 or len(pairs.row) == 0:
+        return False
+    rows, own, m = pairs.rows, pairs.own, run.message[k]
+    for c in range(pairs.first[r], pairs.first[r + 1]):
+        b = block_of_pair(pairs, c)
+        if b < 0:
+            continue
+        first, size, count = tables.theirs[w, b] if mine else tables.first[h, b], 0, pairs.length[c]
+        if first < 0:
+            continue
+        size, says = tables.size[b], True
+        rows.x[:] = 0.0
+        for i in range(min(own, n if mine else v)):
+            rows.x[i] = record.told[h, i, q] if mine else record.payload.xhat[m, i, q]
+        for i in range(size):
+            other = record.payload.xhat[m, first + i, q] if mine else record.told[h, first + i, q]
+            rows.x[own + i] = other
+        linearise_pair(pairs, run, r, c, q)
+        to, there = (0, n + first) if mine else (n, first)
+        for a in range(count):
+            f.z[a] = rows.value[a]
+            f.H[a, :] = 0.0
+            for i in range(min(own, n if mine else v)):
+                f.H[a, to + i] = rows.J[a, i]
+            for i in range(size):
+                f.H[a, there + i] = rows.J[a, own + i]
+            for d in range(count):
+                f.noise[a, d] = rows.C[a, d]
+        fuse(f, count, NAIVE)
+    return says
+
+
+@kernel
+def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
+    """Use what the sender of message ``k`` has read, and the pair, for what node ``h`` knows since
+    others were heard.
+    """
+    f, n, v = record.fusion, len(run.size), len(record.A_j)
+    set_own(record, h, n, q)
+    for j in range(v):
+        f.x[n + j] = record.other[j]
+        for i in range(n):
+            total = 0.0
+            for c in range(n):
+                total += record.moved[i, c] * record.beside[c, j]
+            f.P[i, n + j] = f.P[n + j, i] = total
+        for i in range(v):
+            f.P[n + i, n + j] = record.beside[n + i, j]
+    copy_block(f.P, 0, record.L)
+    if not use_others(record, h, run, k, q):
+        return
+    for i in range(n):
+        record.xhat[h, i, q] = f.x[i]
+        for j in range(n):
+            f.S[i, j], f.T[i, j] = record.L[i, j], f.P[i, j]
+    # The factor by which an own reading would have multiplied the error: P after times the inverse
+    # of P before, which is singular where something is known for certain.
+    semidefinite_root(f.S, n)
+    solve_gain(f, n)
+    copy_block(f.K, 0, record.T)
+    move_factors(record, h, run, record.T, run.link[k], q)
+    copy_matrix(record.L, record.moved)
+    multiply(record.T, record.L, False, record.moved)
+    semidefinite_root(f.P, n)
+    for i in range(n):
+        for j in range(i + 1):
+            record.root[h, i, j, q] = f.P[i, j]
+
+
+@kernel
+def invert(A: FloatArray, n: int, L: FloatArray, out: FloatArray) -> bool:
+    """Write the inverse of the first ``n`` rows and columns of ``A`` into ``out``; False if columns
+    of A, in whatever units, nearly depend on each other. ``L`` is scratch.
+    """
+    out[:] = 0.0
+    for j in range(n):
+        out[j, j] = 1.0
+        for i in range(n):
+            L[i, j] = A[i, j]
+    for j in range(n):
+        scale = column_size(A, j, n)
+        for i in range(n):
+            L[i, j] = A[i, j] / scale
+    solve_inplace(L, out, n)
+    total = 0.0
+    for i in range(n):
+        for j in range(n):
+            total += out[i, j] * out[i, j]
+    # In the norm of Frobenius; not for nan.
+    if not math.sqrt(n * total) < MAX_CONDITION:
+        return False
+    for i in range(n):
+        scale = column_size(A, i, n)
+        for j in range(n):
+            out[i, j] /= scale
+    return True
+
+
+@kernel
+def column_size(A: FloatArray, j: int, n: int) -> float:
+    """Return the norm of the first ``n`` entries of column ``j``."""
+    total = 0.0
+    for i in range(n):
+        total += A[i, j] * A[i, j]
+    return math.sqrt(total)
+
+
+@kernel
+def shift(record: Any, h: int, run: Any) -> None:
+    """Move all estimates of node ``h`` with the origin."""
+    shift_vector(run, record.xhat, h)
+    shift_vector(run, record.told, h)
+
+
+def pair_record(
+    filtering: BlockCrossCovariances, infos: Sequence[NodeInfo], models: Sequence[Any]
+) -> Record:
+    """Return the record. A node tells ``told`` (n,) and ``told_P`` (n, n), what it knew before the
+    readings of this instant, which are ``own`` until it is updated with others.
+
+    For each neighbour, with n' states, it keeps the factors of their cross-covariance, A of its own
+    and C that both share, twice: ``base`` (n, n) and ``core`` (n, n') since the time ``since`` of
+    the last update known to be that of both nodes, ``last`` and ``seen`` since the last update by
+    this node, at the time ``when``.
+    """
+    n, tables = len(models[0].information), block_tables(infos, models)
+    v, links = tables.entry.shape[1], len(tables.entry)
+    square, cross, ints = (n, n), (n, v), np.int64
+    scratch = {
+        **dict.fromkeys(("A", "T", "L", "inverse", "moved"), square),
+        **dict.fromkeys(("A_j", "T_j", "L_j", "inverse_j"), (v, v)),
+        **dict.fromkeys(("C", "X", "part", "seen_now"), cross),
+        **{"other": (v,), "beside": (n + v, v), "column": (n,)},
+    }
+    heard = [sum(p.n for p in places) for info in infos for places in info.heard]
+    own = [sum(p.n for p in info.blocks) or n for info in infos]
+    rows = max(n + v, *(info.rows for info in infos))
+    return Record(
+        node={"told": (n,), "told_P": square, "own": ((), ints)},
+        link={
+            **dict.fromkeys(("base", "last", "told_base", "told_last"), square),
+            **{"core": cross, "seen": cross, "since": (), "when": ()},
+        },
+        link_start={
+            **dict.fromkeys(("base", "last", "told_base", "told_last"), np.eye(n)),
+            **{"since": NEVER, "when": NEVER},
+        },
+        payload={
+            **{"xhat": (v,), "since": (), "when": (), "own": ((), ints)},
+            **dict.fromkeys(("P", "base", "last", "core", "seen"), (v, v)),
+        },
+        settings={
+            **{name: np.zeros(shape) for name, shape in scratch.items()},
+            "tables": tables,
+            "fusion": fusion_of(n + v, rows),
+            "steps": filtering.steps,
+            "pairs": np.array([len(info.blocks) > 0 for info in infos], dtype=ints),
+            "node": np.array([info.node for info in infos], dtype=ints),
+            "peer": np.resize([s for info in infos for s in info.senders] or [0], links),
+            "sizes": np.array(own, dtype=ints),
+            "peer_sizes": np.resize(heard or [n], links),
+        },
+    )
+
+
+def begin_pair(_filter: BlockCrossCovariances, node: Any, _info: NodeInfo, _model: Any) -> None:
+    """Tell the first estimate."""
+    node["told"][:], node["told_P"][:] = node["xhat"], node["root"] @ node["root"].T
 
 
 def require_both_ways(scenario: Any) -> None:
@@ -152,146 +567,24 @@ class BlockCrossCovariances(Filter):
         affine=True,
         payload_numbers=lambda n, *_: n + n * (n + 1) // 2 + 4 * n * n,
     )
+    kernels = Kernels(
+        pair_record,
+        begin_pair,
+        predict=predict,
+        update=update,
+        emit=emit,
+        absorb=absorb,
+        shift=shift,
+        means=("xhat", "told"),
+        sends_readings=True,
+        decides=True,
+        depends_on_data=False,
+        addressed=True,
+    )
 
     @property
     def timing(self) -> Timing:
         """The only exchange of a slot has ``steps`` steps."""
-        return Timing(steps=lambda _: self.steps, decides=True)
+        return Timing(steps=lambda _: self.steps)
 
-    def _has_turn(self, node: int, other: int, exchange: Exchange) -> bool:
-        """Return True if two nodes (ids) exchange now; under clocks they do whenever they can."""
-        return exchange.slot < 0 or (node + other) % self.steps == exchange.step
-
-    def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> PairState:
-        """Return the state at time 0, at which errors of different nodes are independent."""
-        places = node.blocks or (Place("plant", None, 0, len(mean)),)
-        one, nothing = np.eye(len(mean)), np.zeros((len(mean), 0))
-        ties = {k: Tie(one, nothing, NEVER, one, nothing, NEVER) for k in node.senders}
-        xhat, P = np.array(mean), np.array(cov)
-        message = PairMessage(xhat, P, ties, places, stacked([], xhat))
-        return PairState(xhat, P, ties, model, node.node, message)
-
-    def predict(self, state: PairState, gap: float) -> PairState:
-        """Return the state ``gap`` seconds later; the noise of the plant is the block's own."""
-        Phi = state.model.transition(state.xhat, gap)
-        xhat, root = state.model.predict(state.xhat, first_root(state.P), gap)
-        P = symmetric(root @ root.T)
-        return state._replace(xhat=xhat, P=P, ties=state.moved(Phi)).told()
-
-    def update(self, state: PairState, reading: Reading) -> PairState:
-        """Return the state after the readings of its own block; those of pairs are kept for the
-        exchange of this instant.
-        """
-        own = Rows(reading.y, reading.H, reading.R)
-        xhat, P, stays = updated(state.xhat, state.P, own)
-        message = state.message._replace(own=own, pairs=reading.pairs)
-        return state._replace(xhat=xhat, P=P, ties=state.moved(stays), message=message)
-
-    def emit(self, state: PairState, exchange: Exchange) -> tuple[PairState, PairMessage | None]:
-        """Return the estimate with the factors of all ties, and the readings of this instant; None
-        if no pair has its turn.
-        """
-        talks = any(self._has_turn(state.node, j, exchange) for j in state.ties)
-        return state, state.message if talks else None
-
-    def absorb(
-        self, state: PairState, messages: Sequence[Message], exchange: Exchange
-    ) -> PairState:
-        """Return the state after the updates with all senders, one after the other."""
-        mine, joints = state.message, {}
-        for message in messages:
-            told: PairMessage = message.payload
-            # Nodes that estimate the same blocks, as all do in one plant, are no pairs.
-            is_pair = message.age == 0.0 and told.blocks != mine.blocks
-            if is_pair and self._has_turn(state.node, message.sender, exchange):
-                ties = mine.ties[message.sender], told.ties[state.node]
-                joints[message.sender] = joint_of(mine, told, ties, exchange.time)
-        if not joints:
-            return state
-        renewed = {j: joint.tie for j, joint in joints.items()}
-        state = state._replace(ties={**state.ties, **renewed})
-        for j, joint in joints.items():
-            if joint.usable and len(joint.others.z):
-                state = self._heard(state, j, joint)
-        # Each pair has one turn: those that are left are about others.
-        return state.told(state.message.pairs)
-
-    def _heard(self, state: PairState, j: int, joint: Joint) -> PairState:
-        """Return the state after the readings of node ``j`` and of the pair."""
-        n = len(state.xhat)
-        x, P, _ = updated(joint.x, joint.P, joint.own)
-        # What other senders of this instant have changed since.
-        X = state.ties[j].last @ P[:n, n:]
-        x = np.concatenate([state.xhat, x[n:]])
-        P = np.block([[state.P, X], [X.T, P[n:, n:]]])
-        x, P, _ = updated(x, P, joint.others)
-        ties = state.moved(ratio(P[:n, :n], state.P), but=j)
-        return state._replace(xhat=x[:n], P=P[:n, :n], ties=ties)
-
-    def estimate(self, state: PairState) -> tuple[FloatArray, FloatArray]:
-        """Return xhat (n,) and P (n, n)."""
-        return state.xhat, state.P
-
-    def shift(self, state: Any, offset: FloatArray) -> Any:
-        """Return a state, or a message, with ``offset`` (n,) added to the estimate."""
-        if isinstance(state, PairState):
-            state = state._replace(message=self.shift(state.message, offset))
-        return state._replace(xhat=state.xhat + offset)
-
-
-def joint_of(mine: PairMessage, theirs: PairMessage, ties: tuple[Tie, Tie], time: float) -> Joint:
-    """Return what two nodes with these ``ties`` know together at a ``time``: both compute the same,
-    each for itself.
-    """
-    n, m = len(mine.xhat), len(theirs.xhat)
-    A, C, A_j, since = shared_factors(ties[0].of(m), ties[1].of(n))
-    X = A @ C @ A_j.T
-    own = mine.own._replace(H=np.pad(mine.own.H, ((0, 0), (0, m))))
-    others = [theirs.own._replace(H=np.pad(theirs.own.H, ((0, 0), (n, 0))))]
-    others += pair_rows(mine.pairs, mine.xhat, theirs.blocks, theirs.xhat)
-    for z, H, R in pair_rows(theirs.pairs, theirs.xhat, mine.blocks, mine.xhat):
-        others.append(Rows(z, np.roll(H, n, axis=1), R))
-    x = np.concatenate([mine.xhat, theirs.xhat])
-    P = np.block([[mine.P, X], [X.T, theirs.P]])
-    # Own readings are used by both nodes alone, if nothing else is.
-    stay, stay_j = (updated(one.xhat, one.P, one.own)[2] for one in (mine, theirs))
-    A, A_j = stay @ A, stay_j @ A_j
-    usable, X = can_invert(A) and can_invert(A_j), stay @ X @ stay_j.T
-    seen = stacked([own, *others], x)
-    if usable and len(seen.z):
-        # An error does not correlate with the innovations that have updated it: so this is the
-        # cross-covariance, whether the other node hears them too or not.
-        X = updated(x, P, seen)[1][:n, n:]
-        C = np.linalg.solve(A, np.linalg.solve(A_j, X.T).T)
-    tie = Tie(A, C, since, np.eye(n), X, time)
-    return Joint(x, P, own, stacked(others, x), tie, usable)
-
-
-def shared_factors(mine: Tie, theirs: Tie) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return A (n, n), C (n, n') and A_j (n', n') of two nodes, from the ties of both, and the time
-    since when A and A_j count.
-    """
-    if mine.when == theirs.when:
-        return mine.last, mine.seen, theirs.last, mine.when
-    # Of two nodes one may know later that an update was that of both; the other has not been
-    # updated since.
-    since = max(mine.since, theirs.since)
-    A, A_j = (tie.base if tie.since == since else tie.last for tie in (mine, theirs))
-    return A, mine.core if mine.when > theirs.when else theirs.core.T, A_j, since
-
-
-def can_invert(A: FloatArray) -> bool:
-    """Return True if the columns of a factor A (n, n), in whatever units, are independent."""
-    sizes = np.linalg.norm(A, axis=0)
-    return bool(sizes.all() and np.linalg.cond(A / sizes) < MAX_CONDITION)
-
-
-def ratio(after: FloatArray, before: FloatArray) -> FloatArray:
-    """Return ``after before^-1`` (n, n) of two covariances (n, n), the factor by which an own
-    reading would have multiplied the error.
-    """
-    units = np.sqrt(np.where(np.diag(before) > 0.0, np.diag(before), 1.0))
-    scale = np.outer(units, units)
-    # Singular where something is known for certain.
-    scaled = (after / scale) @ np.linalg.pinv(before / scale, hermitian=True)
-    return np.asarray(units[:, None] * scaled / units)
+    shift = Filter.shift  # affine in readings and messages

@@ -17,12 +17,14 @@ class BlockTables(Struct):
 
     entry : (W, w), for each directed link by receiver and component of the sender's state which
             component of the receiver's it is, -1: none
-    first, size : (H, B) and (B,), of each block its first component in the state of each node, -1
-                  where that does not estimate it, and the number of its components
+    first, theirs : (H, B) and (W, B), of each block its first component in the state of each node,
+                    or of the sender of each link, -1 where that does not estimate it
+    size : (B,), of each block the number of its components
     """
 
     entry: IntArray
     first: IntArray
+    theirs: IntArray
     size: IntArray
 
 
@@ -33,8 +35,11 @@ def places_of(blocks: Sequence[Place], n: int) -> dict[Key, Place]:
 
 
 def block_numbers(infos: Sequence[Any]) -> dict[Key, int]:
-    """Return a number for each block that nodes with these ``NodeInfo`` estimate."""
-    keys = [place.key for info in infos for place in info.blocks]
+    """Return a number for each block that nodes with these ``NodeInfo``, or their senders,
+    estimate.
+    """
+    seen = [places for info in infos for places in (info.blocks, *info.heard)]
+    keys = [place.key for places in seen for place in places]
     return {key: number for number, key in enumerate(dict.fromkeys(keys))}
 
 
@@ -43,7 +48,7 @@ def block_tables(infos: Sequence[Any], models: Sequence[Any]) -> BlockTables:
     widths = [len(models[0].information)]
     widths += [sum(p.n for p in places) for info in infos for places in info.heard]
     numbers = block_numbers(infos)
-    rows, first = [], np.full((len(infos), max(1, len(numbers))), -1)
+    rows, theirs, first = [], [], np.full((len(infos), max(1, len(numbers))), -1)
     size = np.zeros(first.shape[1], dtype=np.int64)
     for h, (info, model) in enumerate(zip(infos, models, strict=True)):
         own = places_of(info.blocks, len(model.information))
@@ -53,8 +58,17 @@ def block_tables(infos: Sequence[Any], models: Sequence[Any]) -> BlockTables:
         for k in range(max(len(info.senders), 1 if len(infos) == 1 else 0)):
             row = np.full(max(widths), -1)
             heard = info.heard[k] if k < len(info.heard) else ()
+            theirs.append(np.full(len(size), -1))
+            for place in heard:
+                number = numbers[place.key]
+                theirs[-1][number], size[number] = place.first, place.n
             for key, place in places_of(heard, len(model.information)).items():
                 if key in own:
                     row[place.entries] = np.arange(place.n) + own[key].first
             rows.append(row)
-    return BlockTables(entry=np.array(rows).reshape(-1, max(widths)), first=first, size=size)
+    return BlockTables(
+        entry=np.array(rows).reshape(-1, max(widths)),
+        first=first,
+        theirs=np.array(theirs).reshape(-1, len(size)),
+        size=size,
+    )

@@ -20,14 +20,20 @@ class PythonPairs:
     def __init__(self, info: Any, n: int) -> None:
         heard = [sum(place.n for place in places) for places in info.heard]
         self._own, self._numbers = max(n, *heard, 1), block_numbers([info])
-        self._states, self._sizes = n, [place.n for place in info.blocks]
-        self._n = self._own + max(self._sizes, default=1)
+        seen = [place for places in (info.blocks, *info.heard) for place in places]
+        self._states, self._sizes = n, {place.key: place.n for place in seen}
+        self._n = self._own + max(self._sizes.values(), default=1)
         self._found: list[tuple[Any, int]] = []
         self._functions: dict[int, VectorFunction] = {}
 
     def none(self) -> Pairs:
         """Return no readings."""
         return self._room(0, 1, [0, 0])
+
+    @property
+    def columns(self) -> int:
+        """The most states that a reading is of."""
+        return int(self._own)
 
     def _room(self, count: int, p: int, first: Sequence[int]) -> Pairs:
         rows = linear_rows(count, p, np.full((1, self._n), -1))
@@ -38,18 +44,17 @@ class PythonPairs:
         """Return the pairs of ``readings`` (``single.Whitened``), brought by the payloads
         ``senders`` but for the first, and readings with the values of pairs at the end of y.
         """
-        self._found, rows, first, extended = [], [], [0, 0], list(readings[:1])
-        for reading, payload in zip(readings[1:], senders, strict=True):
-            states, y, H = len(payload.sender.run.struct.size), reading.y, reading.H
-            # What a node of other states reads of its own means nothing here.
-            if H.shape[1:] != (self._states,):
-                y, H = y[:0], H[:0]
+        self._found, rows, first, extended = [], [], [0], []
+        sizes = [self._states, *(len(payload.sender.run.struct.size) for payload in senders)]
+        # Readings of ``update`` come without senders.
+        for reading, states in zip(readings, sizes, strict=True):
+            y = reading.y
             for pair in reading.pairs:
                 self._found.append((pair, states))
                 rows.append(len(y))
                 y = np.concatenate([y, pair.y])
             first.append(len(rows))
-            extended.append(reading._replace(y=y, H=H))
+            extended.append(reading._replace(y=y))
         p = max((len(pair.y) for pair, _ in self._found), default=1)
         pairs = self._room(len(rows), p, first)
         for k, (pair, _) in enumerate(self._found):
@@ -65,7 +70,7 @@ class PythonPairs:
 
         def linearised(x: FloatArray, _: FloatArray, number: float) -> FloatArray:
             (pair, states), own = self._found[int(number)], self._own
-            size = self._sizes[self._numbers.get(pair.other, -1)]
+            size = self._sizes[pair.other]
             z, H, H_other = pair.H(x[:states], x[own : own + size])
             made = np.zeros((p, 1 + self._n))
             made[: len(z), 0], made[: len(z), 1 : 1 + states] = z, H

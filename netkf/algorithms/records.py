@@ -36,6 +36,7 @@ class Record:
            count, which kernels set. Engines make E (``room``) larger where ``update``, ``shift`` or
            a message of ``absorb`` might find no free entry
     link : shapes of what a node knows for each of its incoming links
+    link_start : values of these at time 0, where they are not 0
     payload : shapes of what a message carries
     scratch : shapes of arrays for intermediate results, shared by all nodes
     settings : numbers, arrays and structs that are the same in all runs
@@ -44,6 +45,7 @@ class Record:
     node: Shapes = field(default_factory=dict)
     past: Shapes = field(default_factory=dict)
     link: Shapes = field(default_factory=dict)
+    link_start: Mapping[str, Any] = field(default_factory=dict)
     payload: Shapes = field(default_factory=dict)
     scratch: Shapes = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -97,6 +99,7 @@ class Kernels:
     unrolled : kernels are compiled for each n up to 4 with unrolled loops: only where that makes
                runs a tenth faster
     under_clocks : the verbs under clocks, where they are others than in slots; the record is one
+    means : names of the arrays of estimates, in the record and in payloads
     depends_on_data : whether who sends depends on readings or estimates; by default ``decides``
     """
 
@@ -119,6 +122,7 @@ class Kernels:
     addressed: bool = False
     unrolled: bool = False
     under_clocks: Kernels | None = None
+    means: tuple[str, ...] = ("xhat",)
     depends_on_data: bool | None = None
 
     @property
@@ -238,6 +242,8 @@ def make_records(
     nodes = make_arrays(known, (blocks, count), lanes)
     nodes |= make_arrays(record.past, (blocks, count, FIRST_PAST), lanes)
     per_link = make_arrays(record.link, (blocks, links), lanes)
+    for name, value in record.link_start.items():
+        per_link[name][...] = np.asarray(value)[..., None]
     for h, ((mean, root), info, model) in enumerate(zip(starts, infos, models, strict=True)):
         views = {name: array[0, h, ..., 0] for name, array in nodes.items()}
         views["xhat"][...], views["root"][...] = mean, root

@@ -187,7 +187,7 @@ class Surroundings:
             opposite=np.full(degree, -1),
             weight=np.zeros(degree),
             y=np.zeros((1, 1, 1)),
-            H=np.zeros((1, 1, n, 1)),
+            H=np.zeros((1, 1, n if self._pairs is None else self._pairs.columns, 1)),
             rows=np.zeros(1, dtype=np.int64),
             matrix=np.arange(1),
             message=np.arange(degree),
@@ -235,12 +235,12 @@ class Surroundings:
         count, p = run.y.shape[:2]
         if len(readings) > count or most > p:
             count, p = max(count, len(readings)), max(p, most)
-            run.y, run.H = np.zeros((count, p, 1)), np.zeros((count, p, len(run.size), 1))
+            run.y, run.H = np.zeros((count, p, 1)), np.zeros((count, p, run.H.shape[2], 1))
             run.rows, run.matrix = np.zeros(count, dtype=np.int64), np.arange(count)
         for k, (y, H, _) in enumerate(readings):
             run.y[k, : len(y), 0] = y
-            if len(H):
-                run.H[k, : len(H), :, 0] = H
+            run.H[k] = 0.0
+            run.H[k, : len(H), : H.shape[1], 0] = H
             run.rows[k] = len(H)
 
     def set_inbox(self, own: Any, messages: Sequence[Any], slotted: bool) -> None:
@@ -286,6 +286,7 @@ class Surroundings:
         """Set the circumstances of ``emit`` or ``absorb``."""
         run = self.struct
         run.slot, run.phase, run.step = exchange.slot, exchange.phase, exchange.step
+        run.now = exchange.time
         run.uniform[0], run.sends[0] = exchange.uniform, 1
 
 

@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 
 import netkf
-from netkf.algorithms.block_cross_covariances import NEVER, Tie, joint_of
+from netkf.algorithms.filter import Exchange, Message, Reading
 from netkf.trace.schema import CODES
 from tests.algorithms.test_block_intersection import KEPT, ROBOTS, TWO, load
 
@@ -162,20 +162,21 @@ def test_check_knows_of_how_many_nodes_p_is_right(
 
 def test_factors_that_cannot_be_inverted_are_not_used(tmp_path: Path) -> None:
     """A pair that has not heard each other for long makes contact first."""
-    scenario = load(ROBOTS, tmp_path, filter=KEPT | {"estimates": "own"})
-    filtering, info = scenario.node_filter, scenario.node_infos[0]
-    state = filtering.init(scenario.model_of(0), np.zeros(1), np.eye(1), info)
-    assert isinstance(state.ties[2], Tie)
-    assert state.ties[2].when == NEVER
-    lost = {2: state.ties[2]._replace(base=np.zeros((1, 1)), last=np.zeros((1, 1)))}
-    own = state.message.own._replace(z=np.ones(1), H=np.eye(1), R=np.eye(1))
-    mine = state.message._replace(ties=lost)
-    place = state.message.blocks[0]._replace(node=2)
-    theirs = state.message._replace(ties={1: state.ties[2]}, blocks=(place,), own=own)
-    first = joint_of(mine, theirs, (lost[2], state.ties[2]), 1.0)
-    assert not first.usable
-    both = first.tie, first.tie._replace(seen=first.tie.seen.T)
-    assert joint_of(mine, theirs, both, 2.0).usable
+    scenario = load(ROBOTS, tmp_path, filter=KEPT | {"estimates": "own"}, **TWO)
+    filtering, at = scenario.node_filter, Exchange(time=1.0)
+    nodes = []
+    for k in range(2):
+        start = np.zeros(1), np.eye(1)
+        state = filtering.init(scenario.model_of(k), *start, scenario.node_infos[k])
+        nodes.append(filtering.update(state, Reading(np.ones(1), np.eye(1), np.eye(1), 1.0)))
+    lost = nodes[0]._replace(base=0.0, last=0.0, told_base=0.0, told_last=0.0)
+    for first in (nodes[0], lost):
+        told = filtering.emit(nodes[1], at)[1]
+        after = filtering.absorb(first, [Message(2, 1.0, told, 0.0)], at)
+        # Contact: factors count from now on.
+        np.testing.assert_allclose(after.P, 0.5)
+        assert (after.last.item(), after.when.item()) == (1.0, 1.0)
+    assert (filtering.absorb(lost, [], at).base == 0.0).all()
 
 
 def test_links_that_go_one_way_are_refused(tmp_path: Path) -> None:

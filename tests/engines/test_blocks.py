@@ -122,11 +122,22 @@ def test_recorded_pairs_under_clocks(tmp_path: Path, estimates: str) -> None:
     assert_agree(load(text, tmp_path, filter__estimates=estimates))
 
 
+KEPT = "block-cross-covariances"
+
+
 @pytest.mark.parametrize("linearise", ["ekf", "ukf"])
-@pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
-def test_readings_of_pairs(tmp_path: Path, estimates: str, linearise: str) -> None:
-    changes = {"filter__kind": "block-intersection", "filter__linearise": linearise}
+@pytest.mark.parametrize(
+    ("kind", "estimates"),
+    [("block-intersection", "own"), ("block-intersection", "own+neighbours"), (KEPT, "own")],
+)
+def test_readings_of_pairs(tmp_path: Path, kind: str, estimates: str, linearise: str) -> None:
+    changes = {"filter__kind": kind, "filter__linearise": linearise}
     assert_agree(poses(tmp_path, RANGES + SIGHTS, filter__estimates=estimates, **changes))
+
+
+@pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
+def test_kept_cross_covariances(tmp_path: Path, text: str) -> None:
+    assert_agree(load(text, tmp_path, filter={"kind": KEPT, "estimates": "own"}))
 
 
 def test_unicycles() -> None:

@@ -110,11 +110,11 @@ def _set_gain(f: Fusion, count: int, w: float, v: float) -> None:
                 total += f.H[c, j] * f.T[j, d]
             f.S[c, d] = total
     semidefinite_root(f.S, count)
-    _solve_gain(f, count)
+    solve_gain(f, count)
 
 
 @kernel
-def _solve_gain(f: Fusion, count: int) -> None:
+def solve_gain(f: Fusion, count: int) -> None:
     """Write ``K = T (L L')^-1``, of the root L in S, and I - K H."""
     n = len(f.x)
     for i in range(n):

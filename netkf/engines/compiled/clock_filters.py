@@ -171,7 +171,7 @@ class ClockFilters:
         columns, own = self._columns
         pairs = no_pairs()
         if columns > own:
-            count = messages * self._samples
+            count = readings * self._samples
             rows = linear_rows(count, self._p, np.full((count, columns), -1))
             rows.R[0], rows.origin = np.eye(self._p), np.zeros((1, self._n))
             pairs = pairs_of(rows, own, np.zeros(1 + readings, dtype=np.int64))

@@ -364,6 +364,13 @@ def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
     """
     pool, h = state.pool, state.waiting[state.absorbing]
     node, oldest, count = state.nodes[h], 0.0, 0
+    if len(run.pairs.row) > 0:
+        # The reading of this instant, of which messages may bring another part.
+        own = node.reading if node.reading >= 0 and state.instants.t[node.reading] == now else -1
+        run.reading, run.rows[OWN] = OWN, 0
+        if own >= 0:
+            whiten_instant(state, run, OWN, own)
+        whiten_pairs(state, run, OWN, own)
     m = node.inbox
     while m != -1:
         message = pool[m]

@@ -122,7 +122,8 @@ class BlockColumns(ErrorColumns):
             whole = np.zeros((rows, 2 * self._used + count + SPARE))
             whole[:, MEAN] = array.reshape(-1, width)[:, MEAN]
             whole[:, NOISE : self._used] = stack[first : first + rows]
-            new[key], first = whole.reshape(*array.shape[:-1], -1), first + rows
+            new[key] = whole.reshape(*array.shape[:-1], whole.shape[1])
+            first += rows
         held = replace_columns(held, width, lambda array: new[id(array)])
         self._x, self._states, self._messages, self._kept = held
 

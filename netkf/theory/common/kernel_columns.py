@@ -6,7 +6,7 @@ zero and at unit vectors give the map, which then takes all columns at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,86 +17,125 @@ from netkf.theory.common.forms import MEAN
 
 
 class ColumnState(NamedTuple):
-    """Estimates ``xhat`` (n, C), the state ``inner`` of the filter, in which estimates mean
-    nothing, and the values (p, C) of the readings of pairs of this instant.
+    """The ``means`` (k, C) by name of a filter's state or payload, this ``inner`` one, in which
+    they mean nothing, and the values ``read`` (p, C) of the reading of this instant: of the
+    whitened one, and of each pair.
     """
 
-    xhat: FloatArray
+    means: dict[str, FloatArray]
     inner: Any
-    pairs: tuple[FloatArray, ...] = ()
+    read: tuple[FloatArray, ...] = ()
+
+    @property
+    def inputs(self) -> list[FloatArray]:
+        """All columns that a verb depends on."""
+        return [*self.means.values(), *self.read]
 
 
 class KernelColumns:
-    """The verbs of ``algorithm``, a filter whose payloads have one estimate, ``xhat``."""
+    """The verbs of ``algorithm``, a filter of kernels."""
 
     def __init__(self, algorithm: Filter) -> None:
         self._algorithm, self.timing = algorithm, algorithm.timing
+        assert algorithm.kernels is not None
+        self._names = algorithm.kernels.means
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: Any) -> ColumnState:
         """Return the state at time 0 from ``mean`` (n, C)."""
-        inner = self._algorithm.init(model.moving, np.zeros(len(mean)), cov, node)
-        return ColumnState(mean, inner)
+
+        def begun(x: FloatArray) -> Any:
+            return self._algorithm.init(model.moving, x, cov, node)
+
+        return ColumnState(*self._mapped(begun, [mean]))
 
     def predict(self, state: ColumnState, gap: float) -> ColumnState:
         """Return the state ``gap`` seconds later."""
 
-        def predicted(x: FloatArray) -> Any:
-            return self._algorithm.predict(state.inner._replace(xhat=x), gap)
+        def predicted(*x: FloatArray) -> Any:
+            return self._algorithm.predict(_given(state, iter(x)), gap)
 
-        return ColumnState(*_mapped(predicted, [state.xhat]))
+        return ColumnState(*self._mapped(predicted, state.inputs))
 
     def update(self, state: ColumnState, reading: Reading) -> ColumnState:
         """Return the state after a reading with y (p, C)."""
         still = tuple(_pair(pair, np.zeros(len(pair.y))) for pair in reading.pairs)
 
-        def updated(x: FloatArray, y: FloatArray) -> Any:
+        def updated(y: FloatArray, *x: FloatArray) -> Any:
             given = reading._replace(y=y, pairs=still)
-            return self._algorithm.update(state.inner._replace(xhat=x), given)
+            return self._algorithm.update(_given(state, iter(x)), given)
 
-        mapped = _mapped(updated, [state.xhat, reading.y])
-        return ColumnState(*mapped, tuple(pair.y for pair in reading.pairs))
+        means, inner = self._mapped(updated, [reading.y, *state.inputs])
+        y = reading.y
+        if len(y):
+            y = np.linalg.solve(np.linalg.cholesky(reading.R), y)
+        read = (y, *(pair.y for pair in reading.pairs))
+        return ColumnState(means, inner, read if inner.reading is not None else ())
 
     def emit(self, state: ColumnState, exchange: Exchange) -> tuple[ColumnState, Any]:
-        """Return the state after sending, and the payload: the state before, and what it says."""
+        """Return the state after sending, and the payload, None if nothing is sent."""
+
+        def sent(*x: FloatArray) -> Any:
+            return self._algorithm.emit(_given(state, iter(x)), exchange)[1]
+
         inner, payload = self._algorithm.emit(state.inner, exchange)
-        return state._replace(inner=inner), ColumnState(state.xhat, payload, state.pairs)
+        told = None
+        if payload is not None:
+            told = ColumnState(*self._mapped(sent, state.inputs), state.read)
+        return state._replace(inner=inner), told
 
     def absorb(
         self, state: ColumnState, messages: Sequence[Message], exchange: Exchange
     ) -> ColumnState:
         """Return the state after all messages of this instant."""
         told = [message.payload for message in messages]
-        inputs = [state.xhat, *(one.xhat for one in told), *(y for one in told for y in one.pairs)]
+        inputs = [y for one in (state, *told) for y in one.inputs]
 
-        def absorbed(x: FloatArray, *values: FloatArray) -> Any:
-            heard, pairs = [], iter(values[len(told) :])
-            for message, xhat in zip(messages, values, strict=False):
-                payload = message.payload.inner._replace(xhat=xhat)
-                if message.payload.pairs:
-                    own = tuple(_pair(p, next(pairs)) for p in payload.reading.pairs)
-                    payload.reading = payload.reading._replace(pairs=own)
-                heard.append(message._replace(payload=payload))
-            return self._algorithm.absorb(state.inner._replace(xhat=x), heard, exchange)
+        def absorbed(*values: FloatArray) -> Any:
+            given = iter(values)
+            own = _given(state, given)
+            heard = [m._replace(payload=_given(m.payload, given)) for m in messages]
+            return self._algorithm.absorb(own, heard, exchange)
 
-        return ColumnState(*_mapped(absorbed, inputs), state.pairs)
+        return ColumnState(*self._mapped(absorbed, inputs), state.read)
 
     def estimate(self, state: ColumnState) -> tuple[FloatArray, FloatArray | None]:
         """Return the estimates (n, C), and P (n, n)."""
-        return state.xhat, self._algorithm.estimate(state.inner)[1]
+        return state.means["xhat"], self._algorithm.estimate(state.inner)[1]
+
+    def _mapped(
+        self, verb: Callable[..., Any], inputs: Sequence[FloatArray]
+    ) -> tuple[dict[str, FloatArray], Any]:
+        """Return the means (k, C) after a verb on ``inputs`` (k, C), and the inner state."""
+        ends = np.cumsum([len(part) for part in inputs])
+
+        def called(x: FloatArray) -> tuple[Any, list[FloatArray]]:
+            inner = verb(*np.split(x, ends[:-1]))
+            return inner, [np.array(getattr(inner, name)) for name in names]
+
+        inner = verb(*np.split(np.zeros(ends[-1]), ends[:-1]))
+        names = [name for name in self._names if name in inner._fields]
+        base = [np.array(getattr(inner, name)) for name in names]
+        units = [called(e)[1] for e in np.eye(ends[-1])]
+        columns = np.concatenate(list(inputs))
+        made = {}
+        for k, (name, zero) in enumerate(zip(names, base, strict=True)):
+            unit = np.stack([one[k] - zero for one in units], axis=1)
+            made[name] = unit @ columns
+            made[name][:, MEAN] += zero
+        return made, inner
+
+
+def _given(state: ColumnState, values: Iterator[FloatArray]) -> Any:
+    """Return the inner state, or payload, with the next ``values`` as means and readings."""
+    inner = state.inner._replace(**{name: next(values) for name in state.means})
+    if state.read:
+        y = next(values)
+        own = tuple(_pair(pair, next(values)) for pair in inner.reading.pairs)
+        inner.reading = inner.reading._replace(y=y, pairs=own)
+    return inner
 
 
 def _pair(pair: PairReading, y: FloatArray) -> PairReading:
     """Return a reading of a pair with other values (p,)."""
     matrix: Any = pair.H
     return pair._replace(y=y, H=matrix._replace(y=y))
-
-
-def _mapped(verb: Callable[..., Any], inputs: Sequence[FloatArray]) -> tuple[FloatArray, Any]:
-    """Return the estimates (n, C) after a verb on ``inputs`` (k, C), and the inner state."""
-    sizes = np.cumsum([len(part) for part in inputs])
-    inner = verb(*np.split(np.zeros(sizes[-1]), sizes[:-1]))
-    base = np.array(inner.xhat)
-    unit = [verb(*np.split(e, sizes[:-1])).xhat - base for e in np.eye(sizes[-1])]
-    xhat = np.stack(unit, axis=1) @ np.concatenate(list(inputs))
-    xhat[:, MEAN] += base
-    return xhat, inner
