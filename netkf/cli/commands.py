@@ -111,6 +111,14 @@ def parse_node(text: str) -> str:
     return text.strip()
 
 
+def parse_columns(text: str) -> dict[str, str]:
+    """Return NAME=COLUMN,... as a dictionary; raises argparse.ArgumentTypeError."""
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    if not all(name.strip() and column.strip() for name, _, column in pairs):
+        raise argparse.ArgumentTypeError(f"must be NAME=COLUMN,...; got {text!r}")
+    return {name.strip(): column.strip() for name, _, column in pairs}
+
+
 def _trust(folder: str) -> Option:
     text = f"import classes that the scenario names, also from {folder} or the current one"
     return _flag("--trust", text)
@@ -366,6 +374,14 @@ COMMANDS = (
                 "LOG/scenario.toml)",
                 type=Path,
                 metavar="SCENARIO",
+            ),
+            _option(
+                "--columns",
+                "what the tables of kind csv call their columns: t_ms=stamp,sender=origin,... "
+                "(default: by their names)",
+                type=parse_columns,
+                default={},
+                metavar="NAME=COLUMN,...",
             ),
             _option(
                 "--unreported",

@@ -17,6 +17,7 @@ def _run(options: argparse.Namespace) -> int:
         unreported=options.unreported,
         hole=options.hole,
         trust=options.trust,
+        columns=options.columns,
     )
     print(f"written: {files[0]} with {', '.join(path.name for path in files[1:])}")
     for note in notes:

@@ -18,12 +18,8 @@ from netkf.logs.ulb import read_ulb
 from netkf.runs.files import make_directory, write_text, writing_file
 from netkf.scenario.reading import load
 
-PACKETS: Mapping[str, Callable[[Path], PacketLog]] = {
-    "csv": read_tables,
-    "ulb": read_ulb,
-    "mercator": read_mercator,
-}
-"""By kind of a packet log, the function that reads it."""
+DATA_SETS: Mapping[str, Callable[[Path], PacketLog]] = {"ulb": read_ulb, "mercator": read_mercator}
+"""By kind of a packet log that is no table of any columns, the function that reads it."""
 KINDS = ("csv", "ulb", "mercator", "mrclam")
 
 
@@ -36,6 +32,7 @@ def import_log(
     unreported: str = "unknown",
     hole: float = HOLE,
     trust: bool = True,
+    columns: Mapping[str, str] | None = None,
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write the ``log`` of a ``kind``, a file or a folder, as a scenario with its tables into the
     folder ``out``; nothing is overwritten. Return the paths, the scenario first, and notes.
@@ -45,8 +42,9 @@ def import_log(
     plant, sensors and filter are used, by default the scenario.toml in the folder of the log, if
     there is one; ``unreported`` says what becomes of transmissions that nobody reported, "unknown"
     or "lost"; a receiver that reports nothing has a hole in its log, so that its outcomes are
-    unknown, after ``hole`` packets that it would usually have heard. With ``trust`` classes that
-    the scenario names are imported, as by ``netkf.load``.
+    unknown, after ``hole`` packets that it would usually have heard. ``columns`` says for "csv"
+    what the tables call a column: {"t_ms": "stamp", "sender": "origin"}. With ``trust`` classes
+    that the scenario names are imported, as by ``netkf.load``.
 
     Raises ScenarioError with file and line for a log that cannot be read, before anything is
     written, and WriteError.
@@ -56,6 +54,8 @@ def import_log(
         if value not in known:
             rule = f"must be one of {', '.join(known)}"
             raise ScenarioError(key, rule, value, "choose one of them")
+    if columns and kind != "csv":
+        raise ScenarioError("columns", "are those of kind csv", kind, "leave them out")
     if not log.exists():
         raise ScenarioError(str(log), "does not exist", None, "check the path")
     files: Files = {}
@@ -66,7 +66,8 @@ def import_log(
         base = as_path("like", like) if like is not None else log / "scenario.toml"
         name = re.sub(r"[^\w-]", "_", log.resolve().name.partition(".")[0]) or "log"
         scenario = load(base, trust=trust) if like is not None or base.is_file() else None
-        files, notes = write_network(PACKETS[kind](log), name, hole, unreported, scenario)
+        packets = read_tables(log, columns or {}) if kind == "csv" else DATA_SETS[kind](log)
+        files, notes = write_network(packets, name, hole, unreported, scenario)
     paths = [folder / name for name in sorted(files, key="scenario.toml".__ne__)]
     for path in paths:
         if path.exists():

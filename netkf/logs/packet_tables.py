@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -25,10 +26,24 @@ from netkf.logs.packets import (
 )
 
 SYNONYMS = {
-    "t": ("time", "timestamp", "ts", "seconds", "datetime", "date", "stamp", "when", "sent_at"),
+    "t": (
+        *("time", "timestamp", "ts", "seconds", "datetime", "date", "stamp", "when", "sent_at"),
+        *("s", "ms", "us", "ns", "epoch"),
+    ),
     "sender": ("src", "source", "from", "tx", "transmitter", "srcmac", "origin", "by"),
     "receiver": ("dst", "dest", "destination", "rx", "to", "hearer", "listener", "mac", "heard_by"),
-    "number": ("seq", "seqno", "seqnum", "sequence", "n", "counter", "packet", "msg", "message"),
+    "number": (
+        "seq",
+        "seqno",
+        "seqnum",
+        "sequence",
+        "n",
+        "counter",
+        "packet",
+        "pkt",
+        "msg",
+        "message",
+    ),
     "channel": ("ch", "freq", "frequency"),
     "heard": ("received", "delivered", "ok", "success", "outcome", "status"),
     "t_heard": ("t_rx", "rx_time", "received_at", "arrival", "arrived", "t_received"),
@@ -60,9 +75,10 @@ class _Rows(NamedTuple):
     arrivals: list[Decimal | None]
 
 
-def read_tables(log: Path) -> PacketLog:
+def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     """Return the packet log of a table, or of a folder: of packets.csv, or else of all tables but
-    positions.csv and readings.csv, which may stand beside them.
+    positions.csv and readings.csv, which may stand beside them. ``columns`` names columns: by name
+    in SYNONYMS, with an ending if it needs a unit, what tables call it.
 
     Raises ScenarioError, with file and line, for a table that cannot be read.
     """
@@ -75,7 +91,8 @@ def read_tables(log: Path) -> PacketLog:
     if not paths:
         raise ScenarioError(str(log), "has no table of packets", None, "check the folder")
     notes: list[str] = []
-    rows = _join([_read_rows(path, notes) for path in paths])
+    tables = _rename({path: read_texts(path) for path in paths}, columns)
+    rows = _join([_read_rows(path, raw, notes) for path, raw in tables.items()])
     extras = {name: find_extra(log, name) for name in EXTRAS}
     resolution = find_resolution(rows.stamps)
     # A run counts from 0.
@@ -123,9 +140,29 @@ def find_column(table: pd.DataFrame, name: str) -> str:
     return ""
 
 
-def _read_rows(path: Path, notes: list[str]) -> _Rows:
+def _rename(
+    tables: dict[Path, pd.DataFrame], columns: Mapping[str, str]
+) -> dict[Path, pd.DataFrame]:
+    """Return the tables with the names of a user's ``columns``; raises ScenarioError."""
+    found = {name for table in tables.values() for name in table.columns}
+    new: dict[str, str] = {}
+    hidden: dict[str, str] = {}
+    for name, column in columns.items():
+        whole = next((n for n in SYNONYMS for e in ("", *ENDINGS) if name == n + e), None)
+        if whole is None:
+            rule = f"must name one of {', '.join(SYNONYMS)}"
+            raise ScenarioError("columns", rule, name, "choose one of them")
+        if column.lower() not in found:
+            rule = f"must be columns of the log ({', '.join(sorted(found))})"
+            raise ScenarioError("columns", rule, column, "choose one of them")
+        new[column.lower()] = name
+        # A column that had such a name is another one.
+        hidden |= {whole + ending: f"{whole + ending} (of the log)" for ending in ("", *ENDINGS)}
+    return {path: table.rename(columns=hidden | new) for path, table in tables.items()}
+
+
+def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
     """Return the packets of one table; notes say which columns were taken for what."""
-    raw = read_texts(path)
     names = _find_columns(path, raw, notes)
     empty = pd.Series("", index=raw.index)
     table = pd.DataFrame(
@@ -170,7 +207,9 @@ def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, 
     for name in ("t", "sender"):
         if not names[name]:
             rule = f"must have a column {name} ({', '.join(SYNONYMS[name])})"
-            raise ScenarioError(str(path), rule, list(raw.columns), "name the columns")
+            raise ScenarioError(
+                str(path), rule, list(raw.columns), "name them: --columns t=COLUMN,..."
+            )
     used = {name: column for name, column in names.items() if column}
     listed = ", ".join(f"{a} from {b}" if a != b else a for a, b in used.items())
     unused = [column for column in raw.columns if column not in used.values()]

@@ -34,6 +34,7 @@ MAX_SKIP = 1000
 between.
 """
 TOLD, UNREPORTED = "no report tells", "nobody reported it"
+NOT_LOGGED = "its sender logs what it sends, and not this"
 """Reasons for which outcomes are not known."""
 LATE = 2
 """A number may be that much smaller than the one before because reports are out of order."""
@@ -219,7 +220,9 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
         why[missing] = ""
         silent = missing & ~sends["sent"].to_numpy(dtype=bool)[send]
         if unreported == "unknown":
-            why[silent] = UNREPORTED
+            why[silent] = np.where(_sent_all_that_was_heard(sends)[send], NOT_LOGGED, UNREPORTED)[
+                silent
+            ]
         if silent.any():
             log.notes.append(
                 f"not known: {count_phrase(int(silent.sum()), 'outcome')} of transmissions that "
@@ -231,6 +234,14 @@ def settle(log: PacketLog, hole: float, unreported: str) -> pd.DataFrame:
     whole["why"] = why
     columns = ["send", "receiver", "heard", "delay", "rssi", "why"]
     return whole.sort_values(["send"], kind="stable")[columns].reset_index(drop=True)
+
+
+def _sent_all_that_was_heard(sends: pd.DataFrame) -> np.ndarray:
+    """Return flags of transmissions whose sender logged some, and all that anybody heard: what its
+    log does not have was hardly sent.
+    """
+    known = sends[sends["sent"].astype(bool)].groupby("sender")["logged"].all()
+    return sends["sender"].map(known).fillna(False).to_numpy(dtype=bool)
 
 
 def _in_holes(log: PacketLog, whole: pd.DataFrame, hole: float) -> np.ndarray:

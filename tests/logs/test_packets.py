@@ -89,6 +89,43 @@ def test_what_the_sender_logs_is_lost_and_what_only_numbers_tell_is_not_known(tm
     assert table(tmp_path / "lost", "accounts.csv")["unknown"].sum() == 0
 
 
+def test_a_sender_that_logs_what_it_sends_hardly_sent_what_its_log_does_not_have(tmp_path):
+    heard = ["2,a,b,1", "2,a,c,1", "5,a,b,4"]
+    own = ["t,src,dst,seq", "1,a,,0", "2,a,,1", "5,a,,4", *heard]
+    for name, rows, why in (
+        ("off", own, "its sender logs what it sends, and not this"),
+        ("holes", [*own, "6,a,b,5"], "nobody reported it"),
+    ):
+        netkf.import_log(write(tmp_path / f"{name}.csv", rows), "csv", tmp_path / name)
+        unknown = table(tmp_path / name, "unknown.csv")
+        assert unknown["message"].tolist() == [2, 2, 3, 3]
+        assert set(unknown["why"]) == {why}
+
+
+def test_columns_of_any_name(tmp_path, capsys):
+    rows = ["stamp;who;from whom;k;t;crc", "1000;2;3;0;x;yes", "2500;2;3;1;x;no"]
+    log, out = write(tmp_path / "log.csv", rows), tmp_path / "out"
+    columns = "t_ms=Stamp,sender=from whom,receiver=who,number=k"
+    words = ["import", str(log), "--kind", "csv", "--out", str(out), "--columns"]
+    assert main([*words, columns + ",heard=crc"]) == 0
+    printed = capsys.readouterr().out
+    assert "columns t from t_ms, sender, receiver, number" in printed
+    assert "not used: t (of the log)" in printed
+    sent = table(out, "transmissions.csv")
+    assert np.diff(sent["t"]).tolist() == [1.5]
+    assert table(out, "outcomes.csv")["delivered"].tolist() == [1, 0]
+    assert main([*words[:2], "--kind", "csv", "--out", str(tmp_path / "no")]) == 2
+    assert "name them: --columns t=COLUMN,..." in capsys.readouterr().err
+    for wrong, said in (
+        ("t=when", "must be columns of the log"),
+        ("time=stamp", "must name one of t, sender"),
+    ):
+        assert main([*words[:-2], str(tmp_path / "no"), "--columns", wrong]) == 2
+        assert said in capsys.readouterr().err
+    assert main([*words[:-4], "ulb", *words[-3:], "t=stamp"]) == 2
+    assert "are those of kind csv" in capsys.readouterr().err
+
+
 def test_outcomes_events_and_repeated_rows(tmp_path, capsys):
     told = ["t_ms,src,dst,seq,ok", "1000,1,2,0,yes", "1000,1,3,0,no", "2000,1,2,1,", "2000,1,3,1,1"]
     log = write(tmp_path / "told.csv", [*told, "2000,1,3,1,1"])
