@@ -100,6 +100,7 @@ from netkf.network.losses import (
 )
 from netkf.network.matchings import Broadcast, Matching, RecordedSlots, SlotActivation
 from netkf.network.node_clocks import NodeClock
+from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.network.scheduled import Hopping, ScheduledLoss
@@ -243,6 +244,7 @@ __all__ = [
     "Plant",
     "Poisson",
     "PushSum",
+    "Quantisation",
     "Radio",
     "RangeBearingSensor",
     "RangeGraph",

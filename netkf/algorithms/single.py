@@ -83,6 +83,10 @@ class Payload:
         root: FloatArray = self.root
         return root @ root.T
 
+    def with_fields(self, fields: dict[str, np.ndarray]) -> Payload:
+        """Return a payload with these ``fields``, of the axes of those here."""
+        return Payload(fields, self.reading, self.sender)
+
     def _replace(self, **fields: Any) -> Payload:
         """Return a payload with other values of some fields, as of a NamedTuple."""
         arrays = {name: np.asarray(value)[None, ..., None] for name, value in fields.items()}

@@ -6,6 +6,7 @@ the mean of P over time, and its limit S for fast links.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -39,6 +40,7 @@ class SummarySink(Sink):
     diverged        : nodes whose estimate or covariance was unusable at the last sample
     last            : x, xhat, P and error of the last two samples, arrays (2, ...)
     transmissions   : number of messages and transmissions of each node
+    clipped         : number of numbers in messages that were clipped
     """
 
     thread_safe: ClassVar[bool] = True
@@ -54,11 +56,13 @@ class SummarySink(Sink):
         self.diverged: list[int] = []
         self.last: tuple[FloatArray, ...] = ()
         self.transmissions = Transmissions()
+        self.clipped = 0
 
     def events(self, rows: np.ndarray) -> None:
         """Count the messages in a block ``rows`` (E,) of EVENT rows."""
         self.transmissions.add(rows)
         self.diverged += rows["node"][rows["kind"] == CODES["diverged"]].tolist()
+        self.clipped += int(rows["message"][rows["kind"] == CODES["clip"]].sum())
         is_delivery = rows["kind"] == CODES["deliver"]
         node, peer = rows["node"][is_delivery], rows["peer"][is_delivery]
         links = count_pairs(np.minimum(node, peer), np.maximum(node, peer))
@@ -197,7 +201,10 @@ def summarise(
         "central": promised.central,
         "bound": promised.reason or "Tanwani's H(12), promised by H Theorem 2",
         "rounding_from": sink.rounding_from,
-        "notes": summary_notes(scenario, sink.rounding_from, sink.has_covariance),
+        "notes": [
+            *summary_notes(scenario, sink.rounding_from, sink.has_covariance),
+            *_clipping_notes(scenario, sink.clipped),
+        ],
         "messages": {
             **messages,
             "transmissions": counts.total,
@@ -276,6 +283,14 @@ def summary_notes(
             "they and NEES are averaged over the samples before; shorten the horizon"
         )
     return notes
+
+
+def _clipping_notes(scenario: Scenario, clipped: int) -> list[str]:
+    if not clipped:
+        return []
+    limit = scenario.network.quantise.range if scenario.network.quantise is not None else math.nan
+    numbers = "1 number was" if clipped == 1 else f"{clipped} numbers were"
+    return [f"{numbers} beyond the range of messages, -{limit:g} to {limit:g}, and clipped"]
 
 
 def conserved_sums(sums: dict[str, tuple[float, float]]) -> dict[str, Any]:

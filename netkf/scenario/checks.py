@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.kernels.gains import longest_interval
+from netkf.algorithms.kernels.run import absorb as nothing
 from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
 from netkf.linalg.spectra import growth_rate
@@ -265,6 +267,21 @@ def _check_clocks(scenario: DerivedScenario) -> None:
         raise ScenarioError("network.clocks", why, sorted(owners), "remove it")
 
 
+def _check_quantisation(scenario: DerivedScenario) -> None:
+    if scenario.network.quantise is None:
+        return
+    algorithm, why = scenario.node_filter, None
+    kernels = compiled_kernels(algorithm, not scenario.slotted)
+    if kernels is not None and (kernels.sends_readings or kernels.shift_payload is nothing):
+        why = f"cannot be with the {filter_name(scenario)}, whose messages have readings or bits"
+    elif scenario.input_responses is not None:
+        why = "cannot stand beside an input of a linear plant that filters know"
+    elif scenario.views is not None:
+        why = "cannot stand beside nodes that estimate different blocks"
+    if why is not None:
+        raise ScenarioError("network.quantise", why, scenario.network.quantise.bits, "remove it")
+
+
 def _check_network(scenario: DerivedScenario) -> None:
     network, topology, node_filter = scenario.network, scenario.topology, scenario.node_filter
     for key, part in (
@@ -280,6 +297,7 @@ def _check_network(scenario: DerivedScenario) -> None:
                 part.check(topology)
     _check_lives(scenario)
     _check_clocks(scenario)
+    _check_quantisation(scenario)
     if not node_filter.timing.talks:
         return
     name = filter_name(scenario)

@@ -48,6 +48,7 @@ from netkf.network.losses import Transmission
 from netkf.network.matchings import SlotActivation
 from netkf.network.node_clocks import NodeClock
 from netkf.network.positions import Positions, PositionTable
+from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
 from netkf.plants.blocks import Block, Layout, stack
 from netkf.plants.linear import LinearPlant, SlotPlant
@@ -76,6 +77,7 @@ class Network(Component):
     lives       when nodes are down: crashes, duty cycles, tables; others are always up
     clocks      what clocks of nodes show, where they are wrong
     radio       how long nodes send a message, and in how many frames
+    quantise    in how many bits numbers of messages are sent; exact by default
     """
 
     graph: Graph = field(graph_rule)
@@ -89,6 +91,7 @@ class Network(Component):
         list_of(instance_of(NodeClock), "clocks", min_length=0), default=()
     )
     radio: Radio | None = field(instance_of(Radio), default=None)
+    quantise: Quantisation | None = field(instance_of(Quantisation), default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,7 +382,7 @@ class ScenarioModel(Component):
 
     @cached_property
     def departures(self) -> tuple[tuple[str, str], ...]:
-        """What filters assume, and why it is not so: clocks, readings and gates."""
+        """What filters assume, and why it is not so: clocks, messages and gates."""
         found = []
         if self.network.clocks:
             evidence = (
@@ -387,6 +390,12 @@ class ScenarioModel(Component):
                 "time, and P does not count it"
             )
             found.append(("clocks of nodes are right", evidence))
+        if self.network.quantise is not None:
+            evidence = (
+                "each number of a message has an error of variance "
+                f"{self.network.quantise.variance:.4g} (network.quantise) that P does not count"
+            )
+            found.append(("messages arrive as they are sent", evidence))
         if self.filter.gate is not None:
             evidence = (
                 "a gate refuses a healthy reading of a consistent filter with probability "
@@ -558,7 +567,9 @@ class ScenarioModel(Component):
             # Some filters send their readings.
             rows = sum(len(self.sensors[p.entry].R) for p in self.placed_sensors.get(node, ()))
             numbers = self.node_filter.analysis.payload_numbers(int(self.sizes[index]), rows, phase)
-            self._message_sizes[node, phase] = float(radio.bytes_per_number * numbers)
+            coded = self.network.quantise
+            size = radio.bytes_per_number if coded is None else coded.bits / 8.0
+            self._message_sizes[node, phase] = float(math.ceil(size * numbers))
         return self._message_sizes[node, phase]
 
     @cached_property

@@ -20,6 +20,7 @@ from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
 from netkf.network.node_clocks import NodeClock
+from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
@@ -54,6 +55,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Network, "lives"): {"type": "array", "items": {"$ref": "#/$defs/life"}},
     (Network, "clocks"): {"type": "array", "items": {"$ref": "#/$defs/clock"}},
     (Network, "radio"): {"$ref": "#/$defs/radio"},
+    (Network, "quantise"): {"$ref": "#/$defs/quantisation"},
     (Channel, "channels"): {"$ref": "#/$defs/hopping"},
     (Channel, "loss"): {"$ref": "#/$defs/loss"},
     (Channel, "delay"): {"$ref": "#/$defs/delay"},
@@ -113,6 +115,7 @@ def scenario_schema() -> Schema:
     definitions["channel"] = _table_schema(list_keys(Channel))
     definitions["gate"] = _table_schema(list_keys(Gate))
     definitions["clock"] = _table_schema(list_keys(NodeClock))
+    definitions["quantisation"] = _table_schema(list_keys(Quantisation))
     definitions["radio"] = _table_schema(list_keys(Radio))
     definitions["hopping"] = _table_schema(list_keys(Hopping))
     definitions["time"] = _table_schema(list_keys(Time))

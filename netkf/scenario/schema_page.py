@@ -8,6 +8,7 @@ from netkf.algorithms.gates import Gate
 from netkf.core.fields import Component
 from netkf.network.channels import Channel
 from netkf.network.node_clocks import NodeClock
+from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
@@ -27,6 +28,7 @@ TABLES: dict[str, type[Component]] = {
     "network.channel.channels": Hopping,
     "network.clocks": NodeClock,
     "network.radio": Radio,
+    "network.quantise": Quantisation,
     "filter, beside its kind": Filtering,
     "filter.model": Belief,
     "filter.gate": Gate,

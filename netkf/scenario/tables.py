@@ -22,6 +22,7 @@ from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
 from netkf.network.graph_files import as_graph
 from netkf.network.node_clocks import NodeClock
+from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
@@ -356,6 +357,7 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
         "lives": partial(_build_list, "network.lives", partial(_build_component, "life", origin)),
         "clocks": partial(_build_list, "network.clocks", partial(_build_table, NodeClock, origin)),
         "radio": partial(_build_table, Radio, origin),
+        "quantise": partial(_build_table, Quantisation, origin),
     }
     return _build_object(Network, _build_inner(_as_dict(value), builders), origin)
 

@@ -23,6 +23,7 @@ KINDS = (
     "join",
     "leave",
     "refuse",
+    "clip",
 )
 """Event kinds; a row stores the index of its kind in this tuple.
 
@@ -45,6 +46,7 @@ transmit node transmitted once, as its transmission number ``message``, to all t
 link     the link node - peer of a range graph is up (``message`` 1) or down (0), and was not when
          it was looked at last; it is down before the first look
 refuse   the gate of node refused the reading of one of its sensors
+clip     a message that node sends has ``message`` numbers beyond the range of network.quantise
 join, leave  as restart and crash, of a node that a table lets join and leave the network
 """
 

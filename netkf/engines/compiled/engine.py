@@ -73,9 +73,9 @@ class CompiledEngine(Engine):
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
         network = scenario.network
-        changing = network.lives or network.clocks or network.radio is not None
+        changing = network.lives or network.clocks or network.radio or network.quantise
         if changing or scenario.filter.gate is not None:
-            rule = "nodes that are down at times or have clocks of their own, a radio or a gate"
+            rule = "lives or clocks of nodes, radios, messages of few bits or a gate"
             return f'engine "compiled" cannot run {rule}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)

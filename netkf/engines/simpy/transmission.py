@@ -27,13 +27,16 @@ from netkf.network.channels import (
 from netkf.network.graphs import Link
 from netkf.network.losses import Transmission
 from netkf.network.node_clocks import node_times
+from netkf.network.quantise import encoders
 from netkf.network.radio import Airtime
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import NAN, Recorder
 from netkf.trace.schema import CODES
 
-SEND, DELIVER, LOST, LATE = (CODES[kind] for kind in ("send", "deliver", "lost", "late"))
+SEND, DELIVER, LOST, LATE, CLIP = (
+    CODES[kind] for kind in ("send", "deliver", "lost", "late", "clip")
+)
 
 LINK_DOWN = ChannelDraw(math.inf, False, 0.0)
 """The draw for a link that is down: no uniform number is below a delivery probability."""
@@ -94,6 +97,9 @@ class Transmitter:
         # What hearers share is drawn for each transmission of a sender.
         self.broadcasts = broadcasts_of(scenario, streams)
         self._clocks = node_times(scenario, streams)
+        self._encoders = encoders(scenario, streams)
+        # The last payload of each sender, as the filter made it and as it is received.
+        self._encoded: dict[int, tuple[Any, Any]] = {}
         self._horizon, self._until = scenario.horizon, scenario.end_time
         self._instant = scenario.time_grid.instant
         # Of nodes that move: who hears whom. Set when the true state of the run is known.
@@ -160,6 +166,7 @@ class Transmitter:
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
+        payload = self._encode(sender, payload, phase)
         envelope = Envelope(sender, number, direction.weight, payload, now, exchange)
         # No event for a message without delay: it arrives inside the tick.
         if delay == 0.0:
@@ -192,6 +199,18 @@ class Transmitter:
             self._recorder.append((now, kind, receiver, sender, number, phase, age))
         if arrives_in_time:
             direction.receiver.receive(envelope)
+
+    def _encode(self, sender: int, payload: Any, phase: int) -> Any:
+        """Return what is received of a payload; all hearers of a transmission receive the same."""
+        if not self._encoders:
+            return payload
+        if sender not in self._encoded or self._encoded[sender][0] is not payload:
+            encoded, clipped = self._encoders[sender].encode(payload)
+            self._encoded[sender] = payload, encoded
+            if clipped:
+                row = (self._timeline.now, CLIP, sender, -1, clipped, phase, NAN)
+                self._recorder.append(row)
+        return self._encoded[sender][1]
 
     def _told_age(self, link: Link, sent: float, age: float) -> float:
         """Return the age that the stamp of a message tells its receiver, whose filter believes it:

@@ -1,0 +1,200 @@
+"""Messages of few bits: the error of numbers, and what it does to a filter."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import netkf
+from netkf.checks.check import find_checks
+from netkf.checks.equations import WITHOUT_PAPER
+from netkf.core.errors import ScenarioError
+from netkf.engines.simpy.engine import SimpyEngine
+from netkf.network.quantise import Encoder, Quantisation
+from netkf.rng.streams import Streams
+from netkf.runs.summary import PromisedTraces, SummarySink, summarise
+from netkf.trace.recorder import Recorder
+from netkf.trace.schema import CODES
+
+SLOTS = """
+format = 1
+name = "few-bits"
+horizon = {horizon}
+probe = 1.0
+[plant]
+kind = "linear"
+period = 1.0
+F = [[0.9]]
+Q = [[{Q}]]
+mean = [2.0]
+[[sensors]]
+nodes = [0, 1, 2]
+H = [[1.0]]
+R = [[{R}]]
+[network]
+graph = {{ kind = "complete", nodes = 3 }}
+activation = {{ kind = "broadcast" }}
+{quantise}
+[filter]
+kind = "{filter}"
+{more}
+cov = [[1.0]]
+mean = [0.5]
+"""
+L, W = 0.3, np.full((3, 3), 1.0 / 3.0)
+
+
+@pytest.fixture
+def scenario_of(tmp_path):
+    def make(bits=3, limit=8.0, horizon=30.0, Q=0.1, R=0.5, filter_="constant-gain"):
+        more = {"constant-gain": f"gain = [[{L}]]"}.get(filter_, "")
+        quantise = f"quantise = {{ bits = {bits}, range = {limit} }}" if bits else ""
+        text = SLOTS.format(horizon=horizon, Q=Q, R=R, filter=filter_, more=more, quantise=quantise)
+        (tmp_path / "bits.toml").write_text(text)
+        return netkf.load(tmp_path / "bits.toml")
+
+    return make
+
+
+def test_errors_are_uniform_over_a_step_whatever_is_sent():
+    quantisation = Quantisation(bits=4, range=3.0)
+    random, z = np.random.default_rng(1), np.tile(np.linspace(-2.8, 2.8, 20), 2000)
+    received, clipped = quantisation.apply(z, random)
+    step = 6.0 / 16.0
+    error = (received - z).reshape(2000, 20)
+    assert clipped == 0
+    assert scipy.stats.kstest(error.ravel(), "uniform", (-step / 2.0, step)).pvalue > 1e-4
+    # Moments for each value: none depends on it (five deviations of 2000 draws).
+    spread = step / np.sqrt(12.0)
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=5.0 * spread / np.sqrt(2000.0))
+    fourth = step**4 / 80.0 - (step**2 / 12.0) ** 2
+    off = 5.0 * np.sqrt(fourth / 2000.0)
+    np.testing.assert_allclose((error**2).mean(axis=0), step**2 / 12.0, atol=off)
+    assert quantisation.variance == pytest.approx(step**2 / 12.0)
+
+
+def test_values_beyond_the_range_are_clipped_and_counted():
+    received, clipped = Quantisation(bits=8, range=1.0).apply(
+        np.array([-5.0, 0.3, 7.0, np.inf]), np.random.default_rng(2)
+    )
+    assert clipped == 3
+    np.testing.assert_allclose(received, [-1.0, 0.3, 1.0, 1.0], atol=2.0 / 256.0)
+
+
+def test_triangles_stay_triangles_and_symmetric_matrices_symmetric():
+    encoder = Encoder(Quantisation(bits=5, range=4.0), np.random.default_rng(3))
+    root = np.array([[1.0, 0.0, 0.0], [0.5, 2.0, 0.0], [-1.0, 0.0, 3.0]])
+    (lower, upper, both, count, name), _ = encoder.encode(
+        (root, root.T, root @ root.T / 4.0, 7, "x")
+    )
+    assert (lower[np.triu_indices(3, 1)] == 0.0).all()
+    assert (lower[np.tril_indices(3)] != root[np.tril_indices(3)]).all()
+    assert (upper[np.tril_indices(3, -1)] == 0.0).all()
+    assert np.array_equal(both, both.T)
+    assert (count, name) == (7, "x")
+
+
+def plain_run(slots, bits, limit, seed):
+    """Estimates (T, 3) of the filter with a constant gain whose nodes hear quantised estimates;
+    the state is 2 0.9^k, without noise.
+    """
+    draws = [Streams(seed).generator("dither", i) for i in range(3)]
+    step, x, found = 2.0 * limit / 2.0**bits, np.full(3, 0.5), [np.full(3, 0.5)]
+    for k in range(1, slots):
+        x = 0.9 * x
+        x = x + L * (2.0 * 0.9**k - x)
+        told = np.zeros(3)
+        for i in range(3):
+            # An estimate, and the root of its covariance: two numbers a message.
+            u = step * (draws[i].random(1)[0] - 0.5)
+            draws[i].random(1)
+            level = np.clip(np.floor((x[i] + u + limit) / step), 0.0, 2.0**bits - 1.0)
+            told[i] = (level + 0.5) * step - limit - u
+        x = np.array(
+            [x[i] / 3.0 + sum(told[j] for j in range(3) if j != i) / 3.0 for i in range(3)]
+        )
+        found.append(x)
+    return np.array(found)
+
+
+def test_hearers_use_what_is_received_all_the_same(scenario_of):
+    run = netkf.simulate(scenario_of(Q=0.0, R=1e-24), seed=5)
+    np.testing.assert_allclose(run.xhat[:, :, 0], plain_run(31, 3, 8.0, 5), rtol=1e-9, atol=1e-9)
+
+
+def test_the_steady_error_is_that_of_the_plain_recursion(scenario_of):
+    """e <- W (I - L H)(F e + w) + L v with the messages' noise of variance step^2 / 12."""
+    run = netkf.simulate(scenario_of(horizon=1000.0, Q=0.1, R=0.5), seed=3)
+    others, expected = W - np.diag(np.diag(W)), {}
+    for variance in (4.0 / 12.0, 0.0):
+        S = np.eye(3)
+        for _ in range(300):
+            S = 0.81 * S + 0.1
+            S = W @ ((1.0 - L) ** 2 * S + L**2 * 0.5 * np.eye(3)) @ W.T
+            S = S + variance * others @ others.T
+        expected[variance] = S
+    error = (run.x[:, None] - run.xhat)[51:, :, 0]
+    blocks = np.einsum("bti,btj->bij", *[error.reshape(19, 50, 3)] * 2) / 50.0
+    off = 5.0 * blocks.std(axis=0, ddof=1) / np.sqrt(19.0)
+    with_noise, without = expected.values()
+    assert (np.abs(blocks.mean(axis=0) - with_noise) < off).all()
+    assert (np.abs(blocks.mean(axis=0) - without) > off)[np.diag_indices(3)].all()
+
+
+@pytest.mark.parametrize("kind", ["constant-gain", "hcmci"])
+def test_many_bits_are_none(scenario_of, kind):
+    changes = {"filter": {"kind": "hcmci", "steps": 2}} if kind == "hcmci" else {}
+    run, exact = (
+        netkf.simulate(scenario_of(bits=bits, limit=64.0).replace(changes), seed=1, engine="simpy")
+        for bits in (48, 0)
+    )
+    np.testing.assert_allclose(run.xhat, exact.xhat, atol=1e-10)
+    np.testing.assert_allclose(run.P, exact.P, atol=1e-10)
+    assert not run.count("clip")
+
+
+def test_a_summary_says_what_was_clipped(scenario_of):
+    sink = SummarySink()
+    recorder = Recorder([sink])
+    scenario = scenario_of(limit=0.4)
+    SimpyEngine().run(scenario, Streams(1), recorder, lambda _: None)
+    run = netkf.simulate(scenario, seed=1)
+    rows = run.log[run.log["kind"] == CODES["clip"]]
+    promised = PromisedTraces(None, np.nan, np.nan, "")
+    notes = summarise(scenario, sink, promised, {"sent": 0, "delivered": 0, "lost": 0})["notes"]
+    count = rows["message"].sum()
+    assert notes == [f"{count} numbers were beyond the range of messages, -0.4 to 0.4, and clipped"]
+
+
+def test_sizes_of_messages_follow_from_the_bits(scenario_of):
+    exact, coded = scenario_of(bits=0), scenario_of(bits=5)
+    # An estimate and a root: two numbers, of eight bytes or of five bits.
+    assert (exact.message_size(0, 0), coded.message_size(0, 0)) == (16.0, 2.0)
+
+
+def test_nothing_is_promised_and_it_is_said_why(scenario_of):
+    scenario = scenario_of()
+    table = netkf.theory.assumptions(scenario)
+    row = table[table["assumption"] == "messages arrive as they are sent"].iloc[0]
+    assert not row["holds"]
+    assert "variance 0.3333" in row["evidence"]
+    with pytest.raises(netkf.TheoryError, match=r"variance 0\.3333"):
+        netkf.theory.error_covariance(scenario, netkf.simulate(scenario, seed=1))
+    assert find_checks(scenario) is WITHOUT_PAPER
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"network.quantise": {"bits": 0, "range": 1.0}}, "network.quantise.bits"),
+        ({"network.quantise": {"bits": 60, "range": 1.0}}, "network.quantise.bits"),
+        ({"network.quantise": {"bits": 8, "range": 0.0}}, "network.quantise.range"),
+        ({"network.quantise": {"bits": 8}}, "network.quantise.range"),
+        ({"filter": {"kind": "one-bit"}}, "network.quantise"),
+        ({"filter": {"kind": "intermittent"}}, "network.quantise"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(scenario_of, changes, key):
+    with pytest.raises(ScenarioError) as error:
+        scenario_of().replace(changes)
+    assert key in str(error.value)
+    assert "\n" not in str(error.value)
