@@ -70,7 +70,12 @@ def use_sample(record: Any, h: int, run: Any) -> None:
     """
     lanes, n, r = run.lanes, len(run.size), run.reading
     first, matrix = run.first_y + r, run.first_H + run.matrix[r]
-    if run.rows[r] == 0:
+    # A node that is down has no reading, which zeros stand for.
+    is_read = False
+    for i in range(run.rows[r]):
+        for j in range(n):
+            is_read |= run.H[matrix, i, j, 0] != 0.0
+    if not is_read:
         return
     # All innovations refer to the estimate before the reading: L is the gain of all its rows.
     copy_vector(lanes, run.size, record.mean, 0, record.xhat, h, True)

@@ -535,6 +535,13 @@ class StochasticTrigger(Filter):
             )
         if inner.needs.check is not None:
             inner.needs.check(scenario)
+        if scenario.network.lives and isinstance(self.wrapped, ScheduledReadings):
+            raise ScenarioError(
+                "network.lives",
+                "must be empty where silence is used: a node that is down is silent too",
+                f"{len(scenario.network.lives)} lives",
+                "remove it, or choose another inner filter, which takes silence for a loss",
+            )
         # A number fits readings of any number of rows.
         if not isinstance(self.Y, np.ndarray):
             return

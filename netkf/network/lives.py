@@ -50,7 +50,7 @@ class Life(Component):
     ticks, sends nor hears; a message that arrives then is lost.
 
     memory  kept: a node goes on with the estimate it had; lost: it begins again with the mean and
-            the covariance of its filter
+            the covariance of its filter, in slots when the next one begins
     """
 
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"))
@@ -199,6 +199,23 @@ def lifetimes(scenario: Any, streams: Any) -> dict[int, Lifetime]:
             changes = life.changes(node, random, scenario.horizon)
             up = not changes or not changes[0].up
             instants = [c._replace(time=scenario.time_grid.instant(c.time)) for c in changes]
+            forgets = life.memory == "lost"
+            if forgets and scenario.slotted:
+                instants = _begun_with_slots(instants, scenario.slot_plant)
             kept = tuple(c for c in instants if c.time < scenario.horizon)
-            found[node] = Lifetime(up, kept, life.memory == "lost")
+            found[node] = Lifetime(up, kept, forgets)
+    return found
+
+
+def _begun_with_slots(changes: Sequence[Change], plant: Any) -> list[Change]:
+    """Let a node that forgets go up when the next slot begins, unless it is down again by then."""
+    found: list[Change] = []
+    for change in changes:
+        if not change.up and found and found[-1].up and change.time <= found[-1].time:
+            found.pop()
+            continue
+        slot = int(change.time / plant.period) if change.time < math.inf else 0
+        while change.up and plant.slot_time(slot) < change.time < math.inf:
+            slot += 1
+        found.append(change._replace(time=plant.slot_time(slot)) if change.up and slot else change)
     return found

@@ -845,6 +845,17 @@ class DerivedScenario(ScenarioModel):
         view = self.model_views[index]
         return xhat[view], P[np.ix_(view, view)]
 
+    def fresh_estimate(self, node: int, when: float) -> tuple[FloatArray, FloatArray]:
+        """Return ``initial_estimate`` of a node that begins again at ``when``, in seconds or a
+        slot: in the coordinates of filters, which follow the response to a known input.
+        """
+        (mean, cov), responses = self.initial_estimate(node), self.input_responses
+        if responses is None or responses.believed is None:
+            return mean, cov
+        origin = responses.believed.states(np.array([when]))[0]
+        views = self.model_views
+        return mean - (origin if views is None else origin[views[self.topology.index[node]]]), cov
+
     @property
     def other_starts(self) -> list[int]:
         """The ids of nodes whose filters do not start with mean and covariance of x(0)."""

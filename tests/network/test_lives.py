@@ -239,6 +239,114 @@ def test_slots(scenario_of, filter_):
         assert slots[node] == {t for t in every if not is_down(t, node)}
 
 
+OWN = {
+    "hybrid": "epsilon = 0.4\n",
+    "kcf": "epsilon = 0.1\n",
+    "hcmci": "steps = 2\n",
+}
+OWN_IN_SLOTS = {
+    "constant-gain": "gain = [[0.4]]\n",
+    "push-sum": "gamma = 2\ndelta = 3.0\nrunning_sums = true\n",
+}
+OWN_UNDER_CLOCKS = {"constant-gain": "gain = [[0.4], [0.1]]\n", "push-sum": "delta = 3.0\n"}
+LOSSES = (
+    'kind = "bernoulli", delivery = 0.8',
+    'kind = "gilbert-elliott", mean_loss = 0.3, mean_burst = 3.0',
+    'kind = "shared", delivery = 0.7, share = 0.8',
+    'kind = "recorded", path = "loss.csv"',
+)
+DELAYS = ('kind = "none"', 'kind = "constant", seconds = 0.25', 'kind = "exponential", mean = 0.2')
+
+
+def combined(folder, slots, filter_, k, plant=""):
+    """Scenario number k of all: which life, loss and delay, in slots or under clocks."""
+    life = (
+        'kind = "crashes"\nnodes = [1, 2]\nmean_up = 3.0\nmean_down = 1.5',
+        'kind = "duty"\nnodes = [0, 2]\nperiod = 3.0\nup = 2.0\nphase = 1.0',
+        'kind = "recorded"\nnodes = [1, 2]\npath = "l.csv"',
+    )[k % 3]
+    lives = f'[[network.lives]]\n{life}\nmemory = "{("lost", "kept")[k // 3 % 2]}"'
+    (folder / "l.csv").write_text(TABLE)
+    ends = [(i, j) for i, j in ((0, 1), (1, 0), (1, 2), (2, 1)) for _ in range(12)]
+    rows = [f"{i},{j},{m % 12},{(m * m // 3) % 2}" for m, (i, j) in enumerate(ends)]
+    (folder / "loss.csv").write_text("\n".join(["sender,receiver,message,delivered", *rows]))
+    at = ("nodes", "directions", "readings", "links")[k % 4]
+    clock = (
+        'kind = "readings"' if at == "readings" else f'kind = "poisson", rate = 3.0, at = "{at}"'
+    )
+    text = (SLOTS if slots else CLOCKS).format(lives=lives, horizon=10.0, filter=filter_, at=at)
+    network, own = text.partition("[network.channel]")[0], text[text.index("[filter]") :]
+    if slots:
+        network = network.replace(own, "")
+    network = network.replace("[network]\n", plant + "[network]\n")
+    network = network.replace(f'kind = "poisson", rate = 3.0, at = "{at}"', clock)
+    channel = (
+        f"[network.channel]\nsymmetric = false\nloss = {{ {LOSSES[k % 4]} }}\n"
+        f"delay = {{ {DELAYS[k // 2 % 3]} }}\n"
+    )
+    path = folder / "combined.toml"
+    options = OWN | (OWN_IN_SLOTS if slots else OWN_UNDER_CLOCKS)
+    path.write_text(network + channel + own + options.get(filter_, ""))
+    return netkf.load(path)
+
+
+def assert_accounts_balance(log, horizon):
+    count = {kind: log[log["kind"] == CODES[kind]] for kind in ("send", "deliver", "lost", "late")}
+    ends = {
+        kind: [(int(r["peer"]), int(r["node"]), int(r["message"])) for r in rows]
+        if kind in ("deliver", "late")
+        else [(int(r["node"]), int(r["peer"]), int(r["message"])) for r in rows]
+        for kind, rows in count.items()
+    }
+    fates = ends["deliver"] + ends["lost"] + ends["late"]
+    assert len(set(fates)) == len(fates)  # nothing arrives twice
+    assert len(set(ends["send"])) == len(ends["send"])
+    under_way = set(ends["send"]) - set(fates)
+    assert set(fates) <= set(ends["send"])
+    sent_at = {key: float(t) for key, t in zip(ends["send"], count["send"]["t"], strict=True)}
+    assert all(sent_at[key] > horizon - 5.0 for key in under_way)
+
+
+@pytest.mark.parametrize("slots", [True, False])
+@pytest.mark.parametrize(
+    "filter_", ["hybrid", "constant-gain", "push-sum", "intermittent", "hcmci"]
+)
+def test_engines_agree_and_accounts_balance(tmp_path, slots, filter_):
+    if filter_ == ("hybrid" if slots else "hcmci"):
+        return
+    for k in range(12):
+        if filter_ in ("intermittent", "push-sum") and not slots:
+            k = 4 * k + {"intermittent": 2, "push-sum": 0}[filter_]  # noqa: PLW2901 - their clocks
+        scenario = combined(tmp_path, slots, filter_, k)
+        assert scenario.network.lives
+        one, other = (
+            netkf.simulate(scenario, seed=k, engine=engine) for engine in ("simpy", "compiled")
+        )
+        assert one.fingerprint == other.fingerprint
+        assert one.status == "complete"
+        np.testing.assert_allclose(other.P, one.P, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(other.xhat, one.xhat, rtol=1e-10, atol=1e-10)
+        assert_accounts_balance(one.log, scenario.horizon)
+
+
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+@pytest.mark.parametrize("slots", [True, False])
+def test_a_node_that_forgets_begins_with_its_mean_whatever_drives_the_plant(
+    tmp_path, slots, engine
+):
+    G = "[[2.0]]" if slots else "[[2.0], [1.0]]"
+    driven = f'[plant.input]\nkind = "constant"\nG = {G}\nvalue = [3.0]\n'
+    # Up again at 1 + 3 k, without a sample at 4 and 10 under clocks that are not yet used.
+    scenario = combined(tmp_path, slots, "intermittent" if slots else "local", 1, driven)
+    if not slots:
+        scenario = scenario.replace({"probe": [4.0], "sensors.0.sampling.period": 0.75})
+    run = netkf.simulate(scenario, seed=1, engine=engine)
+    node = 0
+    at = run.times.tolist().index(4.0)
+    expected = [0.0] if slots else [1.0, -2.0]
+    np.testing.assert_allclose(run.xhat[at, node], expected, atol=1e-12)
+
+
 def test_crashes_have_their_law():
     life = Crashes(nodes=(0,), mean_up=3.0, mean_down=1.0)
     changes = life.changes(0, lambda: np.random.default_rng(4), 20_000.0)

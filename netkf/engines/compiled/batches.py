@@ -26,6 +26,7 @@ from netkf.engines.compiled.draws import (
     steps_to_the_end,
 )
 from netkf.engines.compiled.flow import FlowRun, Source, Workspace, empty_samples
+from netkf.engines.compiled.life_tables import NO_LIVES
 from netkf.engines.compiled.per_scenario import once_per_scenario
 from netkf.engines.compiled.sample_tables import KernelSamples, kernel_sensors, no_instants
 from netkf.engines.compiled.senders import senders_of
@@ -183,6 +184,8 @@ def drawn_together(scenario: Scenario) -> bool:
     """
     if scenario.views is not None or len(scenario.plant.changes) or scenario.links_move:
         return False
+    if scenario.network.lives:
+        return False
     if not scenario.sampled_sensors:
         return uses_grid(scenario)
     is_free = scenario.plant.is_random and scenario.plant.linear and not uses_grid(scenario)
@@ -244,6 +247,8 @@ def _expected_ticks(scenario: Scenario) -> float:
 
 class BatchDraws:
     """All random numbers of the R runs ``replicas``, drawn up to the horizon from ``seed``."""
+
+    lives = NO_LIVES
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
         streams = ReplicaStreams(seed, replicas.start, len(replicas))

@@ -141,6 +141,17 @@ class ClockFilters:
             self._p, self._samples = max(p, self._p), max(samples, self._samples)
             self.grow(len(self.run.message))
 
+    def restart(self, h: int, moved: FloatArray) -> None:
+        """Let node ``h`` begin again, in coordinates that have ``moved`` (n',) since time 0."""
+        first, links = self.run.first, self.records.links
+        for name in self.records.arrays:
+            place = slice(first[h], first[h + 1]) if name in links else h
+            getattr(self.record, name)[place] = getattr(self.start, name)[place]
+        if moved.any():
+            self.run.offset[:, 0] = 0.0
+            self.run.offset[: len(moved), 0] = moved
+            call_kernel(self.kernels.shift, self.record, h, run=self.run)
+
     def begin_piece(self, piece: int) -> None:
         """Let nodes believe the models of a piece of the plant, to whose begin they are
         predicted.

@@ -26,6 +26,7 @@ from netkf.engines.compiled.events import (
     NONE_SENT,
     ON_ABSORB,
     ON_DELIVER,
+    ON_LIFE,
     ON_REBASE,
     ON_SAMPLE,
     ON_SENSE,
@@ -35,6 +36,7 @@ from netkf.engines.compiled.events import (
     SOME_ARRIVE,
     TICK,
     TRANSMIT,
+    WANT_LIFE,
     WANT_MESSAGES,
     WANT_PAST,
     WANT_REBASE,
@@ -47,9 +49,9 @@ from netkf.engines.compiled.events import (
     max_readings,
     next_event,
     next_reached,
-    on_deliver,
-    on_sense,
+    on_sense_or_deliver,
     participant,
+    passes_over,
     reached,
     record_event,
     record_event_with_age,
@@ -168,6 +170,8 @@ def clock_loop(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs)
         if request != GO_ON:
             return request
         seek_piece(state, now)
+        if passes_over(state, event):
+            continue
         run.now = now
         predict_participants(state, record, run, verbs, event, now)
         if event == ON_TICK:
@@ -181,15 +185,13 @@ def clock_loop(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs)
                     on_absorb(state, record, run, verbs, now)
         elif event == ON_ABSORB:
             on_absorb(state, record, run, verbs, now)
-        elif event == ON_SENSE:
-            on_sense(state, now)
+        elif event in (ON_SENSE, ON_DELIVER):
+            on_sense_or_deliver(state, event, now)
         elif event == ON_SAMPLE:
             on_sample(state, record, run, verbs, now)
-        elif event == ON_DELIVER:
-            on_deliver(state, now)
-        elif event == ON_REBASE:
-            # Python moves the origin and goes to the next frame.
-            return WANT_REBASE
+        elif event in (ON_REBASE, ON_LIFE):
+            # Python moves the origin or the node, and goes to the next frame or life.
+            return WANT_LIFE if event == ON_LIFE else WANT_REBASE
         elif not on_probe(state, record, run, verbs):
             return WANT_SAMPLES
 
@@ -208,6 +210,8 @@ def predict_participants(
         lost = becomes != SOME_ARRIVE and verbs.counts_sends + verbs.whole_gaps == 0
     for k in range(count_participants(state, event)):
         h = participant(state, event, k)
+        if event == ON_TICK and state.nodes[h].down == 1:
+            continue
         if not lost or state.nodes[h].sensors > state.nodes[h].sensor:
             predict_node(state, record, run, verbs, h, now)
 
@@ -305,7 +309,8 @@ def on_tick(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, no
     # Each end of a link sends a payload of its own.
     for w in range(entity.first, entity.after):
         h = state.directions[state.outgoing[w]].sender
-        send_all(state, record, run, verbs, h, (w, w + 1, outcome + w - entity.first), now)
+        if state.nodes[h].down == 0:
+            send_all(state, record, run, verbs, h, (w, w + 1, outcome + w - entity.first), now)
 
 
 @kernel

@@ -72,10 +72,13 @@ class CompiledEngine(Engine):
         if unknown:
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
-        network = scenario.network
-        changing = network.lives or network.clocks or network.radio or network.quantise
+        network, rule = scenario.network, ""
+        changing = network.clocks or network.radio or network.quantise
         if changing or scenario.filter.gate is not None:
-            rule = "lives or clocks of nodes, radios, messages of few bits or a gate"
+            rule = "clocks of nodes, radios, messages of few bits or a gate"
+        elif network.lives and scenario.slotted and scenario.views is not None:
+            rule = "nodes that are down at times and estimate different states in slots"
+        if rule:
             return f'engine "compiled" cannot run {rule}; {remedy}'
         if compiled_kernels(scenario.node_filter, not scenario.slotted) is None:
             name = name_of("filter", scenario.filter.algorithm)

@@ -25,13 +25,13 @@ SENSE, TICK, SEND, DELIVER, LOST, LATE, ABSORB, TRANSMIT, LINK = (
     CODES[kind]
     for kind in ("sense", "tick", "send", "deliver", "lost", "late", "absorb", "transmit", "link")
 )
-(GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE,
- WANT_PAST, DONE) = range(9)  # fmt: skip
+(GO_ON, WANT_TICKS, WANT_STEPS, WANT_MESSAGES, WANT_ROWS, WANT_SAMPLES, WANT_REBASE, WANT_LIFE,
+ WANT_PAST, DONE) = range(10)  # fmt: skip
 """Requests of the loop to Python: the next window of ticks, the next steps of the path, a larger
-pool of messages, space for rows, for samples; a move of the origin; a longer past; DONE: the run
-has reached the horizon. GO_ON: no request.
+pool of messages, space for rows, for samples; a move of the origin; a node that goes up or down; a
+longer past; DONE: the run has reached the horizon. GO_ON: no request.
 """
-ON_REBASE, ON_SENSE, ON_SAMPLE, ON_TICK, ON_DELIVER, ON_ABSORB, ON_PROBE = range(7)
+ON_REBASE, ON_LIFE, ON_SENSE, ON_SAMPLE, ON_TICK, ON_DELIVER, ON_ABSORB, ON_PROBE = range(8)
 """Kinds of events, in the order in which those of one instant happen."""
 NEVER = math.inf
 NONE_SENT, ALL_LOST, SOME_ARRIVE = range(3)
@@ -72,6 +72,9 @@ def next_event(state: Simulation) -> tuple[int, float]:
     """
     # ``<`` keeps the earlier event of the list at equal times: the order of ranks.
     event, now = ON_REBASE, next_of(state.frames, state.frame_at)
+    life = next_of(state.lives, state.life_at)
+    if life < now:
+        event, now = ON_LIFE, life
     sense = next_of(state.path.grid, state.grid_at)
     if sense < now:
         event, now = ON_SENSE, sense
@@ -115,7 +118,7 @@ def count_participants(state: Simulation, event: int) -> int:
     if event in (ON_REBASE, ON_PROBE):
         count = len(state.nodes)
     # A delivery changes an inbox only: the receiver is predicted when it absorbs.
-    elif event == ON_DELIVER:
+    elif event in (ON_DELIVER, ON_LIFE):
         count = 0
     elif event == ON_TICK and state.clock_kind == LINKS:
         # Both ends of a link.
@@ -143,6 +146,23 @@ def participant(state: Simulation, event: int, k: int) -> int:
         return int(state.instants.index[state.instant_at])
     # Moves of the origin and stored samples concern all nodes.
     return k
+
+
+@kernel
+def passes_over(state: Simulation, event: int) -> bool:
+    """Return True if the next event is a sample or a tick of nodes that are down, and go on to the
+    one after it.
+    """
+    if event not in (ON_SAMPLE, ON_TICK):
+        return False
+    for k in range(count_participants(state, event)):
+        if state.nodes[participant(state, event, k)].down == 0:
+            return False
+    if event == ON_SAMPLE:
+        state.instant_at += 1
+    else:
+        state.tick_at += 1
+    return True
 
 
 @kernel
@@ -241,8 +261,13 @@ def ends_instant(state: Simulation, now: float) -> bool:
 
 
 @kernel
-def on_deliver(state: Simulation, now: float) -> None:
-    """Take the message that arrives next, at ``now`` (seconds), from the heap."""
+def on_sense_or_deliver(state: Simulation, event: int, now: float) -> None:
+    """Handle the next ``event`` (ON_SENSE or ON_DELIVER): at the latter take the message that
+    arrives next, at ``now`` (seconds), from the heap.
+    """
+    if event == ON_SENSE:
+        on_sense(state, now)
+        return
     m = pop(state.pool, state.heap, state.in_flight)
     state.in_flight -= 1
     arrive(state, m, now)
@@ -256,6 +281,10 @@ def arrive(state: Simulation, m: int, now: float) -> None:
     message = state.pool[m]
     direction = state.directions[message.direction]
     sender_id, receiver_id = state.nodes[direction.sender].id, state.nodes[direction.receiver].id
+    if state.nodes[direction.receiver].down == 1:
+        record_event(state, now, LOST, sender_id, receiver_id, message.number)
+        release(state, m)
+        return
     age = snapped(now - message.sent, state.per_second)
     # ``not <=`` also rejects an age that is nan.
     if not age <= state.age_limit:

@@ -21,6 +21,7 @@ from netkf.engines.compiled.clock_filters import ClockFilters
 from netkf.engines.compiled.draws import Noise, Paths, blocks_at_once, no_path, no_sensing
 from netkf.engines.compiled.events import (
     DONE,
+    WANT_LIFE,
     WANT_MESSAGES,
     WANT_PAST,
     WANT_REBASE,
@@ -29,6 +30,7 @@ from netkf.engines.compiled.events import (
     WANT_TICKS,
 )
 from netkf.engines.compiled.lane_series import series_of_lanes
+from netkf.engines.compiled.life_tables import life_table
 from netkf.engines.compiled.sample_tables import samples_of
 from netkf.engines.compiled.samples import by_node, entries_of, record_samples
 from netkf.engines.compiled.senders import senders_of
@@ -71,6 +73,7 @@ MAX_BUFFERED_SAMPLES, MAX_BUFFERED_FLOATS = 256, 1 << 18
 AT_START = (
     *("run", "first_run", "first_delay", "frame_at", "piece", "grid_at", "wake_at", "instant_at"),
     *(
+        "life_at",
         "tick_at",
         "link_at",
         "probe_at",
@@ -116,7 +119,9 @@ class Source:
             is_driven = isinstance(states, DrivenTruth)
             x = states.local_states(sampled) if is_driven else states.states(sampled)[0]
             samples.read(x, sampled, -math.inf, math.inf)
-        self._ticks = Schedule(scenario, streams, instants=samples.instants, truth=self.states)
+        self.lives = life_table(scenario, streams)
+        known = {"instants": samples.instants, "truth": self.states, "lives": self.lives}
+        self._ticks = Schedule(scenario, streams, **known)
 
     def window(self) -> TickArrays:
         """Return the next window of ticks."""
@@ -210,12 +215,14 @@ class Workspace:
                 start.table, start.gains, self._unrolled, self._scenario.plant.n
             )
         scratch, flow_arrays = self._scratch
+        nodes = start.nodes.copy()
+        nodes["down"] = draws.lives.down
         n = start.xhat.shape[1]
         xhat, root = self._begin_estimates(instants, together)
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
             size=sized(n) if self._unrolled else np.zeros(n),
             plant=sized(n) if self._unrolled else np.zeros(self._scenario.plant.n),
-            nodes=start.nodes.copy(),
+            nodes=nodes,
             xhat=xhat,
             root=root,
             now=np.zeros(len(xhat)),
@@ -235,6 +242,7 @@ class Workspace:
             ticks_stop=len(window.t),
             # Plants that change have no frames.
             frames=draws.states.frame_times if not len(changes) else changes,
+            lives=draws.lives.t,
             probes=self._probes,
             buffer=self._buffer if buffer is None else buffer,
             # The recorder keeps the rows of a traced run, so the next one gets others.
@@ -351,6 +359,8 @@ class FlowRun:
             self._clocked.grow_past()
         elif request == WANT_REBASE:
             self._rebase()
+        elif request == WANT_LIFE:
+            self._change_life()
 
     def _rebase(self) -> None:
         state, k = self._state, self._state.frame_at
@@ -366,6 +376,23 @@ class FlowRun:
             # No message is under way, and covariances refer to no origin.
             state.xhat[:] += offset
         state.frame_at = k + 1
+
+    def _change_life(self) -> None:
+        state, lives, k = self._state, self._draws.lives, self._state.life_at
+        time, h, kind = float(lives.t[k]), int(lives.index[k]), int(lives.kind[k])
+        node = self._scenario.nodes[h]
+        state.life_at = k + 1
+        if state.traced:
+            state.rows[state.row] = time, kind, node, -1, -1, -1, math.nan
+            state.row += 1
+        else:
+            state.counts[kind] += 1
+        state.nodes["down"][h] ^= 1
+        if lives.restarts[k]:
+            assert self._clocked is not None
+            fresh, first = (self._scenario.fresh_estimate(node, t)[0] for t in (time, 0.0))
+            self._clocked.restart(h, fresh - first)
+            state.now[h] = time
 
     def _enlarge_pool(self) -> None:
         add_messages(self._state, self._state.most_messages)

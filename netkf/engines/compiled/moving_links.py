@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,10 +30,14 @@ class MovingLinks(NamedTuple):
 
 
 def moving_links(
-    scenario: Scenario, senders: Senders, listed: list[FloatArray], truth: Any
+    scenario: Scenario,
+    senders: Senders,
+    listed: list[FloatArray],
+    truth: Any,
+    is_down: Callable[[int, FloatArray], np.ndarray],
 ) -> MovingLinks:
     """Return the links of a run at the ticks of its entities, ``listed`` (K,) in seconds, where
-    nodes are where its ``truth`` says.
+    nodes are where its ``truth`` says; ``is_down(index, times)`` says when a node is down.
     """
     rows: list[Any] = []
     reach, owner = Reach(scenario, truth, rows.append), list[int]()
@@ -42,6 +47,12 @@ def moving_links(
     t = np.concatenate([np.empty(0), *ticks, samples])
     entity = np.repeat(np.arange(len(ticks) + 1), [*map(len, ticks), len(samples)])
     heard: list[list[bool]] = [[] for _ in senders.directions]
+    # Nobody looks at a link neither of whose ends can send.
+    index, ends = scenario.topology.index, 1 + (senders.at == "links")
+    awake = [
+        {node: iter((~is_down(index[node], times)).tolist()) for node in entity[:ends]}
+        for entity, times in zip(senders.entities, ticks, strict=True)
+    ]
     distance: list[list[float]] = [[] for _ in senders.directions]
     follows, number = scenario.network.channel.loss.follows_distance, [0, 0]
     # Samples come behind all ticks of their instant, and these in the order of entities.
@@ -50,9 +61,10 @@ def moving_links(
         if is_sample:
             reach.look_at_all(None, now)
         else:
+            up = {node for node, flags in awake[e].items() if next(flags)}
             for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
                 i, j = senders.directions[w]
-                heard[w].append(reach.connects(i, j, now))
+                heard[w].append(bool(up) and reach.connects(i, j, now) and i in up)
                 if follows:
                     distance[w].append(reach.distance(i, j, now))
         owner += [-1 - number[1] if is_sample else number[0]] * (len(rows) - len(owner))

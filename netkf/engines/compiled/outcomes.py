@@ -196,7 +196,7 @@ def list_outcomes(
                     bad = bad if common.bad is None else common.bad
                 if moving is not None:
                     heard = moving.heard[w]
-                if moving is not None and channel.loss.follows_distance:
+                if moving is not None and scenario.links_move and channel.loss.follows_distance:
                     first = first._replace(distance=moving.distance[w][heard])
                 sent = first._replace(
                     number=np.arange(len(times[heard])), time=times[heard], bad=bad[heard],

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from netkf.engines.compiled.life_tables import LifeTable, life_table
 from netkf.engines.compiled.slot_messages import (
     ABSORB,
     DELIVER,
@@ -81,6 +82,31 @@ class StepEnd(NamedTuple):
     rows: int
 
 
+def steps_of(scenario: Scenario, setup: SlotSetup, slot: int) -> Iterator[Step]:
+    """Yield the steps of the exchanges of a slot."""
+    timing, repeats = scenario.node_filter.timing, [0, 0]
+    # At the horizon filters that predict are only sampled.
+    acts = slot < setup.last or not timing.predicts
+    if not (acts and timing.talks and slot >= timing.first_exchange):
+        return
+    start = now = scenario.slot_plant.slot_time(slot)
+    for step, phase, end in zip(*(c.tolist() for c in setup.stages[:3]), strict=True):
+        if step >= 0:
+            until = scenario.time_grid.instant(start + end)
+            exchange_step = Step(slot, step, phase, repeats[phase], now, until)
+            now, repeats[phase] = exchange_step.end, repeats[phase] + 1
+            yield exchange_step
+
+
+def slot_restarts(scenario: Scenario, lives: LifeTable) -> dict[int, list[int]]:
+    """Return by slot the indices of the nodes that begin again when it begins."""
+    found: dict[int, list[int]] = {}
+    slots = scenario.slot_plant.slots_of(lives.t[lives.restarts])
+    for slot, h in zip(slots.tolist(), lives.index[lives.restarts].tolist(), strict=True):
+        found.setdefault(slot, []).append(h)
+    return found
+
+
 class SlotEvents:
     """Makes the messages and events of one run, slot after slot."""
 
@@ -91,6 +117,9 @@ class SlotEvents:
         if scenario.links_move:
             self._reach = Reach(scenario, scenario.slot_truth(streams), self._append_row)
         self._follows_distance = scenario.network.channel.loss.follows_distance
+        self.lives, self._life_at = life_table(scenario, streams), 0
+        self._down = {scenario.nodes[h] for h in np.flatnonzero(self.lives.down).tolist()}
+        self.restarts = slot_restarts(scenario, self.lives)
         self._random = streams.generator("matching")
         each, channel = setup.directions_per_link, scenario.network.channel
         conditions = conditions_of(channel.loss, streams, scenario.horizon)
@@ -123,6 +152,7 @@ class SlotEvents:
         # By receiver and sender: number and age of the message.
         self._inbox: dict[int, dict[int, tuple[int, float]]] = {}
         self._rows: list[Row | StepEnd | None] = []
+        self._awake: list[np.ndarray] = []
         self._decide: Decide | None = None
         self._sent: np.ndarray | None = None
         self._unread = np.zeros((0, 0), dtype=bool)
@@ -133,14 +163,35 @@ class SlotEvents:
         """Return (E, N) flags: nodes that are asked for a message in each step of the next slot."""
         setup, index = self._setup, self._scenario.topology.index
         asked = np.zeros((len(setup.fresh), len(setup.nodes)), dtype=np.uint8)
-        for step in self._iterate_steps(self._slot):
+        for step in steps_of(self._scenario, setup, self._slot):
             self._chosen_pairs.append(self._choose_pairs(step))
             # Links of the matching just drawn; broadcasts use all links.
             links = list(self._by_link)
             if self._timing.pairwise:
                 links = [k for k in self._chosen_pairs[-1][0] if self._is_up(k, step)]
             asked[step.step, [index[node] for link in links for node in link]] = 1
+            now = np.array([step.begin])
+            for h in np.flatnonzero(asked[step.step]).tolist():
+                asked[step.step, h] = not self.lives.is_down(h, now)[0]
         return asked
+
+    def absent(self, first: int, count: int) -> np.ndarray:
+        """Return (S, N) bool: nodes that are down when the others read, in ``count`` slots from
+        ``first`` on.
+        """
+        times = np.array([self._reading_time(slot) for slot in range(first, first + count)])
+        nodes = range(len(self._setup.nodes))
+        return np.column_stack([self.lives.is_down(h, times) for h in nodes])
+
+    def _reading_time(self, slot: int) -> float:
+        steps = steps_of(self._scenario, self._setup, slot)
+        now = self._scenario.slot_plant.slot_time(slot)
+        for step in self._setup.stages.step.tolist():
+            if step < 0:
+                break
+            for exchange_step in islice(steps, 1):
+                now = exchange_step.end
+        return now
 
     def following(self, max_events: int, decide: Decide | None) -> tuple[int, np.ndarray]:
         """Make the messages and events of the next slots, up to about ``max_events`` events; return
@@ -148,11 +199,12 @@ class SlotEvents:
         ``decide(step, up)`` returns who sends, (N,), given ``up`` (E, W) of the steps before.
         """
         setup, arrivals = self._setup, []
-        self._rows, self._decide = [], decide
+        self._rows, self._decide, self._awake = [], decide, []
         while self._slot < setup.slots:
             arrivals.append(self._one_slot())
             self._slot += 1
-            if decide is not None or len(self._rows) >= max_events:
+            begins_again = self._slot in self.restarts
+            if decide is not None or len(self._rows) >= max_events or begins_again:
                 break
         # After the last slot deliver the messages that are still under way.
         if self._slot == setup.slots:
@@ -160,9 +212,16 @@ class SlotEvents:
             self._deliver(math.inf)
         return len(arrivals), np.stack(arrivals)[None]
 
+    @property
+    def awake(self) -> np.ndarray:
+        """(S, E, N) flags: nodes that may send, in the slots just made; empty without lives."""
+        has_lives = bool(self._scenario.network.lives)
+        return np.array(self._awake if has_lives else np.zeros((0,) * 3), dtype=np.uint8)
+
     def _one_slot(self) -> np.ndarray:
         setup, timing, slot = self._setup, self._timing, self._slot
         up = np.zeros((len(setup.fresh), len(self._directions)), dtype=np.uint8)
+        self._awake.append(np.ones((len(setup.fresh), len(setup.nodes)), dtype=np.uint8))
         if setup.may_miss:
             self._unread = setup.unread(slot, 1)[0]
         start = self._scenario.slot_plant.slot_time(slot)
@@ -189,14 +248,16 @@ class SlotEvents:
 
     def _make_stage_events(self, slot: int, up: np.ndarray) -> float:
         """Make the events of a slot; return when its last stage happens, in seconds."""
-        steps, now = self._iterate_steps(slot), self._scenario.slot_plant.slot_time(slot)
+        steps = steps_of(self._scenario, self._setup, slot)
+        now = self._scenario.slot_plant.slot_time(slot)
         for step in self._setup.stages.step.tolist():
             if step < 0:
                 # Slot 0 of a filter that does not predict has no reading: its sample is the initial
                 # state.
                 if slot > 0 or self._timing.predicts:
                     for node in self._scenario.sensing_nodes:
-                        self._append_row((now, SENSE, node, -1, -1, -1, NAN))
+                        if node not in self._down:
+                            self._append_row((now, SENSE, node, -1, -1, -1, NAN))
                 continue
             for exchange_step in islice(steps, 1):
                 now = exchange_step.end
@@ -205,24 +266,12 @@ class SlotEvents:
                 self._open = self._exchanges
                 if self._decide is not None:
                     self._sent = self._decide(step, up)
+                down = [self._scenario.topology.index[node] for node in self._down]
+                self._awake[-1][step, down] = 0
                 self._send_all(exchange_step)
                 self._deliver(exchange_step.end)
                 self._end_step(exchange_step, up[step])
         return now
-
-    def _iterate_steps(self, slot: int) -> Iterator[Step]:
-        setup, timing, repeats = self._setup, self._timing, [0, 0]
-        # At the horizon filters that predict are only sampled.
-        acts = slot < setup.last or not timing.predicts
-        if not (acts and timing.talks and slot >= timing.first_exchange):
-            return
-        start = now = self._scenario.slot_plant.slot_time(slot)
-        for step, phase, end in zip(*(c.tolist() for c in setup.stages[:3]), strict=True):
-            if step >= 0:
-                until = self._instant(start + end)
-                exchange_step = Step(slot, step, phase, repeats[phase], now, until)
-                now, repeats[phase] = exchange_step.end, repeats[phase] + 1
-                yield exchange_step
 
     def rows(self, stopped: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the events of the slots just made as EVENT rows (K,), and the number of rows
@@ -272,7 +321,7 @@ class SlotEvents:
             senders = senders_of_pairs(pairs, self._scenario.topology.directed)
             self._broadcasts.begin(senders, bool(self._setup.fresh[step.step]))
         for i, j in pairs:
-            if not broadcast:
+            if not broadcast and not self._down.issuperset((i, j)):
                 self._append_row((now, TICK, i, j, -1, phase, NAN))
             both = self._by_link[i, j]
             if self._setup.fresh[step.step] or (i, j) not in self._last:
@@ -307,6 +356,8 @@ class SlotEvents:
         )
 
     def _is_silent(self, direction: Direction, step: Step) -> bool:
+        if direction.ends[0] in self._down:
+            return True
         node = self._scenario.topology.index[direction.ends[0]]
         if self._sent is not None and not self._sent[node]:
             return True
@@ -325,7 +376,7 @@ class SlotEvents:
             if self._follows_distance and self._reach is not None:
                 sent = sent._replace(distance=self._reach.distance(*direction.ends, now))
             delay = self._instant(transit_time(channel, sent, draw))
-        if math.isnan(delay):
+        if math.isnan(delay) or (delay == 0.0 and receiver in self._down):
             self._append_row((now, LOST, sender, receiver, number, step.phase, NAN))
         elif delay == 0.0:
             self._append_row((now, DELIVER, receiver, sender, number, step.phase, 0.0))
@@ -349,15 +400,29 @@ class SlotEvents:
 
     def _deliver(self, until: float) -> None:
         while self._in_flight and self._in_flight[0][0] <= until:
+            self._pass_lives(self._in_flight[0][0])
             now, _, _, direction, number, sent, phase, exchange = heapq.heappop(self._in_flight)
             (sender, receiver), in_time = direction.ends, exchange == self._open
-            age = self._instant(now - sent)
+            age, is_lost = self._instant(now - sent), receiver in self._down
             # After the horizon nothing is recorded; the last exchange may still be finished.
-            if now < self._scenario.horizon:
+            if now < self._scenario.horizon and is_lost:
+                self._append_row((now, LOST, sender, receiver, number, phase, NAN))
+            elif now < self._scenario.horizon:
                 kind = DELIVER if in_time else LATE
                 self._append_row((now, kind, receiver, sender, number, phase, age))
-            if in_time:
+            if in_time and not is_lost:
                 self._inbox.setdefault(receiver, {})[sender] = (number, age)
+        self._pass_lives(until)
+
+    def _pass_lives(self, until: float) -> None:
+        """Let nodes go up and down until a time."""
+        lives = self.lives
+        while self._life_at < len(lives.t) and lives.t[self._life_at] <= until:
+            k, self._life_at = self._life_at, self._life_at + 1
+            node = self._scenario.nodes[lives.index[k]]
+            self._append_row((float(lives.t[k]), int(lives.kind[k]), node, -1, -1, -1, NAN))
+            self._down ^= {node}
+            self._inbox.pop(node, None)
 
     def _end_step(self, step: Step, up: np.ndarray) -> None:
         count = len(self._rows)

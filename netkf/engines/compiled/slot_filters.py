@@ -57,7 +57,7 @@ class SlotFilters:
         """Make the filters at time 0; unless ``with_means`` all estimates are zero. At most
         ``active`` lanes of a block have runs; ``pairs`` are readings of these, where there are any.
         """
-        self._setup, self._kernels = setup, kernels
+        self._setup, self.kernels = setup, kernels
         H, W, n = setup.estimators, len(setup.links.sender), setup.width
         means = setup.xhat if with_means else np.zeros(setup.xhat.shape)
         self.records = make_records(
@@ -85,12 +85,14 @@ class SlotFilters:
             "runs": np.zeros(LANES, dtype=np.int64),
         }
         self._lay_out_stages()
+        if setup.forgets:
+            _ = self._start
 
     @cached_property
     def _verbs(self) -> SlotVerbs:
         """The verbs that a run needs."""
         talks, linear = EXCHANGE in self._stages, len(self._run.nonlinear.kind) == 0
-        return slot_verbs(self._kernels, self.records.struct, self._run, talks, linear)
+        return slot_verbs(self.kernels, self.records.struct, self._run, talks, linear)
 
     def _models_of(self, active: int) -> list[Any]:
         """Return the models of all nodes, or the one that they share."""
@@ -105,7 +107,7 @@ class SlotFilters:
     def _run_of(self, pairs: Pairs) -> Any:
         """Return what surrounds the nodes, before any slot."""
         setup, n = self._setup, self._setup.width
-        size = size_of(n, self._kernels.unrolled)
+        size = size_of(n, self.kernels.unrolled)
         cls: Any = MapRun if isinstance(setup.models[0], MapModel) else SlotRun
         cls = cls.of_size(n) if isinstance(size, tuple) else cls
         # Inbox: a node hears at most all of its links.
@@ -158,10 +160,25 @@ class SlotFilters:
             dtype=np.int64,
         )
 
+    @cached_property
+    def _start(self) -> dict[str, np.ndarray]:
+        """The arrays of all records at time 0."""
+        return {name: array.copy() for name, array in self.records.arrays.items()}
+
+    def restart(self, h: int, moved: FloatArray) -> None:
+        """Let filter ``h`` begin again, in coordinates that have ``moved`` (n,) since slot 0."""
+        first, links = self._setup.links.first, self.records.links
+        for name, array in self.records.arrays.items():
+            place = slice(first[h], first[h + 1]) if name in links else h
+            array[:, place] = self._start[name][:, place]
+        if moved.any():
+            self._run.offset[:] = moved[:, None]
+            call_kernel(self.kernels.shift, self.records.struct, h, run=self._run)
+
     def observe(self) -> None:
         """Write into the record of each node of the first block what exchanges conserve, now."""
         for h in range(self._setup.estimators):
-            call_kernel(self._kernels.observe, self.records.struct, h, run=self._run)
+            call_kernel(self.kernels.observe, self.records.struct, h, run=self._run)
 
     def set_rows(self, rows: Any) -> None:
         """Let readings have nonlinear rows, ``nonlinear_rows.NonlinearRows``."""
@@ -186,8 +203,8 @@ class SlotFilters:
         setup, record, count = self._setup, self.records.struct, len(plan.sensed)
         verbs, run = self._verbs, any_slot_run(self._run)
         if verbs.shift == NOTHING and plan.rebased.any():
-            verbs.shift = address_of(self._kernels.shift, record, self._run)
-        step = 1 if self._kernels.slotwise else max(1, count)
+            verbs.shift = address_of(self.kernels.shift, record, self._run)
+        step = 1 if self.kernels.slotwise else max(1, count)
         assert setup.algorithm.kernels is not None
         prepare = setup.algorithm.kernels.prepare
         slots = [slot - plan.first for slot in setup.model_slots]

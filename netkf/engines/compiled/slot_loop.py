@@ -49,7 +49,7 @@ class SlotPlan(Struct):
     up : (B, S, E, W, L), 1 if a message arrives on a directed link in a step of the exchanges
     direction : (W,), index in the axis W of ``up`` of each link by receiver
     sent : (B, S, E, H, L), 1 if a node is asked for a message, and where kernels decide 0 where it
-        sends nothing; empty if all nodes send that are asked
+        sends nothing; empty if all nodes are asked, and send
     uniform : (B, S, E, H, L), uniform numbers for these decisions; empty unless randomised
     varies : whether H differs from block to block and slot to slot
     models : (H, words), the struct of each filter's model, (0, words) if ``run.model`` is all's
@@ -217,6 +217,8 @@ def exchange(
     if e != plan.begin and verbs.emit != NOTHING:
         # All messages are made before any arrives.
         for h in range(nodes):
+            if plan.sent.shape[0] > 0 and not any_lane(load_flags(lanes, plan.sent, b, s, e, h)):
+                continue
             if decides:
                 store_flags(lanes, run.sends, load_flags(lanes, plan.sent, b, s, e, h))
                 if plan.uniform.shape[0] > 0:

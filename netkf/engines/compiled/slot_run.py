@@ -272,6 +272,9 @@ class SlotRuns:
             "uniform": self._draw_uniforms(messages.sent),
         }
         unread, begin = self._missed_readings(messages, count), WHOLE
+        # Nodes begin again before the first slot of a block.
+        for h in [] if self._events is None else self._events.restarts.get(self._slot, ()):
+            filters.restart(h, self._moved(h))
 
         def decided(step: int, up: np.ndarray) -> np.ndarray:
             nonlocal begin
@@ -293,6 +296,13 @@ class SlotRuns:
             self.setup.pairs.nonlinear.raise_error()
         self._slot += count
 
+    def _moved(self, h: int) -> FloatArray:
+        """Return by how much the prior of a filter differs in the coordinates of this slot."""
+        node, predicts = self.setup.infos[h].node, self.setup.algorithm.timing.predicts
+        slots = self._slot - (not predicts), 0
+        fresh, first = (self._scenario.fresh_estimate(node, slot)[0] for slot in slots)
+        return fresh - first
+
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
         setup, events = self.setup, self._events
         if events is None:
@@ -306,7 +316,9 @@ class SlotRuns:
             up = np.zeros((1, 1, len(sent), len(setup.directions)), dtype=np.uint8)
             return self._next_times(1, True), _pack_messages(up, sent[None, None])
         count, up = events.following(max_events, None)
-        return self._next_times(count, True), _pack_messages(up, np.zeros((0,) * 4, dtype=np.uint8))
+        awake = events.awake
+        sent = awake[None] if len(awake) else np.zeros((0,) * 4, dtype=np.uint8)
+        return self._next_times(count, True), _pack_messages(up, sent)
 
     def _empty_samples(self, count: int) -> SampledStates:
         """Return space for ``count`` samples of all R runs, in memory that is reused."""
@@ -542,6 +554,11 @@ class SlotRuns:
             setup.nonlinear.raise_error()
         if (self._recorded or self._own) and times.sensed.any():
             self._read_in_python(times, x, y, H)
+        if self._events is not None and self._scenario.network.lives:
+            down = self._events.absent(self._slot, count)
+            y[:, down] = H[:, down] = 0.0
+            for s in setup.nonlinear_sensors:
+                y[:, down[:, s.estimator], s.estimator, s.row : s.row + s.rows] = np.nan
         return y, H
 
     def _read_in_python(

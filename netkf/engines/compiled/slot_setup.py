@@ -71,6 +71,7 @@ class SlotSetup:
         self.frame = frame_slots(scenario.linear_plant.F) or 0 if scenario.exact_errors else 0
         # A filter that all nodes share estimates the whole state.
         self.views = None if algorithm.timing.pooled else scenario.views
+        self.forgets = any(life.memory == "lost" for life in scenario.network.lives)
         self.width = self.n if self.views is None else scenario.width
         self._set_slots(scenario)
         self._set_stages(scenario)
@@ -178,7 +179,9 @@ class SlotSetup:
                 if isinstance(sensor, RegressorSensor):
                     self.regressor_sensors.append(assigned)
         linear = not self.regressor_sensors and not self.nonlinear_sensors
-        self.varies = len(self.kernel_sensors) < len(self.assigned) or not linear
+        all_fixed = len(self.kernel_sensors) == len(self.assigned) and linear
+        # Who is down has no reading.
+        self.varies = not all_fixed or bool(scenario.network.lives)
         # The same in all blocks of runs and all slots, hence 1, 1.
         self.H: FloatArray = aligned((1, 1, self.estimators, self.p, self.columns.width, LANES))
         self._set_nonlinear_rows(scenario)
@@ -400,7 +403,7 @@ class SlotSetup:
         # Which message has which number is known before the exchange, unless nodes may be silent.
         if self.deliveries is not None and (self.decides or self.may_miss):
             return False
-        if scenario.links_move:
+        if scenario.links_move or scenario.network.lives:
             return False
         # Kernels know broadcasts and matchings without delay, with the built-in losses.
         exchanges = (

@@ -34,7 +34,7 @@ def _record_type(integers: str, floats: str = "") -> np.dtype:
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
 
 
-NODE = _record_type("model id sensor sensors inbox last sent reading")
+NODE = _record_type("model id sensor sensors inbox last sent reading down")
 """One filter.
 
 model : index of its model
@@ -43,6 +43,7 @@ sensor, sensors : its increment sensors are those with indices ``sensor`` to ``s
 inbox, last : first and last message of its inbox, -1: none
 sent : number of transmissions so far
 reading : index of the instant of its newest sample
+down : 1 while it neither senses, sends nor hears
 """
 
 DIRECTED_LINK = _record_type("sender receiver messages", "weight")
@@ -251,6 +252,7 @@ class Simulation(Struct):
                                               outcomes begin
     link_at : the next change of a link, of those in ``ticks``
     frames, frame_at : times (F,) at which frames begin
+    lives, life_at : times (K,) at which nodes go up or down
     probes, probe_at : times (T,) of samples
     run, first_run : number of the present run, and of the first one
     horizon, per_second : seconds, and ticks of the time grid in a second (core.instants)
@@ -287,6 +289,7 @@ class Simulation(Struct):
     path: PathBlock
     ticks: TickArrays
     frames: FloatArray
+    lives: FloatArray
     probes: FloatArray
     buffer: SampleBuffer
     rows: np.ndarray
@@ -301,6 +304,7 @@ class Simulation(Struct):
     ticks_stop: int
     first_delay: int
     frame_at: int
+    life_at: int
     piece: int
     grid_at: int
     wake_at: int

@@ -18,6 +18,7 @@ import numpy as np
 
 from netkf.core.clock import generate_ticks
 from netkf.core.instants import snapped
+from netkf.engines.compiled.life_tables import NO_LIVES, LifeTable, links_of_lives
 from netkf.engines.compiled.moving_links import MovingLinks, moving_links
 from netkf.engines.compiled.outcomes import (
     ChannelStreams,
@@ -476,7 +477,7 @@ class Schedule:
     or all at once. ``bits``: the outcomes of a tick are one integer with a bit for each of its
     messages, 1 if it arrives, instead of a delay for each; only if no message takes time. Where
     nodes transmit after their samples, these are those of ``instants``; where they move, they are
-    where the ``truth`` of the run says.
+    where the ``truth`` of the run says. The ``lives`` are those of a single run.
     """
 
     def __init__(
@@ -486,19 +487,23 @@ class Schedule:
         bits: bool = False,
         instants: Instants | None = None,
         truth: Any = None,
+        lives: LifeTable = NO_LIVES,
     ) -> None:
         senders, channel = senders_of(scenario), scenario.network.channel
         self._runs, sizes = streams.runs, np.diff(senders.first)
         listed, outcomes, delivery = None, [], np.ones((2, len(senders.directions)))
         if not senders.entities or senders.at == "readings" or _is_listed(scenario):
             listed = _list_ticks(scenario, streams, senders, instants)
+            if senders.at == "readings":
+                # Who is down takes no sample, after which to transmit.
+                listed = [t[~lives.is_down(h, t)] for h, t in enumerate(listed)]
             numbers = np.array([len(t) for t in listed], dtype=np.int64).reshape(self._runs, -1)
             rates = numbers.mean(axis=0) / scenario.horizon
         else:
             rates = _rates(scenario)
         self._moving: MovingLinks | None = None
         if scenario.links_move and listed is not None:
-            self._moving = moving_links(scenario, senders, listed, truth)
+            self._moving = moving_links(scenario, senders, listed, truth, lives.is_down)
         elif senders.entities and is_kernel_channel(channel):
             delivery = _delivery(scenario)
         if (
@@ -506,7 +511,10 @@ class Schedule:
             and senders.entities
             and (self._moving or not is_kernel_channel(channel))
         ):
-            outcomes = list_outcomes(scenario, streams, senders, listed, self._moving)
+            heard = self._moving
+            if scenario.network.lives and heard is None:
+                heard = links_of_lives(senders, listed, lives, scenario.topology.index)
+            outcomes = list_outcomes(scenario, streams, senders, listed, heard)
         # The laws of a user's clock are its own.
         clock = scenario.network.activation if listed is None else None
         purposes = "clock", "phase"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from functools import partial
 from typing import Any
 
 import simpy
@@ -23,6 +24,7 @@ class Membership:
 
     def __init__(self, scenario: Scenario, streams: Streams, recorder: Recorder) -> None:
         self._recorder, self._index = recorder, scenario.topology.index
+        self._fresh_estimate = scenario.fresh_estimate
         self._lives = lifetimes(scenario, streams)
         self._down = {node for node, life in self._lives.items() if not life.up}
 
@@ -47,7 +49,7 @@ class Membership:
             if change.up:
                 self._down.remove(node)
                 if life.forgets:
-                    carrier.restart(change.time)
+                    carrier.restart(change.time, partial(self._fresh_estimate, node))
             else:
                 self._down.add(node)
                 carrier.inbox.clear()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -198,14 +198,13 @@ class Node:
         """The model in which matrices may change."""
         self.algorithm, self._timing = algorithm, algorithm.timing
         self._interval = interval_rule(algorithm)
-        self._start = start
         self.state = algorithm.init(model, *start, info)
         # By sender: absorption is in the order of senders, whatever the order of arrival.
         self.inbox: dict[int, list[Envelope]] = {}
 
-    def restart(self, time: float) -> None:
-        """Begin again with the estimate of the start, at ``time`` seconds."""
-        self.state = self.algorithm.init(self.model, *self._start, self.info)
+    def restart(self, time: float, fresh: Callable[[float], tuple[FloatArray, FloatArray]]) -> None:
+        """Begin again at ``time`` seconds with the estimate ``fresh(time)``, of a slot in slots."""
+        self.state = self.algorithm.init(self.model, *fresh(time), self.info)
 
     def _advance(self, start: float, gap: float) -> None:
         """Predict the filter over ``gap`` seconds from ``start`` on."""
@@ -324,9 +323,9 @@ class ClockedNode(Node):
         instant; None unless readings make the node transmit.
         """
 
-    def restart(self, time: float) -> None:
-        """Begin again with the estimate of the start, at ``time`` seconds."""
-        super().restart(time)
+    def restart(self, time: float, fresh: Callable[[float], tuple[FloatArray, FloatArray]]) -> None:
+        """Begin again at ``time`` seconds with the estimate ``fresh(time)``."""
+        super().restart(time, fresh)
         self._now = self._clock.shows(time)
 
     def predict_to(self, time: float) -> None:

@@ -148,6 +148,8 @@ class SlotNode(Node):
         # -1: no exchange is open, and every message is late.
         self._open = -1
         self._stopped, self._has_stopped = False, self.algorithm.analysis.stopped
+        # The slot that the estimate is of.
+        self._slot = 0
         self._samples: list[tuple[FloatArray, Any, FloatArray]] = []
         self._pairs: list[PairReading] = []
 
@@ -163,9 +165,15 @@ class SlotNode(Node):
                     self._perform(stage, slot)
             slot += 1
 
+    def restart(self, time: float, fresh: Callable[[float], tuple[FloatArray, FloatArray]]) -> None:
+        """Begin again with the estimate ``fresh(slot)`` of the present slot."""
+        super().restart(self._slot, fresh)
+        self._stopped = False
+
     def _perform(self, stage: Stage, slot: int) -> None:
         self._follow(slot)
         if stage.kind == "predict":
+            self._slot = slot + self._timing.predicts
             # A filtered estimate is of the slot before.
             start = self._schedule.start(slot - (not self._timing.predicts))
             self._advance(start, self._period)

@@ -1,0 +1,78 @@
+"""Who is down when, as tables made before a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.engines.compiled.moving_links import MovingLinks
+from netkf.engines.compiled.senders import Senders
+from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.network.lives import lifetimes
+from netkf.rng.streams import Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.schema import CODES
+
+
+class LifeTable(NamedTuple):
+    """The K changes of one run by (time, node): when nodes go up or down.
+
+    t, index, kind : (K,), seconds, index of the node, and kind of the event
+    restarts : (K,) bool, whether the node goes up and begins again
+    down : (N,), 1 for nodes that are down at first; (1,) without lives
+    """
+
+    t: FloatArray
+    index: IntArray
+    kind: IntArray
+    restarts: np.ndarray
+    down: np.ndarray
+
+    def is_down(self, node: int, times: FloatArray) -> np.ndarray:
+        """Return a mask (T,) of the ``times`` at which the node with this index is down; changes of
+        an instant come before all else.
+        """
+        if not len(self.t) and not self.down.any():
+            return np.zeros(len(times), dtype=bool)
+        passed = np.searchsorted(self.t[self.index == node], times, side="right")
+        down: np.ndarray = (passed + self.down[node]) % 2 == 1
+        return down
+
+
+NO_LIVES = LifeTable(
+    np.zeros(0), *(np.zeros(0, dtype=np.int64) for _ in range(2)), np.zeros(0, dtype=bool),
+    np.zeros(1, dtype=np.int64),
+)  # fmt: skip
+
+
+def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
+    """Return the lives of a run."""
+    if not scenario.network.lives:
+        return NO_LIVES
+    index, lives = scenario.topology.index, lifetimes(scenario, streams)
+    rows = sorted(
+        (change.time, index[node], CODES[change.kind], change.up and life.forgets)
+        for node, life in lives.items()
+        for change in life.changes
+    )
+    t, node, kind, restarts = zip(*rows, strict=True) if rows else ((),) * 4
+    down = np.zeros(len(index), dtype=np.int64)
+    down[[index[i] for i, life in lives.items() if not life.up]] = 1
+    integers = (np.array(column, dtype=np.int64) for column in (node, kind))
+    return LifeTable(np.array(t, dtype=float), *integers, np.array(restarts, dtype=bool), down)
+
+
+def links_of_lives(
+    senders: Senders, listed: Sequence[FloatArray], lives: LifeTable, index: dict[int, int]
+) -> MovingLinks:
+    """Return which messages of ticks, ``listed`` by entity in seconds, are sent: those of nodes
+    that are up.
+    """
+    heard = [np.zeros(0, dtype=bool)] * len(senders.directions)
+    for e, times in enumerate(listed):
+        for w in senders.outgoing[senders.first[e] : senders.first[e + 1]].tolist():
+            heard[w] = ~lives.is_down(index[senders.directions[w][0]], times)
+    nothing = np.zeros(0, dtype=np.int64)
+    return MovingLinks(heard, [], nothing, nothing.reshape(0, 3))
