@@ -55,6 +55,7 @@ from netkf.engines.simpy.engine import SimpyEngine
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import replicate
 from netkf.runs.simulate import choose_engine, require_scenario, simulate
+from netkf.scenario.records import nodes_with_law
 from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
@@ -134,8 +135,8 @@ def find_checks(scenario: Scenario) -> PaperChecks:
     """Return the checks of the paper of a scenario's filter; raises TheoryError without one."""
     if not scenario.is_linear:
         return WITHOUT_PAPER
-    # Papers are about plants that do not change; the equations hold for all.
-    if len(scenario.plant.changes):
+    # Papers are about plants that do not change and are drawn; the equations hold for all.
+    if len(scenario.plant.changes) or not scenario.is_random:
         return UNDER_CLOCKS
     promised = promised_filter(scenario.filter.algorithm)
     # Without messages the equations of a Kalman filter are all that is promised.
@@ -161,7 +162,12 @@ def _whole(scenario: Scenario, run: Run) -> tuple[Scenario, Run]:
 
 def with_check_times(scenario: Scenario) -> Scenario:
     """Return the scenario with samples at the times where promises are checked."""
-    return dataclasses.replace(scenario, probe=np.array(probe_times(scenario)))
+    times = np.array(probe_times(scenario))
+    if not scenario.is_random:
+        # Recorded states may be known at the times of [probe] alone.
+        nearest = np.abs(scenario.times[None] - times[:, None]).argmin(axis=1)
+        times = scenario.times[np.unique(nearest)]
+    return dataclasses.replace(scenario, probe=times)
 
 
 class ReplicaResult(NamedTuple):
@@ -471,7 +477,7 @@ def _require_laws(scenario: Scenario) -> None:
     if scenario.network.clocks:
         evidence = scenario.departures[0][1]
         raise TheoryError(f"{evidence}, so nothing is promised; {CONSISTENCY}")
-    if not scenario.is_random:
+    if not nodes_with_law(scenario).any():
         raise TheoryError(
             "the state or the readings are recorded: there is one run, and no law to check; "
             "netkf theory says what is assumed"

@@ -31,6 +31,7 @@ from netkf.checks.rounding import compare_identities
 from netkf.checks.samples import ReplicaSummary, RunSamples, check_replay
 from netkf.core.errors import TheoryError
 from netkf.network.clocks import LinkClock
+from netkf.scenario.records import unjudged_line
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.evidence import nonlinear_rows
 from netkf.theory.one_bit.covariances import bit_covariances
@@ -123,7 +124,11 @@ def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
     conserved = with_promised_filter(scenario).node_filter.analysis.conserved
     mass = () if conserved is nothing_conserved else (MASS_CONSERVED,)
     bound = () if design_of(scenario) == "smaller" else (UPPER_BOUND,)
-    return (*mass, FOLLOWS_EVENTS, *bound, *ERRORS)
+    unjudged = unjudged_line(scenario)
+    left_out = Promise(
+        "errors of all blocks have a known law", "netkf", (), lambda *_: find_unknown(unjudged)
+    )
+    return (*mass, FOLLOWS_EVENTS, *bound, *ERRORS, *((left_out,) if unjudged else ()))
 
 
 UNDER_CLOCKS = PaperChecks(_promises_under_clocks, summarise=summarise_drift)

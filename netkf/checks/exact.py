@@ -46,6 +46,7 @@ from netkf.laws.intervals import (
 )
 from netkf.laws.noise import MIN_VARIANCE_SHARE, whiten
 from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.scenario.records import nodes_with_law
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.increments import integration_steps
 from netkf.theory.errors import ErrorLaw, diagonal_blocks, error_law
@@ -77,19 +78,25 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     events. That is nan for later replicas, for too many errors together, and without known
     equations.
     """
-    times, nodes, n = run.xhat.shape
     at, sampled = checked_samples(scenario, run.times), sampled_indices(scenario)
+    whole, known = run, nodes_with_law(scenario)
+    if not known.all():
+        # Without the nodes that follow what is recorded; states that are unknown round nothing.
+        x, error, P = np.nan_to_num(run.x), run.error[:, known], run.P[:, known]
+        run = dataclasses.replace(run, x=x, error=error, P=P)
+        sampled = np.searchsorted(np.flatnonzero(known), sampled)
+    times, nodes, n = run.error.shape
     e = np.where(blurred_samples(run, run.P)[..., None], np.nan, run.error)
     law = None
     if run.replica < max_replayed(scenario) and few_errors(scenario).holds:
         # Where there is none an assumption says so, and rows that need it are not promised.
         with contextlib.suppress(TheoryError):
-            law = error_law(with_promised_filter(scenario), run)
+            law = _law_of_nodes(error_law(with_promised_filter(scenario), whole), known)
     if law is None:
         by_node = {name: np.full(run.P.shape, np.nan) for name in ("replayed", "Sigma")}
         by_node["mean"] = np.full(e.shape, np.nan)
         # One weight for each error of all nodes at all sample times.
-        size = times * errors_at_once(scenario)
+        size = times * nodes * n if not known.all() else times * errors_at_once(scenario)
         shapes = {"whole": (len(at), 2), "joint": (2,), "quadratic": (1 + size,)}
         pooled = {name: np.full(shape, np.nan) for name, shape in shapes.items()}
         pooled["bias"] = np.full((n, n + 1), np.nan)
@@ -106,6 +113,15 @@ def summarise_exactly(scenario: Scenario, run: Run) -> ReplicaSummary:
     by_node |= {"P": run.P, "e": e, "nees": np.where(unknown, np.nan, errors(run.error, run.P)[1])}
     kept = {name: part[at][:, sampled] for name, part in by_node.items()}
     return ReplicaSummary(**kept, **pooled)
+
+
+def _law_of_nodes(law: ErrorLaw, known: np.ndarray) -> ErrorLaw:
+    """Return the law of the errors of the nodes in a mask (N,), where it has all."""
+    if known.all():
+        return law
+    times, _, n = law.P.shape[:3]
+    kept = np.tile(np.repeat(known, n), times)
+    return ErrorLaw(law.mean[kept], law.covariance[np.ix_(kept, kept)], law.P[:, known])
 
 
 def _exact_statistics(

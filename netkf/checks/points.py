@@ -6,6 +6,7 @@ import numpy as np
 
 from netkf.checks.evidence import Assumption
 from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.scenario.records import nodes_with_law
 from netkf.scenario.scenario import Scenario
 
 HORIZON_SHARES = (0.125, 0.25, 0.5, 1.0)
@@ -72,12 +73,14 @@ def checked_samples(scenario: Scenario, times: FloatArray) -> IntArray:
 
 
 def sampled_indices(scenario: Scenario) -> IntArray:
-    """Return the indices (W,) of the nodes whose samples are kept: all, or evenly spaced ones."""
-    nodes, n = len(scenario.nodes), scenario.width
-    if nodes <= MAX_NODES:
-        return np.arange(nodes)
+    """Return the indices (W,) of the nodes whose samples are kept: all whose errors have a known
+    law, or evenly spaced ones.
+    """
+    chosen, n = np.flatnonzero(nodes_with_law(scenario)), scenario.width
+    if len(chosen) <= MAX_NODES:
+        return chosen
     count = int(np.clip(MAX_ENTRIES // n**2, MIN_SAMPLED, MAX_SAMPLED))
-    return np.round(np.linspace(0, nodes - 1, count)).astype(np.int64)
+    return chosen[np.round(np.linspace(0, len(chosen) - 1, count)).astype(np.int64)]
 
 
 def sampled_nodes(scenario: Scenario) -> list[int]:

@@ -21,6 +21,56 @@ from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.sampling import all_sample_times, is_drawn_from, sample_times
 
 
+def blocks_without_law(scenario: DerivedScenario) -> dict[Place, str]:
+    """Return why the errors of blocks have no law that is known, by block: their states or their
+    readings are recorded, or their states are not known.
+    """
+    reasons, n = {}, scenario.plant.n
+    drawn = np.full(n, scenario.plant.draws)
+    if not scenario.plant.is_random and scenario.plant.draws:
+        drawn = scenario.plant.record.drawn
+    read = [support_of(sensor, n) for sensor in scenario.sensors if not sensor.is_random]
+    recorded = np.zeros(n, dtype=bool)
+    recorded[np.concatenate([np.zeros(0, dtype=int), *read])] = True
+    for place in scenario.layout.places:
+        if scenario.unknown[place.entries].any():
+            reasons[place] = "unknown"
+        elif not drawn[place.entries].all():
+            reasons[place] = "recorded"
+        elif recorded[place.entries].any():
+            reasons[place] = "with recorded readings"
+    return reasons
+
+
+def unjudged_line(scenario: DerivedScenario) -> str:
+    """Return which blocks have errors without a known law and why, or an empty text."""
+    reasons = blocks_without_law(scenario).items()
+    return ", ".join(f"{place.label or 'the state'} is {why}" for place, why in reasons)
+
+
+def nodes_with_law(scenario: DerivedScenario) -> np.ndarray:
+    """Return a mask (N,) of the nodes whose errors follow a known law: those that neither estimate
+    nor read what has none, nor hear of it.
+    """
+    lost = blocks_without_law(scenario)
+    known = np.full(len(scenario.nodes), not lost)
+    if not lost or scenario.node_filter.timing.pooled:
+        return known
+    without = np.zeros(scenario.plant.n, dtype=bool)
+    for place in lost:
+        without[place.entries] = True
+    for k, node in enumerate(scenario.nodes):
+        seen = [scenario.support(sensor) for sensor in scenario.placed_sensors.get(node, ())]
+        known[k] = not any(without[part].any() for part in (scenario.view(k), *seen))
+    index, changed = scenario.topology.index, scenario.node_filter.timing.talks
+    while changed:
+        before = known.sum()
+        for sender, receiver in scenario.topology.directions:
+            known[index[receiver]] &= known[index[sender]]
+        changed = bool(known.sum() < before)
+    return known
+
+
 def check_records(scenario: DerivedScenario) -> None:
     """Raise ScenarioError if a recorded table does not fit the scenario or lacks a needed row."""
     for k, sensor in enumerate(scenario.sensors):

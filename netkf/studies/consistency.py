@@ -32,6 +32,7 @@ from netkf.rng.streams import Streams
 from netkf.runs.labels import covariance_bias
 from netkf.runs.simulate import choose_engine, require_scenario, simulate
 from netkf.runs.summary import NO_COVARIANCE, nees_bounds
+from netkf.scenario.records import blocks_without_law, nodes_with_law, unjudged_line
 from netkf.scenario.scenario import Scenario
 from netkf.studies.innovations import (
     ClockedInnovations,
@@ -58,7 +59,8 @@ BIAS_TOLERANCE = 0.02
 
 
 def judged_blocks(scenario: Scenario) -> list[JudgedBlock]:
-    """Return the blocks that are judged, node by node."""
+    """Return the blocks that are judged, node by node: those whose errors have a law."""
+    lost = blocks_without_law(scenario)
     if len(scenario.layout.places) == 1:
         whole = np.arange(scenario.plant.n)
         return [JudgedBlock(k, "", whole, whole) for k in range(len(scenario.nodes))]
@@ -66,6 +68,9 @@ def judged_blocks(scenario: Scenario) -> list[JudgedBlock]:
     for k, places in enumerate(scenario.estimated):
         first = 0
         for place in places:
+            if place in lost:
+                first += place.n
+                continue
             own, states = np.arange(place.n), np.arange(place.first, place.first + place.n)
             blocks.append(JudgedBlock(k, place.label, first + own, states))
             first += place.n
@@ -113,11 +118,13 @@ def run_consistency(
     if _count_errors(scenario) <= MAX_ERRORS:
         with contextlib.suppress(TheoryError):
             sigma = error_squares(scenario, run)
+            # Others follow what is recorded too, of which this is an average over a law.
+            sigma[:, ~nodes_with_law(scenario)] = np.nan
     columns = [_block_consistency(run, sigma, block) for block in blocks]
     nees, expected, blurred = (np.stack(column, axis=1) for column in zip(*columns, strict=True))
     if innovations is not None:
         innovations.sigma = sigma
-    elif scenario.slotted and scenario.plant.linear:
+    elif scenario.slotted and scenario.plant.linear and scenario.is_random:
         innovations = _Innovations(scenario, run, sigma)
     nis, expected_nis = _mean_nis(innovations, blocks, blurred)
     times = run.times[blurred.any(axis=1) & (run.times > 0.0)]
@@ -354,10 +361,13 @@ def consistency(
     that is unknown (push-sum with frozen or asymptotic gains, a user's own filter). ``seed`` and
     the options from ``workers`` on are those of ``netkf.monte_carlo``.
 
-    Raises ScenarioError for bad arguments and if there is no truth.
+    Blocks that are recorded, unknown or read by recorded sensors are not judged; of nodes that hear
+    of these the expected NEES is unknown.
+
+    Raises ScenarioError for bad arguments and if there is no block to judge.
     """
     require_scenario(scenario, "consistency")
-    if not scenario.is_random:
+    if len(blocks_without_law(scenario)) == len(scenario.layout.places):
         rule = "states or readings are recorded, so the law of the errors is unknown"
         raise ScenarioError("plant", rule, None, "simulate the plant and all readings")
     count = integer(low=MIN_RUNS)("runs", runs)
@@ -409,6 +419,8 @@ def judge_consistency(
             f"errors, more than {MAX_ERRORS}, takes long; netkf.theory.error_covariance computes it"
         )
         notes = (*notes, reason)
+    if unjudged := unjudged_line(scenario):
+        notes = (*notes, f"not judged: {unjudged}, so that errors have no known law")
     if np.isfinite(blurred_from):
         reason = f"from {blurred_from:g} s on rounding of a large state blurs errors"
         notes = (*notes, f"{reason}: those samples are left out; shorten the horizon")
@@ -475,9 +487,10 @@ def _verdict(
         return "no NEES: P is singular, or P or the errors are not finite"
     if expected is None:
         side = "near n" if abs(excess) <= width else "above n" if excess > 0.0 else "below n"
+        reason = "" if scenario.is_random else "what is recorded is heard too, so "
         if scenario.misses_input:
             return f"{side}; filters do not know the input"
-        return f"{side}; the expected NEES is unknown"
+        return f"{side}; {reason}the expected NEES is unknown"
     if abs(excess) > width:
         return f"BROKEN: errors are {'larger' if excess > 0.0 else 'smaller'} than expected"
     if abs(expected / n - 1.0) <= BIAS_TOLERANCE:

@@ -263,6 +263,41 @@ def test_each_block_is_drawn_recorded_or_unknown_by_itself(tmp_path, slots):
         from_table(table, tmp_path)
 
 
+@pytest.mark.parametrize("slots", [True, False])
+def test_blocks_that_are_drawn_are_judged_and_others_named(tmp_path, slots):
+    table = mixed(tmp_path, slots)
+    heard = from_table(table, tmp_path)
+    del table["sensors"][3]
+    table["filter"] = {"kind": "local", "estimates": "own"}
+    alone = from_table(table, tmp_path)
+    left_out = "not judged: a@2 is recorded, a@3 is unknown, so that errors have no known law"
+    for scenario, expected in ((alone, [1.0]), (heard, [math.nan])):
+        found = netkf.consistency(scenario, runs=10, workers=1)
+        assert found.table["block"].tolist() == ["a@1"]
+        np.testing.assert_allclose(found.table["expected"], expected)
+        assert "BROKEN" not in found.rows[0].verdict
+        assert found.notes == (left_out,)
+    # A filter that trusts its readings too much is found.
+    narrow = alone.replace({"filter.model": {"R": [[0.005]]}}) if slots else alone
+    verdict = netkf.consistency(narrow, runs=10, workers=1).rows[0].verdict
+    assert "overconfident" in verdict if slots else verdict == "consistent"
+    if slots:
+        rows = netkf.check(alone, runs=10, workers=1).table.set_index("promise")
+        assert "broken" not in set(rows["verdict"])
+        assert (
+            rows.loc["P follows the equations along the events of each run", "verdict"] == "holds"
+        )
+        reason = rows.loc["errors of all blocks have a known law", "evidence"]
+        assert reason == "a@2 is recorded, a@3 is unknown"
+        with pytest.raises(netkf.TheoryError, match="no law to check"):
+            netkf.check(heard, runs=10, workers=1)
+    recorded = {"plants": [{**plant, "kind": "unknown"} for plant in table["plants"]]}
+    recorded["plants"][1].pop("path")
+    recorded["sensors"] = [table["sensors"][2]]
+    with pytest.raises(ScenarioError, match="law of the errors is unknown"):
+        netkf.consistency(alone.replace(recorded), runs=10, workers=1)
+
+
 SEEN = """t,node,to,y0,R0
 2026-03-01T12:00:01Z,1,7,4.0,0.04
 2026-03-01T12:00:01Z,1,8,3.0,0.09

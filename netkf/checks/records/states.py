@@ -61,7 +61,8 @@ def _status_fault(scenario: Scenario, run: Run) -> str:
 
 def _truth_fault(scenario: Scenario, run: Run) -> str:
     expected, allowed = drawn_states(scenario, run.seed, run.replica, run.times)
-    gap = np.nan_to_num(np.abs(run.x - expected).max(axis=1, initial=0.0), nan=np.inf)
+    away = np.where(scenario.unknown, 0.0, np.abs(run.x - expected))
+    gap = np.nan_to_num(away.max(axis=1, initial=0.0), nan=np.inf)
     if not (gap > allowed).any():
         return ""
     k = int(np.argmax(gap > allowed))
@@ -122,7 +123,7 @@ def _error_fault(scenario: Scenario, run: Run) -> str:
 def with_start(scenario: Scenario, horizon: float, log: np.ndarray | None = None) -> Scenario:
     """Return the scenario cut at ``horizon``, with samples at 0 and before events of ``log``."""
     times = [np.zeros(1), scenario.times]
-    if not scenario.slotted and log is not None:
+    if not scenario.slotted and log is not None and scenario.is_random:
         for kind in ("absorb", "tick", "sense"):
             instants = log["t"][(log["kind"] == CODES[kind]) & (log["t"] < horizon)]
             times.append(instants[:: max(1, len(instants) // COINCIDENT)][:COINCIDENT])

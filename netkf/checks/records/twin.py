@@ -40,7 +40,9 @@ def _gaps(scenario: Scenario, run: Run, twin: Run) -> list[tuple[str, FloatArray
     """Return names of values, the differences (T, N) of two runs, and what rounding explains."""
     covs = [scenario.initial_estimate(node)[1] for node in scenario.nodes]
     starts = np.stack([enlarged(cov, *np.max([c.shape for c in covs], axis=0)) for cov in covs])
-    # States that a node does not estimate are nan in both, and differ by nothing.
+    # Errors of unknown states are nan in both, as are states that a node does not estimate.
+    unknown = np.isnan(twin.error) & np.isnan(run.error) & np.isfinite(twin.xhat)
+    error, run_error = (np.where(unknown, 0.0, one.error) for one in (twin, run))
     missing = np.isnan(twin.xhat)
     outside = missing & np.isnan(run.xhat) & ~missing.all(axis=2, keepdims=True)
     of_P = outside[..., :, None] | outside[..., None, :]
@@ -55,14 +57,14 @@ def _gaps(scenario: Scenario, run: Run, twin: Run) -> list[tuple[str, FloatArray
         covariance = np.where(given, gaps.max(axis=(2, 3), initial=0.0), 0.0)
         estimate, state = (
             np.where(outside, 0.0, np.abs(one - other)).max(axis=2, initial=0.0)
-            for one, other in ((run.error, twin.error), (run.xhat, twin.xhat))
+            for one, other in ((run_error, error), (run.xhat, twin.xhat))
         )
     # An estimate inherits the relative rounding of the largest covariance so far, by which its
     # gains were computed, and those of the errors and states that it comes from.
     deviation = np.sqrt(np.trace(P, axis1=2, axis2=3))
-    own = np.where(outside, 0.0, np.abs(twin.error))
+    own = np.where(outside, 0.0, np.abs(error))
     errors = np.maximum.accumulate(own.max(axis=(1, 2), initial=0.0))[:, None]
-    states = np.maximum.accumulate(np.abs(twin.x).max(axis=1, initial=0.0))[:, None]
+    states = np.maximum.accumulate(np.nan_to_num(np.abs(twin.x)).max(axis=1, initial=0.0))[:, None]
     spread = np.divide(terms, np.square(deviation), out=np.ones_like(size), where=deviation > 0.0)
     rounding = OPERATIONS * EPS * errors * np.maximum.accumulate(np.maximum(spread, 1.0))
     rounding = rounding + OPERATIONS * EPS * (0.0 if twin.exact_errors else states)
