@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import time
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -12,10 +14,13 @@ import pandas as pd
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import t as student_t
 
+from netkf.core.fields import SourceFile
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate
 from netkf.linalg.arrays import FloatArray
 from netkf.logs.outcomes import Chain
+from netkf.network.scheduled import ScheduledLoss
+from netkf.runs.files import write_text
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.messages import DELIVERED, by_link, join_messages
@@ -38,6 +43,10 @@ NAMES: dict[str, tuple[str, ...]] = {
 """The parameters of each law but that of links."""
 
 
+Interval = tuple[float, float, tuple[str, str], int]
+"""From and until (s), a link, and the index of the delivery that it then has."""
+
+
 class Law(NamedTuple):
     """A law of losses fitted to a log.
 
@@ -46,6 +55,7 @@ class Law(NamedTuple):
              posterior Beta(heard + 1/2, lost + 1/2)
     cov    : of the other laws: covariance of the values, of a chain of their logits, whose
              posterior is Gaussian
+    rows   : of deliveries that change: which of the values (K,) a link has when
     """
 
     kind: str
@@ -54,6 +64,7 @@ class Law(NamedTuple):
     counts: FloatArray | None = None
     cov: FloatArray | None = None
     links: tuple[tuple[str, str], ...] = ()
+    rows: tuple[Interval, ...] = ()
 
     def draw(self, random: np.random.Generator) -> FloatArray:
         """Return parameters drawn from their posterior."""
@@ -73,27 +84,50 @@ class Law(NamedTuple):
     def describe(self) -> str:
         """Return the parameters as text."""
         values = [f"{value:.3g}" for value in self.values]
-        if self.kind == "per-link":
-            return f"{min(self.values):.3g} to {max(self.values):.3g} on {len(values)} links"
+        parts = {"per-link": "links", "scheduled": "windows of time", "hopping": "channels"}
+        if self.kind in parts:
+            low, high = min(self.values), max(self.values)
+            return f"{low:.3g} to {high:.3g} on {len(values)} {parts[self.kind]}"
         pairs = zip(NAMES[self.kind], values, strict=True)
         return ", ".join(f"{name} {value}" for name, value in pairs)
 
-    def loss_table(self, values: FloatArray | None = None) -> dict[str, Any]:
-        """Return the table network.channel.loss with these ``values``, by default the estimates."""
-        own = [float(value) for value in (self.values if values is None else values)]
+    @property
+    def file(self) -> str:
+        """The name of the table of a law with ``rows``."""
+        return f"fit_{self.kind}.csv"
+
+    def schedule(self, values: FloatArray) -> str:
+        """Return the table from,until,sender,receiver,delivery of a law with ``rows``."""
+        own = values.tolist()
+        lines = [f"{a!r},{b!r},{i},{j},{own[k]!r}" for a, b, (i, j), k in self.rows]
+        return "\n".join(["from,until,sender,receiver,delivery", *lines, ""])
+
+    def loss_table(self, values: FloatArray) -> dict[str, Any]:
+        """Return the table network.channel.loss with these ``values``; that of a law with ``rows``
+        refers to its file.
+        """
+        if self.rows:
+            return {"kind": "scheduled", "path": self.file}
+        own = values.tolist()
         table = {} if self.kind == "per-link" else dict(zip(NAMES[self.kind], own, strict=True))
         if self.kind == "distance":
             return {"kind": "distance", "delivery": {"kind": "logistic", **table}}
         return {"kind": self.kind, **table}
 
-    def changes(self, scenario: Scenario, values: FloatArray) -> dict[str, Any]:
-        """Return the keys of a scenario that make its losses those of the law with ``values``."""
+    def apply(self, scenario: Scenario, values: FloatArray, folder: Path) -> Scenario:
+        """Return a scenario whose losses are those of the law with ``values``, with the table of a
+        law with ``rows`` in an empty ``folder``.
+        """
         changed: dict[str, Any] = {"network.channel.loss": self.loss_table(values)}
+        if self.rows:
+            write_text(folder / self.file, self.schedule(values))
+            loss = ScheduledLoss(path=SourceFile(self.file, folder))
+            changed = {"network.channel.loss": loss}
         if self.kind == "per-link":
             changed["network.graph"] = edges_with(
                 scenario, dict(zip(self.links, values, strict=True))
             )
-        return changed
+        return scenario.replace(changed)
 
 
 def edges_with(scenario: Scenario, deliveries: dict[tuple[str, str], float]) -> dict[str, Any]:
@@ -169,11 +203,12 @@ def law_run(
 ) -> dict[str, float]:
     """Return the quantities of one run of a law with parameters drawn from their posterior."""
     random = np.random.default_rng([STREAM, seed, replica])
-    changes = law.changes(scenario, law.draw(random))
+    values = law.draw(random)
     if delay:
-        changes["network.channel.delay"] = delay
-    drawn = scenario.replace(changes)
-    return measure_run(drawn, simulate(drawn, seed, replica))
+        scenario = scenario.replace({"network.channel.delay": delay})
+    with TemporaryDirectory() as folder:
+        drawn = law.apply(scenario, values, Path(folder))
+        return measure_run(drawn, simulate(drawn, seed, replica))
 
 
 def measure_run(scenario: Scenario, run: Run) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress
 from netkf.linalg.arrays import FloatArray
 from netkf.logs import outcomes as stats
-from netkf.logs.envelope import Law, compare_with_laws
+from netkf.logs.envelope import Interval, Law, compare_with_laws
 from netkf.logs.outcomes import Outcomes, Test, make_outcomes
 from netkf.logs.packets import UNREPORTED, parse_numbers, read_texts
 from netkf.network.recorded import RecordedDelay, RecordedLoss
@@ -44,6 +45,8 @@ NEEDS = {
     "gilbert-elliott": ("links", "fate", "constancy", "channel"),
     "shared": ("links", "time", "constancy", "channel"),
     "distance": ("distance", "time", "fate", "constancy", "channel"),
+    "scheduled": ("links", "time", "fate", "channel"),
+    "hopping": ("links", "time", "fate", "constancy"),
 }
 """What each law of losses assumes."""
 MAKERS = {
@@ -52,11 +55,11 @@ MAKERS = {
     "fate": "shared",
     "constancy": "scheduled",
     "links": "per-link, distance",
-    "channel": "channels = { hopping = ... }",
+    "channel": "hopping",
     "directions": "per-link",
     "distance": "per-link",
 }
-"""Laws of netkf that do without an assumption, of which bernoulli to shared are fitted."""
+"""Laws that do without an assumption."""
 MAYBE = 0.05
 """Below this p a departure is allowed for in other tests, whether it is there or not."""
 KEY = ["sender", "receiver", "message"]
@@ -124,7 +127,7 @@ def fit_log(
     table, notes = read_outcomes(scenario)
     outcomes = make_outcomes(table)
     distance = _distances(scenario, outcomes)
-    tests, share, time = run_tests(outcomes, distance)
+    tests, share, time, edges = run_tests(outcomes, distance)
     level = (1.0 - confidence) / max(sum(np.isfinite(t.p) for t in tests.values()), 1)
     test_table = _test_table(tests, level)
     rejected = {key for key, test in tests.items() if test.p < level}
@@ -140,6 +143,7 @@ def fit_log(
         likelihood, variance = stats.shared_law(outcomes, delivery, part)
         cov = np.diag([variance * shrink, share.error**2])
         laws.append(Law("shared", np.array([delivery, part]), likelihood, cov=cov))
+    laws += _varying_laws(outcomes, edges, tests, shrink, scenario.horizon)
     law_table = _law_table(laws, rejected, len(table))
     if np.isfinite(share.value):
         notes.append(
@@ -240,23 +244,26 @@ def _complete_replay(
 
 def run_tests(
     outcomes: Outcomes, distance: FloatArray | None
-) -> tuple[dict[str, Test], stats.Share, float]:
-    """Return a test of each assumption that the log can tell of, the shared fate, and the
-    correlation time in packets.
+) -> tuple[dict[str, Test], stats.Share, float, FloatArray]:
+    """Return a test of each assumption that the log can tell of, the shared fate, the correlation
+    time in packets, and the edges of windows of time in which quality hardly changes.
     """
-    time = stats.correlation_time(outcomes)
-    test_time = stats.test_time(outcomes)
+    constancy = stats.test_constancy(outcomes, stats.correlation_time(outcomes))
+    edges = stats.choose_windows(outcomes) if constancy.p < MAYBE else np.empty(0)
+    # Slow changes are neither bursts nor shared fate.
+    steady = stats.split_at(outcomes, edges)
+    time, test_time = stats.correlation_time(steady), stats.test_time(steady)
     lags = min(30, math.ceil(3.0 * time)) if test_time.p < MAYBE else 0
-    share, fate = stats.shared_fate(outcomes, lags)
+    share, fate = stats.shared_fate(steady, lags)
     slack = time if test_time.p < MAYBE else 1.0
     counts = outcomes.counts.astype(float)
     spread = stats.residual_spread(outcomes, share.value, slack)
     pooled = np.full(len(counts), counts[:, 1].sum() / counts[:, 0].sum())
     found = {
         "time": test_time,
-        "memory": stats.test_memory(outcomes),
+        "memory": stats.test_memory(steady),
         "fate": fate,
-        "constancy": stats.test_constancy(outcomes, time),
+        "constancy": constancy,
         "links": stats.test_alike(ASSUMPTIONS["links"], counts, pooled, spread, 1),
     }
     parts = outcomes.by_channel.astype(float)
@@ -270,7 +277,7 @@ def run_tests(
         values, _ = stats.fit_distance(distance, counts[:, 0], counts[:, 1], slack)
         curve = expit((values[0] - distance) / values[1])
         found["distance"] = stats.test_alike(ASSUMPTIONS["distance"], counts, curve, spread, 2)
-    return found, share, time
+    return found, share, time, edges
 
 
 def _direction_test(outcomes: Outcomes, counts: FloatArray, slack: float) -> dict[str, Test]:
@@ -400,6 +407,52 @@ def _fit_laws(
     return [law._replace(links=pairs) for law in laws]
 
 
+def _varying_laws(
+    outcomes: Outcomes, edges: FloatArray, tests: Mapping[str, Test], shrink: float, end: float
+) -> list[Law]:
+    """Return the laws whose one delivery of all links changes in time, or with the channel of a
+    transmission, where the log tells of that.
+    """
+    index, laws = list(outcomes.links), []
+    if len(edges):
+        counts = stats.counts_in(outcomes, edges)
+        begins = [0.0, *edges.tolist()]
+        ends = [*edges.tolist(), end]
+        rows = [
+            (a, b, link, k)
+            for k, (a, b) in enumerate(zip(begins, ends, strict=True))
+            for link in index
+        ]
+        laws.append(_varying_law("scheduled", counts, rows, shrink))
+    if "channel" in tests and tests["channel"].p < MAYBE:
+        counts = outcomes.by_channel.sum(axis=1).astype(float)
+        numbers = {name: k for k, name in enumerate(sorted(set(outcomes.channels)))}
+        laws.append(_varying_law("hopping", counts, _hops(outcomes, numbers, end), shrink))
+    return laws
+
+
+def _hops(outcomes: Outcomes, numbers: Mapping[str, int], end: float) -> list[Interval]:
+    """Return an interval around each transmission, with the number of its channel."""
+    sent: dict[int, list[tuple[float, int]]] = {}
+    for group, channel in zip(outcomes.groups, outcomes.channels, strict=True):
+        for link in group.links.tolist():
+            sent.setdefault(link, []).extend((t, numbers[channel]) for t in group.t.tolist())
+    rows = []
+    for link, own in sent.items():
+        own.sort()
+        middles = [0.5 * (a[0] + b[0]) for a, b in pairwise(own)]
+        parts = zip([0.0, *middles], [*middles, end], own, strict=True)
+        # Stamps of one instant leave no interval between them.
+        rows += [(a, b, outcomes.links[link], k) for a, b, (_, k) in parts if b > a]
+    return rows
+
+
+def _varying_law(kind: str, counts: FloatArray, rows: list[Interval], shrink: float) -> Law:
+    heard, likelihood = counts[:, 1], _likelihood(counts[:, 1], counts[:, 0])
+    values = heard / counts[:, 0]
+    return Law(kind, values, likelihood, counts / shrink, rows=tuple(rows))
+
+
 def _likelihood(heard: Any, count: Any) -> float:
     p = heard / count
     return float(np.sum(xlogy(heard, p) + xlog1py(count - heard, -p)))
@@ -444,10 +497,12 @@ def _write(
             write_text(folder / name, table.to_csv(index=False))
     base, paths = as_table(scenario), {}
     for law in laws:
+        if law.rows:
+            write_text(folder / law.file, law.schedule(law.values))
         document = {**base, "name": f"{scenario.name}-{law.kind}"}
         document["claim"] = f"losses by the law {law.kind}, fitted to the log of {scenario.name}"
         network = {**base["network"]}
-        channel = {**network["channel"], "loss": law.loss_table()}
+        channel = {**network["channel"], "loss": law.loss_table(law.values)}
         network["channel"] = channel | ({"delay": delay} if delay else {})
         if law.kind == "per-link":
             network["graph"] = {"kind": "csv", "path": FILES[0]}

@@ -154,6 +154,54 @@ def make_outcomes(table: pd.DataFrame) -> Outcomes:
     return Outcomes(tuple(links), tuple(groups), tuple(channels))
 
 
+def split_at(outcomes: Outcomes, edges: FloatArray) -> Outcomes:
+    """Return the outcomes with groups of one window of time each, which ``edges`` (K - 1,) part."""
+    groups, channels = [], []
+    for group, channel in zip(outcomes.groups, outcomes.channels, strict=True):
+        window = np.searchsorted(edges, group.t, side="right")
+        for k in np.unique(window):
+            own = np.flatnonzero(window == k)
+            follows = group.follows[own] & (np.arange(len(own)) > 0)
+            groups.append(Group(group.x[own], group.t[own], follows, group.links))
+            channels.append(channel)
+    return Outcomes(outcomes.links, tuple(groups), tuple(channels))
+
+
+def counts_in(outcomes: Outcomes, edges: FloatArray) -> np.ndarray:
+    """Return known outcomes and packets heard in the K windows of ``edges`` (K - 1,), (K, 2)."""
+    counts = np.zeros((len(edges) + 1, 2))
+    for group in outcomes.groups:
+        window = np.searchsorted(edges, group.t, side="right")
+        np.add.at(counts[:, 0], window, np.isfinite(group.x).sum(axis=1))
+        np.add.at(counts[:, 1], window, np.nansum(group.x, axis=1))
+    return counts
+
+
+def choose_windows(outcomes: Outcomes) -> FloatArray:
+    """Return the edges (K - 1,) of the K windows, a power of two of them, that tell best of slow
+    changes (AIC); what hearers share and what lasts less long than a window counts as noise.
+    """
+    t = np.concatenate([group.t for group in outcomes.groups])
+    z = np.concatenate([group.residuals.sum(axis=1) for group in outcomes.groups])
+    size = np.concatenate(
+        [np.isfinite(g.x) @ np.nan_to_num(g.mean * (1.0 - g.mean)) for g in outcomes.groups]
+    )
+    best, edges = 0.0, np.empty(0)
+    fast = correlation_time(split_at(outcomes, np.quantile(t, np.arange(1, BLOCKS) / BLOCKS)))
+    spread = fast * float((z**2).sum() / max(size.sum(), 1e-300))
+    count = 2
+    while count <= min(BLOCKS, len(t) / (MIN_PACKETS * len(outcomes.groups))):
+        inner = np.quantile(t, np.arange(1, count) / count)
+        window = np.searchsorted(inner, t, side="right")
+        sums, sizes = np.bincount(window, z, count), np.bincount(window, size, count)
+        gain = float((sums**2 / np.maximum(sizes, 1e-300)).sum()) / spread
+        gain -= 2.0 * (count - 1)
+        if gain > best:
+            best, edges = gain, inner
+        count *= 2
+    return edges
+
+
 def binomial_interval(
     heard: FloatArray, count: FloatArray, level: float
 ) -> tuple[FloatArray, FloatArray]:

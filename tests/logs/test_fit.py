@@ -16,6 +16,7 @@ from netkf.logs.outcomes import (
     Group,
     Outcomes,
     binomial_interval,
+    counts_in,
     fit_chain,
     fit_distance,
     make_outcomes,
@@ -73,7 +74,7 @@ def test_true_laws_are_kept_and_parameters_lie_in_their_intervals():
     inside, together, rejected = [], [], {"time": [], "memory": [], "constancy": []}
     for random in seeds(200):
         outcomes = drawn(random, share=0.4, p=p)
-        tests, share, _ = run_tests(outcomes, None)
+        tests, share, *_ = run_tests(outcomes, None)
         inside.append(abs(share.value - 0.4) < 1.96 * share.error)
         count, heard = outcomes.counts.T.astype(float)
         low, high = binomial_interval(heard, count, LEVEL / len(count))
@@ -119,9 +120,29 @@ def test_departures_of_the_stated_size_are_found_with_the_stated_power():
 
 
 def test_slow_changes_are_found():
-    tests, _, _ = run_tests(drawn(np.random.default_rng(3), T=600, wave=0.15), None)
+    tests, *_ = run_tests(drawn(np.random.default_rng(3), T=600, wave=0.15), None)
     assert tests["constancy"].p < 1e-4
     assert 0.05 < tests["constancy"].estimate < 0.15  # 0.15 / sqrt 2 = 0.106
+
+
+def test_slow_changes_are_neither_bursts_nor_shared_fate():
+    """Few true assumptions are rejected; without windows most would be."""
+    flags, without = [], []
+    for random in seeds(25, 6):
+        outcomes = drawn(random, T=600, p=0.7, wave=0.15)
+        tests, share, _, edges = run_tests(outcomes, None)
+        assert len(edges) > 2
+        assert abs(share.value) < 0.08
+        flags += [tests[name].p < LEVEL for name in ("time", "memory", "fate")]
+        without.append(time_test(outcomes).p < LEVEL)
+    assert rate(flags) < binomial_range(75, LEVEL)[1] < 0.5 < rate(without)
+    counts = counts_in(outcomes, edges)
+    assert counts[:, 0].sum() == 5400
+    window = np.searchsorted(edges, np.arange(600.0), side="right")
+    true = 0.7 + 0.15 * np.sin(6.0 * math.pi * np.arange(600) / 600)
+    expected = np.bincount(window, true) / np.bincount(window)
+    error = counts[:, 1] / counts[:, 0] - expected
+    assert (abs(error) < 4.0 * np.sqrt(0.21 / counts[:, 0])).all()
 
 
 def test_the_chain_of_two_states():
@@ -189,7 +210,15 @@ def test_a_fit_writes_laws_that_run_and_says_what_fails(tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     tests = {row["key"]: row for row in document["tests"]}
     assert tests["channel"]["verdict"] == "rejected"
-    assert tests["channel"]["made_by"].startswith("channels")
+    assert tests["channel"]["made_by"] == "hopping"
+    hopping = pd.read_csv(tmp_path / "out" / "fit_hopping.csv")
+    sent = pd.read_csv(tmp_path / "out" / "outcomes.csv").sort_values(["sender", "receiver", "t"])
+    hopping = hopping.sort_values(["sender", "receiver", "from"])
+    assert (
+        (hopping["from"].to_numpy() < sent["t"]) & (sent["t"] < hopping["until"].to_numpy())
+    ).all()
+    shares = sent.groupby("channel")["delivered"].transform("mean")
+    np.testing.assert_allclose(hopping["delivery"], shares)
     links = pd.read_csv(tmp_path / "out" / "fit_links.csv")
     outcomes = pd.read_csv(tmp_path / "out" / "outcomes.csv")
     mean = outcomes.groupby(["sender", "receiver"])["delivered"].mean().to_numpy()
