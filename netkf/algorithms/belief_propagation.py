@@ -394,6 +394,12 @@ def begin_belief_propagation(
     node["frame"][:] = frame.basis
 
 
+MODES = (
+    "whose evidence that lasts is kept in coordinates of the modes of one plant, of which a change "
+    "would mix those that have decayed with others and lose their digits"
+)
+
+
 @built_in("belief-propagation")
 @dataclass(frozen=True, eq=False)
 class BeliefPropagation(Filter):
@@ -448,8 +454,8 @@ class BeliefPropagation(Filter):
             samples=True,
             inverts=True,
             linear_plant=self.memory == ALL,
-            one_model=self.memory == ALL,
-            one_model_under_clocks=True,
+            one_model=MODES if self.memory == ALL else "",
+            one_model_under_clocks=MODES,
             check=self._check_scenario,
             notes=self._scenario_notes,
         )

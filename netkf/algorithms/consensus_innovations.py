@@ -21,6 +21,7 @@ theorem) is followed, without the numbers of its equations. The null space of G 
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -67,29 +68,18 @@ class PseudoStates(NamedTuple):
 
     G : information of all sensors together
     inverse : its pseudo-inverse G^+
-    A, coupling : of the prediction ``A yhat + coupling xhat``: ``A = G F G^+`` and
-                  ``coupling = G F (I - G^+ G)``
     """
 
     G: FloatArray
     inverse: FloatArray
-    A: FloatArray
-    coupling: FloatArray
 
 
-def pseudo_states(F: FloatArray, information: FloatArray) -> PseudoStates:
+def pseudo_states(information: FloatArray) -> PseudoStates:
     """Return the matrices (n, n) of the pseudo-state ``G x``: G = ``information`` (n, n), that of
-    all sensors, its pseudo-inverse, and those of its prediction by the transition F (n, n).
+    all sensors, and its pseudo-inverse.
     """
     # Sensors may leave directions unobserved: G is singular then, and G^+ G projects on the others.
-    inverse = np.asarray(np.linalg.pinv(information, hermitian=True))
-    projector = inverse @ information
-    return PseudoStates(
-        information,
-        inverse,
-        information @ F @ inverse,
-        information @ F @ (np.eye(len(F)) - projector),
-    )
+    return PseudoStates(information, np.asarray(np.linalg.pinv(information, hermitian=True)))
 
 
 class GainSequence:
@@ -106,14 +96,17 @@ class GainSequence:
         matrices: tuple[FloatArray, FloatArray, FloatArray],
         information: FloatArray,
         heard: tuple[tuple[int, ...], ...],
+        changes: Sequence[int] = (),
     ) -> None:
-        """Set the errors at the start of a network: ``matrices`` are F, Q and the covariance of
-        x(0), (n, n) each; ``information`` and ``heard`` are those of ``NetworkInfo``.
+        """Set the errors at the start of a network: ``matrices`` are F and Q (S, n, n) of the
+        pieces of the plant before and after each of the ``changes`` (slots), and the covariance of
+        x(0); ``information`` and ``heard`` are those of ``NetworkInfo``.
         """
         self._F, Q, cov = matrices
+        self._changes = changes
         self._n, self._neighbours, self._information = len(cov), heard, information
         n, N = self._n, len(heard)
-        self._pseudo = pseudo_states(self._F, self._information.sum(axis=0))
+        self._pseudo = pseudo_states(self._information.sum(axis=0))
         # Columns of zeros, as of nodes without a sensor, add no noise: leave them out.
         roots = map(square_root, self._information)
         self._noises = [root[:, root.any(axis=0)] for root in roots]
@@ -121,7 +114,7 @@ class GainSequence:
         stacked = np.concatenate([np.tile(np.eye(n), (N, 1)), np.tile(self._pseudo.G, (N, 1))])
         # All nodes start from the same mean: only x(0) - mean makes errors, as does w later.
         self._errors = stacked @ square_root(cov)
-        self._driven = stacked @ square_root(Q)
+        self._driven = [stacked @ square_root(one) for one in Q]
         self._gains: list[tuple[Gains, ...]] = []
         self._converged = False
 
@@ -130,7 +123,7 @@ class GainSequence:
         # Gains do not depend on readings: each slot is computed once.
         while len(self._gains) < slot and not self._converged:
             self._gains.append(self._advance_slot())
-            if len(self._gains) > 1:
+            if len(self._gains) > 1 + max(self._changes, default=0):
                 roots = (np.stack([one.root for one in gains]) for gains in self._gains[-2:])
                 former, present = (S @ np.swapaxes(S, 1, 2) for S in roots)
                 change = np.abs(present - former).max()
@@ -162,8 +155,11 @@ class GainSequence:
         """Advance ``_errors`` by a slot."""
         nodes = range(len(self._neighbours))
         x, y = self._errors.reshape(2, len(nodes), self._n, -1)
-        predicted = np.stack([self._F @ x, self._pseudo.coupling @ x + self._pseudo.A @ y])
-        self._errors = np.hstack([predicted.reshape(self._errors.shape), self._driven])
+        # Slot number k is predicted from k - 1 on.
+        piece = bisect.bisect_right(self._changes, len(self._gains))
+        F, (G, inverse) = self._F[piece], self._pseudo
+        predicted = np.stack([F @ x, G @ (F @ (inverse @ y + x - inverse @ (G @ x)))])
+        self._errors = np.hstack([predicted.reshape(self._errors.shape), self._driven[piece]])
         # The order of the filter: yhat from the exchange, then xhat from the new yhat.
         gains = self._correct_pseudo_states()
         K = [self._correct_state(i) for i in nodes]
@@ -244,22 +240,28 @@ def optimal_gain(e: FloatArray, theta: FloatArray, terms: FloatArray) -> FloatAr
     return np.asarray((e @ V.T * inverse) @ (U.T * scale))
 
 
-def gain_sequence(model: Any, network: NetworkInfo, cov: FloatArray) -> GainSequence:
-    """Return the gains of a ``network`` of nodes with F and Q of ``model`` that start with the
-    covariance ``cov`` (n, n); all of its nodes and runs share them.
+def gain_sequence(
+    matrices: tuple[FloatArray, FloatArray], network: NetworkInfo, cov: FloatArray, changes: Any
+) -> GainSequence:
+    """Return the gains of a ``network`` of nodes with F and Q (S, n, n) of each piece between the
+    ``changes`` (slots) that start with the covariance ``cov`` (n, n); all of its nodes and runs
+    share them.
     """
     # Bytes can be the key of a cache.
-    parts = (model.F, model.Q, cov, network.information)
+    parts = (*matrices, cov, network.information)
     entries = tuple(np.asarray(part, dtype=np.float64).tobytes() for part in parts)
-    return _shared_sequence(len(cov), entries, network.heard)
+    return _shared_sequence(len(cov), entries, network.heard, tuple(changes.tolist()))
 
 
 @lru_cache(maxsize=8)
 def _shared_sequence(
-    n: int, entries: tuple[bytes, ...], heard: tuple[tuple[int, ...], ...]
+    n: int,
+    entries: tuple[bytes, ...],
+    heard: tuple[tuple[int, ...], ...],
+    changes: tuple[int, ...],
 ) -> GainSequence:
     F, Q, cov, information = (np.frombuffer(part).reshape(-1, n, n) for part in entries)
-    return GainSequence((F[0], Q[0], cov[0]), information, heard)
+    return GainSequence((F, Q, cov[0]), information, heard, changes)
 
 
 @kernel
@@ -267,16 +269,29 @@ def predict(record: Any, h: int, run: Any) -> None:
     """Predict the estimates of node ``h``, of the pseudo-state and of the state; the root follows
     from the gains.
     """
-    lanes, n, x, y, A = run.lanes, len(run.size), record.xhat, record.pseudo, record.A
-    for i in range(n):
-        total = spread(lanes, 0.0)
-        for j in range(n):
-            total += A[i, j] * load(lanes, y, h, j)
-            total += record.coupling[i, j] * load(lanes, x, h, j)
-        store(lanes, run.row, i, total)
-    for i in range(n):
-        store(lanes, y, h, i, load(lanes, run.row, i))
-    transform_mean(lanes, run.size, x, h, run.model.F, run.moved_mean)
+    lanes, x, y, F, inverse = run.lanes, record.xhat, record.pseudo, run.model.F, record.inverse
+    # y - G x, of which G^+ is a difference of states.
+    multiply(run, record.G, x, h, run.gains)
+    for i in range(len(run.size)):
+        store(lanes, run.gains, i, load(lanes, y, h, i) - load(lanes, run.gains, i))
+    for i in range(len(run.size)):
+        total = load(lanes, x, h, i)
+        for j in range(len(run.size)):
+            total += inverse[i, j] * load(lanes, run.gains, j)
+        store(lanes, y, h, i, total)
+    transform_mean(lanes, run.size, y, h, F, run.moved_mean)
+    transform_mean(lanes, run.size, y, h, record.G, run.moved_mean)
+    transform_mean(lanes, run.size, x, h, F, run.moved_mean)
+
+
+@kernel
+def multiply(run: Any, matrix: FloatArray, x: FloatArray, k: int, out: FloatArray) -> None:
+    """Write the product of a ``matrix`` (n, n) and ``x[k]`` into ``out`` (n, L)."""
+    for i in range(len(run.size)):
+        total = spread(run.lanes, 0.0)
+        for j in range(len(run.size)):
+            total += matrix[i, j] * load(run.lanes, x, k, j)
+        store(run.lanes, out, i, total)
 
 
 @kernel
@@ -361,7 +376,8 @@ def consensus_innovations_record(
     network = infos[0].network
     assert network is not None
     n, H = len(models[0].information), len(infos)
-    pseudo = pseudo_states(models[0].F, network.information.sum(axis=0))
+    pseudo = pseudo_states(network.information.sum(axis=0))
+    pieces = getattr(models[0], "pieces", models[:1])
     return Record(
         node={"pseudo": (n,), "start": (n, n)},
         payload={"pseudo": (n,)},
@@ -369,6 +385,9 @@ def consensus_innovations_record(
             **{name: np.array(part, order="C") for name, part in pseudo._asdict().items()},
             "B": np.zeros((1, 1, n, n)),
             **{name: np.zeros((1, H, n, n)) for name in ("M", "K", "roots")},
+            "F": np.array([piece.F for piece in pieces]),
+            "Q": np.array([piece.Q for piece in pieces]),
+            "changes": np.array(getattr(models[0], "slots", ()), dtype=np.int64),
             "table_row": np.zeros(1, dtype=np.int64),
             "first_slot": -1,
         },
@@ -385,7 +404,7 @@ def begin_consensus_innovations(
 
 
 def prepare_consensus_innovations(
-    _: Any, record: Any, infos: Sequence[NodeInfo], models: Sequence[Any], first: int, count: int
+    _: Any, record: Any, infos: Sequence[NodeInfo], _models: Any, first: int, count: int
 ) -> None:
     """Set the gains of the slots, which follow from the network and its start."""
     network = infos[0].network
@@ -393,7 +412,7 @@ def prepare_consensus_innovations(
     if record.first_slot == first and len(record.table_row) == count:
         return
     start = np.ascontiguousarray(record.start[0, ..., 0])
-    sequence = gain_sequence(models[0], network, start)
+    sequence = gain_sequence((record.F, record.Q), network, start, record.changes)
     record.table_row, gains = sequence.table(first, count, [info.place for info in infos])
     record.B, record.M, record.K, record.roots = map(np.ascontiguousarray, gains)
     record.first_slot = first
@@ -429,7 +448,6 @@ class ConsensusInnovations(Filter):
         """Its demands on a scenario."""
         return Needs(
             one_way=True,
-            one_model=True,
             fixed_sensors=True,
             linear_plant=True,
             every_reading=True,

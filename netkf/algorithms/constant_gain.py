@@ -47,9 +47,9 @@ from netkf.linalg.structs import Struct
 class ClosedLoops(Struct):
     """The closed loops of H nodes that read increments of at most p rows.
 
-    A : the plant (n, n)
+    A : the plant (S, n, n) in each of S pieces between its changes
     L, H : gains (H, n, p) and rows (H, p, n)
-    closed, rate : A - L H (H, n, n), and the rate (H,) in 1/s at which its error changes
+    closed, rate : A - L H (S, H, n, n), and the rate (H,) in 1/s at which increments move x
     tables : A - L H tabulated, and in ``models`` the row (H,) of each node, -1: no increments
     maps : scratch (6, n, n)
     """
@@ -102,6 +102,7 @@ def predict_closed_loop(record: Any, h: int, run: Any) -> None:
     copy_vector(run.lanes, run.size, record.mean, 0, record.xhat, h, True)
     carry_mean(run.model, run, record.mean, 0, run.gap)
     root, x = drop_lane(record.root), drop_lane(record.xhat)
+    tables.piece = run.model.piece
     move(tables, run, tables.models[h], root, x, h, run.gap)
     copy_vector(run.lanes, run.size, record.xhat, h, record.mean, 0, True)
 
@@ -112,11 +113,11 @@ def use_sample_or_increments(record: Any, h: int, run: Any) -> None:
     if run.model.increments == 0:
         use_sample(record, h, run)
         return
-    loops = record.loops
+    loops, piece = record.loops, run.model.piece
     moments = run.model.moments[: run.model.gains.moments[run.model.models[h]]]
     correct_by_moments(
-        drop_lane(record.xhat), h, loops.A, loops.closed[h], loops.H[h], loops.L[h], moments,
-        run.gap, loops.maps,
+        drop_lane(record.xhat), h, loops.A[piece], loops.closed[piece, h], loops.H[h], loops.L[h],
+        moments, run.gap, loops.maps,
     )  # fmt: skip
 
 
@@ -196,7 +197,6 @@ class ConstantGain(Filter):
         """Its demands on a scenario."""
         return Needs(
             one_way=True,
-            one_model_of_increments=True,
             fixed_sensors=True,
             linear_plant=True,
             every_reading=True,
@@ -242,27 +242,33 @@ class ConstantGain(Filter):
 
 def _closed_loops(models: Sequence[FlowModel], gains: Sequence[FloatArray]) -> ClosedLoops:
     """Return the closed loops of the nodes with these models and gains (n, p)."""
+    pieces = list(zip(*(getattr(model, "pieces", (model,)) for model in models), strict=True))
     N, n = len(models), len(models[0].A)
     p = max(1, *(gain.shape[1] for gain in gains))
-    L, H, closed = np.zeros((N, n, p)), np.zeros((N, p, n)), np.zeros((N, n, n))
+    L, H, closed = np.zeros((N, n, p)), np.zeros((N, p, n)), np.zeros((len(pieces), N, n, n))
     rate, rows = np.zeros(N), np.full(N, -1, dtype=np.int64)
     tables: list[FlowTable] = []
-    for k, (model, gain) in enumerate(zip(models, gains, strict=True)):
-        if len(model.H):
+    reading = [k for k, model in enumerate(models) if len(model.H)]
+    rows[reading] = np.arange(len(reading))
+    for s, present in enumerate(pieces):
+        for k in reading:
+            model, gain = present[k], gains[k]
             loop = closed_loop(model, gain)
-            L[k, :, : gain.shape[1]], H[k, : len(model.H)], closed[k] = gain, model.H, loop.A
+            L[k, :, : gain.shape[1]], H[k, : len(model.H)], closed[s, k] = gain, model.H, loop.A
             # The rate at which increments move the estimate.
-            rate[k], rows[k] = np.linalg.norm(gain @ model.H), len(tables)
+            rate[k] = np.linalg.norm(gain @ model.H)
             tables.append(loop.flow)
-    # Without closed loops any table will do, as no node uses it.
-    table = stack_tables(tables or [models[0].unobserved_flow])
+        # Without closed loops any table will do, as no node uses it.
+        tables += [] if reading else [present[0].unobserved_flow]
+    changes = np.array(getattr(models[0], "changes", ()), dtype=np.float64)
+    gains_of_none = stack_gains([models[0].gains])
     return ClosedLoops(
-        A=np.array(models[0].A),
+        A=np.array([present[0].A for present in pieces]),
         L=L,
         H=H,
         closed=closed,
         rate=rate,
-        tables=clock_tables(np.zeros(n), table, rows, stack_gains([models[0].gains])),
+        tables=clock_tables(np.zeros(n), stack_tables(tables), rows, gains_of_none, changes),
         maps=np.zeros((6, n, n)),
     )
 

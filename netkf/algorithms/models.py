@@ -372,6 +372,16 @@ class ChangingSlotModel(SlotModel):
         return xhat, root
 
 
+def changing_models(pieces: Sequence[Sequence[Any]], changes: Sequence[Any]) -> list[Any]:
+    """Return the models of nodes from those of each piece of the plant, between ``changes``, in
+    seconds or in slots.
+    """
+    if len(pieces) == 1:
+        return list(pieces[0])
+    cls: Any = ChangingSlotModel if isinstance(pieces[0][0], SlotModel) else ChangingFlowModel
+    return [cls(of_node, changes) for of_node in zip(*pieces, strict=True)]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RateModel(FlowModel):
     """Continuous time of a plant that need not be linear: ``dx = f(x, u(t), t) dt + dw``, cov(dw) =

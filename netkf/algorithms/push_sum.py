@@ -513,6 +513,11 @@ SLOTS = Kernels(
     observe=observe,
     under_clocks=running_sums.KERNELS,
 )
+LIMIT = "whose asymptotic gains are the limit of one plant, at which none is right after a change"
+PARTS = (
+    "whose totals keep information under way in parts by the rates at which modes decay: those of "
+    "other modes do not follow from them"
+)
 DECIDING = replace(SLOTS, decides=True, depends_on_data=False)
 
 
@@ -587,8 +592,8 @@ class PushSum(Filter):
             linear_plant=True,
             every_reading=True,
             inverts_under_clocks=True,
-            one_model=self.asymptotic,
-            one_model_under_clocks=True,
+            one_model=LIMIT if self.asymptotic else "",
+            one_model_under_clocks=PARTS,
             ways_between_all=True,
             samples=True,
             check=self._check_scenario,

@@ -17,10 +17,8 @@ class Needs:
 
     inverts : covariances must never be singular
     inverts_under_clocks : the same, in continuous time only
-    one_model : it computes with the matrices of the plant before a run, so that it cannot follow
-                changes of them
-    one_model_under_clocks, one_model_of_increments : the same, in continuous time only, and where
-                                                      sensors give increments
+    one_model : why it cannot follow changes of the plant, the end of a sentence; "": it can
+    one_model_under_clocks : the same, in continuous time only
     samples : it cannot use increment sensors
     fixed_sensors : it computes with H before there are readings, so H must not vary: no nonlinear
                     sensors, regressors or columns phi
@@ -53,9 +51,8 @@ class Needs:
 
     inverts: bool = False
     inverts_under_clocks: bool = False
-    one_model: bool = False
-    one_model_under_clocks: bool = False
-    one_model_of_increments: bool = False
+    one_model: str = ""
+    one_model_under_clocks: str = ""
     samples: bool = False
     fixed_sensors: bool = False
     linear_plant: bool = False

@@ -20,12 +20,11 @@ import scipy.linalg
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval
 from netkf.algorithms.models import (
-    ChangingFlowModel,
-    ChangingSlotModel,
     FlowModel,
     MapModel,
     RateModel,
     SlotModel,
+    changing_models,
 )
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
@@ -203,12 +202,8 @@ class DerivedScenario(ScenarioModel):
         """Return the believed model of the node with this index, 0 for a pooled filter: of one run
         where it changes.
         """
-        pieces = [models[entity] for models in self.model_pieces]
-        if len(pieces) == 1:
-            return pieces[0]
-        if self.slotted:
-            return ChangingSlotModel(pieces, self.followed_slots)
-        return ChangingFlowModel(pieces, self.followed_changes.tolist())
+        changes = self.followed_slots if self.slotted else self.followed_changes.tolist()
+        return changing_models([(models[entity],) for models in self.model_pieces], changes)[0]
 
     @property
     def followed_slots(self) -> tuple[int, ...]:

@@ -34,10 +34,9 @@ def check_preconditions(scenario: DerivedScenario) -> None:
     the key, the filter, the value and a remedy.
     """
     needs = scenario.node_filter.needs
-    before_clocks = needs.one_model_under_clocks and not scenario.slotted
-    before_increments = needs.one_model_of_increments and bool(scenario.increment_sensors)
-    if needs.one_model or before_clocks or before_increments:
-        _check_one_model(scenario)
+    _check_one_model(scenario, needs.one_model)
+    if not scenario.slotted:
+        _check_one_model(scenario, needs.one_model_under_clocks)
     if scenario.views is not None:
         _check_blocks(scenario)
     if needs.own_blocks:
@@ -66,12 +65,11 @@ def check_preconditions(scenario: DerivedScenario) -> None:
         _check_heard(scenario)
 
 
-def _check_one_model(scenario: DerivedScenario) -> None:
-    if len(scenario.followed_changes):
+def _check_one_model(scenario: DerivedScenario, reason: str) -> None:
+    if reason and len(scenario.followed_changes):
         raise ScenarioError(
             "plant.schedule",
-            f"cannot be followed by the {filter_name(scenario)}, which computes with the matrices "
-            "of the plant before a run",
+            f"cannot be followed by the {filter_name(scenario)}, {reason}",
             f"{len(scenario.followed_changes)} changes",
             f"write model = {{ schedule = false }} in [filter], or {ANOTHER}",
         )

@@ -169,6 +169,7 @@ SLOT_FILTERS = {
     "track-fusion ici": {"rule": "ici"},
     "track-fusion cross": {"rule": "cross-covariance"},
     "constant-gain": {"gain": [[0.4], [0.2]]},
+    "consensus-innovations": {},
 }
 
 
@@ -266,6 +267,36 @@ def test_constant_gains_of_samples_follow_the_changes(engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_constant_gains_of_increments_follow_the_changes(engine):
+    """P by Van Loan over each piece with A - L H."""
+    L = np.array([[0.4], [0.2]])
+    silent = {"activation": {"kind": "poisson", "at": "nodes", "rate": 1e-9}}
+    options = {"sensor": {"sampling": "continuous"}, "filter": {"gain": L.tolist()}}
+    run = netkf.simulate(clocks("constant-gain", network=silent, **options), engine=engine)
+    P, edges = np.eye(2), sorted({*TIMES, *run.times.tolist()})
+    for a, b in itertools.pairwise(edges):
+        k = int(np.searchsorted(TIMES, a, side="right"))
+        closed, noise = A[k] - L @ H, B[k] @ B[k].T + L @ R @ L.T
+        block = expm(np.block([[-closed, noise], [np.zeros((2, 2)), closed.T]]) * (b - a))
+        Phi = block[2:, 2:].T
+        P = Phi @ P @ Phi.T + Phi @ block[:2, 2:]
+        if b in run.times:
+            found = run.P[run.times.tolist().index(b)]
+            np.testing.assert_allclose(found, np.broadcast_to(P, found.shape), rtol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_gains_of_a_whole_network_follow_the_changes(engine):
+    """P of consensus + innovations is the covariance of the error, which the plant's pieces say."""
+    scenario = slots("consensus-innovations")
+    run = netkf.simulate(scenario, engine=engine)
+    exact = netkf.theory.error_covariance(scenario, run)
+    np.testing.assert_allclose(run.P, exact, rtol=1e-8, atol=1e-12)
+    unaware = scenario.replace({"filter.model": {"schedule": False}})
+    assert abs(netkf.simulate(unaware).P - run.P).max() > 0.1
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_late_readings_are_used_exactly_across_changes(tmp_path, engine):
     # Messages take 1.1 s, and all changes lie between a reading and its arrival.
     instants = [0.3, 1.9, 2.1, 3.9, 4.05]
@@ -353,7 +384,7 @@ CLOCK_FILTERS = {
     "track-fusion": {"rule": "ici"},
     "constant-gain": {"gain": [[0.4], [0.2]]},
 }
-SAMPLES_ONLY = ("kcf", "intermittent", "constant-gain")
+SAMPLES_ONLY = ("kcf", "intermittent")
 INCREMENTS = {"sampling": "continuous"}
 DELAYS = {"none": {"kind": "none"}, "random": {"kind": "exponential", "mean": 0.4}}
 CASES = [
@@ -559,7 +590,6 @@ def test_pieces_that_are_equal_are_one_plant(tmp_path, make):
 
 
 REFUSED = {
-    "consensus-innovations": {},
     "push-sum": {"gamma": 3, "delta": 4.0, "asymptotic": True},
     "belief-propagation": {"memory": "all"},
 }
@@ -578,16 +608,18 @@ def test_filters_that_compute_before_a_run_refuse(kind):
 UNDER_CLOCKS = {
     "push-sum": {"sampling": {"kind": "poisson", "rate": 2.0}},
     "belief-propagation": {"sampling": {"kind": "poisson", "rate": 2.0}},
-    "constant-gain": INCREMENTS,
+}
+REASONS = {
+    "push-sum": "totals keep information under way in parts by the rates at which modes decay",
+    "belief-propagation": "evidence that lasts is kept in coordinates of the modes of one plant",
 }
 
 
 @pytest.mark.parametrize("kind", UNDER_CLOCKS)
 def test_filters_that_compute_before_a_run_refuse_under_clocks(kind):
-    gain = {"gain": [[0.4], [0.2]]} if kind == "constant-gain" else {}
     with pytest.raises(ScenarioError, match=r"plant.schedule: cannot be followed by the") as caught:
-        clocks(kind, filter=gain, sensor=UNDER_CLOCKS[kind])
-    assert "computes with the matrices of the plant before a run" in str(caught.value)
+        clocks(kind, sensor=UNDER_CLOCKS[kind])
+    assert REASONS[kind] in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

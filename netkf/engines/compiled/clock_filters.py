@@ -18,7 +18,7 @@ from netkf.algorithms.kernels.run import (
     scratch_of,
     size_of,
 )
-from netkf.algorithms.models import RateModel
+from netkf.algorithms.models import RateModel, changing_models
 from netkf.algorithms.records import Kernels, double_past, make_records, resized
 from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.clock_loop import NO_MODELS, batch_loop, clock_loop, clock_verbs
@@ -61,7 +61,7 @@ class ClockFilters:
         self._rates = [m for m in scenario.model_pieces[0] if isinstance(m, RateModel)]
         pooled = scenario.node_filter.timing.pooled
         infos = scenario.node_infos[:1] if pooled else scenario.node_infos
-        models = wide_models(scenario)[0]
+        models = changing_models(wide_models(scenario), scenario.followed_changes.tolist())
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
         count = len(links["sender"])

@@ -21,7 +21,7 @@ from netkf.algorithms.kernels.run import (
     scratch_of,
     size_of,
 )
-from netkf.algorithms.models import MapModel
+from netkf.algorithms.models import MapModel, changing_models
 from netkf.algorithms.records import Kernels, make_records
 from netkf.engines.compiled.slot_loop import (
     EXCHANGE,
@@ -64,7 +64,7 @@ class SlotFilters:
             setup.algorithm,
             list(zip(means, setup.root, strict=True)),
             setup.infos,
-            setup.model_pieces[0],
+            changing_models(setup.model_pieces, setup.followed_slots),
             links=W,
             messages=H + W if kernels.addressed else H,
             blocks=blocks,

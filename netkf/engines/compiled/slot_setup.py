@@ -295,7 +295,7 @@ class SlotSetup:
         self.model_pieces: list[Sequence[Any]] = [
             [_enlarged(model, self.width) for model in piece] for piece in pieces
         ]
-        self.model_slots = scenario.model_slots
+        self.model_slots, self.followed_slots = scenario.model_slots, scenario.followed_slots
         self.period = scenario.slot_plant.period
         starts = [scenario.initial_estimate(info.node) for info in infos]
         # Filters of the same states believe one F and Q at a time.

@@ -16,6 +16,7 @@ import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.kernels.run import ClockRun
+from netkf.algorithms.models import changing_models
 from netkf.algorithms.records import Kernels, make_records, record_class
 from netkf.core.errors import TheoryError
 from netkf.engines.compiled.clock_filters import ClockFilters
@@ -188,7 +189,7 @@ class LinearVerbs:
             scenario.node_filter,
             [(np.zeros(self.n), root) for root in start.root],
             scenario.node_infos[:1] if pooled else scenario.node_infos,
-            scenario.model_pieces[0],
+            changing_models(scenario.model_pieces, scenario.followed_changes.tolist()),
             links=len(self.run.sender),
             messages=messages,
         )
