@@ -107,6 +107,7 @@ from netkf.network.scheduled import Hopping, ScheduledLoss
 from netkf.plants.blocks import Block
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
+from netkf.plants.faults import Biased, Drifting, Fault, Outliers, Stuck
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant
 from netkf.plants.maps import NonlinearPlant
@@ -158,6 +159,7 @@ __all__ = [
     "Belief",
     "BeliefPropagation",
     "Bernoulli",
+    "Biased",
     "Block",
     "BlockBeliefPropagation",
     "BlockCrossCovariances",
@@ -183,6 +185,7 @@ __all__ = [
     "DiffusionFilter",
     "DiffusionKalman",
     "DistanceLoss",
+    "Drifting",
     "DutyCycle",
     "EdgelistGraph",
     "Edges",
@@ -191,6 +194,7 @@ __all__ = [
     "EventTriggeredCi",
     "Exchange",
     "ExponentialDelay",
+    "Fault",
     "Filter",
     "Filtering",
     "Gate",
@@ -236,6 +240,7 @@ __all__ = [
     "OnReadings",
     "OneBit",
     "OptimisedIntersection",
+    "Outliers",
     "PairReading",
     "Partition",
     "PathGraph",
@@ -276,6 +281,7 @@ __all__ = [
     "Star",
     "State",
     "StochasticTrigger",
+    "Stuck",
     "Time",
     "Timing",
     "Topology",

@@ -474,7 +474,7 @@ def _require_laws(scenario: Scenario) -> None:
     find_checks(scenario)
     if scenario.network.lives:
         raise TheoryError(f"{LIVES}, so nothing is promised; {CONSISTENCY}")
-    if scenario.network.clocks:
+    if scenario.network.clocks or scenario.faults:
         evidence = scenario.departures[0][1]
         raise TheoryError(f"{evidence}, so nothing is promised; {CONSISTENCY}")
     if not nodes_with_law(scenario).any():

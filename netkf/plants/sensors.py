@@ -25,6 +25,7 @@ from netkf.core.fields import (
     Component,
     definite_covariance,
     field,
+    instance_of,
     list_of,
     matrix,
     node_id,
@@ -35,6 +36,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.lanes import ONE, Lanes, load, root_of, spread, store
 from netkf.linalg.portable import cholesky
 from netkf.linalg.structs import Size
+from netkf.plants.faults import Fault
 from netkf.plants.linear import Blocks, Readings, SlotReadings
 from netkf.plants.paths import DiffusionPath
 from netkf.plants.readings import ReadingTable
@@ -45,7 +47,9 @@ ROOT_3 = math.sqrt(3.0)
 
 @dataclass(frozen=True, eq=False)
 class Sensor(Component):
-    """The contract of sensors: each of ``nodes`` has one, with independent noise."""
+    """The contract of sensors: each of ``nodes`` has one, with independent noise; ``fault`` says
+    when and how it is bad, which filters do not know.
+    """
 
     is_random: ClassVar[bool] = True
     """True if runs draw the readings from H and R; else H and R are what filters assume of readings
@@ -53,6 +57,7 @@ class Sensor(Component):
     """
 
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"))
+    fault: Fault | None = field(instance_of(Fault), default=None)
 
     linear: ClassVar[bool] = True
     """Whether readings are linear in the state."""

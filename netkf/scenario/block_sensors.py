@@ -102,7 +102,8 @@ def _stacked(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
 
 def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
     if isinstance(sensor, RELATIVE):
-        yield from sensor.lowered(layout, list(_pairs(sensor, layout, topology)))
+        for one in sensor.lowered(layout, list(_pairs(sensor, layout, topology))):
+            yield one if sensor.fault is None else dataclasses.replace(one, fault=sensor.fault)
         return
     name = _name_of(sensor, layout)
     if name is None:

@@ -22,6 +22,7 @@ from netkf.plants.maps import NonlinearPlant
 from netkf.plants.regressors import RegressorSensor
 from netkf.scenario.compatibility import check_activation, check_time, filter_name
 from netkf.scenario.derived import DerivedScenario
+from netkf.scenario.model import takes_samples
 from netkf.scenario.positions import check_positions
 from netkf.scenario.preconditions import check_preconditions
 from netkf.scenario.records import check_records
@@ -267,6 +268,28 @@ def _check_clocks(scenario: DerivedScenario) -> None:
         raise ScenarioError("network.clocks", why, sorted(owners), "remove it")
 
 
+def _check_faults(scenario: DerivedScenario) -> None:
+    for k, sensor in enumerate(scenario.sensors):
+        fault, key = sensor.fault, f"{scenario.sensor_key(k)}.fault"
+        if fault is None:
+            continue
+        declared = scenario.declared_sensors[scenario.sensor_entries[k]]
+        for place, node in enumerate(fault.nodes or ()):
+            if node not in declared.nodes:
+                rule = "must be a node of this sensor"
+                raise ScenarioError(f"{key}.nodes[{place}]", rule, node, "remove it")
+        if sensor.record is not None or not (scenario.slotted or takes_samples(sensor)):
+            rule = "belongs to sensors whose readings are drawn, in slots or by sampling"
+            remedy = "change the table, or write sampling = { ... }"
+            raise ScenarioError(key, rule, kind_name(fault, "fault"), remedy)
+        p = len(scenario.noise_covariance(k, believed=False))
+        for name in ("value", "size", "rate"):
+            value = getattr(fault, name, None)
+            if isinstance(value, np.ndarray) and len(value) != p:
+                rule = f"must have a number for each of {p} values"
+                raise ScenarioError(f"{key}.{name}", rule, value, "correct it")
+
+
 def _check_quantisation(scenario: DerivedScenario) -> None:
     if scenario.network.quantise is None:
         return
@@ -298,6 +321,7 @@ def _check_network(scenario: DerivedScenario) -> None:
     _check_lives(scenario)
     _check_clocks(scenario)
     _check_quantisation(scenario)
+    _check_faults(scenario)
     if not node_filter.timing.talks:
         return
     name = filter_name(scenario)

@@ -39,6 +39,7 @@ from netkf.plants.changes import dividing_period
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion, default_sensing_period
 from netkf.plants.driven import InputResponses, MovedReadings, driven
+from netkf.plants.faults import FaultyReadings
 from netkf.plants.linear import LinearPlant, Readings
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.response import Difference, FlowResponse, Response, SlotResponse
@@ -738,7 +739,12 @@ class DerivedScenario(ScenarioModel):
 
     def sample_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Samples:
         """Return the samples of one sensor of a node in one run in continuous time."""
-        path = sample_path(self, streams, node, placed_sensor)
+        path: Any = sample_path(self, streams, node, placed_sensor)
+        fault = self.fault_of(node, placed_sensor)
+        if fault is not None:
+            taken = times_of_sensor(self, streams, node, placed_sensor).tolist()
+            random = streams.generator("fault", node, placed_sensor.ordinal)
+            path = FaultyReadings(path, fault, random, taken.__getitem__)
         believed = self._moves_readings(self.sensors[placed_sensor.entry])
         if believed is None:
             return path
@@ -749,18 +755,23 @@ class DerivedScenario(ScenarioModel):
         """Return the readings of one sensor of a node in one run in slots."""
         sensor: Sensor = self.located_sensors[placed_sensor.entry]
         period = self.slot_plant.period
-        path = sensor.slot_path(
+        path: Any = sensor.slot_path(
             node, period, lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
         )
+        fault = self.fault_of(node, placed_sensor)
+        if fault is not None:
+            random = streams.generator("fault", node, placed_sensor.ordinal)
+            path = FaultyReadings(path, fault, random, self.slot_plant.slot_time)
         believed = self._moves_readings(sensor)
         return path if believed is None else MovedReadings(path, believed)
 
     def _moves_readings(self, sensor: Sensor) -> Response | None:
         """Return the response that states are counted from, if readings of the sensor depend on
-        it: drawn linear ones are of the local state.
+        it: drawn linear ones of healthy sensors are of the local state.
         """
         responses = self.input_responses
-        if responses is None or (sensor.linear and sensor.is_random):
+        drawn = sensor.linear and sensor.is_random and sensor.fault is None
+        if responses is None or drawn:
             return None
         return responses.believed
 

@@ -51,6 +51,7 @@ from netkf.network.positions import Positions, PositionTable
 from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
 from netkf.plants.blocks import Block, Layout, stack
+from netkf.plants.faults import Fault
 from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
@@ -61,8 +62,8 @@ from netkf.scenario.positions import placed_nodes, positions_of, table_of_positi
 from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
 
-EVERY_READING = "every reading is used"
-"""An assumption of all filters, see ``ScenarioModel.departures``."""
+EVERY_READING, HEALTHY = "every reading is used", "all sensors are healthy"
+"""Assumptions of all filters, see ``ScenarioModel.departures``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,7 +383,9 @@ class ScenarioModel(Component):
 
     @cached_property
     def departures(self) -> tuple[tuple[str, str], ...]:
-        """What filters assume, and why it is not so: clocks, messages and gates."""
+        """What filters assume, and why it is not so: clocks, sensors, messages and
+        gates.
+        """
         found = []
         if self.network.clocks:
             evidence = (
@@ -390,6 +393,13 @@ class ScenarioModel(Component):
                 "time, and P does not count it"
             )
             found.append(("clocks of nodes are right", evidence))
+        if self.faults:
+            nodes = ", ".join(map(str, list(self.faults)[:5])) + ", ..." * (len(self.faults) > 5)
+            evidence = (
+                f"sensors of node {nodes} are bad for a time (sensors.fault): errors have a part "
+                "that neither filters nor P know of"
+            )
+            found.append((HEALTHY, evidence))
         if self.network.quantise is not None:
             evidence = (
                 "each number of a message has an error of variance "
@@ -534,6 +544,21 @@ class ScenarioModel(Component):
         if isinstance(believed_R, tuple):
             return believed_R[self.sensor_entries[entry]]
         return believed_R
+
+    def fault_of(self, node: int, placed_sensor: PlacedSensor) -> Fault | None:
+        """Return the fault that a sensor of ``node`` (id) has at some time, or None."""
+        fault: Fault | None = self.sensors[placed_sensor.entry].fault
+        has_it = fault is not None and (fault.nodes is None or node in fault.nodes)
+        return fault if has_it else None
+
+    @cached_property
+    def faults(self) -> dict[int, tuple[tuple[PlacedSensor, Fault], ...]]:
+        """The sensors with a fault, by node (id)."""
+        found = {
+            node: tuple((p, f) for p in placed for f in [self.fault_of(node, p)] if f is not None)
+            for node, placed in self.placed_sensors.items()
+        }
+        return {node: bad for node, bad in found.items() if bad}
 
     def transmission(self, link: Link) -> Transmission:
         """Return what is known beforehand of message 0 on a directed link: its entry in the graph's

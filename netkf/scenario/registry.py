@@ -24,6 +24,7 @@ from netkf.network import (
     recorded,
     scheduled,
 )
+from netkf.plants import faults
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
@@ -55,6 +56,7 @@ FAMILIES: dict[str, type[Component]] = {
     "input": Input,
     "sensor": Sensor,
     "sampling": Clock,
+    "fault": faults.Fault,
     "graph": graphs.Graph,
     "activation": clocks.LinkClock,
     "life": lives.Life,
@@ -97,6 +99,12 @@ KINDS: dict[str, dict[str, type[Component]]] = {
         "poisson": clocks.Poisson,
         "renewal": clocks.Renewal,
         "recorded": RecordedSampling,
+    },
+    "fault": {
+        "stuck": faults.Stuck,
+        "biased": faults.Biased,
+        "drifting": faults.Drifting,
+        "outliers": faults.Outliers,
     },
     "graph": {
         "cycle": graphs.Cycle,

@@ -28,6 +28,7 @@ from netkf.plants.diffusion import Diffusion
 from netkf.plants.linear import LinearPlant
 from netkf.plants.maps import NonlinearPlant
 from netkf.plants.plant import Plant
+from netkf.plants.sensors import Sensor
 from netkf.scenario.imports import offered_kinds
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
 from netkf.scenario.registry import KINDS, list_kinds
@@ -49,6 +50,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (ScenarioModel, "network"): {"$ref": "#/$defs/network"},
     (ScenarioModel, "filter"): {"$ref": "#/$defs/filter"},
     (ScenarioModel, "time"): {"$ref": "#/$defs/time"},
+    (Sensor, "fault"): {"$ref": "#/$defs/fault"},
     (Network, "graph"): {"$ref": "#/$defs/graph"},
     (Network, "activation"): {"$ref": "#/$defs/activation"},
     (Network, "channel"): {"$ref": "#/$defs/channel"},
@@ -71,6 +73,7 @@ FAMILIES = {
     "input": ("input",),
     "sensor": ("sensor",),
     "sampling": ("sampling",),
+    "fault": ("fault",),
     "graph": ("graph",),
     "activation": ("activation", "slot activation"),
     "life": ("life",),

@@ -42,6 +42,7 @@ SECTIONS = {
     "input": "plant.input.kind",
     "sensor": "sensors.kind",
     "sampling": "sensors.sampling.kind",
+    "fault": "sensors.fault.kind",
     "graph": "network.graph.kind",
     "activation": "network.activation.kind in continuous time",
     "slot activation": "network.activation.kind in slots",

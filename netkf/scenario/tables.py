@@ -345,7 +345,8 @@ def _build_list(key: str, build: Callable[[Any], Any], value: Any) -> tuple[Any,
 
 
 def _build_sensor(origin: Origin, value: Any) -> Any:
-    table = _build_inner(_as_dict(value), {"sampling": partial(_build_part, "sampling", origin)})
+    parts = {key: partial(_build_part, key, origin) for key in ("sampling", "fault")}
+    table = _build_inner(_as_dict(value), parts)
     return _build_component("sensor", origin, table, default_kind="linear")
 
 

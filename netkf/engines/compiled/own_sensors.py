@@ -21,8 +21,8 @@ METHODS = ("path", "slot_path", "samples", "matrix_of", "varying")
 
 
 def is_own(sensor: Sensor) -> bool:
-    """Return True if a sensor reads in a way of its own: kernels do not know it."""
-    return not any(
+    """Return True if a sensor reads in a way of its own, or is bad: kernels do not know it."""
+    return sensor.fault is not None or not any(
         isinstance(sensor, base)
         and all(getattr(type(sensor), m, None) is getattr(base, m, None) for m in METHODS)
         for base in BUILT_IN
@@ -35,6 +35,8 @@ def reads_in_python(sensor: Sensor, slotted: bool) -> bool:
     """
     if isinstance(sensor, NonlinearSensor):
         name = "slot_path" if slotted else "samples"
+        if slotted and sensor.fault is not None:
+            return False
         return getattr(type(sensor), name) is getattr(NonlinearSensor, name)
     return sensor.linear and (slotted or getattr(sensor, "sampling", None) is not None)
 
