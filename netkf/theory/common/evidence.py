@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from netkf.core.errors import TheoryError
 from netkf.network.recorded import RecordedDelay, RecordedLoss
-from netkf.scenario.model import EVERY_READING
+from netkf.scenario.model import EVERY_READING, HEALTHY
 from netkf.scenario.scenario import Scenario
+from netkf.theory.common.faults import fault_evidence
 
 AssumptionRow = tuple[str, str, bool | None, str]
 """assumption, source, holds (None: not known), evidence."""
@@ -30,7 +31,7 @@ def nonlinear_rows(scenario: Scenario) -> list[AssumptionRow]:
         for part, is_linear in parts.items()
         if not is_linear
     ]
-    details = {EVERY_READING: _refused_spread}
+    details = {EVERY_READING: _refused_spread, HEALTHY: fault_evidence}
     return rows + [
         (name, "all papers", False, evidence + (details[name](scenario) if name in details else ""))
         for name, evidence in scenario.departures

@@ -1,0 +1,166 @@
+"""Whether a gate can notice a bad sensor: laws of innovations of a sensor with a stated fault.
+
+The innovation of a consistent filter is normal with covariance S = H P H' + R. If readings are off
+by b, and so the innovation by z, its z' S^-1 z is noncentral chi-square with that of the mean. A
+filter of this sensor alone knows least and follows the fault most; one that knows the state has
+S = R and never follows. If no other sensor is bad, the filter of a node lies between the two.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.stats
+
+from netkf.algorithms.gates import Gate
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.portable import noise_root
+from netkf.network.clocks import Periodic
+from netkf.plants.faults import Fault, Outliers
+from netkf.plants.transitions import Transitions
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.scenario import Scenario
+
+MAX_READINGS = 100_000
+"""Readings of a bad time that are looked at."""
+
+
+class Refusals(NamedTuple):
+    """Probabilities (K,) that a gate refuses readings at ``times`` (K,) of a bad sensor, while it
+    has refused none before: of the filter that hears nobody, nan if that has no steady state, and
+    of one that knows the state.
+    """
+
+    times: FloatArray
+    alone: FloatArray
+    knowing: FloatArray
+
+
+class _Alone(NamedTuple):
+    """The Kalman filter of one sensor in its steady state: transition F, gain K, H and S."""
+
+    F: FloatArray
+    K: FloatArray
+    H: FloatArray
+    S: FloatArray
+
+
+def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | None:
+    """Return how likely the gate refuses each reading of a bad sensor; None if the fault states no
+    law, or times or matrices of readings are not fixed beforehand.
+    """
+    gate, fault = scenario.filter.gate, scenario.fault_of(node, placed)
+    sensor = scenario.sensors[placed.entry]
+    step = _step(scenario, placed)
+    if gate is None or fault is None or step is None or sensor.varying or not sensor.linear:
+        return None
+    R = scenario.noise_covariance(placed.entry, believed=True)
+    last = scenario.horizon if fault.until is None else min(fault.until, scenario.horizon)
+    # The first reading of a sensor, in slots too where most filters have none in slot 0.
+    first = max(int(np.ceil(fault.since / step - 1e-9)), 1)
+    times = step * np.arange(first, min(int(last / step + 1e-9), first + MAX_READINGS) + 1)
+    alone = _alone(scenario, sensor.matrix_of(scenario.plant.n), R, step)
+    if isinstance(fault, Outliers):
+        values = [np.nan if alone is None else _of_outliers(gate, fault, alone.S)]
+        values.append(_of_outliers(gate, fault, R))
+        return Refusals(times[:1], np.array(values[:1]), np.array(values[1:]))
+    if not len(times) or fault.bias(times[0]) is None:
+        return None
+    biases = np.array([np.broadcast_to(fault.bias(time), len(R)) for time in times])  # type: ignore[arg-type]
+    knowing = refused_with_bias(gate, biases, R)
+    if alone is None:
+        return Refusals(times, np.full(len(times), np.nan), knowing)
+    return Refusals(
+        times, refused_with_bias(gate, innovation_biases(alone, biases), alone.S), knowing
+    )
+
+
+def innovation_biases(alone: _Alone, biases: FloatArray) -> FloatArray:
+    """Return by how much the innovations (K, p) are off of a filter that uses readings which are
+    off by ``biases`` (K, p): ``z = b - H e`` with ``e <- F (e + K z)``.
+    """
+    found, e = [], np.zeros(len(alone.F))
+    for bias in biases:
+        found.append(bias - alone.H @ e)
+        e = alone.F @ (e + alone.K @ found[-1])
+    return np.array(found)
+
+
+def refused_with_bias(gate: Gate, biases: FloatArray, S: FloatArray) -> FloatArray:
+    """Return the probabilities (K,) that innovations of covariance S (p, p) and means ``biases``
+    (K, p) are refused: the tail of the noncentral chi-square law.
+    """
+    noncentral = np.einsum("ki,ki->k", biases, np.linalg.solve(S, biases.T).T)
+    return np.asarray(scipy.stats.ncx2.sf(gate.limit(len(S)), len(S), noncentral))
+
+
+def _of_outliers(gate: Gate, fault: Outliers, S: FloatArray) -> float:
+    """Return the least probability that an outlier is refused, exact for one value."""
+    # z is normal with covariance S + sigma^2; its least spread in units of S.
+    least = 1.0 + fault.sigma**2 / np.linalg.eigvalsh(S)[-1]
+    return float(scipy.stats.chi2.sf(gate.limit(len(S)) / least, len(S)))
+
+
+def _step(scenario: Scenario, placed: PlacedSensor) -> float | None:
+    """Return the seconds between readings of a sensor, None if they differ."""
+    if len(scenario.plant.changes) or not scenario.plant.linear:
+        return None
+    if scenario.slotted:
+        return float(scenario.slot_plant.period)
+    clock = getattr(scenario.sensors[placed.entry], "sampling", None)
+    if isinstance(clock, Periodic) and not clock.jitter and not clock.phase:
+        return float(clock.period)
+    return None
+
+
+def _alone(scenario: Scenario, H: FloatArray, R: FloatArray, step: float) -> _Alone | None:
+    if scenario.slotted:
+        F, Q = scenario.slot_belief
+    else:
+        A, BB = scenario.belief
+        laws = Transitions(A, noise_root(BB)).laws(np.array([step]))
+        F, Q = laws[0][0], laws[1][0] @ laws[1][0].T
+    try:
+        P = scipy.linalg.solve_discrete_are(F.T, H.T, Q, R)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    S = H @ P @ H.T + R
+    return _Alone(F, P @ H.T @ np.linalg.inv(S), H, S)
+
+
+def fault_evidence(scenario: Scenario) -> str:
+    """Return what a gate makes of the faults of a scenario, as the end of a sentence."""
+    gate = scenario.filter.gate
+    if gate is None:
+        return "; no gate refuses their readings (filter.gate)"
+    told: dict[str, None] = {}
+    for node, bad in scenario.faults.items():
+        for placed, fault in bad:
+            told.setdefault(_about(fault, refusals(scenario, node, placed), gate))
+    return "".join(f"; {one}" for one in told)
+
+
+def _about(fault: Fault, found: Refusals | None, gate: Gate) -> str:
+    name = type(fault).__name__.lower()
+    if found is None:
+        return f"how often the gate refuses {name} readings is not known beforehand"
+    first, last = (
+        f"{'0' if np.isnan(found.alone[k]) else f'{found.alone[k]:.3g}'} to {found.knowing[k]:.3g}"
+        for k in (0, -1)
+    )
+    if isinstance(fault, Outliers):
+        return f"the gate refuses an outlier with probability {first}"
+    if found.knowing.max() <= 2.0 * (1.0 - gate.probability):
+        return (
+            f"the gate can never tell {name} readings from healthy ones: it refuses them with "
+            f"probability {found.knowing.max():.3g} at most"
+        )
+    times = [found.times[p >= 0.5] for p in (found.knowing, found.alone)]
+    soonest, latest = (f"from {t[0]:g} s on" if len(t) else "never" for t in times)
+    return (
+        f"the gate refuses the first {name} reading with probability {first} and, if none before, "
+        f"the last with {last} (a node that hears nobody, one that knows the state); with at least "
+        f"1/2 {latest} and {soonest}"
+    )
