@@ -82,6 +82,7 @@ TABLES = {
     "input": "[plant.input]",
     "sensor": "[[sensors]]",
     "sampling": "sensors.sampling",
+    "fault": "sensors.fault",
     "graph": "network.graph",
     "activation": "network.activation",
     "slot activation": "network.activation",

@@ -21,6 +21,7 @@ HEADINGS = {
     "input": "plant.input.kind",
     "sensor": "sensors.kind",
     "sampling": "sensors.sampling.kind",
+    "fault": "sensors.fault.kind",
     "graph": "network.graph.kind",
     "activation": "network.activation.kind in continuous time",
     "life": "network.lives.kind",

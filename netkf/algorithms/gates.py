@@ -18,7 +18,7 @@ NEVER = 1e300
 
 @dataclass(frozen=True, eq=False)
 class Gate(Component):
-    """A reading of p numbers is refused if its normalised innovation squared z' S^-1 z, with
+    """A reading of p numbers, of the node or in a message, is refused if its normalised innovation squared z' S^-1 z, with
     S = H P H' + R, is beyond the quantile ``probability`` of the chi-square law with p degrees of
     freedom.
 

@@ -133,6 +133,11 @@ class Kernels:
         return not (self.decides if self.depends_on_data is None else self.depends_on_data)
 
     @property
+    def sends_whole_readings(self) -> bool:
+        """True if messages have readings as they were taken, and not bits that follow from them."""
+        return self.sends_readings and self.shift_payload is not standard.absorb
+
+    @property
     def is_convex(self) -> bool:
         """True if nodes are Kalman filters that form convex combinations, and nothing else."""
         return replace(self, unrolled=False) == Kernels(absorb=combine_convex)

@@ -87,6 +87,10 @@ class Payload:
         """Return a payload with these ``fields``, of the axes of those here."""
         return Payload(fields, self.reading, self.sender)
 
+    def with_reading(self, reading: Whitened) -> Payload:
+        """Return a payload with another reading."""
+        return Payload(self.fields, reading, self.sender)
+
     def _replace(self, **fields: Any) -> Payload:
         """Return a payload with other values of some fields, as of a NamedTuple."""
         arrays = {name: np.asarray(value)[None, ..., None] for name, value in fields.items()}

@@ -162,3 +162,54 @@ def write(scenario):
     path = scenario._folder / "again.toml"
     path.write_text(to_toml(as_table(scenario)))
     return path
+
+
+@pytest.mark.parametrize("then", ["ignore", "inflate"])
+def test_readings_of_others_pass_the_gate_too(scenario_of, tmp_path, then):
+    """A node hears the reading of the other in the same slot, after it has used its own, with the R
+    that the other's gate has given to it.
+    """
+    rng = np.random.default_rng(8)
+    y = rng.normal(size=(40, 2)) * 2.0
+    rows = [f"{k}.0,{i},{float(y[k, i])!r}" for k in range(40) for i in (0, 1)]
+    (tmp_path / "y.csv").write_text("\n".join(["t,node,y0", *rows]) + "\n")
+    start, network = SLOTS.index("[[sensors]]"), SLOTS.index("[network]")
+    sensor = '[[sensors]]\nkind = "recorded"\npath = "y.csv"\nH = [[1.0, 0.5]]\nR = [[0.5]]\n'
+    text = SLOTS[:start] + sensor + SLOTS[network:]
+    text = text.replace('"local"', '"intermittent"').replace(
+        "[filter]", 'activation = {{ kind = "broadcast" }}\n[filter]'
+    )
+    run = netkf.simulate(scenario_of(text, f'probability = 0.9, then = "{then}"', 40.0), seed=1)
+    F, Q = np.array([[0.9, 0.3], [0.0, 0.8]]), np.diag([0.2, 0.3])
+    H, limit = np.array([[1.0, 0.5]]), scipy.stats.chi2.ppf(0.9, 1)
+    nodes, found, refused = [(np.zeros(2), np.eye(2))] * 2, [], []
+
+    def use(k, i, j, R):
+        """Let node i use the reading of node j, sent with R; return the R it is used with."""
+        (x, P), z = nodes[i], (y[k, j] - H @ nodes[i][0])[0]
+        expected = (H @ P @ H.T)[0, 0]
+        if z * z / (expected + R) > limit:
+            refused.append((k, i, j))
+            # The R with which z^2 / S is the limit.
+            R = z * z / limit - expected if then == "inflate" else np.inf
+        if np.isfinite(R):
+            K = P @ H.T / (expected + R)
+            nodes[i] = x + K[:, 0] * z, P - K @ H @ P
+        return R
+
+    for k in range(40):
+        found.append([*nodes])
+        sent = [use(k, i, i, 0.5) for i in (0, 1)]
+        for i in (0, 1):
+            if np.isfinite(sent[1 - i]):
+                use(k, i, 1 - i, sent[1 - i])
+        nodes = [(F @ x, F @ P @ F.T + Q) for x, P in nodes]
+    for k, both in enumerate(found):
+        for i, (x, P) in enumerate(both):
+            np.testing.assert_allclose(run.xhat[k, i], x, rtol=1e-7, atol=1e-9)
+            np.testing.assert_allclose(run.P[k, i], P, rtol=1e-7, atol=1e-9)
+    rows = run.log[run.log["kind"] == CODES["refuse"]]
+    told = [(int(row["t"]), row["node"], row["peer"] if row["peer"] >= 0 else row["node"])
+            for row in rows]  # fmt: skip
+    assert sorted(told) == sorted(refused)
+    assert any(i != j for _, i, j in refused)

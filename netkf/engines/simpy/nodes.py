@@ -23,6 +23,7 @@ from netkf.algorithms.gates import Gate
 from netkf.algorithms.kernels.maps import Spread
 from netkf.algorithms.kernels.run import interval_end
 from netkf.algorithms.models import ChangingFlowModel, MapModel, RateModel, first_root
+from netkf.algorithms.single import Payload
 from netkf.algorithms.translation import Common, state_before
 from netkf.core.places import Place
 from netkf.engines.base import LONGER, MIN_GAP_SHARE, Rank
@@ -227,9 +228,11 @@ class Node:
         else:
             envelopes.append(envelope)
 
-    def take_messages(self, exchange: Exchange) -> tuple[list[Envelope], list[Message]]:
+    def take_messages(
+        self, exchange: Exchange, time: float, recorder: Recorder
+    ) -> tuple[list[Envelope], list[Message]]:
         """Empty the inbox; return its envelopes by sender, and the messages that filters take in
-        this ``exchange``.
+        this ``exchange``; the ``recorder`` takes what the gate refuses at this ``time``.
         """
         # A floating-point sum must not depend on the order of arrival.
         envelopes = [envelope for peer in sorted(self.inbox) for envelope in self.inbox[peer]]
@@ -239,7 +242,24 @@ class Node:
             # What it would say itself: a filter's verbs leave its state as it is.
             own = self.algorithm.emit(self.state, exchange)[1]
         messages = [Message(e.sender, e.weight, self._translated(e, own), e.age) for e in envelopes]
+        if self._gate is not None:
+            messages = [
+                m._replace(payload=self._gated_payload(m, time, recorder)) for m in messages
+            ]
         return envelopes, messages
+
+    def _gated_payload(self, message: Message, time: float, recorder: Recorder) -> Any:
+        """Return a payload with its reading as the gate lets it pass. Estimates pass, because their
+        errors are correlated in an unknown way with those of the node, and readings of the past.
+        """
+        payload, reading = message.payload, getattr(message.payload, "reading", None)
+        whole = isinstance(payload, Payload) and payload.sender.kernels.sends_whole_readings
+        if not whole or reading is None or message.age > 0.0:
+            return payload
+        # Whitened: the covariance of its noise is 1.
+        sample = reading.y, reading.H, np.eye(len(reading.y))
+        scale = self._gate_factor(sample, time, message.sender, recorder) ** -0.5
+        return payload.with_reading(reading._replace(y=scale * reading.y, H=scale * reading.H))
 
     def _translated(self, envelope: Envelope, own: Any) -> Any:
         common = None if self.view is None else self.view.common.get(envelope.sender)
@@ -275,19 +295,23 @@ class Node:
         """Return the linearised samples of this ``time`` that the gate lets pass, with the R that
         it gives them, and record those it refuses; entries of a sample that are nan do not count.
         """
-        if self._gate is None or not samples:
+        if self._gate is None:
             return samples
+        factors = [self._gate_factor(sample, time, -1, recorder) for sample in samples]
+        pairs = zip(samples, factors, strict=True)
+        return [(y, H, factor * R) for (y, H, R), factor in pairs if np.isfinite(factor)]
+
+    def _gate_factor(self, sample: Sample, time: float, peer: int, recorder: Recorder) -> float:
+        """Return by what the gate multiplies R of a sample of ``peer`` (id, -1: its own)."""
         xhat, P = self.algorithm.estimate(self.state)
-        passed = []
-        for y, H, R in samples:
-            present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
-            z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
-            factor = self._gate.factor(z, J @ P @ J.T, C)
-            if factor != 1.0:
-                recorder.append((time, REFUSE, self.node, -1, -1, -1, NAN))
-            if np.isfinite(factor):
-                passed.append((y, H, factor * R))
-        return passed
+        y, H, R = sample
+        present = np.isfinite(y) if len(y) == len(H) else np.zeros(len(H), dtype=bool)
+        z, J, C = (y - H @ xhat)[present], H[present], R[np.ix_(present, present)]
+        assert self._gate is not None
+        factor = self._gate.factor(z, J @ P @ J.T, C)
+        if factor != 1.0:
+            recorder.append((time, REFUSE, self.node, peer, -1, -1, NAN))
+        return factor
 
     def shift(self, offset: FloatArray) -> None:
         """Add ``offset`` (n,) to the estimate, after the origin of the coordinates has moved."""
@@ -428,7 +452,7 @@ class ClockedNode(Node):
         time = self._timeline.now
         self.predict_to(time)
         exchange = Exchange(time=self._now)
-        messages = self.take_messages(exchange)[1]
+        messages = self.take_messages(exchange, time, self._recorder)[1]
         self.state = self.algorithm.absorb(self.state, messages, exchange)
         oldest = max(message.age for message in messages)
         self._recorder.append((time, ABSORB, self.node, -1, -1, -1, oldest))

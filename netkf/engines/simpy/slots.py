@@ -243,7 +243,7 @@ class SlotNode(Node):
     def _close(self, stage: Stage, slot: int) -> None:
         append, now, phase = self._recorder.append, stage.time, stage.phase
         exchange = Exchange(now, phase, stage.step, slot)
-        envelopes, messages = self.take_messages(exchange)
+        envelopes, messages = self.take_messages(exchange, now, self._recorder)
         # From now on a message of this exchange is late.
         self._open = -1
         self.state = self.algorithm.absorb(self.state, messages, exchange)
