@@ -18,9 +18,9 @@ NEVER = 1e300
 
 @dataclass(frozen=True, eq=False)
 class Gate(Component):
-    """A reading of p numbers, of the node or in a message, is refused if its normalised innovation squared z' S^-1 z, with
-    S = H P H' + R, is beyond the quantile ``probability`` of the chi-square law with p degrees of
-    freedom.
+    """A reading of p numbers, of the node or in a message, is refused if its normalised innovation
+    squared z' S^-1 z, with S = H P H' + R, is beyond the quantile ``probability`` of the chi-square
+    law with p degrees of freedom.
 
     probability  that a consistent filter takes a healthy reading
     then         "ignore": a refused reading is not used; "inflate": its R is multiplied so that it
