@@ -739,31 +739,40 @@ class DerivedScenario(ScenarioModel):
 
     def sample_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Samples:
         """Return the samples of one sensor of a node in one run in continuous time."""
-        path: Any = sample_path(self, streams, node, placed_sensor)
-        fault = self.fault_of(node, placed_sensor)
-        if fault is not None:
-            taken = times_of_sensor(self, streams, node, placed_sensor).tolist()
-            random = streams.generator("fault", node, placed_sensor.ordinal)
-            path = FaultyReadings(path, fault, random, taken.__getitem__)
-        believed = self._moves_readings(self.sensors[placed_sensor.entry])
-        if believed is None:
+        path: Samples = sample_path(self, streams, node, placed_sensor)
+        sensor = self.sensors[placed_sensor.entry]
+        believed = self._moves_readings(sensor)
+        if believed is None and sensor.fault is None:
             return path
         times = times_of_sensor(self, streams, node, placed_sensor)
-        return MovedReadings(path, believed, times)
+        path = self._given(path, streams, node, placed_sensor, times.tolist().__getitem__)
+        return path if believed is None else MovedReadings(path, believed, times)
 
     def slot_path(self, streams: Streams, node: int, placed_sensor: PlacedSensor) -> Readings:
         """Return the readings of one sensor of a node in one run in slots."""
         sensor: Sensor = self.located_sensors[placed_sensor.entry]
         period = self.slot_plant.period
-        path: Any = sensor.slot_path(
+        path: Readings = sensor.slot_path(
             node, period, lambda purpose: streams.generator(purpose, node, placed_sensor.ordinal)
         )
-        fault = self.fault_of(node, placed_sensor)
-        if fault is not None:
-            random = streams.generator("fault", node, placed_sensor.ordinal)
-            path = FaultyReadings(path, fault, random, self.slot_plant.slot_time)
+        path = self._given(path, streams, node, placed_sensor, self.slot_plant.slot_time)
         believed = self._moves_readings(sensor)
         return path if believed is None else MovedReadings(path, believed)
+
+    def _given(
+        self,
+        path: Any,
+        streams: Streams,
+        node: int,
+        placed_sensor: PlacedSensor,
+        when: Callable[[int], float],
+    ) -> Any:
+        """Return what a sensor gives, bad or not, whose healthy readings are ``path``."""
+        fault = self.fault_of(node, placed_sensor)
+        if fault is None:
+            return path
+        random = streams.generator("fault", node, placed_sensor.ordinal)
+        return FaultyReadings(path, fault, random, when)
 
     def _moves_readings(self, sensor: Sensor) -> Response | None:
         """Return the response that states are counted from, if readings of the sensor depend on

@@ -57,24 +57,26 @@ def refusals(scenario: Scenario, node: int, placed: PlacedSensor) -> Refusals | 
     if gate is None or fault is None or step is None or sensor.varying or not sensor.linear:
         return None
     R = scenario.noise_covariance(placed.entry, believed=True)
-    last = scenario.horizon if fault.until is None else min(fault.until, scenario.horizon)
     # The first reading of a sensor, in slots too where most filters have none in slot 0.
     first = max(int(np.ceil(fault.since / step - 1e-9)), 1)
-    times = step * np.arange(first, min(int(last / step + 1e-9), first + MAX_READINGS) + 1)
+    count = min(int(scenario.horizon / step) + 1, MAX_READINGS)
+    times = np.asarray(step * np.arange(first, first + count), dtype=np.float64)
+    times = times[[fault.holds(time) and time < scenario.horizon for time in times.tolist()]]
     alone = _alone(scenario, sensor.matrix_of(scenario.plant.n), R, step)
     if isinstance(fault, Outliers):
         values = [np.nan if alone is None else _of_outliers(gate, fault, alone.S)]
         values.append(_of_outliers(gate, fault, R))
         return Refusals(times[:1], np.array(values[:1]), np.array(values[1:]))
-    if not len(times) or fault.bias(times[0]) is None:
+    stated = [fault.bias(time) for time in times.tolist()]
+    known = [np.zeros(len(R)) + bias for bias in stated if bias is not None]
+    if not known or len(known) < len(stated):
         return None
-    biases = np.array([np.broadcast_to(fault.bias(time), len(R)) for time in times])  # type: ignore[arg-type]
+    biases = np.array(known)
     knowing = refused_with_bias(gate, biases, R)
     if alone is None:
         return Refusals(times, np.full(len(times), np.nan), knowing)
-    return Refusals(
-        times, refused_with_bias(gate, innovation_biases(alone, biases), alone.S), knowing
-    )
+    off = innovation_biases(alone, biases)
+    return Refusals(times, refused_with_bias(gate, off, alone.S), knowing)
 
 
 def innovation_biases(alone: _Alone, biases: FloatArray) -> FloatArray:
