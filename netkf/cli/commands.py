@@ -236,7 +236,9 @@ COMMANDS = (
             _vary("KEY.PATH=LOW:HIGH", "the key to search and its range"),
             _option(
                 "--target",
-                "quantities: worst_rms, mean_rms, worst_trace, mean_trace, within_central",
+                "quantities: worst_rms, mean_rms, worst_trace, mean_trace, within_central, "
+                "worst_instant, quantile_99, time_above, mean_age, worst_age, transmissions, bytes, "
+                "joules, and time_connected>=LIMIT",
                 required=True,
                 metavar="QUANTITY<=LIMIT",
             ),

@@ -25,10 +25,16 @@ from netkf.ensembles.moments import Moments
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace
 from netkf.runs.documents import DamagedError, reading_file
 from netkf.runs.files import BLOCKS_FOLDER, write_atomically, writing_file
+from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT
 
-PARTS = ("samples", "averages", "messages")  # attributes of RunStatistics that are Moments
+PARTS = (
+    "samples",
+    "averages",
+    "messages",
+    "quantities",
+)  # attributes of RunStatistics that are Moments
 MARK = b"\nsha256 "  # begins the last line of a block's file
 SEAL_BYTES = len(MARK) + 64  # length of that line, with the SHA-256 in hexadecimal
 CHUNK = 1 << 20  # bytes hashed at once
@@ -189,6 +195,7 @@ class BlockCheckpoints:
         moments = [(getattr(statistics, name), name) for name in PARTS]
         moments += [(sums, "conserved") for sums, _ in statistics.conserved.values()]
         columns |= {"messages": len(MESSAGES), "conserved": 2}
+        columns["quantities"] = len(ensemble_names(self._scenario)) * (count + 1)
         totals = statistics.totals.shape == (2,) and statistics.totals.dtype == np.int64
         return totals and all(
             quantity.mean.shape == quantity.M2.shape == (rows.get(name, 1), columns[name])
@@ -334,6 +341,7 @@ def _restore_statistics(arrays: Any) -> RunStatistics:
         samples=moments("samples"),
         averages=moments("averages"),
         messages=moments("messages"),
+        quantities=moments("quantities"),
         totals=arrays["totals"],
         conserved={
             name: (moments(f"conserved_{name}"), float(d)) for name, d in texts["conserved"].items()

@@ -31,11 +31,13 @@ class Reduced(NamedTuple):
                     after time 0, nan without samples
     rounding_from : (R,) the first sample time in seconds at which rounding blurs the errors, else
                     inf
+    spans         : (R, 3) the first sample in averages, and the ends of those of errors and of P
     """
 
     samples: list[Moments]
     averages: FloatArray
     rounding_from: FloatArray
+    spans: np.ndarray
 
 
 class Samples(Struct):
@@ -108,7 +110,7 @@ def reduce_batch(batch: RunBatch, pieces: Sequence[slice]) -> Reduced:
     with np.errstate(invalid="ignore"):
         averages = samples.averages / counts[:, None]
     parts = zip(samples.size, samples.mean, samples.M2, strict=True)
-    return Reduced([Moments(*part) for part in parts], averages, rounding_from)
+    return Reduced([Moments(*part) for part in parts], averages, rounding_from, samples.spans)
 
 
 def _averaged_spans(batch: RunBatch, kept: np.ndarray, rounding_from: FloatArray) -> np.ndarray:

@@ -14,10 +14,13 @@ from netkf.ensembles.moments import Moments, merge_moments, moments_of
 from netkf.ensembles.reduction import reduce_batch
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
+from netkf.runs.quantities import NetworkSink, sample_names, sample_quantities
 from netkf.runs.simulate import collect_run
 from netkf.scenario.scenario import Scenario
 from netkf.trace.batch import RunBatch
-from netkf.trace.recorder import MemorySink, Recorder
+from netkf.trace.nees import traces as traces_of
+from netkf.trace.nees import without_padding
+from netkf.trace.recorder import MemorySink, Recorder, Sink
 from netkf.trace.schema import KINDS
 
 MESSAGES = ("sent", "delivered", "lost", "in_flight", "transmissions")
@@ -42,6 +45,7 @@ class RunStatistics(NamedTuple):
                     P and of e e', e the error, and of NEES
     averages      : (1, (N + 1) 3) moments over runs of the mean square error, mean trace of P and
                     mean NEES over the samples after time 0, for each node and all nodes
+    quantities    : (1, (N + 1) K) moments of the quantities ``ensemble_names`` of runs
     messages      : (1, 5) moments of the counts MESSAGES; transmissions are nan in slots
     totals        : (2,) number of events and of diverged runs
     conserved     : for each conserved sum its moments at start and end (1, 2), and the largest
@@ -54,6 +58,7 @@ class RunStatistics(NamedTuple):
 
     samples: Moments
     averages: Moments
+    quantities: Moments
     messages: Moments
     totals: np.ndarray
     conserved: dict[str, tuple[Moments, float]]
@@ -79,6 +84,7 @@ def merge(a: RunStatistics, b: RunStatistics) -> RunStatistics:
     return RunStatistics(
         samples=merge_moments(a.samples, b.samples),
         averages=merge_moments(a.averages, b.averages),
+        quantities=merge_moments(a.quantities, b.quantities),
         messages=merge_moments(a.messages, b.messages),
         totals=a.totals + b.totals,
         conserved=conserved,
@@ -97,10 +103,10 @@ def block_statistics(
     Of the first ``traces`` replicas of the ensemble (not of the block) events and samples are kept.
     """
     tree, count = MergeTree(merge), 0
-    for batch, batch_traces in _batches(scenario, seed, replicas, engine, traces):
+    for batch, network, batch_traces in _batches(scenario, seed, replicas, engine, traces):
         # The nodes (level, k) of the tree that consist of runs of this batch.
         pieces = list(aligned_pieces(count, count + len(batch)))
-        values = run_values(batch, scenario, count)
+        values = run_values(batch, scenario, network, count)
         for number, (level, k) in enumerate(pieces):
             piece = merge_runs(values, number)
             tree.add(k, piece._replace(fingerprint=batch.fingerprint, traces=batch_traces), level)
@@ -111,27 +117,50 @@ def block_statistics(
 
 def _batches(
     scenario: Scenario, seed: int, replicas: range, engine: Engine, traces: int
-) -> Iterator[tuple[RunBatch, tuple[Trace, ...]]]:
-    """Yield batches of the runs of ``replicas``, simulated with ``seed``, with their traces."""
+) -> Iterator[tuple[RunBatch, FloatArray | None, tuple[Trace, ...]]]:
+    """Yield batches of the runs of ``replicas``, simulated with ``seed``, with the quantities of
+    their networks and their traces.
+    """
     for replica in range(replicas.start, min(traces, replicas.stop)):
-        yield _traced_run(scenario, seed, replica, engine)
+        memory = MemorySink()
+        batch, network, recorder = _recorded_run(scenario, seed, replica, engine, memory)
+        run = collect_run(
+            scenario, memory, recorder, seed, replica, engine.name, str(batch.status[0])
+        )
+        trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
+        yield batch, network, (trace,)
     untraced = range(max(replicas.start, traces), replicas.stop)
     if untraced:
-        for batch in engine.run_many(scenario, seed, untraced, fingerprint=untraced.start == 0):
-            yield batch, ()
+        batches = simulate_batches(scenario, seed, untraced, engine, untraced.start == 0)
+        for batch, network in batches:
+            yield batch, network, ()
 
 
-def _traced_run(
-    scenario: Scenario, seed: int, replica: int, engine: Engine
-) -> tuple[RunBatch, tuple[Trace, ...]]:
-    """Simulate one ``replica`` of the runs of ``seed``."""
-    sink, memory = batch_sink(scenario, range(replica, replica + 1)), MemorySink()
-    recorder = Recorder([sink, memory])
+def simulate_batches(
+    scenario: Scenario, seed: int, replicas: range, engine: Engine, fingerprint: bool = False
+) -> Iterator[tuple[RunBatch, FloatArray | None]]:
+    """Yield batches of the runs of ``replicas``, simulated with ``seed``, with the quantities
+    NETWORK (R, N + 1, 6) of each of its R runs, None unless the scenario wants them.
+    """
+    if not scenario.metrics.network:
+        for batch in engine.run_many(scenario, seed, replicas, fingerprint=fingerprint):
+            yield batch, None
+        return
+    for replica in replicas:
+        yield _recorded_run(scenario, seed, replica, engine)[:2]
+
+
+def _recorded_run(
+    scenario: Scenario, seed: int, replica: int, engine: Engine, *sinks: Sink
+) -> tuple[RunBatch, FloatArray | None, Recorder]:
+    """Simulate one ``replica`` of the runs of ``seed`` with its events."""
+    sink, wanted = batch_sink(scenario, range(replica, replica + 1)), scenario.metrics.network
+    network = [NetworkSink(scenario, seed, replica)] if wanted else []
+    recorder = Recorder([sink, *network, *sinks])
     status = engine.run(scenario, Streams(seed, replica), recorder, silent)
     sink.finish(recorder, status)
-    run = collect_run(scenario, memory, recorder, seed, replica, engine.name, status)
-    trace = Trace(replica, run.log, run.times, run.x, run.xhat, run.P, run.error)
-    return sink.batch(), (trace,)
+    values = network[0].values(status == "complete")[None] if network else None
+    return sink.batch(), values, recorder
 
 
 class RunValues(NamedTuple):
@@ -141,6 +170,7 @@ class RunValues(NamedTuple):
     samples  : moments (T, F (2 u + 1)) of F filters for each piece
     copies   : number of nodes for which a filter stands: N for a pooled filter, else 1
     averages : (R, N + 1, 3) squared error, trace of P and NEES, of each node and of all
+    quantities : (R, N + 1, K) those of ``ensemble_names``, of each node and of all
     messages : (R, 5) the counts MESSAGES
     events, diverged, rounding_from : (R,) number of events; True if the run diverged; first sample
                time (s) at which rounding blurs the errors, else inf
@@ -151,6 +181,7 @@ class RunValues(NamedTuple):
     samples: Sequence[Moments]
     copies: int
     averages: FloatArray
+    quantities: FloatArray
     messages: FloatArray
     events: np.ndarray
     diverged: np.ndarray
@@ -158,12 +189,15 @@ class RunValues(NamedTuple):
     sums: dict[str, FloatArray]
 
 
-def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues:
+def run_values(
+    batch: RunBatch, scenario: Scenario, network: FloatArray | None = None, first: int = 0
+) -> RunValues:
     """Return what statistics need of the R runs of a batch: averages over time (R, N + 1, 3) of
     squared error, trace of P and NEES, of each node and of all, counts of messages (R, 5), and
     moments of the samples.
 
-    ``first`` is the index of the batch's first run in the binary tree over all runs.
+    ``network`` are the quantities of their networks, if they are wanted, and ``first`` is the index
+    of the batch's first run in the binary tree over all runs.
     """
     # The largest nodes of the tree that consist of runs of this batch.
     indices = [(k << level, level) for level, k in aligned_pieces(first, first + len(batch))]
@@ -180,12 +214,34 @@ def run_values(batch: RunBatch, scenario: Scenario, first: int = 0) -> RunValues
         samples=reduced.samples,
         copies=copies,
         averages=np.concatenate([averages, overall], axis=1),
+        quantities=_quantities(batch, scenario, reduced.spans, copies, network),
         messages=count_messages(batch.counts, scenario.slotted),
         events=batch.counts.sum(axis=1),
         diverged=batch.diverged,
         rounding_from=reduced.rounding_from,
         sums=dict(batch.sums),
     )
+
+
+def _quantities(
+    batch: RunBatch, scenario: Scenario, spans: np.ndarray, copies: int, network: FloatArray | None
+) -> FloatArray:
+    """Return ``RunValues.quantities`` over the samples ``spans`` (R, 3)."""
+    if scenario.plant.truth_known:
+        error, _ = without_padding(batch.error, batch.P)
+        squares, ends = np.einsum("rtfi,rtfi->rtf", error, error), spans[:, 1]
+    else:
+        squares, ends = traces_of(batch.P), spans[:, 2]
+    # Runs with the same samples, mostly all, together.
+    found = np.empty((len(batch), len(scenario.nodes) + 1, len(sample_names(scenario))))
+    for first, end in np.unique(np.column_stack([spans[:, 0], ends]), axis=0).tolist():
+        runs = (spans[:, 0] == first) & (ends == end)
+        part = squares[:, first:end] if runs.all() else squares[runs, first:end]
+        values = sample_quantities(scenario, part)
+        if copies > 1:
+            values = np.repeat(values[:, -1:], len(scenario.nodes) + 1, axis=1)
+        found[runs] = values
+    return found if network is None else np.concatenate([found, network], axis=2)
 
 
 def merge_runs(values: RunValues, piece: int) -> RunStatistics:
@@ -211,9 +267,11 @@ def merge_runs(values: RunValues, piece: int) -> RunStatistics:
         mean, M2 = (np.tile(moment, values.copies) for moment in (samples.mean, samples.M2))
         samples = Moments(samples.size, mean, M2)
     averages, messages = values.averages[runs].reshape(count, 1, -1), values.messages[runs, None]
+    quantities = values.quantities[runs].reshape(count, 1, -1)
     return RunStatistics(
         samples=samples,
         averages=moments_of(averages.copy(), sizes.copy()),
+        quantities=moments_of(quantities.copy(), sizes.copy()),
         messages=moments_of(messages.copy(), sizes.copy()),
         totals=np.array([values.events[runs].sum(), values.diverged[runs].sum()]),
         conserved=conserved,

@@ -8,6 +8,7 @@ import numpy as np
 
 from netkf.ensembles.statistics import MESSAGES, RunStatistics
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.quantities import ensemble_names, quantity_rows
 from netkf.runs.summary import (
     CONFIDENCE,
     PromisedTraces,
@@ -33,7 +34,14 @@ def summarise_ensemble(
     error = statistics.averages.standard_error().reshape(-1, 3)
     # JSON has no infinity: None if rounding blurs no errors.
     rounding_from = statistics.rounding_from if np.isfinite(statistics.rounding_from) else None
-    *nodes, overall = node_rows(scenario, mean, mean_bounds(scenario, promised), error)
+    names = ensemble_names(scenario)
+    moments = statistics.quantities
+    values, errors = (
+        one.reshape(-1, len(names)) for one in (moments.mean, moments.standard_error())
+    )
+    rows = node_rows(scenario, mean, mean_bounds(scenario, promised), error)
+    quantities = quantity_rows(names, values, errors)
+    *nodes, overall = (a | b for a, b in zip(rows, quantities, strict=True))
     messages = statistics.messages.mean[0].tolist()
     messages_se = statistics.messages.standard_error()[0].tolist()
     summary: dict[str, Any] = {

@@ -1,66 +1,194 @@
-"""How often the links of a range graph are up, and in how many parts the network falls."""
+"""How often links and nodes are up, and in how many parts the network falls."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from netkf.linalg.arrays import FloatArray
+from netkf.network.clocks import RecordedClock
+from netkf.network.contacts import Contacts
 from netkf.network.graphs import node_columns
+from netkf.network.lives import Lifetime
+from netkf.network.matchings import RecordedSlots
+from netkf.network.recorded import RecordedLoss
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Sink
+from netkf.trace.schema import CODES, EVENT
+
+RECENT = 5.0
+"""Where messages are recorded a link is up while the newest one heard is no older than so many mean
+intervals between messages.
+"""
+MAX_AT_ONCE = 1 << 24
+"""Links times samples that are looked at together."""
 
 
 class ConnectivitySink(Sink):
-    """Counts, at the samples of a run, the links that are up and the components that they make.
+    """Looks at the samples of a run which links are up, and in how many parts the nodes that are up
+    fall.
 
-    up         : (L,) samples at which each link is up
-    components : number of components at each sample
+    A link is up while both ends are and it is in range (``range`` graphs) or in contact
+    (``contacts``), and where activations or losses are recorded while its newest message heard is
+    RECENT. Parts are joined by links in both directions, or by some in either direction if the
+    whole graph has no more. ``lives`` are those of the run, by node.
     """
 
     thread_safe: ClassVar[bool] = True
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._topology, self._positions = scenario.topology, scenario.positions
-        index = self._topology.index
-        self._ends = np.array([(index[i], index[j]) for i, j in self._topology.links]).reshape(
-            -1, 2
-        )
-        self.up, self.components = np.zeros(len(self._ends), dtype=np.int64), list[int]()
+    def __init__(self, scenario: Scenario, lives: Mapping[int, Lifetime]) -> None:
+        self._scenario, self._lives, topology = scenario, lives, scenario.topology
+        network = scenario.network
+        self._contacts = network.activation if isinstance(network.activation, Contacts) else None
+        recorded = isinstance(network.activation, RecordedClock | RecordedSlots)
+        self.by_messages = recorded or isinstance(network.channel.loss, RecordedLoss)
+        parts = topology.radius, self._contacts
+        self.changes = bool(lives) or self.by_messages or parts != (None, None)
+        index = topology.index
+        self._ends = np.array([(index[i], index[j]) for i, j in topology.directions], dtype=int)
+        self._ends = self._ends.reshape(-1, 2)
+        number = {link: k for k, link in enumerate(topology.links)}
+        # The link of each direction: its own of a directed graph.
+        links = [number.get((i, j), number.get((j, i))) for i, j in topology.directions]
+        self._links = np.array(links, dtype=int)
+        self._strength: Literal["strong", "weak"] = "strong"
+        if self._parts(np.ones(len(self._ends), dtype=bool))[0] > 1:
+            self._strength = "weak"
+        self._heard: list[np.ndarray] = []
+        self._sent, self._samples = 0, list[tuple[FloatArray, np.ndarray]]()
+        self.count = self.connected = self.components = 0
+        self.up = np.zeros(len(self._ends), dtype=np.int64)
+        self.nodes_connected = np.zeros(len(topology.nodes), dtype=np.int64)
 
     def events(self, rows: np.ndarray) -> None:
-        """Ignore events."""
+        """Keep the messages heard, where they say which links are up."""
+        if self.by_messages:
+            self._sent += int((rows["kind"] == CODES["send"]).sum())
+            self._heard.append(rows[rows["kind"] == CODES["deliver"]])
 
     def states(
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
         """Look at all links at T times t (T,) in seconds with the true states x (T, n)."""
-        links, radius, size = self._topology.links, self._topology.radius, len(self._topology.nodes)
-        assert radius is not None
-        for time, state in zip(t.tolist(), x, strict=True):
-            distances = [self._positions.distance(link, time, state) for link in links]
-            up = np.array(distances, dtype=np.float64) <= radius
-            ends = tuple(self._ends[up].T)
-            graph = coo_array((np.ones(len(ends[0])), ends), shape=(size, size))
-            self.components.append(int(connected_components(graph, directed=False)[0]))
-            self.up += up
+        at_once = max(1, MAX_AT_ONCE // max(1, len(self._ends)))
+        for k in range(0, len(t), at_once):
+            part = slice(k, k + at_once)
+            links = self._links_up(t[part], x[part])
+            if self.by_messages:
+                self._samples.append((t[part], links))
+            else:
+                self._look(t[part], links)
+
+    def _links_up(self, t: FloatArray, x: FloatArray) -> np.ndarray:
+        """Return the links (T, D) that are in range and in contact."""
+        topology, positions = self._scenario.topology, self._scenario.positions
+        up = np.ones((len(t), len(self._ends)), dtype=bool)
+        if topology.radius is not None:
+            for time, state, row in zip(t.tolist(), x, up, strict=True):
+                distances = [positions.distance(link, time, state) for link in topology.links]
+                row[:] = np.array(distances, dtype=np.float64)[self._links] <= topology.radius
+        if self._contacts is not None:
+            for d, (i, j) in enumerate(topology.directions):
+                entity = (i, j) if self._contacts.at == "directions" else (min(i, j), max(i, j))
+                up[:, d] &= self._contacts.in_contact(entity, t)
+        return up
+
+    def _nodes_up(self, t: FloatArray) -> np.ndarray:
+        """Return the nodes (T, N) that are up."""
+        up = np.ones((len(t), len(self.nodes_connected)), dtype=bool)
+        for node, life in self._lives.items():
+            # A change takes effect before the sample of its instant.
+            changes = np.searchsorted([change.time for change in life.changes], t, side="right")
+            up[:, self._scenario.topology.index[node]] = life.up ^ (changes % 2 == 1)
+        return up
+
+    def _parts(self, up: np.ndarray) -> tuple[int, np.ndarray]:
+        """Return in how many parts the links ``up`` (D,) join the nodes, and that of each (N,)."""
+        size, ends = len(self._scenario.nodes), self._ends[up].T
+        graph = coo_array((np.ones(len(ends[0])), (ends[0], ends[1])), shape=(size, size))
+        count, labels = connected_components(graph, connection=self._strength)
+        return int(count), np.asarray(labels)
+
+    def _look(self, t: FloatArray, links: np.ndarray) -> None:
+        """Count the samples at ``t`` (T,), when these ``links`` (T, D) are up if their ends are."""
+        if not self.changes:  # one look is enough
+            links, weights = links[:1], np.array([len(t)])
+            nodes = np.ones((len(links), len(self.nodes_connected)), dtype=bool)
+        else:
+            nodes = self._nodes_up(t)
+            links &= nodes[:, self._ends[:, 0]] & nodes[:, self._ends[:, 1]]
+            states = np.packbits(np.concatenate([links, nodes], axis=1), axis=1)
+            _, first, weights = np.unique(states, axis=0, return_index=True, return_counts=True)
+            links, nodes = links[first], nodes[first]
+        for up, alive, weight in zip(links, nodes, weights.tolist(), strict=True):
+            _, labels = self._parts(up)
+            sizes = np.bincount(labels[alive], minlength=1)
+            parts = int((sizes > 0).sum())
+            self.count += weight
+            self.connected += weight * (parts == 1)
+            self.components += weight * parts
+            self.up += weight * up
+            self.nodes_connected[alive] += weight * (sizes[labels[alive]] == sizes.max())
+
+    def finish(self) -> None:
+        """Look at the samples that waited for all messages."""
+        for t, links in self._samples:
+            newest = np.stack([*self._newest_heard(t)], axis=1) if len(self._ends) else links * 1.0
+            interval = self._scenario.horizon * len(self._ends) / max(self._sent, 1)
+            is_recent = (t[:, None] - newest <= RECENT * interval) & (newest > 0.0)
+            self._look(t, links & is_recent)
+        self._samples = []
+
+    def _newest_heard(self, t: FloatArray) -> Iterator[FloatArray]:
+        """Yield for each directed link when its newest message heard was sent (T,), 0 without."""
+        rows, size = np.concatenate([np.empty(0, EVENT), *self._heard]), len(self._scenario.nodes)
+        sender, receiver = (
+            np.searchsorted(self._scenario.nodes, rows[n]) for n in ("peer", "node")
+        )
+        order = np.argsort(sender * size + receiver, kind="stable")
+        rows, link = rows[order], (sender * size + receiver)[order]
+        for i, j in self._ends.tolist():
+            first, last = np.searchsorted(link, [i * size + j, i * size + j + 1])
+            yield newest_heard(rows[first:last], t)
 
     def entry(self) -> dict[str, Any]:
         """Return the entry of summary.json: the share of samples at which the network is connected,
         the mean number of its components, and the share at which each link is up.
         """
-        count = len(self.components)
-        parts = np.array(self.components)
+        count, topology = max(self.count, 1), self._scenario.topology
+        shares = dict(zip(topology.directions, (self.up / count).tolist(), strict=True))
         links = [
-            {**node_columns(i), "peer": j, "up": up / max(count, 1)}
-            for (i, j), up in zip(self._topology.links, self.up.tolist(), strict=True)
+            {
+                **node_columns(i),
+                "peer": j,
+                "up": shares[i, j] if topology.directed else min(shares[i, j], shares[j, i]),
+            }
+            for i, j in topology.links
         ]
         return {
-            "samples": count,
-            "connected": float((parts == 1).mean()) if count else None,
-            "components": float(parts.mean()) if count else None,
+            "samples": self.count,
+            "connected": self.connected / count if self.count else None,
+            "components": self.components / count if self.count else None,
             "links": links,
         }
+
+    def shares(self) -> FloatArray:
+        """Return the share of samples (N + 1,) at which each node is up and no part is larger than
+        its own, and that at which the nodes that are up are one part; nan without samples.
+        """
+        with np.errstate(invalid="ignore"):
+            return np.append(self.nodes_connected, self.connected) / np.float64(self.count)
+
+
+def newest_heard(arrivals: np.ndarray, t: FloatArray) -> FloatArray:
+    """Return when the newest message that has arrived by ``t`` (T,) was sent, in seconds, 0 without
+    one; ``arrivals`` (K,) are EVENT rows in the order of time.
+    """
+    # A message that overtakes others makes them old before they arrive.
+    sent = np.maximum.accumulate(arrivals["t"] - np.nan_to_num(arrivals["age"]))
+    place = np.searchsorted(arrivals["t"], t, side="right")
+    return np.asarray(np.concatenate([[0.0], sent])[place])

@@ -19,7 +19,6 @@ from netkf.engines.base import Engine, Progress, silent
 from netkf.linalg import compiling
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.rng.streams import Streams
-from netkf.runs.connectivity import ConnectivitySink
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failure
 from netkf.runs.files import (
@@ -31,6 +30,7 @@ from netkf.runs.files import (
 )
 from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
+from netkf.runs.quantities import NetworkSink
 from netkf.runs.simulate import choose_engine
 from netkf.runs.summary import (
     PromisedTraces,
@@ -165,7 +165,7 @@ def save(run: Run, scenario: Scenario, directory: str | Path) -> Path:
 @dataclass(frozen=True, eq=False)
 class _Output:
     """A run directory with its sinks; ``links`` is empty unless losses or delays are recorded,
-    ``connectivity`` unless links come and go.
+    ``network`` if nobody wants it.
     """
 
     directory: Path
@@ -173,14 +173,14 @@ class _Output:
     samples: SummarySink
     tables: ParquetSink | None
     links: list[SentPerLink]
-    connectivity: list[ConnectivitySink]
+    network: list[NetworkSink]
     manifest: Manifest
 
     @property
     def sinks(self) -> list[Sink]:
         """All sinks, which receive the events and samples of the run."""
         tables = [] if self.tables is None else [self.tables]
-        return [self.samples, *tables, *self.links, *self.connectivity]
+        return [self.samples, *tables, *self.links, *self.network]
 
     def close_tables(self) -> None:
         """Finish the Parquet tables, if the run has any; raises WriteError."""
@@ -200,9 +200,10 @@ class _Output:
             "delivered": count("deliver"),
             "lost": count("lost") + count("late"),
         }
-        summary = summarise(self.scenario, self.samples, promised, messages)
-        if self.connectivity:
-            summary["connectivity"] = self.connectivity[0].entry()
+        network = self.network[0].values(status == "complete") if self.network else None
+        summary = summarise(self.scenario, self.samples, promised, messages, network)
+        if self.network and self.network[0].connectivity.changes:
+            summary["connectivity"] = self.network[0].connectivity.entry()
         if sums:
             summary["conserved"] = conserved_sums(sums)
         # How much of the recorded tables (readings, losses) the run has used; a run that ended
@@ -233,13 +234,15 @@ def _create_output(
     # Written first, so that the directory of a process that is killed says "interrupted".
     manifest.write("interrupted", {})
     write_scenario(directory, scenario, seed)
+    samples = SummarySink()
+    network = NetworkSink(scenario, seed, replica, samples.transmissions)
     return _Output(
         directory=directory,
         scenario=scenario,
-        samples=SummarySink(),
+        samples=samples,
         tables=ParquetSink(directory, scenario, replica) if tables else None,
         links=[SentPerLink()] if is_recorded else [],
-        connectivity=[] if scenario.topology.radius is None else [ConnectivitySink(scenario)],
+        network=[] if scenario.metrics.network is False else [network],
         manifest=manifest,
     )
 

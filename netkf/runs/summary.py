@@ -17,6 +17,7 @@ from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
 from netkf.network.graphs import node_columns
 from netkf.runs.labels import covariance_notes
+from netkf.runs.quantities import NETWORK, quantity_rows, sample_names, sample_quantities
 from netkf.runs.transmissions import Transmissions, count_pairs
 from netkf.scenario.scenario import Scenario
 from netkf.trace.nees import blurred_from, errors, traces
@@ -180,20 +181,29 @@ def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
 
 
 def summarise(
-    scenario: Scenario, sink: SummarySink, promised: PromisedTraces, messages: dict[str, int]
+    scenario: Scenario,
+    sink: SummarySink,
+    promised: PromisedTraces,
+    messages: dict[str, int],
+    network: FloatArray | None = None,
 ) -> dict[str, Any]:
     """Return the summary of a run, as in summary.json.
 
     ``nodes`` and ``overall`` have averages over time, see :func:`select_averaged_samples`: the RMS
-    error, the mean trace of P, the mean bound and the ratio of both, and the mean NEES; ``nodes``
-    also the numbers of messages and transmissions of each node. ``messages`` are the numbers of
-    messages ``sent``, ``delivered`` and ``lost`` in the network. Averages are nan if there is no
-    sample or no covariance.
+    error, the mean trace of P, the mean bound and the ratio of both, and the mean NEES, and the
+    quantities of ``runs.quantities`` over the same samples, with those of the ``network``
+    (N + 1, 6), if they are known; ``nodes`` also the numbers of messages and transmissions of each
+    node. ``messages`` are the numbers of messages ``sent``, ``delivered`` and ``lost`` in the
+    network. Averages are nan if there is no sample or no covariance.
     """
-    *nodes, overall = _average_rows(scenario, sink, promised)
+    rows = _average_rows(scenario, sink, promised)
+    if network is not None:
+        rows = [a | b for a, b in zip(rows, quantity_rows(NETWORK, network), strict=True)]
+    *nodes, overall = rows
     counts = sink.transmissions
     for row in nodes:
         row |= {"sent": counts.sent[row["node"]], "transmissions": counts.count_for(row["node"])}
+    overall["transmissions"] = counts.total
     return {
         "nodes": nodes,
         "overall": overall,
@@ -228,7 +238,20 @@ def _average_rows(
             bound = promised.bound[indices.covariances].mean(axis=0)
             bound = np.append(bound, bound.mean())
         nodes = np.column_stack([mean_square, trace, nees])
-        return node_rows(scenario, np.vstack([nodes, nodes.mean(axis=0)]), bound)
+        rows = node_rows(scenario, np.vstack([nodes, nodes.mean(axis=0)]), bound)
+    truth_known = scenario.plant.truth_known
+    chosen = indices.errors if truth_known else indices.covariances
+    squares = np.array(sink.sq_error if truth_known else sink.trace)
+    squares = squares.reshape(-1, len(scenario.nodes))[chosen]
+    values = sample_quantities(scenario, squares)
+    quantities = quantity_rows(sample_names(scenario), values)
+    rows = [a | b for a, b in zip(rows, quantities, strict=True)]
+    if len(chosen):
+        at = np.array(sink.times)[chosen][squares.argmax(axis=0)]
+        for row, time in zip(rows, at.tolist(), strict=False):
+            row["worst_at"] = time
+        rows[-1]["worst_at"] = at[int(squares.max(axis=0).argmax())]
+    return rows
 
 
 def node_rows(

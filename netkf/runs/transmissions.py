@@ -23,17 +23,19 @@ class Transmissions:
     transmission by itself. In slots all messages of a node in one step of an exchange are one
     transmission.
 
-    ``sent`` has the number of messages of each node.
+    ``sent`` has the number of messages of each node; transmissions are counted by node and phase,
+    which is -1 under clocks.
     """
 
     def __init__(self) -> None:
         self.sent: Counter[int] = Counter()
-        self._broadcasts: Counter[int] = Counter()
-        self._slot_transmissions: Counter[int] = Counter()
-        self._clock_messages: Counter[int] = Counter()
+        self._broadcasts: Counter[tuple[int, int]] = Counter()
+        self._slot_transmissions: Counter[tuple[int, int]] = Counter()
+        self._clock_messages: Counter[tuple[int, int]] = Counter()
         # The last (time, phase) of the rows counted so far, and the nodes that sent in it.
         self._step: tuple[float, int] = (np.nan, -1)
         self._senders: set[int] = set()
+        self._phases: set[int] = set()
 
     def add(self, rows: np.ndarray) -> None:
         """Count the next block ``rows`` (E,) of EVENT rows; blocks must come in the order of the
@@ -41,7 +43,10 @@ class Transmissions:
         """
         is_send = rows["kind"] == SEND
         node, t, phase = (rows[name][is_send] for name in ("node", "t", "phase"))
-        _add_counts(self.sent, node)
+        for sender, count in zip(
+            *(a.tolist() for a in np.unique(node, return_counts=True)), strict=True
+        ):
+            self.sent[sender] += count
         _add_counts(self._broadcasts, rows["node"][rows["kind"] == TRANSMIT])
         in_slots = phase >= 0
         _add_counts(self._clock_messages, node[~in_slots])
@@ -51,19 +56,29 @@ class Transmissions:
         """Count the transmissions of ``send`` rows of slots, of which these are columns (K,)."""
         if not len(node):
             return
-        step = np.cumsum(np.append(False, (t[1:] != t[:-1]) | (phase[1:] != phase[:-1])))
+        begins = np.append(True, (t[1:] != t[:-1]) | (phase[1:] != phase[:-1]))
+        step = np.cumsum(begins) - 1
+        phases = phase[begins]
         # Each pair of step and sender once.
         step, node, _ = count_pairs(step, node)
         # The first step may have begun in the block before.
         seen = self._senders if (float(t[0]), int(phase[0])) == self._step else set()
         repeated = [sender in seen for sender in node[step == 0].tolist()]
-        _add_counts(self._slot_transmissions, np.delete(node, np.flatnonzero(repeated)))
+        once = np.delete(np.arange(len(node)), np.flatnonzero(repeated))
+        _add_counts(self._slot_transmissions, node[once], phases[step[once]])
+        self._phases.update(phases.tolist())
         self._senders = {*node[step == step[-1]].tolist(), *(seen if not step[-1] else ())}
         self._step = float(t[-1]), int(phase[-1])
 
     def count_for(self, node: int) -> int:
         """Return the number of transmissions of a node."""
-        return self._slot_transmissions[node] + self._clock_transmissions[node]
+        return sum(self.by_phase(node).values())
+
+    def by_phase(self, node: int) -> dict[int, int]:
+        """Return the number of transmissions of a node by exchange of the slot, -1 under clocks."""
+        return {
+            phase: counter[node, phase] for phase, counter in self._counters if counter[node, phase]
+        }
 
     @property
     def total(self) -> int:
@@ -71,8 +86,13 @@ class Transmissions:
         return self._slot_transmissions.total() + self._clock_transmissions.total()
 
     @property
-    def _clock_transmissions(self) -> Counter[int]:
-        return self._broadcasts if self._broadcasts else self._clock_messages
+    def _counters(self) -> list[tuple[int, Counter[tuple[int, int]]]]:
+        in_slots = [(phase, self._slot_transmissions) for phase in sorted(self._phases)]
+        return [*in_slots, (-1, self._clock_transmissions)]
+
+    @property
+    def _clock_transmissions(self) -> Counter[tuple[int, int]]:
+        return self._broadcasts or self._clock_messages
 
 
 class SentPerLink(Sink):
@@ -111,8 +131,10 @@ def count_pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, ...]
     return codes // span + least, codes % span + low, counts
 
 
-def _add_counts(counter: Counter[int], nodes: np.ndarray) -> None:
-    """Add to ``counter``, in place, how often each node id occurs in ``nodes`` (K,)."""
-    distinct, counts = np.unique(nodes, return_counts=True)
-    for node, count in zip(distinct.tolist(), counts.tolist(), strict=True):
-        counter[node] += count
+def _add_counts(
+    counter: Counter[tuple[int, int]], nodes: np.ndarray, phases: np.ndarray | None = None
+) -> None:
+    """Add to ``counter``, in place, how often each pair of ``nodes`` and ``phases`` (K,) occurs."""
+    phases = np.full(len(nodes), -1) if phases is None else phases
+    for node, phase, count in zip(*(a.tolist() for a in count_pairs(nodes, phases)), strict=True):
+        counter[node, phase] += count

@@ -41,6 +41,7 @@ from netkf.core.places import Place
 from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
+from netkf.network.energy import Energy
 from netkf.network.graph_files import graph_rule
 from netkf.network.graphs import Graph, Link, RangeGraph, Topology
 from netkf.network.lives import Life
@@ -57,6 +58,7 @@ from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
 from netkf.scenario.block_sensors import estimated_blocks, require_no_blocks, stacked_sensors
+from netkf.scenario.metrics import Metrics
 from netkf.scenario.names import bind_names
 from netkf.scenario.positions import placed_nodes, positions_of, table_of_positions
 from netkf.scenario.stamps import Time, restamp
@@ -79,6 +81,7 @@ class Network(Component):
     clocks      what clocks of nodes show, where they are wrong
     radio       how long nodes send a message, and in how many frames
     quantise    in how many bits numbers of messages are sent; exact by default
+    energy      what a transmission costs its sender, for summaries
     """
 
     graph: Graph = field(graph_rule)
@@ -93,6 +96,7 @@ class Network(Component):
     )
     radio: Radio | None = field(instance_of(Radio), default=None)
     quantise: Quantisation | None = field(instance_of(Quantisation), default=None)
+    energy: Energy | None = field(instance_of(Energy), default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +214,7 @@ class ScenarioModel(Component):
     claim: str = field(line, default="")
     seed: int = field(integer(low=0), default=0)
     time: Time = field(instance_of(Time), default=Time())
+    metrics: Metrics = field(instance_of(Metrics), default=Metrics())
     plants: tuple[Block, ...] = field(
         list_of(instance_of(Block), "blocks", min_length=0), default=()
     )

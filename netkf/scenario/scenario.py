@@ -33,6 +33,7 @@ class Scenario(DerivedScenario):
     claim    what the scenario shows, one line
     seed     root seed of all random numbers
     time     what the stamps of recorded tables mean, ``[time]``
+    metrics  what summaries say beside means over time, ``[metrics]``
 
     All fields are checked on construction, alone and against each other; ScenarioError names the
     first mistake in one line.

@@ -19,6 +19,7 @@ from netkf.algorithms.registry import default_timing, split_choice
 from netkf.core.fields import Component, Rule
 from netkf.network.channels import Channel
 from netkf.network.contacts import Contacts
+from netkf.network.energy import Energy
 from netkf.network.node_clocks import NodeClock
 from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
@@ -30,6 +31,7 @@ from netkf.plants.maps import NonlinearPlant
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import Sensor
 from netkf.scenario.imports import offered_kinds
+from netkf.scenario.metrics import Metrics
 from netkf.scenario.model import Belief, Filtering, Network, ScenarioModel
 from netkf.scenario.registry import KINDS, list_kinds
 from netkf.scenario.scenario import Scenario
@@ -51,6 +53,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (ScenarioModel, "filter"): {"$ref": "#/$defs/filter"},
     (ScenarioModel, "time"): {"$ref": "#/$defs/time"},
     (Sensor, "fault"): {"$ref": "#/$defs/fault"},
+    (ScenarioModel, "metrics"): {"$ref": "#/$defs/metrics"},
     (Network, "graph"): {"$ref": "#/$defs/graph"},
     (Network, "activation"): {"$ref": "#/$defs/activation"},
     (Network, "channel"): {"$ref": "#/$defs/channel"},
@@ -58,6 +61,7 @@ NESTED_TABLES: dict[tuple[type[Component], str], Schema] = {
     (Network, "clocks"): {"type": "array", "items": {"$ref": "#/$defs/clock"}},
     (Network, "radio"): {"$ref": "#/$defs/radio"},
     (Network, "quantise"): {"$ref": "#/$defs/quantisation"},
+    (Network, "energy"): {"$ref": "#/$defs/energy"},
     (Channel, "channels"): {"$ref": "#/$defs/hopping"},
     (Channel, "loss"): {"$ref": "#/$defs/loss"},
     (Channel, "delay"): {"$ref": "#/$defs/delay"},
@@ -120,8 +124,10 @@ def scenario_schema() -> Schema:
     definitions["clock"] = _table_schema(list_keys(NodeClock))
     definitions["quantisation"] = _table_schema(list_keys(Quantisation))
     definitions["radio"] = _table_schema(list_keys(Radio))
+    definitions["energy"] = _table_schema(list_keys(Energy))
     definitions["hopping"] = _table_schema(list_keys(Hopping))
     definitions["time"] = _table_schema(list_keys(Time))
+    definitions["metrics"] = _table_schema(list_keys(Metrics))
     definitions["model"] = _table_schema(list_keys(Belief))
     return {
         "$schema": DIALECT,

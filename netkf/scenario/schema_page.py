@@ -7,11 +7,13 @@ from collections.abc import Iterator, Sequence
 from netkf.algorithms.gates import Gate
 from netkf.core.fields import Component
 from netkf.network.channels import Channel
+from netkf.network.energy import Energy
 from netkf.network.node_clocks import NodeClock
 from netkf.network.quantise import Quantisation
 from netkf.network.radio import Radio
 from netkf.network.scheduled import Hopping
 from netkf.plants.blocks import Block
+from netkf.scenario.metrics import Metrics
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
@@ -29,9 +31,11 @@ TABLES: dict[str, type[Component]] = {
     "network.clocks": NodeClock,
     "network.radio": Radio,
     "network.quantise": Quantisation,
+    "network.energy": Energy,
     "filter, beside its kind": Filtering,
     "filter.model": Belief,
     "filter.gate": Gate,
+    "metrics": Metrics,
 }
 """Classes of the tables without a kind, by heading."""
 INNER = ((Filtering, "algorithm"), (Block, "plant"))

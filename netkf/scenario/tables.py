@@ -20,6 +20,7 @@ from netkf.core.contracts import ContractError, is_netkf_class, place_of_error
 from netkf.core.errors import ScenarioError, errors_under, suggest_nearest
 from netkf.core.fields import Component, SourceFile, integer, source_file, walk
 from netkf.network.channels import Channel
+from netkf.network.energy import Energy
 from netkf.network.graph_files import as_graph
 from netkf.network.node_clocks import NodeClock
 from netkf.network.quantise import Quantisation
@@ -29,6 +30,7 @@ from netkf.plants.blocks import Block
 from netkf.plants.states import state_file
 from netkf.scenario.derived import DerivedScenario
 from netkf.scenario.imports import Origin, find_class
+from netkf.scenario.metrics import Metrics
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.plugins import describe_error, explain_user_error
 from netkf.scenario.registry import KINDS, SLOTTED, find_kind, list_names_of_kind
@@ -167,6 +169,7 @@ def _build(cls: type[S], table: Mapping[str, Any], origin: Origin) -> Any:
         "sensors": partial(_build_list, "sensors", partial(_build_sensor, origin)),
         "network": partial(_build_network, origin, time),
         "filter": partial(_build_filtering, origin),
+        "metrics": partial(_build_table, Metrics, origin),
     }
     return _build_object(cls, _build_inner(values, builders), origin, ("format",))
 
@@ -359,6 +362,7 @@ def _build_network(origin: Origin, time: str, value: Any) -> Any:
         "clocks": partial(_build_list, "network.clocks", partial(_build_table, NodeClock, origin)),
         "radio": partial(_build_table, Radio, origin),
         "quantise": partial(_build_table, Quantisation, origin),
+        "energy": partial(_build_table, Energy, origin),
     }
     return _build_object(Network, _build_inner(_as_dict(value), builders), origin)
 

@@ -33,6 +33,7 @@ from netkf.runs.documents import (
     require_form,
 )
 from netkf.runs.parquet_files import column_names, read_numbers
+from netkf.runs.quantities import quantities_in
 from netkf.runs.stored import AVERAGES_FORM, MANIFEST_FORM, SUMMARY_FORM, read_checked_document
 from netkf.studies.metrics import mean_over_runs
 
@@ -100,7 +101,7 @@ class RunDirectory:
         table = self.summary["overall"]
         if node >= 0:
             table = next(row for row in self.summary["nodes"] if row["node"] == node)
-        value = self.summary[quantity] if quantity in ("limit", "central") else table[quantity]
+        value = self.summary[quantity] if quantity in ("limit", "central") else table.get(quantity)
         return value, table.get(f"{quantity}_se")
 
     @property
@@ -171,6 +172,9 @@ def read_directory(directory: Path) -> RunDirectory:
         read_checked_document(directory, "manifest.json", MANIFEST_FORM)  # its seal
         summary = read_checked_document(directory, "summary.json", SUMMARY)
         name_rows(summary["nodes"])
+        for row in (*summary["nodes"], summary["overall"]):
+            numbers = [key for name in quantities_in(row) for key in (name, f"{name}_se")]
+            require_form(row, {f"{key}?": NUMBER for key in numbers})
         check_files(directory, manifest, ["scenario.toml", "summary.json"])
     return RunDirectory(directory, manifest, summary)
 
@@ -244,7 +248,9 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     runs = [read_directory(as_path("directories", directory)) for directory in directories]
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
     first = runs[0]
-    quantities = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
+    more = (q for run in runs for q in quantities_in(run.summary["overall"]))
+    known = [q for q in dict.fromkeys(more) if any(run.value(q, -1)[0] is not None for run in runs)]
+    quantities = [(q, -1) for q in (*AVERAGES, *known, *MESSAGES)]
     if all(run.nodes == first.nodes for run in runs):
         quantities += [("rms_error", node) for node in first.nodes]
     level = (1.0 - confidence) / (len(quantities) * max(1, len(runs) - 1))

@@ -23,6 +23,7 @@ from netkf.runs.failures import explain_failures
 from netkf.runs.files import check_sources, create_output_directory, write_scenario, write_text
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
+from netkf.runs.quantities import NETWORK, sample_names
 from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.imports import offered_kinds
 from netkf.scenario.registry import list_kinds, name_of
@@ -31,7 +32,6 @@ from netkf.scenario.writing import as_table, part_as_table
 from netkf.studies.filter_values import (
     FilterValues,
     Quantity,
-    Traffic,
     block_values,
     count_traffic,
     credibility,
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 CARRIED = ("mean", "cov", "model", "estimates")
 """Keys of ``[filter]`` that every compared filter takes over from the scenario."""
 QUANTITIES = ("rms_error", "worst_instant", "nees_ratio")
+"""Quantities that tables show with their differences."""
 MAX_FILTERS = 200
 Progress = Callable[[int, int], None]
 Choice = str | Mapping[str, Any] | Filter
@@ -63,10 +64,12 @@ class FilterEntry(NamedTuple):
 class ComparedFilter:
     """One filter of a comparison.
 
-    quantities    : rms_error, worst_instant (mean over runs of the largest error of any node at any
-                    sample) and nees_ratio (NEES / n), empty if it cannot run
+    quantities    : rms_error, nees_ratio (NEES / n), worst_instant (mean over runs of the largest
+                    error of any node at any sample), and the other quantities of samples of
+                    summaries; empty if it cannot run
     consistency   : "consistent", "overconfident" or "conservative", by NEES / n, "-" where unknown
-    transmissions, bytes : of replica 0, a broadcast counts once; nan if it cannot run
+    traffic       : the quantities of the network in summaries, of replica 0: transmissions (a
+                    broadcast counts once), bytes, ages, ...; empty if it cannot run
     status        : "complete", how many runs diverged, or why it cannot run there
     predicts      : True if its samples in slots are predictions, not filtered
     same_losses   : False if its messages and those of the first filter that ran meet other losses
@@ -76,8 +79,7 @@ class ComparedFilter:
     filter: str
     quantities: Mapping[str, Quantity]
     consistency: str
-    transmissions: float
-    bytes: float
+    traffic: Mapping[str, float]
     status: str
     predicts: bool = False
     same_losses: bool = True
@@ -88,21 +90,32 @@ class ComparedFilter:
         return bool(self.quantities)
 
     @property
+    def transmissions(self) -> float:
+        """Transmissions in replica 0, nan if it cannot run."""
+        return self.traffic.get("transmissions", math.nan)
+
+    @property
+    def bytes(self) -> float:
+        """Bytes transmitted in replica 0, nan if it cannot run."""
+        return self.traffic.get("bytes", math.nan)
+
+    @property
     def rms_error(self) -> Quantity:
         """The RMS error, with its difference from that of the first filter."""
         return self.quantities["rms_error"]
 
-    def document(self) -> dict[str, Any]:
-        """Return plain values, one level deep: the row of the table, nan where a quantity is
-        missing.
+    def document(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return plain values, one level deep: the row of the table with the quantities ``names``,
+        nan where one is missing.
         """
         row: dict[str, Any] = {"filter": self.filter}
-        for name in QUANTITIES:
+        for name in names:
             quantity = self.quantities.get(name, Quantity(math.nan, math.nan))
             row[name] = quantity.value
             for part in ("se", "difference", "low", "high", "real"):
                 row[f"{name}_{part}"] = getattr(quantity, part)
-        names = ("consistency", "transmissions", "bytes", "predicts", "same_losses", "status")
+        row |= {name: self.traffic.get(name, math.nan) for name in NETWORK}
+        names = ("consistency", "predicts", "same_losses", "status")
         return row | {name: getattr(self, name) for name in names}
 
 
@@ -123,7 +136,12 @@ class FilterComparison(NotebookTable):
         """One row per filter."""
         import pandas as pd
 
-        return pd.DataFrame([row.document() for row in self.rows])
+        return pd.DataFrame([row.document(self.quantities) for row in self.rows])
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """The names of the quantities of filters that ran."""
+        return next(tuple(row.quantities) for row in self.rows if row.ran)
 
     def __repr__(self) -> str:
         names = one_line(", ".join(row.filter for row in self.rows))
@@ -136,7 +154,7 @@ class FilterComparison(NotebookTable):
 
     def document(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        rows = [row.document() for row in self.rows]
+        rows = [row.document(self.quantities) for row in self.rows]
         names = ("scenario", "runs", "seed", "confidence")
         return {**{name: getattr(self, name) for name in names}, "first": self.first, "rows": rows}
 
@@ -172,7 +190,7 @@ def compare_filters(
     root = scenario.seed if seed is None else integer(low=0)("seed", seed)
     candidates = _candidates(scenario, filters, engine)
     values: dict[str, FilterValues] = {}
-    traffic: dict[str, Traffic] = {}
+    traffic: dict[str, dict[str, float]] = {}
     with make_pool(count, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
         for k, candidate in enumerate(candidates):
             label, case = candidate.label, candidate.scenario
@@ -188,21 +206,22 @@ def compare_filters(
                 progress(k + 1, len(candidates))
     first = next(iter(values))
     # Bonferroni: all differences from the first filter hold together.
-    level = (1.0 - confidence) / (len(QUANTITIES) * max(1, len(values) - 1))
+    names = sample_names(scenario)
+    level = (1.0 - confidence) / ((2 + len(names)) * max(1, len(values) - 1))
     rows, first_scenario = [], next(one.scenario for one in candidates if one.scenario is not None)
     for label, case, reason in candidates:
         if case is None:
             # No quantities, consistency and traffic, but the reason why it cannot run.
-            rows.append(ComparedFilter(label, {}, "-", math.nan, math.nan, reason))
+            rows.append(ComparedFilter(label, {}, "-", {}, reason))
             continue
         base, n = values[first] if label != first else None, float(scenario.sizes.mean())
         diverged = int(values[label].diverged.sum())
         rows.append(
             ComparedFilter(
                 label,
-                estimate_quantities(values[label], base, n, level),
+                estimate_quantities(values[label], base, n, names, level),
                 credibility(values[label], n, level),
-                *traffic[label],
+                traffic[label],
                 f"{diverged} of {count} runs diverged" if diverged else "complete",
                 predicts=case.slotted and case.node_filter.timing.predicts,
                 same_losses=_meet_same_losses(case, first_scenario),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,12 +13,10 @@ from netkf.engines.base import Engine
 from netkf.ensembles.statistics import run_values
 from netkf.laws.intervals import interval_of_squares
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.quantities import NETWORK, NetworkSink, with_network
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import mean_over_runs
-from netkf.trace.batch import RunBatch
-from netkf.trace.nees import without_padding
-from netkf.trace.schema import CODES
 
 ROUNDING = 1e-9
 """Relative difference up to which two filters count as equal."""
@@ -28,14 +26,14 @@ class FilterValues(NamedTuple):
     """Values of R runs, averages over the samples after time 0 (R,) each.
 
     square   : squared error, mean of all nodes
-    worst    : largest error of any node at any sample (not an average)
     nees     : e' P^-1 e, mean of all nodes
+    samples  : (R, K) quantities ``runs.quantities.sample_names``, of all nodes (not averages)
     diverged : True if the run ended early
     """
 
     square: FloatArray
-    worst: FloatArray
     nees: FloatArray
+    samples: FloatArray
     diverged: np.ndarray
 
 
@@ -46,23 +44,8 @@ def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine)
         values = run_values(batch, scenario)
         # (R,): squared error and NEES, means over time and nodes.
         square, _, nees = values.averages[:, -1].T
-        ends = enumerate(values.rounding_from.tolist())
-        worst = np.array([_largest_error(batch, r, end) for r, end in ends])
-        parts.append(FilterValues(square, worst, nees, values.diverged > 0))
+        parts.append(FilterValues(square, nees, values.quantities[:, -1], values.diverged > 0))
     return join_values(*parts)
-
-
-def _largest_error(batch: RunBatch, r: int, blurred_from: float) -> float:
-    """Return the largest |e| of run ``r`` after time 0 and before ``blurred_from`` s, or nan."""
-    length = int(batch.lengths[r])
-    times = batch.times[:length]
-    # The last sample of a run that diverges is not finite.
-    usable = (times > 0.0) & ~(times >= blurred_from)
-    if batch.diverged[r]:
-        usable[-1:] = False
-    e, _ = without_padding(batch.error[r, :length][usable], batch.P[r, :length][usable])
-    sizes = np.linalg.norm(e, axis=-1)
-    return float(sizes.max()) if sizes.size else math.nan
 
 
 def join_values(*parts: FilterValues) -> FilterValues:
@@ -70,26 +53,12 @@ def join_values(*parts: FilterValues) -> FilterValues:
     return FilterValues(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-class Traffic(NamedTuple):
-    """The traffic of all nodes in a run; a broadcast is one of the ``transmissions``."""
-
-    transmissions: int
-    bytes: float
-
-
-def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> Traffic:
-    """Simulate replica 0 and return what its nodes send: transmissions and bytes."""
-    log, slotted = simulate(scenario, seed, 0, engine).log, scenario.slotted
-    sent = log[log["kind"] == CODES["send"]]
-    if slotted:
-        # All messages of a node in one step of an exchange are one transmission.
-        sent = np.unique(sent[["t", "phase", "node"]])
-    elif (log["kind"] == CODES["transmit"]).any():
-        sent = log[log["kind"] == CODES["transmit"]]
-    # The exchange of the slot, by which some filters send different things; -1 under clocks.
-    phases = sent["phase"].tolist() if slotted else [-1] * len(sent)
-    pairs = zip(sent["node"].tolist(), phases, strict=True)
-    return Traffic(len(sent), sum(itertools.starmap(scenario.message_size, pairs)))
+def count_traffic(scenario: Scenario, seed: int, engine: Engine) -> dict[str, float]:
+    """Simulate replica 0 and return the quantities NETWORK of all its nodes together."""
+    wanted = with_network(scenario)
+    sink = NetworkSink(wanted, seed, 0)
+    run = simulate(wanted, seed, 0, engine, [sink])
+    return dict(zip(NETWORK, sink.values(run.status == "complete")[-1].tolist(), strict=True))
 
 
 class Quantity(NamedTuple):
@@ -108,15 +77,19 @@ class Quantity(NamedTuple):
 
 
 def estimate_quantities(
-    values: FilterValues, first: FilterValues | None, n: float, level: float
+    values: FilterValues,
+    first: FilterValues | None,
+    n: float,
+    names: Sequence[str],
+    level: float,
 ) -> dict[str, Quantity]:
-    """Return ``rms_error``, ``worst_instant`` and ``nees_ratio`` (NEES / n) of a filter of n
-    states, the mean of the nodes', with the paired differences from the ``first`` one; each
+    """Return ``rms_error``, ``nees_ratio`` (NEES / n) and the quantities of samples, ``names``, of
+    a filter of n states, of all nodes, with the paired differences from the ``first`` one; each
     interval misses with probability ``level``.
     """
     quantities = {}
-    base = _influences(first, n) if first is not None else {}
-    for name, (value, influence) in _influences(values, n).items():
+    base = _influences(first, n, names) if first is not None else {}
+    for name, (value, influence) in _influences(values, n, names).items():
         runs = len(influence)
         quantity = Quantity(value, mean_over_runs(influence).error)
         if name in base and not (values.diverged.any() or first is None or first.diverged.any()):
@@ -133,17 +106,17 @@ def estimate_quantities(
     return quantities
 
 
-def _influences(values: FilterValues, n: float) -> dict[str, tuple[float, FloatArray]]:
+def _influences(
+    values: FilterValues, n: float, names: Sequence[str]
+) -> dict[str, tuple[float, FloatArray]]:
     """Return each quantity with its influence values (R,), whose mean has its error."""
     # Delta method: differences of two filters have the error of differences of influences.
     rms = math.sqrt(float(values.square.mean()))
     # d sqrt(m) = dm / (2 sqrt(m))
     square = values.square / (2.0 * rms) if rms > 0.0 else values.square
-    nees = values.nees / n
-    return {
-        "rms_error": (rms, square),
-        "worst_instant": (float(values.worst.mean()), values.worst),
-        "nees_ratio": (float(nees.mean()), nees),
+    means = {"nees_ratio": values.nees / n, **dict(zip(names, values.samples.T, strict=True))}
+    return {"rms_error": (rms, square)} | {
+        name: (float(column.mean()), column) for name, column in means.items()
     }
 
 

@@ -15,7 +15,7 @@ from netkf.algorithms.kernels.root_flow import whiten_observation
 from netkf.algorithms.models import SlotModel
 from netkf.core.errors import TheoryError
 from netkf.engines.base import Engine
-from netkf.ensembles.statistics import count_messages, run_values
+from netkf.ensembles.statistics import count_messages, run_values, simulate_batches
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
 from netkf.scenario.model import Filtering
@@ -30,6 +30,9 @@ MAX_ERRORS = 24
 """
 
 
+NO_QUANTITIES = np.empty((0, 0))
+
+
 class RunMetrics(NamedTuple):
     """Averages over time of R runs.
 
@@ -38,6 +41,7 @@ class RunMetrics(NamedTuple):
     diverged           : (R, 1) 1 if the run ended early
     rounding_from      : (R, 1) time (s) from which rounding blurs errors, which are averaged over
                          the samples before it; not finite without one
+    quantities         : (R, K) the quantities ``runs.quantities.ensemble_names``, of all nodes
     """
 
     mean_square: FloatArray
@@ -45,17 +49,18 @@ class RunMetrics(NamedTuple):
     messages: FloatArray
     diverged: np.ndarray
     rounding_from: FloatArray
+    quantities: FloatArray = NO_QUANTITIES
 
 
 def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> RunMetrics:
     """Simulate ``replicas`` of ``seed`` and return their metrics; for ``replicate_blocks``."""
     parts = []
-    for batch in engine.run_many(scenario, seed, replicas):
-        values = run_values(batch, scenario)
+    for batch, network in simulate_batches(scenario, seed, replicas, engine):
+        values = run_values(batch, scenario, network)
         # averages (R, N + 1, 3): squared error, trace of P, NEES; the last row is of all nodes.
         square, trace, _ = np.moveaxis(values.averages[:, :-1], 2, 0)
         ends = values.diverged[:, None], values.rounding_from[:, None]
-        parts.append(RunMetrics(square, trace, values.messages, *ends))
+        parts.append(RunMetrics(square, trace, values.messages, *ends, values.quantities[:, -1]))
     return join_metrics(*parts)
 
 

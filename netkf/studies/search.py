@@ -13,9 +13,14 @@ from netkf.core.notebook import NotebookTable
 from netkf.ensembles.blocks import BlockTask
 from netkf.ensembles.pool import Pool
 from netkf.ensembles.replicas import replicate_blocks
+from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import central_trace, join_metrics
 from netkf.studies.targets import (
+    MISSED,
+    NOT_SHOWN,
+    REACHED,
+    UNDECIDED,
     Target,
     quantity_by_simulation,
     quantity_by_theory,
@@ -25,8 +30,6 @@ from netkf.studies.targets import (
 if TYPE_CHECKING:
     import pandas as pd
 
-REACHED, MISSED, UNDECIDED, NOT_SHOWN = "reached", "missed", "undecided", "not shown"
-"""States of a value; ``not shown``: an upper bound is above the limit, which proves nothing."""
 FIRST_BATCH, FIRST_EXPECTED = 32, 8
 """Runs before the first decision about a value: of simulated errors, and of expected ones."""
 END_RATIO = 1.25
@@ -73,7 +76,7 @@ class Sizing(NotebookTable):
     value    : the smallest value that reaches the target, or the largest if ``grows``; None if none
                does
     misses   : the nearest value that was not shown to reach it, or None
-    grows    : True if the quantity grows with the key
+    grows    : True if the quantity grows with the key, or falls if it should be at least the limit
     by       : theory, simulation, or both (a bound where it reaches the target, else simulation)
     quantity : description of the computed quantity
     sure     : certainty of the result, and assumptions
@@ -155,8 +158,8 @@ class Search:
         ends = [first, last]
         if BOUND in (first.by, last.by) and first.by != last.by:  # compare bounds with bounds
             ends = [self._decide_by_theory(end.value) for end in ends]
-        grows = ends[1].quantity > ends[0].quantity
-        # The end at which the quantity is smaller should reach the target, the other may not.
+        grows = (ends[1].quantity > ends[0].quantity) != self.target.least
+        # The end at which the quantity is better should reach the target, the other may not.
         good, bad = (first, last) if grows else (last, first)
         value: float | None = None
         misses: float | None = None
@@ -242,12 +245,10 @@ class Search:
                 )
             )
             simulated += batch
-            interval = quantity_by_simulation(join_metrics(*metrics), target, plan.level, central)
-            state = UNDECIDED
-            if interval.high <= target.limit:
-                state = REACHED
-            elif not interval.low <= target.limit:  # also if it is not a number
-                state = MISSED
+            joined = join_metrics(*metrics)
+            names = ensemble_names(scenario)
+            interval = quantity_by_simulation(joined, target, plan.level, central, names)
+            state = target.decide(interval)
             say(
                 f"{self.key} = {value:g}: {target.quantity} {interval.value:.4g}, between "
                 f"{interval.low:.4g} and {interval.high:.4g} after {simulated:,} of at most "
@@ -339,7 +340,8 @@ class Search:
         pure = {probe.by for probe in probes} == {BOUND}
         for first, second in pairwise(probes):
             ends = [(p.quantity, p.quantity) if pure else (p.low, p.high) for p in (first, second)]
-            turned = ends[0][0] > ends[1][1] if grows else ends[0][1] < ends[1][0]
+            falls, rises = ends[0][0] > ends[1][1], ends[0][1] < ends[1][0]
+            turned = falls if grows != self.target.least else rises
             if turned:
                 return (
                     f"{certainty}; NOT monotone between {first.value:g} and {second.value:g}: "

@@ -30,7 +30,6 @@ from netkf.studies.search import (
     Sizing,
 )
 from netkf.studies.targets import (
-    QUANTITIES,
     Target,
     parse_target,
     quantity_by_theory,
@@ -56,7 +55,9 @@ def size(
 ) -> Sizing:
     """Search ``key`` between ``low`` and ``high`` for the value that just reaches ``target``, such
     as ``"worst_rms<=0.5"``; quantities are worst_rms, mean_rms, worst_trace, mean_trace and
-    within_central, the largest RMS error over that of a filter with all readings.
+    within_central, the largest RMS error over that of a filter with all readings, and by simulation
+    those of summaries over all nodes: worst_instant, quantile_99 and its kind, time_above,
+    mean_age, worst_age, ``time_connected>=0.95``, transmissions, bytes, joules.
 
     ``by`` is "theory" (a bound on the quantity, or its exact value), "simulation", or None: the
     exact value where it is known; else the bound where that reaches the target, and simulation
@@ -80,14 +81,14 @@ def size(
     if parsed.of_errors and not scenario.plant.truth_known:
         rule = "is about errors, and there is no ground truth"
         raise ScenarioError("--target", rule, target, "ask for mean_trace or worst_trace")
-    base = scenario if seed is None else scenario.replace({"seed": seed})
+    base = parsed.prepare(scenario if seed is None else scenario.replace({"seed": seed}))
     is_integer = _check_range(base, key, low, high)
     engine_used = choose_engine(engine, base.replace({key: low}))
     chosen = by or _choose_method(base, key, (low, high), parsed)
     search = Search(base, key, is_integer, parsed, chosen)
     if chosen == "theory":
         return search.run(low, high, 1.0, quantity_by_theory(search.at(low), parsed)[1])
-    quantity = f"{QUANTITIES[parsed.quantity]}, over the runs"
+    quantity = f"{parsed.description}, over the runs"
     task: BlockTask = partial(block_metrics, engine=engine_used)
     first = FIRST_BATCH
     # Expected squared errors vary less from run to run than squared errors: fewer runs suffice.

@@ -12,10 +12,11 @@ from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line
 from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, DamagedError, check_files, require_form
 from netkf.runs.parquet_files import read_flags, read_numbers, read_texts
+from netkf.runs.quantities import NETWORK, sample_names
 from netkf.runs.stored import read_checked_document
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
-from netkf.studies.compare_filters import QUANTITIES, ComparedFilter, FilterComparison
+from netkf.studies.compare_filters import ComparedFilter, FilterComparison
 from netkf.studies.filter_values import Quantity
 
 if TYPE_CHECKING:
@@ -37,10 +38,8 @@ COMPARISON: dict[str, Any] = {"filters": TEXTS, "confidence": NUMBER}
 """What the manifest of a comparison has beside that of a run."""
 TEXT_COLUMNS = ("filter", "consistency", "status")
 FILTERS = "filters.parquet"
-TRAFFIC = ("transmissions", "bytes")
 PARTS = ("se", "difference", "low", "high", "real")
 """Parts of a quantity beside its value, each in a column of its own."""
-FLAGS = (*(f"{key}_real" for key in QUANTITIES), "predicts", "same_losses")
 
 
 @dataclass(frozen=True, repr=False)
@@ -63,13 +62,15 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     _require_confidence(manifest)
     check_files(directory, manifest, [FILTERS])
     path = directory / FILTERS
-    parts = [f"{key}_{part}" for key in QUANTITIES for part in PARTS[:-1]]
-    numbers = read_numbers(path, [*QUANTITIES, *parts, *TRAFFIC], allow_empty=True)
+    quantities = ("rms_error", "nees_ratio", *sample_names(base))
+    parts = [f"{key}_{part}" for key in quantities for part in PARTS[:-1]]
+    numbers = read_numbers(path, [*quantities, *parts, *NETWORK], allow_empty=True)
     columns: dict[str, Any] = {str(name): values.tolist() for name, values in numbers.items()}
-    columns |= {name: read_flags(path, name).tolist() for name in FLAGS}
+    flags = (*(f"{key}_real" for key in quantities), "predicts", "same_losses")
+    columns |= {name: read_flags(path, name).tolist() for name in flags}
     columns |= {name: read_texts(path, name).astype(str).tolist() for name in TEXT_COLUMNS}
     rows = [
-        _read_filter({name: values[k] for name, values in columns.items()})
+        _read_filter({name: values[k] for name, values in columns.items()}, quantities)
         for k in range(len(numbers))
     ]
     if [row.filter for row in rows] != manifest["filters"] or not any(row.ran for row in rows):
@@ -86,19 +87,18 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     )
 
 
-def _read_filter(row: dict[str, Any]) -> ComparedFilter:
+def _read_filter(row: dict[str, Any], names: tuple[str, ...]) -> ComparedFilter:
     quantities = {
-        key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in QUANTITIES
+        key: Quantity(row[key], *(row[f"{key}_{part}"] for part in PARTS)) for key in names
     }
-    sent, size = (int(row[k]) if math.isfinite(row[k]) else math.nan for k in TRAFFIC)
+    ran = math.isfinite(row["transmissions"])
     return ComparedFilter(
         filter=row["filter"],
         # Traffic is nan only for filters that cannot run. Consistency does not tell them apart: it
         # is "-" for all filters if there is a single run.
-        quantities={} if math.isnan(sent) else quantities,
+        quantities=quantities if ran else {},
         consistency=row["consistency"],
-        transmissions=sent,
-        bytes=size,
+        traffic={name: row[name] for name in NETWORK} if ran else {},
         status=row["status"],
         predicts=row["predicts"],
         same_losses=row["same_losses"],

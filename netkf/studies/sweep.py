@@ -29,6 +29,7 @@ from netkf.runs.files import (
 )
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
+from netkf.runs.quantities import ensemble_names
 from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
@@ -39,6 +40,7 @@ from netkf.studies.metrics import (
     bound_traces,
     central_trace,
     join_metrics,
+    mean_over_runs,
     square_root_of,
     worst_node,
 )
@@ -73,11 +75,13 @@ def sweep(
     instants: ``status`` then says "another truth".
 
     A row has the varied keys, ``runs``; ``worst_rms`` (of the node with the largest), ``mean_rms``
-    (of all nodes together), ``mean_trace`` and ``worst_trace`` of P, each with its standard error
-    ``_se`` over runs; ``bound`` and ``central``, mean traces of the bound on P (hybrid paper, H
-    equation 12) and of the covariance of the centralised filter if they exist; messages ``sent``,
-    ``delivered`` and ``lost`` per run; ``status``, complete or diverged, and whether the truth is
-    another than in the first row. All but messages are averages over the samples after time 0.
+    (of all nodes together), ``mean_trace`` and ``worst_trace`` of P, ``worst_instant``, quantiles,
+    and what ``metrics.level`` and ``metrics.network`` ask for, of all nodes together as in
+    summaries, each with its standard error ``_se`` over runs; ``bound`` and ``central``, mean traces
+    of the bound on P (hybrid paper, H equation 12) and of the covariance of the centralised filter
+    if they exist; messages ``sent``, ``delivered`` and ``lost`` per run; ``status``, complete or
+    diverged, and whether the truth is another than in the first row. Averages over time are over
+    the samples after time 0.
 
     ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of ``netkf.monte_carlo``;
     ``progress(done, wanted)`` is called with numbers of points. Raises ScenarioError, before
@@ -143,6 +147,8 @@ def _make_row(point: GridPoint, metrics: RunMetrics) -> Row:
         "mean_trace": all_nodes(metrics.trace),
         "worst_trace": worst_node(metrics.trace),
     }
+    columns = zip(ensemble_names(point.scenario), metrics.quantities.T, strict=True)
+    quantities |= {name: mean_over_runs(values) for name, values in columns}
     row: Row = {key: table_value(value) for key, value in point.changes.items()}
     row["runs"] = len(metrics.trace)
     for name, (value, error) in quantities.items():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.printable import shorten
 from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
 from netkf.studies.compare import Comparison
-from netkf.studies.compare_filters import QUANTITIES, FilterComparison
+from netkf.studies.compare_filters import QUANTITIES, ComparedFilter, FilterComparison
 from netkf.studies.consistency import Consistency
 from netkf.studies.filter_values import Quantity
 from netkf.studies.search import Sizing
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 PROMISED = ("bound", "central")
 COLUMNS = ("worst_rms", "mean_rms", "mean_trace", *PROMISED)
+MORE_COLUMNS = ("worst_instant", "time_above", "mean_age", "time_connected", "joules")
+"""Columns of those sweeps that have them."""
+FILTER_COLUMNS = {"time_above": "time above", "mean_age": "age", "joules": "J"}
+"""Headers of columns of those comparisons of filters that have them."""
 MAX_ROWS = 40  # rows that fit onto a screen
 MAX_LENGTH = 30  # characters of a cell
 
@@ -26,6 +30,7 @@ MAX_LENGTH = 30  # characters of a cell
 def format_sweep(lines: pd.DataFrame, keys: Sequence[str]) -> str:
     """Return the table of a sweep; what theory gives for no point has no column."""
     columns = [name for name in COLUMNS if name not in PROMISED or lines[name].notna().any()]
+    columns += [name for name in MORE_COLUMNS if name in lines and lines[name].notna().any()]
     header = [*keys, *(name.replace("_", " ") for name in columns), "messages", "status"]
     rows = [
         [
@@ -147,13 +152,21 @@ def format_filters(comparison: FilterComparison) -> str:
     header = ["filter", "RMS error", "difference", "worst instant", "difference", "NEES / n"]
     header += ["difference", "consistency", "transmissions", "kB"]
     ran = [row for row in comparison.rows if row.ran]
+    more = [name for name in FILTER_COLUMNS if any(_is_known(row, name) for row in ran)]
+    header += [FILTER_COLUMNS[name] for name in more]
     rows = [
         [
             shorten(row.filter),
             *(cell for name in QUANTITIES for cell in _format_quantity(row.quantities[name])),
             row.consistency,
-            f"{row.transmissions:,}",
+            f"{row.transmissions:,.0f}",
             f"{row.bytes / 1000.0:,.6g}",
+            *(
+                format_number(row.traffic[name])
+                if name in row.traffic
+                else format_with_error(row.quantities[name].value, row.quantities[name].se)
+                for name in more
+            ),
         ]
         for row in ran
     ]
@@ -166,6 +179,8 @@ def format_filters(comparison: FilterComparison) -> str:
         f"by run; * for certain, all marks together at confidence {comparison.confidence:g}"
     )
     lines.append("worst instant: largest error of any node at any sample; traffic of replica 0")
+    if "mean_age" in more:
+        lines.append("age: of the newest reading of each sensor, mean over time and nodes, s")
     predicting = [shorten(row.filter) for row in ran if row.predicts]
     if predicting and len(predicting) < len(ran):
         lines.append(
@@ -178,6 +193,12 @@ def format_filters(comparison: FilterComparison) -> str:
             "and so other losses and delays of the same law"
         )
     return "\n".join(lines)
+
+
+def _is_known(row: ComparedFilter, name: str) -> bool:
+    if name in row.traffic:
+        return math.isfinite(row.traffic[name])
+    return name in row.quantities
 
 
 def _format_quantity(cells: Quantity) -> tuple[str, str]:

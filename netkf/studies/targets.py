@@ -2,46 +2,43 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
 
 from netkf.core.errors import ScenarioError, TheoryError
+from netkf.runs.quantities import NETWORK
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import RunMetrics, bound_traces, central_trace
 from netkf.theory import assumptions
 
-QUANTITIES = {
+REACHED, MISSED, UNDECIDED, NOT_SHOWN = "reached", "missed", "undecided", "not shown"
+"""States of a value; ``not shown``: an upper bound is above the limit, which proves nothing."""
+AVERAGES = {
     "worst_rms": "RMS error of the node with the largest",
     "mean_rms": "RMS error of all nodes together",
     "worst_trace": "mean trace of P of the node with the largest",
     "mean_trace": "mean trace of P of all nodes",
     "within_central": "RMS error of the node with the largest over that of a centralised filter",
 }
-"""Quantities of a target; all are averages over the samples after time 0."""
-
-
-class Target(NamedTuple):
-    """A quantity that should be at most ``limit``."""
-
-    quantity: str
-    limit: float
-
-    def __str__(self) -> str:
-        return f"{self.quantity} <= {self.limit:g}"
-
-    @property
-    def of_errors(self) -> bool:
-        """True if it is about errors, False if about covariances."""
-        return not self.quantity.endswith("_trace")
-
-    @property
-    def of_worst(self) -> bool:
-        """True if it is about the worst node, False if about all nodes together."""
-        return not self.quantity.startswith("mean_")
+"""Quantities of a target that are averages over the samples after time 0."""
+QUANTITIES = AVERAGES | {
+    "worst_instant": "largest error of any node at any sample after time 0",
+    "time_above": "share of samples whose error is above metrics.level",
+    "mean_age": "mean age of the newest reading of each sensor, of all nodes",
+    "worst_age": "largest age of the newest reading of any sensor at any node",
+    "time_connected": "share of time in which the nodes that are up are connected",
+    "transmissions": "transmissions of all nodes in a run",
+    "bytes": "bytes transmitted by all nodes in a run",
+    "joules": "joules spent by all nodes in a run",
+}
+"""Quantities of a target, beside quantile_99 and its kind."""
+QUANTILE = re.compile(r"quantile_(\d+(?:\.\d+)?)")
 
 
 class QuantityInterval(NamedTuple):
@@ -52,20 +49,83 @@ class QuantityInterval(NamedTuple):
     high: float
 
 
+class Target(NamedTuple):
+    """A quantity that should be at most ``limit``, or at least if ``least``."""
+
+    quantity: str
+    limit: float
+    least: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.quantity} {'>=' if self.least else '<='} {self.limit:g}"
+
+    @property
+    def of_runs(self) -> bool:
+        """True if it is one of ``runs.quantities``, which theory does not know."""
+        return self.quantity not in AVERAGES
+
+    @property
+    def of_errors(self) -> bool:
+        """True if it is about mean square errors, False if about covariances or of runs."""
+        return not self.of_runs and not self.quantity.endswith("_trace")
+
+    @property
+    def description(self) -> str:
+        """What the quantity is."""
+        quantile = QUANTILE.fullmatch(self.quantity)
+        if quantile:
+            return f"error that is not exceeded in {quantile[1]} % of samples"
+        return QUANTITIES[self.quantity]
+
+    def decide(self, interval: QuantityInterval) -> str:
+        """Return if a quantity in this interval reaches the target."""
+        low, high = interval.low, interval.high
+        if low >= self.limit if self.least else high <= self.limit:
+            return REACHED
+        # Also if an end is not a number.
+        return UNDECIDED if (high >= self.limit if self.least else low <= self.limit) else MISSED
+
+    def prepare(self, scenario: Scenario) -> Scenario:
+        """Return a scenario whose runs have the quantity; raises ScenarioError if none has."""
+        metrics = scenario.metrics
+        quantile = QUANTILE.fullmatch(self.quantity)
+        if quantile:
+            metrics = dataclasses.replace(metrics, quantiles=(float(quantile[1]) / 100.0,))
+        elif self.quantity == "time_above" and metrics.level is None:
+            rule, remedy = "needs a level of errors", "add --set metrics.level=..."
+            raise ScenarioError("--target", rule, self.quantity, remedy)
+        elif self.quantity == "joules" and scenario.network.energy is None:
+            rule, remedy = "needs network.energy", "add joules_per_packet to [network.energy]"
+            raise ScenarioError("--target", rule, self.quantity, remedy)
+        elif self.quantity in NETWORK:
+            metrics = dataclasses.replace(metrics, network=True)
+        return dataclasses.replace(scenario, metrics=metrics)
+
+    @property
+    def of_worst(self) -> bool:
+        """True if it is about the worst node, False if about all nodes together."""
+        return not self.quantity.startswith("mean_")
+
+
 def parse_target(text: Any) -> Target:
     """Return the target of a text like ``worst_rms<=0.5``; raises ScenarioError."""
-    match = re.fullmatch(r"\s*(\w+)\s*<=\s*(\S+)\s*", text) if isinstance(text, str) else None
-    listed = ", ".join(QUANTITIES)
-    if match is None or match[1] not in QUANTITIES:
+    pattern = r"\s*([\w.]+)\s*(<=|>=)\s*(\S+)\s*"
+    match = re.fullmatch(pattern, text) if isinstance(text, str) else None
+    listed = ", ".join((*QUANTITIES, "quantile_99 and others"))
+    if match is None or not (match[1] in QUANTITIES or QUANTILE.fullmatch(match[1])):
         message = f"must be QUANTITY<=LIMIT with a quantity of {listed}"
         raise ScenarioError("--target", message, text, "write worst_rms<=0.5")
+    least = match[2] == ">="
+    if least != (match[1] == "time_connected"):
+        right = f"{match[1]}{'<=' if least else '>='}"
+        raise ScenarioError("--target", f"must be {right}LIMIT", text, f"write {right}{match[3]}")
     try:
-        limit = float(match[2])
+        limit = float(match[3])
     except ValueError:
         limit = math.nan
     if not (math.isfinite(limit) and limit > 0.0):
-        raise ScenarioError("--target", "limit must be a number above 0", match[2], "correct it")
-    return Target(match[1], limit)
+        raise ScenarioError("--target", "limit must be a number above 0", match[3], "correct it")
+    return Target(match[1], limit, least)
 
 
 def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
@@ -74,6 +134,8 @@ def quantity_by_theory(scenario: Scenario, target: Target) -> tuple[float, str]:
 
     Raises TheoryError if theory has no answer.
     """
+    if target.of_runs:
+        raise TheoryError(f"theory knows no {target.quantity}")
     traces, algorithm = bound_traces(scenario), scenario.filter.algorithm
     # Without exchange the bound of bound_traces() is the covariance itself.
     message = "exact: the covariance of filters that do not talk"
@@ -107,19 +169,28 @@ def _explain_errors(scenario: Scenario) -> str:
 
 
 def quantity_by_simulation(
-    metrics: RunMetrics, target: Target, level: float, central: float | None
+    metrics: RunMetrics,
+    target: Target,
+    level: float,
+    central: float | None,
+    names: Sequence[str] = (),
 ) -> QuantityInterval:
     """Return the quantity of the target over the runs of ``metrics``, with an interval that misses
     its true value with probability ``level``.
 
     The interval is Student's, simultaneous for all nodes (Bonferroni) if the target is about the
-    worst node. ``central`` is the trace of P of the centralised filter to divide by, or None.
+    worst node. ``central`` is the trace of P of the centralised filter to divide by, or None;
+    ``names`` are those of ``metrics.quantities``.
     """
-    values = metrics.mean_square if target.of_errors else metrics.trace
+    if target.of_runs:
+        values = metrics.quantities[:, [names.index(target.quantity)]]
+    else:
+        values = metrics.mean_square if target.of_errors else metrics.trace
     if (np.isnan(values) & ~(metrics.diverged > 0)).any():
         # Rounding hides the errors of some run: nothing can be decided.
         return QuantityInterval(math.nan, -math.inf, math.inf)
-    values = np.where(metrics.diverged > 0, np.inf, values)  # a run that diverged is the worst
+    # A run that diverged is the worst.
+    values = np.where(metrics.diverged > 0, 0.0 if target.least else np.inf, values)
     columns = values if target.of_worst else values.mean(axis=1, keepdims=True)
     runs, count = columns.shape
     with np.errstate(over="ignore", invalid="ignore"):
