@@ -237,8 +237,8 @@ COMMANDS = (
             _option(
                 "--target",
                 "quantities: worst_rms, mean_rms, worst_trace, mean_trace, within_central, "
-                "worst_instant, quantile_99, time_above, mean_age, worst_age, transmissions, bytes, "
-                "joules, and time_connected>=LIMIT",
+                "worst_instant, quantile_99, time_above, mean_age, worst_age, transmissions, "
+                "bytes, joules, and time_connected>=LIMIT",
                 required=True,
                 metavar="QUANTITY<=LIMIT",
             ),

@@ -7,11 +7,10 @@ import time
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.sparse.csgraph import connected_components
 from scipy.stats import t as student_t
 
 from netkf.core.fields import SourceFile
@@ -20,16 +19,14 @@ from netkf.ensembles.replicas import Progress, replicate
 from netkf.linalg.arrays import FloatArray
 from netkf.logs.outcomes import Chain
 from netkf.network.scheduled import ScheduledLoss
+from netkf.runs.connectivity import ConnectivitySink
 from netkf.runs.files import write_text
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
-from netkf.trace.messages import DELIVERED, by_link, join_messages
 from netkf.trace.run import Run
 
 COLUMNS = ["law", "quantity", "replay", "low", "median", "high", "p", "inside", "runs"]
 RUNS, FEW_RUNS, BUDGET = 200, 20, 180.0
-RECENT = 5.0
-"""A link is up while its last packet heard is no older than so many intervals of its sender."""
 STREAM = 0x6C617773
 """Seeds the posterior draws apart from the streams of the runs."""
 
@@ -220,49 +217,16 @@ def measure_run(scenario: Scenario, run: Run) -> dict[str, float]:
     squares = run.sq_error if run.truth_known else np.trace(run.P, axis1=2, axis2=3)
     by_time = squares[later].mean(axis=1)
     kind = "error" if run.truth_known else "deviation by P"
-    messages = join_messages(run.log)
-    heard = messages[messages["outcome"] == DELIVERED]
-    ages, connected = measure_network(scenario, run.times[later], messages)
+    network = ConnectivitySink(scenario, {}, by_messages=True)
+    network.events(run.log)
+    t, *samples = (part[later] for part in (run.times, run.x, run.xhat, run.P, run.error))
+    network.states(t, *samples)
+    network.finish()
+    age = float(t.mean() - np.mean([one.mean() for one in network.newest_heard(t)]))
     return {
         f"RMS {kind}": float(np.sqrt(by_time.mean())),
         f"{kind} at the worst instant": float(np.sqrt(by_time.max())),
-        "mean age (s)": ages,
-        "messages heard": float(len(heard)),
-        "time connected": connected,
+        "mean age (s)": age,
+        "messages heard": float(run.count("deliver")),
+        "time connected": float(network.shares()[-1]),
     }
-
-
-def measure_network(
-    scenario: Scenario, times: FloatArray, messages: np.ndarray
-) -> tuple[float, float]:
-    """Return the mean age in seconds, over links and sample ``times`` (T,), of the newest message
-    heard, and the share of times at which links whose newest is recent connect the network.
-
-    It is connected if every node hears every other one along some links, or if the graph never
-    allows that, along links in either direction.
-    """
-    index, size = scenario.topology.index, len(scenario.topology.nodes)
-    links = scenario.topology.directions
-    newest = np.full((len(times), len(links)), 0.0)
-    order = {link: k for k, link in enumerate(links)}
-    for rows in by_link(messages):
-        arrived = rows[rows["outcome"] == DELIVERED]
-        arrived = arrived[np.argsort(arrived["ended"], kind="stable")]
-        place = np.searchsorted(arrived["ended"], times, side="right")
-        sent = np.concatenate([[0.0], np.maximum.accumulate(arrived["sent"])])
-        newest[:, order[int(rows["sender"][0]), int(rows["receiver"][0])]] = sent[place]
-    age = times[:, None] - newest
-    per_link = len(messages) / max(len(links), 1)
-    is_up = (age <= RECENT * scenario.horizon / max(per_link, 1.0)) & (newest > 0.0)
-    ends = np.array([[index[i], index[j]] for i, j in links])
-    whole = np.zeros((size, size))
-    whole[ends[:, 0], ends[:, 1]] = 1.0
-    kind: Literal["strong", "weak"] = (
-        "strong" if connected_components(whole, connection="strong")[0] == 1 else "weak"
-    )
-    together = 0
-    for flags in is_up:
-        graph = np.zeros((size, size))
-        graph[ends[flags, 0], ends[flags, 1]] = 1.0
-        together += connected_components(graph, connection=kind)[0] == 1
-    return float(age.mean()), together / max(len(times), 1)

@@ -24,8 +24,7 @@ from netkf.runs.tables import (
     has_bound,
 )
 from netkf.studies.compare import Comparison, Entry
-from netkf.studies.compare_filters import QUANTITIES
-from netkf.studies.filter_values import Quantity
+from netkf.studies.filter_values import JUDGED, Quantity
 from netkf.studies.stored import StoredComparison
 from netkf.trace.nees import traces
 
@@ -160,7 +159,7 @@ def filters_table(comparison: StoredComparison) -> str:
     rows = [
         [
             row.filter,
-            *(cell for name in QUANTITIES for cell in _quantity_cells(row.quantities[name])),
+            *(cell for name in JUDGED for cell in _quantity_cells(row.quantities[name])),
             row.consistency,
             f"{row.transmissions:,.0f}",
             f"{row.bytes / 1000.0:,.6g}",

@@ -35,17 +35,21 @@ class ConnectivitySink(Sink):
     A link is up while both ends are and it is in range (``range`` graphs) or in contact
     (``contacts``), and where activations or losses are recorded while its newest message heard is
     RECENT. Parts are joined by links in both directions, or by some in either direction if the
-    whole graph has no more. ``lives`` are those of the run, by node.
+    whole graph has no more. ``lives`` are those of the run, by node; with ``by_messages`` its
+    messages say which links are up as if they were recorded.
     """
 
     thread_safe: ClassVar[bool] = True
 
-    def __init__(self, scenario: Scenario, lives: Mapping[int, Lifetime]) -> None:
+    def __init__(
+        self, scenario: Scenario, lives: Mapping[int, Lifetime], by_messages: bool = False
+    ) -> None:
         self._scenario, self._lives, topology = scenario, lives, scenario.topology
         network = scenario.network
         self._contacts = network.activation if isinstance(network.activation, Contacts) else None
         recorded = isinstance(network.activation, RecordedClock | RecordedSlots)
-        self.by_messages = recorded or isinstance(network.channel.loss, RecordedLoss)
+        recorded = recorded or isinstance(network.channel.loss, RecordedLoss)
+        self.by_messages = recorded or by_messages
         parts = topology.radius, self._contacts
         self.changes = bool(lives) or self.by_messages or parts != (None, None)
         index = topology.index
@@ -137,13 +141,13 @@ class ConnectivitySink(Sink):
     def finish(self) -> None:
         """Look at the samples that waited for all messages."""
         for t, links in self._samples:
-            newest = np.stack([*self._newest_heard(t)], axis=1) if len(self._ends) else links * 1.0
+            newest = np.stack([*self.newest_heard(t)], axis=1) if len(self._ends) else links * 1.0
             interval = self._scenario.horizon * len(self._ends) / max(self._sent, 1)
             is_recent = (t[:, None] - newest <= RECENT * interval) & (newest > 0.0)
             self._look(t, links & is_recent)
         self._samples = []
 
-    def _newest_heard(self, t: FloatArray) -> Iterator[FloatArray]:
+    def newest_heard(self, t: FloatArray) -> Iterator[FloatArray]:
         """Yield for each directed link when its newest message heard was sent (T,), 0 without."""
         rows, size = np.concatenate([np.empty(0, EVENT), *self._heard]), len(self._scenario.nodes)
         sender, receiver = (
@@ -157,11 +161,19 @@ class ConnectivitySink(Sink):
 
     def entry(self) -> dict[str, Any]:
         """Return the entry of summary.json: the share of samples at which the network is connected,
-        the mean number of its components, and the share at which each link is up.
+        the mean number of its components, and, unless messages tell it, the share at which each
+        link is up.
         """
         count, topology = max(self.count, 1), self._scenario.topology
         shares = dict(zip(topology.directions, (self.up / count).tolist(), strict=True))
-        links = [
+        entry: dict[str, Any] = {
+            "samples": self.count,
+            "connected": self.connected / count if self.count else None,
+            "components": self.components / count if self.count else None,
+        }
+        if self.by_messages:
+            return entry
+        entry["links"] = [
             {
                 **node_columns(i),
                 "peer": j,
@@ -169,12 +181,7 @@ class ConnectivitySink(Sink):
             }
             for i, j in topology.links
         ]
-        return {
-            "samples": self.count,
-            "connected": self.connected / count if self.count else None,
-            "components": self.components / count if self.count else None,
-            "links": links,
-        }
+        return entry
 
     def shares(self) -> FloatArray:
         """Return the share of samples (N + 1,) at which each node is up and no part is larger than

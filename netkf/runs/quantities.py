@@ -168,6 +168,7 @@ def _make_ages(scenario: Scenario, forgetful: Sequence[int]) -> Ages | None:
         scenario.topology.directions,
         sorted(scenario.increment_sensors),
         forgetful,
+        scenario.node_filter.analysis.swaps,
         scenario.node_filter.analysis.tells_estimates,
         lambda nodes, times: _read_at(scenario, nodes, times),
     )

@@ -94,7 +94,7 @@ def summary_table(
         )
     if "conserved" in summary:
         lines.append("mass: " + _describe_conserved(summary["conserved"]))
-    lines.append(_message_line(summary["messages"]))
+    lines += [*_quantity_lines(summary), _message_line(summary["messages"])]
     lines += [f"note: {note}" for note in usage_notes(summary.get("records", {}))]
     return "\n".join(lines)
 
@@ -136,6 +136,22 @@ def _node_table(summary: dict[str, Any]) -> Iterator[str]:
 def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[str]:
     """Return the cells of a row of averages that begins with ``name``."""
     return [name, *(format_with_error(row[key], row.get(f"{key}_se")) for key in columns)]
+
+
+def _quantity_lines(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield a line on quantities that were asked for, or that vary because links come and go."""
+    row, parts = summary["overall"], []
+    shown = {
+        "time_above": "error above the level in {:.2%} of the samples",
+        "time_connected": "connected {:.1%} of the time",
+        "worst_age": "newest readings at most {:.4g} s old",
+        "joules": "{:,.4g} J",
+    }
+    asked = row.get("time_above") is not None or row.get("joules") is not None
+    if asked or "connectivity" in summary:
+        parts = [text.format(row[key]) for key, text in shown.items() if row.get(key) is not None]
+    if parts:
+        yield f"worst instant: {format_number(row['worst_instant'])}; {', '.join(parts)}"
 
 
 def _message_line(messages: dict[str, Any]) -> str:

@@ -248,9 +248,7 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     runs = [read_directory(as_path("directories", directory)) for directory in directories]
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
     first = runs[0]
-    more = (q for run in runs for q in quantities_in(run.summary["overall"]))
-    known = [q for q in dict.fromkeys(more) if any(run.value(q, -1)[0] is not None for run in runs)]
-    quantities = [(q, -1) for q in (*AVERAGES, *known, *MESSAGES)]
+    quantities = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
     if all(run.nodes == first.nodes for run in runs):
         quantities += [("rms_error", node) for node in first.nodes]
     level = (1.0 - confidence) / (len(quantities) * max(1, len(runs) - 1))
@@ -259,6 +257,14 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         for q, node in quantities
     ]
     rows += [ComparedRow(q, -1, tuple(Entry(*run.value(q, -1)) for run in runs)) for q in TRACES]
+    # Shown, not judged.
+    more = dict.fromkeys(q for run in runs for q in quantities_in(run.summary["overall"]))
+    entries = {q: tuple(Entry(*run.value(q, -1)) for run in runs) for q in more}
+    rows[len(AVERAGES) : len(AVERAGES)] = [
+        ComparedRow(q, -1, found)
+        for q, found in entries.items()
+        if any(entry.value is not None for entry in found)
+    ]
     return Comparison(
         directories=tuple(str(run.directory) for run in runs),
         names=tuple(str(run.manifest.get("name", "")) for run in runs),

@@ -30,6 +30,7 @@ from netkf.scenario.registry import list_kinds, name_of
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import as_table, part_as_table
 from netkf.studies.filter_values import (
+    JUDGED,
     FilterValues,
     Quantity,
     block_values,
@@ -44,8 +45,6 @@ if TYPE_CHECKING:
 
 CARRIED = ("mean", "cov", "model", "estimates")
 """Keys of ``[filter]`` that every compared filter takes over from the scenario."""
-QUANTITIES = ("rms_error", "worst_instant", "nees_ratio")
-"""Quantities that tables show with their differences."""
 MAX_FILTERS = 200
 Progress = Callable[[int, int], None]
 Choice = str | Mapping[str, Any] | Filter
@@ -207,7 +206,7 @@ def compare_filters(
     first = next(iter(values))
     # Bonferroni: all differences from the first filter hold together.
     names = sample_names(scenario)
-    level = (1.0 - confidence) / ((2 + len(names)) * max(1, len(values) - 1))
+    level = (1.0 - confidence) / (len(JUDGED) * max(1, len(values) - 1))
     rows, first_scenario = [], next(one.scenario for one in candidates if one.scenario is not None)
     for label, case, reason in candidates:
         if case is None:

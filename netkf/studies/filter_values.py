@@ -18,6 +18,8 @@ from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import mean_over_runs
 
+JUDGED = ("rms_error", "worst_instant", "nees_ratio")
+"""Quantities whose differences have intervals."""
 ROUNDING = 1e-9
 """Relative difference up to which two filters count as equal."""
 
@@ -84,8 +86,8 @@ def estimate_quantities(
     level: float,
 ) -> dict[str, Quantity]:
     """Return ``rms_error``, ``nees_ratio`` (NEES / n) and the quantities of samples, ``names``, of
-    a filter of n states, of all nodes, with the paired differences from the ``first`` one; each
-    interval misses with probability ``level``.
+    a filter of n states, of all nodes, with the paired differences from the ``first`` one; those of
+    JUDGED have intervals, each of which misses with probability ``level``.
     """
     quantities = {}
     base = _influences(first, n, names) if first is not None else {}
@@ -94,7 +96,7 @@ def estimate_quantities(
         quantity = Quantity(value, mean_over_runs(influence).error)
         if name in base and not (values.diverged.any() or first is None or first.diverged.any()):
             base_value, influence_difference = base[name][0], influence - base[name][1]
-            width = _width(influence_difference, level)
+            width = _width(influence_difference, level) if name in JUDGED else math.nan
             gap = value - base_value
             # The interval excludes 0, and the difference is not mere rounding, by which two forms
             # of one algorithm differ.

@@ -77,11 +77,11 @@ def sweep(
     A row has the varied keys, ``runs``; ``worst_rms`` (of the node with the largest), ``mean_rms``
     (of all nodes together), ``mean_trace`` and ``worst_trace`` of P, ``worst_instant``, quantiles,
     and what ``metrics.level`` and ``metrics.network`` ask for, of all nodes together as in
-    summaries, each with its standard error ``_se`` over runs; ``bound`` and ``central``, mean traces
-    of the bound on P (hybrid paper, H equation 12) and of the covariance of the centralised filter
-    if they exist; messages ``sent``, ``delivered`` and ``lost`` per run; ``status``, complete or
-    diverged, and whether the truth is another than in the first row. Averages over time are over
-    the samples after time 0.
+    summaries, each with its standard error ``_se`` over runs; ``bound`` and ``central``, mean
+    traces of the bound on P (hybrid paper, H equation 12) and of the covariance of the centralised
+    filter if they exist; messages ``sent``, ``delivered`` and ``lost`` per run; ``status``,
+    complete or diverged, and whether the truth is another than in the first row. Averages over
+    time are over the samples after time 0.
 
     ``workers``, ``executor``, ``scheduler`` and ``engine`` are those of ``netkf.monte_carlo``;
     ``progress(done, wanted)`` is called with numbers of points. Raises ScenarioError, before

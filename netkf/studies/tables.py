@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from netkf.core.printable import shorten
 from netkf.runs.tables import format_number, format_table, format_with_error, shorten_rows
 from netkf.studies.compare import Comparison
-from netkf.studies.compare_filters import QUANTITIES, ComparedFilter, FilterComparison
+from netkf.studies.compare_filters import ComparedFilter, FilterComparison
 from netkf.studies.consistency import Consistency
-from netkf.studies.filter_values import Quantity
+from netkf.studies.filter_values import JUDGED, Quantity
 from netkf.studies.search import Sizing
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def format_filters(comparison: FilterComparison) -> str:
     rows = [
         [
             shorten(row.filter),
-            *(cell for name in QUANTITIES for cell in _format_quantity(row.quantities[name])),
+            *(cell for name in JUDGED for cell in _format_quantity(row.quantities[name])),
             row.consistency,
             f"{row.transmissions:,.0f}",
             f"{row.bytes / 1000.0:,.6g}",

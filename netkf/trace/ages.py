@@ -12,7 +12,7 @@ from netkf.linalg.compiling import kernel
 from netkf.linalg.structs import Struct
 from netkf.trace.schema import CODES
 
-SENSE, SEND, DROP, DELIVER, ABSORB, SWAP, FORGET = range(1, 8)
+SENSE, SEND, DROP, DELIVER, USE, FORGET = range(1, 7)
 """What an event does to ages; others do nothing."""
 ACTIONS = np.zeros(len(CODES), dtype=np.int64)
 for _kind, _action in (
@@ -21,8 +21,8 @@ for _kind, _action in (
     ("lost", DROP),
     ("late", DROP),
     ("deliver", DELIVER),
-    ("absorb", ABSORB),
-    ("swap", SWAP),
+    ("absorb", USE),
+    ("swap", USE),
     ("crash", FORGET),
     ("leave", FORGET),
 ):
@@ -45,6 +45,7 @@ class AgeState(Struct):
     under_way     : (D,) first message in the list of each directed link
     inbox         : (N,) first message in the list of those that wait at a node
     free          : (C + 1,) numbers of messages that are free, how many of them last
+    swaps         : True if nodes replace what they know by what a message tells
     """
 
     newest: FloatArray
@@ -60,6 +61,7 @@ class AgeState(Struct):
     under_way: np.ndarray
     inbox: np.ndarray
     free: np.ndarray
+    swaps: int
 
 
 class Ages:
@@ -73,6 +75,7 @@ class Ages:
     nodes, sources, links : ids in increasing order; directed links (sender, receiver), sorted
     steady    : the sources that read continuously
     forgetful : nodes that know nothing after they were down
+    swaps     : a message replaces what its receiver knew, of several the last of the last sender
     tells_all : ``tells_all(phase)``, False for messages that tell the sender's own reading only
     read_at   : ``read_at(node, times)``, when the readings used at ``times`` (K,) were taken, nan
                 where there was none; ``node`` (K,) are ids
@@ -85,6 +88,7 @@ class Ages:
         links: Sequence[tuple[int, int]],
         steady: Sequence[int],
         forgetful: Sequence[int],
+        swaps: bool,
         tells_all: Callable[[int], bool],
         read_at: Callable[[np.ndarray, FloatArray], FloatArray],
     ) -> None:
@@ -106,6 +110,7 @@ class Ages:
             "under_way": np.full(len(links), -1),
             "inbox": np.full(len(nodes), -1),
             "free": np.zeros(1, dtype=np.int64),
+            "swaps": int(swaps),
         }
         self._grow(CAPACITY)
 
@@ -137,7 +142,7 @@ class Ages:
         action[(action == FORGET) & ~self._forgetful[np.minimum(node, len(self._nodes) - 1)]] = 0
         phases = {phase: self._tells_all(phase) for phase in np.unique(rows["phase"]).tolist()}
         tells_all = np.isin(rows["phase"], [phase for phase, whole in phases.items() if whole])
-        columns = action, time, node, peer, link, rows["message"].copy(), tells_all
+        columns = action, time, node, link, rows["message"].copy(), tells_all
         done = 0
         while done < len(rows):
             done = follow(self._state, *columns, done)
@@ -197,17 +202,20 @@ def tell(s: AgeState, i: int, k: int, t: float, tells_all: bool) -> None:
 
 
 @kernel
-def use(s: AgeState, i: int, swap_with: int, t: float) -> None:
-    """Let node ``i`` use the messages that wait for it: all, or in a swap with a node the last one
-    of that, which replaces all that it knows.
+def use(s: AgeState, i: int, t: float) -> None:
+    """Let node ``i`` use the messages that wait for it: all, or in a swap the last one of the last
+    sender, which replaces all that it knows.
     """
-    k, swaps = s.inbox[i], swap_with >= 0
+    k, chosen = s.inbox[i], -1
     while k >= 0:
-        replaces = swaps and s.sender[k] == swap_with
+        if chosen < 0 or s.sender[k] > s.sender[chosen]:
+            chosen = k
+        k = s.following[k]
+    k = s.inbox[i]
+    while k >= 0:
         for c in range(s.newest.shape[1]):
-            if replaces or (swap_with < 0 and s.held[k, c] > s.newest[i, c]):
+            if (s.swaps and k == chosen) or (not s.swaps and s.held[k, c] > s.newest[i, c]):
                 renew(s, i, c, s.held[k, c], t)
-        swaps = swaps and not replaces
         release(s, k)
         k = s.following[k]
     s.inbox[i] = -1
@@ -219,7 +227,6 @@ def follow(
     action: np.ndarray,
     time: FloatArray,
     node: np.ndarray,
-    peer: np.ndarray,
     link: np.ndarray,
     number: np.ndarray,
     tells_all: np.ndarray,
@@ -244,8 +251,8 @@ def follow(
                 release(s, k)
             elif k >= 0:
                 s.following[k], s.inbox[i] = s.inbox[i], k
-        elif action[e] == ABSORB or action[e] == SWAP:
-            use(s, i, peer[e] if action[e] == SWAP else -1, t)
+        elif action[e] == USE:
+            use(s, i, t)
         elif action[e] == SENSE:
             renew(s, i, s.own[i], t, t)
         elif action[e] == FORGET:
