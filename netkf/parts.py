@@ -70,6 +70,7 @@ from netkf.network.delays import (
     NoDelay,
     UniformDelay,
 )
+from netkf.network.energy import Energy
 from netkf.network.graph_files import EdgelistGraph, GmlGraph, GraphFile, GraphmlGraph
 from netkf.network.graphs import (
     Complete,
@@ -134,6 +135,7 @@ from netkf.plants.relative import (
 )
 from netkf.plants.sampling import RecordedSampling
 from netkf.plants.sensors import LinearSensor, Sensor
+from netkf.scenario.metrics import Metrics
 from netkf.scenario.model import Belief, Filtering, Network
 from netkf.scenario.registry import KINDS
 from netkf.scenario.scenario import Scenario
@@ -189,6 +191,7 @@ __all__ = [
     "DutyCycle",
     "EdgelistGraph",
     "Edges",
+    "Energy",
     "ErdosRenyi",
     "Estimate",
     "EventTriggeredCi",
@@ -226,6 +229,7 @@ __all__ = [
     "Loss",
     "Matching",
     "Message",
+    "Metrics",
     "Model",
     "Needs",
     "Network",

@@ -139,18 +139,16 @@ def _row_cells(name: str, row: dict[str, Any], columns: Iterable[str]) -> list[s
 
 
 def _quantity_lines(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield a line on quantities that were asked for, or that vary because links come and go."""
-    row, parts = summary["overall"], []
+    """Yield a line on quantities beside means if a level or energy was stated."""
+    row = summary["overall"]
     shown = {
         "time_above": "error above the level in {:.2%} of the samples",
         "time_connected": "connected {:.1%} of the time",
         "worst_age": "newest readings at most {:.4g} s old",
         "joules": "{:,.4g} J",
     }
-    asked = row.get("time_above") is not None or row.get("joules") is not None
-    if asked or "connectivity" in summary:
-        parts = [text.format(row[key]) for key, text in shown.items() if row.get(key) is not None]
-    if parts:
+    parts = [text.format(row[key]) for key, text in shown.items() if row.get(key) is not None]
+    if row.get("time_above") is not None or row.get("joules") is not None:
         yield f"worst instant: {format_number(row['worst_instant'])}; {', '.join(parts)}"
 
 
