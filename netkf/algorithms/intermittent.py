@@ -40,6 +40,7 @@ from netkf.linalg.compiling import kernel
 
 SLACK = 1.0 + 1e-6
 """Factor by which the past that is remembered is longer than needed, since ages are rounded."""
+ROUNDING = 1e-9
 MOVE = -1
 """In place of a number of rows: the event is a move of the origin."""
 
@@ -129,6 +130,9 @@ def use_late(record: Any, h: int, run: Any, k: int) -> None:
     forget(record, h, run)
     time, moves = record.time[h, 0] - run.age[k], record.payload.moves[run.message[k], 0]
     last = record.kept[h, 0]
+    # It was taken before this node began again, which is more than a rounding of its age.
+    if time < record.past_time[h, 0, 0] - ROUNDING * run.age[k]:
+        return
     # The order of events at one time is that of moves, and does not matter for readings. A reading
     # of the time of a move comes after it, however its age is rounded.
     e = last

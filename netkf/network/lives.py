@@ -196,13 +196,14 @@ def lifetimes(scenario: Any, streams: Any) -> dict[int, Lifetime]:
                 generator: np.random.Generator = streams.generator("life", node)
                 return generator
 
-            changes = life.changes(node, random, scenario.horizon)
+            # The last slot is finished after the horizon, for its sample.
+            changes = life.changes(node, random, scenario.end_time)
             up = not changes or not changes[0].up
             instants = [c._replace(time=scenario.time_grid.instant(c.time)) for c in changes]
             forgets = life.memory == "lost"
             if forgets and scenario.slotted:
                 instants = _begun_with_slots(instants, scenario.slot_plant)
-            kept = tuple(c for c in instants if c.time < scenario.horizon)
+            kept = tuple(c for c in instants if c.time < scenario.end_time)
             found[node] = Lifetime(up, kept, forgets)
     return found
 

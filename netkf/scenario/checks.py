@@ -226,7 +226,8 @@ def _list_ids(nodes: tuple[int, ...]) -> str:
 
 def _check_lives(scenario: DerivedScenario) -> None:
     owners: dict[int, int] = {}
-    for k, life in enumerate(scenario.network.lives):
+    lives = scenario.network.lives
+    for k, life in enumerate(lives):
         for node in life.nodes:
             if owners.setdefault(node, k) != k:
                 rule = f"must not have a node of network.lives[{owners[node]}]"
@@ -236,6 +237,17 @@ def _check_lives(scenario: DerivedScenario) -> None:
                 rule = "cannot have a life where sensors give increments, only where they sample"
                 remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
                 raise ScenarioError(f"network.lives[{k}].nodes", rule, node, remedy)
+    kernels, forget = scenario.node_filter.kernels, [life.memory == "lost" for life in lives]
+    changes = len(scenario.plant.changes) or not scenario.plant.linear
+    if (
+        any(forget)
+        and changes
+        and kernels is not None
+        and kernels.of(not scenario.slotted).remembers
+    ):
+        rule = "must be kept where late readings are used and the plant changes or is not linear"
+        remedy = 'write "kept", or late = "drop" in [filter]'
+        raise ScenarioError(f"network.lives[{forget.index(True)}].memory", rule, "lost", remedy)
     if owners and scenario.node_filter.timing.pooled:
         rule = f"has no meaning for the {filter_name(scenario)}, which is in no node"
         raise ScenarioError("network.lives", rule, sorted(owners), "remove it")

@@ -125,11 +125,11 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     require_linear(scenario)
     forgets = any(life.memory == "lost" for life in scenario.network.lives)
-    if scenario.network.lives and (scenario.slotted or forgets):
-        raise TheoryError(
-            f"{LIVES}: exact errors are known under clocks, of nodes that keep their memory; "
-            f"{CONSISTENCY}"
-        )
+    in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
+    matters = scenario.network.lives and (scenario.slotted or forgets)
+    if matters and (in_python or scenario.views is not None):
+        rule = "exact errors are known of filters whose verbs are affine kernels of one state"
+        raise TheoryError(f"{LIVES}: {rule}; {CONSISTENCY}")
     if scenario.links_follow_state:
         raise TheoryError("the true state says who hears whom: events tell of it")
     if scenario.slotted:

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.stats
 
 import netkf
 from netkf.network.lives import Crashes, DutyCycle
+from netkf.theory.errors import error_law
 from netkf.trace.schema import CODES
 
 CLOCKS = """
@@ -165,12 +167,12 @@ def laws_of_gap(gap):
     return Phi, Phi @ big[:2, 2:]
 
 
-def joint_moments(run, weight):
-    """P of each node, and the joint covariance of all errors, by time: the linear recursion that
-    the events of a run without delays say, written plainly.
+def joint_moments(run, weight, lost):
+    """P of each node, and the joint covariance of all errors, by time: the linear recursion of the
+    true state and all errors that the events of a run without delays say, written plainly.
     """
     H, R, prior = np.array([[1.0, 0.0]]), 0.3, np.array([[1.0, 0.2], [0.2, 2.0]])
-    P, joint, now = [prior] * 3, np.kron(np.ones((3, 3)), prior), 0.0
+    P, joint, now = [prior] * 3, np.kron(np.ones((4, 4)), prior), 0.0
     names, heard, found = {code: kind for kind, code in CODES.items()}, {}, []
     rows = [
         (t, 0, names[k], n, p) for t, k, n, p in run.log[["t", "kind", "node", "peer"]].tolist()
@@ -181,10 +183,10 @@ def joint_moments(run, weight):
         if t > now:
             Phi, Q = laws_of_gap(t - now)
             P = [Phi @ one @ Phi.T + Q for one in P]
-            move, now = np.kron(np.eye(3), Phi), t
-            joint = move @ joint @ move.T + np.kron(np.ones((3, 3)), Q)
-        D, noise = np.eye(6), np.zeros((6, 6))
-        own = slice(2 * node, 2 * node + 2)
+            move, now = np.kron(np.eye(4), Phi), t
+            joint = move @ joint @ move.T + np.kron(np.ones((4, 4)), Q)
+        D, noise = np.eye(8), np.zeros((8, 8))
+        own = slice(2 * node + 2, 2 * node + 4)
         if kind == "sense":
             K = P[node] @ H.T / (H @ P[node] @ H.T + R)
             D[own, own] -= K @ H
@@ -196,23 +198,78 @@ def joint_moments(run, weight):
             before = list(P)
             for sender in heard.pop(node):
                 D[own, own] -= weight * np.eye(2)
-                D[own, 2 * sender : 2 * sender + 2] += weight * np.eye(2)
+                D[own, 2 * sender + 2 : 2 * sender + 4] += weight * np.eye(2)
                 P[node] = P[node] + weight * (before[sender] - before[node])
+        elif kind in ("restart", "join") and lost:
+            # The error of a mean that knows nothing is the state, less its mean.
+            D[own], P[node] = 0.0, prior
+            D[own, :2] = np.eye(2)
         elif kind == "probe":
-            found.append((P, joint))
+            found.append((P, joint[2:, 2:]))
             continue
         joint = D @ joint @ D.T + noise
     return found
 
 
-def test_errors_given_the_events_are_exact(scenario_of):
-    lives, files = recorded()
+@pytest.mark.parametrize("memory", ["kept", "lost"])
+def test_errors_given_the_events_are_exact(scenario_of, memory):
+    lives, files = recorded(memory)
     no_delay = CLOCKS.replace('delay = {{ kind = "constant", seconds = 0.1 }}', "")
     scenario = scenario_of(no_delay, lives, files, filter_="hybrid")
     run = netkf.simulate(scenario, seed=4)
     Sigma = netkf.theory.error_covariance(scenario, run, stacked=True)
-    for k, (P, joint) in enumerate(joint_moments(run, 0.4)):
+    for k, (P, joint) in enumerate(joint_moments(run, 0.4, memory == "lost")):
         np.testing.assert_allclose(run.P[k], P, rtol=1e-9)
+        np.testing.assert_allclose(Sigma[k], joint, rtol=1e-9, atol=1e-12)
+
+
+def moments_in_slots(run, lost):
+    """P of each node and the joint covariance of all errors at the begin of each slot of nodes that
+    use readings of their neighbours when they arrive: the recursion of (x, errors).
+    """
+    F, Q, R, prior = 1.1, 0.4, 0.5, 2.0
+    P, joint = np.full(3, prior), np.full((4, 4), prior)
+    names, found = {code: kind for kind, code in CODES.items()}, []
+    rows = [(t, names[k], n, p) for t, k, n, p in run.log[["t", "kind", "node", "peer"]].tolist()]
+    for slot in range(len(run.times)):
+        for t, kind, node, _ in rows:
+            if t == slot and kind in ("restart", "join") and lost:
+                joint[node + 1], P[node] = joint[0], prior
+                joint[:, node + 1] = joint[:, 0]
+                joint[node + 1, node + 1] = joint[0, 0]
+        found.append((P.copy(), joint[1:, 1:].copy()))
+        # What a node uses: its own reading, and those that arrive before it goes down.
+        used = [
+            {n for t, kind, n, _ in rows if t == slot and kind == "sense" and n == i}
+            for i in range(3)
+        ]
+        for k, (t, kind, node, peer) in enumerate(rows):
+            down = [t2 for t2, kind2, n, _ in rows[k:] if n == node and kind2 in ("crash", "leave")]
+            if t == slot and kind == "deliver" and not (down and down[0] <= slot + 0.5):
+                used[node].add(peer)
+        D, gains = np.diag(np.full(4, F)), np.zeros((4, 3))
+        for i, readings in enumerate(used):
+            if readings:
+                K = P[i] / (len(readings) * P[i] + R)
+                D[i + 1, i + 1] = F * (1.0 - len(readings) * K)
+                gains[i + 1, list(readings)] = F * K
+                P[i] = P[i] * (1.0 - len(readings) * K)
+        P = F * F * P + Q
+        joint = D @ joint @ D.T + R * gains @ gains.T + Q
+    return found
+
+
+@pytest.mark.parametrize("memory", ["kept", "lost"])
+def test_errors_in_slots_given_the_events_are_exact(scenario_of, memory):
+    lives, files = recorded(memory)
+    lives += '\n[network.channel]\nloss = { kind = "bernoulli", delivery = 0.7 }'
+    # Node 1 goes down while messages are under way, after 0.2 of a slot.
+    files = {"l.csv": TABLE.replace("6,1,leave", "6.2,1,leave")}
+    scenario = scenario_of(SLOTS, lives, files, filter_="intermittent")
+    run = netkf.simulate(scenario, seed=4)
+    Sigma = netkf.theory.error_covariance(scenario, run, stacked=True)
+    for k, (P, joint) in enumerate(moments_in_slots(run, memory == "lost")):
+        np.testing.assert_allclose(run.P[k, :, 0, 0], P, rtol=1e-9)
         np.testing.assert_allclose(Sigma[k], joint, rtol=1e-9, atol=1e-12)
 
 
@@ -329,6 +386,32 @@ def test_engines_agree_and_accounts_balance(tmp_path, slots, filter_):
         assert_accounts_balance(one.log, scenario.horizon)
 
 
+@pytest.mark.parametrize(
+    ("slots", "filter_", "numbers"),
+    [
+        (True, "push-sum", (3, 4, 5)),
+        (True, "hcmci", (1, 5)),
+        (False, "intermittent", (2, 6, 14)),
+        (False, "push-sum", (0, 4)),
+    ],
+)
+def test_exact_errors_know_the_covariances_of_every_filter(tmp_path, slots, filter_, numbers):
+    # The errors of runs, in units of their exact joint covariance, are standard normal.
+    squares, size = 0.0, 0
+    for k in numbers:
+        scenario = combined(tmp_path, slots, filter_, k)
+        run = netkf.simulate(scenario, seed=k, engine="compiled")
+        law = error_law(scenario, run)
+        np.testing.assert_allclose(law.P, run.P, rtol=1e-9, atol=1e-9)
+        values, vectors = np.linalg.eigh(law.covariance)
+        known = values > 1e-9 * values.max()
+        errors = vectors.T @ ((run.x[:, None] - run.xhat).reshape(-1) - law.mean)
+        squares += float((errors[known] ** 2 / values[known]).sum())
+        size += int(known.sum())
+        assert np.abs(errors[~known]).max(initial=0.0) < 1e-3
+    assert 1e-4 < scipy.stats.chi2(size).cdf(squares) < 1.0 - 1e-4
+
+
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 @pytest.mark.parametrize("slots", [True, False])
 def test_a_node_that_forgets_begins_with_its_mean_whatever_drives_the_plant(
@@ -388,9 +471,6 @@ def test_theory_and_check_say_that_nothing_is_promised(scenario_of):
     scenario = scenario_of(CLOCKS, *recorded(), filter_="hybrid")
     with pytest.raises(netkf.TheoryError, match=r"network\.lives.*consistency"):
         netkf.check(scenario, runs=10)
-    forgetful = scenario_of(CLOCKS, *recorded("lost"), filter_="hybrid")
-    with pytest.raises(netkf.TheoryError, match=r"network\.lives.*consistency"):
-        netkf.theory.error_covariance(forgetful, netkf.simulate(forgetful, seed=1))
     with pytest.raises(netkf.TheoryError):
         netkf.theory.covariance_bound(scenario, [1.0])
 

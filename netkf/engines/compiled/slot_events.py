@@ -98,6 +98,26 @@ def steps_of(scenario: Scenario, setup: SlotSetup, slot: int) -> Iterator[Step]:
             yield exchange_step
 
 
+def absent(
+    scenario: Scenario, setup: SlotSetup, lives: LifeTable, first: int, count: int
+) -> np.ndarray:
+    """Return (S, N) bool: nodes that are down when the others read, in ``count`` slots from
+    ``first`` on.
+    """
+    times = np.array([_reading_time(scenario, setup, k) for k in range(first, first + count)])
+    return np.column_stack([lives.is_down(h, times) for h in range(len(setup.nodes))])
+
+
+def _reading_time(scenario: Scenario, setup: SlotSetup, slot: int) -> float:
+    steps, now = steps_of(scenario, setup, slot), scenario.slot_plant.slot_time(slot)
+    for step in setup.stages.step.tolist():
+        if step < 0:
+            break
+        for exchange_step in islice(steps, 1):
+            now = exchange_step.end
+    return now
+
+
 def slot_restarts(scenario: Scenario, lives: LifeTable) -> dict[int, list[int]]:
     """Return by slot the indices of the nodes that begin again when it begins."""
     found: dict[int, list[int]] = {}
@@ -174,24 +194,6 @@ class SlotEvents:
             for h in np.flatnonzero(asked[step.step]).tolist():
                 asked[step.step, h] = not self.lives.is_down(h, now)[0]
         return asked
-
-    def absent(self, first: int, count: int) -> np.ndarray:
-        """Return (S, N) bool: nodes that are down when the others read, in ``count`` slots from
-        ``first`` on.
-        """
-        times = np.array([self._reading_time(slot) for slot in range(first, first + count)])
-        nodes = range(len(self._setup.nodes))
-        return np.column_stack([self.lives.is_down(h, times) for h in nodes])
-
-    def _reading_time(self, slot: int) -> float:
-        steps = steps_of(self._scenario, self._setup, slot)
-        now = self._scenario.slot_plant.slot_time(slot)
-        for step in self._setup.stages.step.tolist():
-            if step < 0:
-                break
-            for exchange_step in islice(steps, 1):
-                now = exchange_step.end
-        return now
 
     def following(self, max_events: int, decide: Decide | None) -> tuple[int, np.ndarray]:
         """Make the messages and events of the next slots, up to about ``max_events`` events; return
@@ -420,7 +422,9 @@ class SlotEvents:
         while self._life_at < len(lives.t) and lives.t[self._life_at] <= until:
             k, self._life_at = self._life_at, self._life_at + 1
             node = self._scenario.nodes[lives.index[k]]
-            self._append_row((float(lives.t[k]), int(lives.kind[k]), node, -1, -1, -1, NAN))
+            now = float(lives.t[k])
+            if now < self._scenario.horizon:
+                self._append_row((now, int(lives.kind[k]), node, -1, -1, -1, NAN))
             self._down ^= {node}
             self._inbox.pop(node, None)
 

@@ -172,8 +172,13 @@ class SlotFilters:
             place = slice(first[h], first[h + 1]) if name in links else h
             array[:, place] = self._start[name][:, place]
         if moved.any():
-            self._run.offset[:] = moved[:, None]
-            call_kernel(self.kernels.shift, self.records.struct, h, run=self._run)
+            self.shift_lane(h, slice(None), moved)
+
+    def shift_lane(self, h: int, lane: Any, offset: FloatArray) -> None:
+        """Add ``offset`` (n,) to the estimate of filter ``h`` in a lane of the first block."""
+        self._run.offset[:] = 0.0
+        self._run.offset[:, lane] = offset.reshape(-1, *([1] * isinstance(lane, slice)))
+        call_kernel(self.kernels.shift, self.records.struct, h, run=self._run)
 
     def observe(self) -> None:
         """Write into the record of each node of the first block what exchanges conserve, now."""

@@ -24,7 +24,7 @@ from netkf.engines.base import Progress
 from netkf.engines.compiled.outcomes import channel_streams
 from netkf.engines.compiled.own_sensors import read_whitened
 from netkf.engines.compiled.samples import by_node, record_samples
-from netkf.engines.compiled.slot_events import SlotEvents
+from netkf.engines.compiled.slot_events import SlotEvents, absent
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_messages import (
@@ -555,7 +555,7 @@ class SlotRuns:
         if (self._recorded or self._own) and times.sensed.any():
             self._read_in_python(times, x, y, H)
         if self._events is not None and self._scenario.network.lives:
-            down = self._events.absent(self._slot, count)
+            down = absent(self._scenario, setup, self._events.lives, self._slot, count)
             y[:, down] = H[:, down] = 0.0
             for s in setup.nonlinear_sensors:
                 y[:, down[:, s.estimator], s.estimator, s.row : s.row + s.rows] = np.nan

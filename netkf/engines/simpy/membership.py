@@ -24,7 +24,7 @@ class Membership:
 
     def __init__(self, scenario: Scenario, streams: Streams, recorder: Recorder) -> None:
         self._recorder, self._index = recorder, scenario.topology.index
-        self._fresh_estimate = scenario.fresh_estimate
+        self._fresh_estimate, self._horizon = scenario.fresh_estimate, scenario.horizon
         self._lives = lifetimes(scenario, streams)
         self._down = {node for node, life in self._lives.items() if not life.up}
 
@@ -45,7 +45,8 @@ class Membership:
             # Before anything else of this instant, but for a move of the origin.
             yield timeline.at(change.time, Rank.LIFE, self._index[node])
             code = CODES[change.kind]
-            self._recorder.append((change.time, code, node, -1, -1, -1, NAN))
+            if change.time < self._horizon:
+                self._recorder.append((change.time, code, node, -1, -1, -1, NAN))
             if change.up:
                 self._down.remove(node)
                 if life.forgets:

@@ -25,8 +25,8 @@ from netkf.theory.common.observations import Observation, timed_observations
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
 
-SENSE, SEND, DELIVER, ABSORB, TRANSMIT = (
-    CODES[kind] for kind in ("sense", "send", "deliver", "absorb", "transmit")
+SENSE, SEND, DELIVER, ABSORB, TRANSMIT, RESTART, JOIN = (
+    CODES[kind] for kind in ("sense", "send", "deliver", "absorb", "transmit", "restart", "join")
 )
 
 LARGE, CHECKS = 1e4, 256
@@ -82,6 +82,10 @@ class ClockColumns(LoggedColumns):
         # The state grows by less than e in between; other filters do not commute with a shift.
         rate = max(np.abs(plant.A).sum(axis=0).max(), CHECKS / scenario.horizon)
         movable = not len(plant.changes) and np.array_equal(scenario.belief[0], plant.A)
+        lost = [life.nodes for life in scenario.network.lives if life.memory == "lost"]
+        self._forgetful = frozenset(node for nodes in lost for node in nodes)
+        # A node that begins again does so with a mean that does not move along.
+        movable = movable and not lost
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
         self._begin_piece(0)
@@ -137,6 +141,10 @@ class ClockColumns(LoggedColumns):
             self._inboxes.setdefault(node, []).append(self._sent.pop((peer, node, message)))
         elif kind == ABSORB and node in self._inboxes:
             self._absorb(node, time)
+        elif kind in (RESTART, JOIN) and node in self._forgetful:
+            fresh, first = (self._scenario.fresh_estimate(node, t)[0] for t in (time, 0.0))
+            self._times[self._index[node]] = time
+            self._filters.restart(self._index[node], fresh - first)
 
     def _move_truth(self, time: float) -> None:
         """Move the true state to ``time``, with an input for each noise of the plant."""

@@ -201,7 +201,12 @@ class LinearVerbs:
         if any(array.dtype.itemsize != 8 for array in arrays.values()):
             raise TheoryError("exact errors need records of int64 and float64")
         self._lay_out(arrays, {})
-        self._set_means(with_means.records.arrays)
+        self._start = {name: array.copy() for name, array in arrays.items()}
+        self._start_means = {
+            name: (array[0] - self._view(name)).copy()
+            for name, array in with_means.records.arrays.items()
+        }
+        self._set_means()
         self._offset_places = np.column_stack([np.full(self.n, -1), np.arange(self.n)])
         self._own_places = np.column_stack([np.zeros(self._p, dtype=np.int64), np.arange(self._p)])
         self._y, self._H = np.zeros((0, self._p, 1)), np.zeros((0, self._p, self.n, 1))
@@ -236,9 +241,9 @@ class LinearVerbs:
         words = self._stored[begin : begin + math.prod(shape)]
         return words.view(self._dtypes[name]).reshape(shape)
 
-    def _set_means(self, arrays: dict[str, np.ndarray]) -> None:
-        for name, array in arrays.items():
-            difference = (array[0] - self._view(name)).reshape(-1)
+    def _set_means(self) -> None:
+        for name, means in self._start_means.items():
+            difference = means.reshape(-1)
             words = self._begin[name] + np.flatnonzero(difference)
             rows = self._row[words] = self.forms.take(len(words))
             self.forms.table[rows, MEAN] = difference[difference != 0]
@@ -384,6 +389,31 @@ class LinearVerbs:
         """Predict node ``h`` and move it with the origin, by ``offset`` (n, C)."""
         words, places = self.node_words(h, 1), self._offset_places
         self._apply(self.kernels.shift, words, h, gap, places=places, others=offset)
+
+    def restart(self, h: int, moved: FloatArray) -> None:
+        """Let node ``h`` begin again, in coordinates that have ``moved`` (n,) since time 0."""
+        first, forms = self.run.first, self.forms
+        forms.table[self.xhat_rows[h]] = 0.0
+        for name, means in self._start_means.items():
+            shape, place = self._shapes[name], slice(h, h + 1)
+            if name in self._links:
+                place = slice(first[h], first[h + 1])
+            words = self._begin[name] + np.arange(math.prod(shape)).reshape(shape)[place]
+            rows = self._row[words]
+            if name != "xhat":
+                forms.give(rows[rows >= 0])
+                self._row[words] = -1
+            # The past may have grown.
+            begun = words[:, : means.shape[1]]
+            self._stored[begun] = self._start[name][place].view(np.float64)
+            linear = begun[means[place] != 0.0]
+            missing = linear[self._row[linear] < 0]
+            self._row[missing] = forms.take(len(missing))
+            forms.table[self._row[linear], MEAN] = means[place][means[place] != 0.0]
+        if moved.any():
+            offset = np.zeros((self.n, forms.used))
+            offset[: len(moved), MEAN] = moved
+            self.shift(h, 0.0, offset)
 
     def shift_message(self, m: int, offset: FloatArray) -> None:
         """Move message ``m`` with the origin, by ``offset`` (n, C) at the time of sending."""

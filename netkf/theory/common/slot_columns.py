@@ -18,11 +18,14 @@ import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
 from netkf.algorithms.records import make_records
+from netkf.engines.compiled.life_tables import LifeTable, life_table
+from netkf.engines.compiled.slot_events import Step, absent, slot_restarts, steps_of
 from netkf.engines.compiled.slot_filters import SlotFilters
 from netkf.engines.compiled.slot_loop import WHOLE, SlotSamples
 from netkf.engines.compiled.slot_setup import SlotSetup, slot_setup
 from netkf.linalg.arrays import FloatArray, square_root
 from netkf.linalg.lanes import LANES, blocks_of
+from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.columns import ErrorColumns, padded
 from netkf.theory.common.observations import Observation, slot_observations
@@ -56,13 +59,22 @@ class SlotColumns(ErrorColumns):
         super().__init__()
         self._fewest = 0
         self._all_observations = slot_observations(scenario, run)
+        self._lives = life_table(scenario, Streams(run.seed, run.replica))
+        self._restarts = slot_restarts(scenario, self._lives)
+        # The origin follows the true state, so that errors on unstable plants keep their digits,
+        # but not the mean with which a node begins again.
+        self._framed = scenario.filters_know_the_truth and not self._setup.forgets
         # The true state (n, columns).
         self._x = np.column_stack([np.zeros(self.n), plant.start_mean, plant.start_root])
         self._filters = self._begin()
 
     def _observe(self, slot: int) -> dict[int, Observation]:
         """Return the readings of a slot by estimator."""
-        return self._all_observations(slot)
+        observations = self._all_observations(slot)
+        if not len(self._lives.t) and not self._lives.down.any():
+            return observations
+        down = absent(self._scenario, self._setup, self._lives, slot, 1)[0]
+        return {h: one for h, one in observations.items() if not down[h]}
 
     def _begin(self) -> SlotFilters:
         setup = self._setup
@@ -74,18 +86,39 @@ class SlotColumns(ErrorColumns):
         means = make_records(
             setup.algorithm, starts, setup.infos, setup.models, len(setup.links.sender), 1
         )
+        self._start = {}
         for name, array in filters.records.arrays.items():
             array[0, ..., MEAN] = means.arrays[name][0, ..., 0]
+            if setup.forgets:
+                self._start[name] = array[0].copy()
         return filters
+
+    def _restart(self, slot: int) -> None:
+        """Let the nodes begin again that do so when a slot begins."""
+        setup, records, scenario = self._setup, self._filters.records, self._scenario
+        first = setup.links.first
+        before = max(slot - (not scenario.node_filter.timing.predicts), 0)
+        for h in self._restarts.get(slot, ()):
+            for name, array in records.arrays.items():
+                place = slice(first[h], first[h + 1]) if name in records.links else h
+                array[:, place] = self._start[name][place][..., ZERO : ZERO + 1]
+                array[0, place] = self._start[name][place]
+            node = setup.infos[h].node
+            fresh, of_start = (scenario.fresh_estimate(node, k)[0] for k in (before, 0))
+            if (fresh != of_start).any():
+                self._filters.shift_lane(h, MEAN, fresh - of_start)
 
     def replay(self) -> Iterator[None]:
         """Replay the events of the run; yield at each of ``run.times``."""
         scenario, run, setup = self._scenario, self._run, self._setup
-        arrivals = _arrivals(scenario, run, setup) if scenario.node_filter.timing.talks else {}
+        talks = scenario.node_filter.timing.talks
+        arrivals = _arrivals(scenario, run, setup, self._lives) if talks else {}
         predicts, processed = scenario.node_filter.timing.predicts, 0
         for until in scenario.slot_plant.slots_of(run.times).tolist():
             while processed < until:
                 slot = processed if predicts else processed + 1
+                if not predicts:
+                    self._restart(slot)
                 if predicts:
                     self._simulate(slot, self._observe(slot), arrivals)
                     self._move_truth(processed)
@@ -96,6 +129,8 @@ class SlotColumns(ErrorColumns):
                     self._compress()
                     self._fewest = self._x.shape[1]
                 processed += 1
+                if predicts:
+                    self._restart(processed)
             yield
 
     def _move_truth(self, slot: int) -> None:
@@ -131,8 +166,7 @@ class SlotColumns(ErrorColumns):
         self._fit(columns)
         blocks = len(self._filters.records.arrays["xhat"])
         width = blocks * LANES
-        # The origin follows the true state, so that errors on unstable plants keep their digits.
-        framed = self._scenario.filters_know_the_truth
+        framed = self._framed
         state = padded(self._x, width - columns).reshape(n, 1, blocks, LANES)
         local = np.ascontiguousarray(state.transpose(2, 1, 0, 3))
         if framed and setup.algorithm.timing.predicts:
@@ -149,7 +183,15 @@ class SlotColumns(ErrorColumns):
         y = y.reshape(*y.shape[:2], blocks, LANES).transpose(2, 0, 1, 3)[:, None]
         algorithm, steps = setup.algorithm, len(setup.fresh)
         up = arrivals.get(slot, np.zeros((steps, len(setup.directions)), dtype=np.uint8))
-        shape = (blocks, 1, *up.shape, LANES)
+        shape, sent = (blocks, 1, *up.shape, LANES), np.zeros((0,) * 5, dtype=np.uint8)
+        if self._scenario.network.lives:
+            # Who is down gives nothing away.
+            begins = np.zeros(steps)
+            for one in steps_of(self._scenario, setup, slot):
+                begins[one.step] = one.begin
+            asleep = [self._lives.is_down(h, begins) for h in range(setup.estimators)]
+            sent = np.zeros((blocks, 1, steps, setup.estimators, LANES), dtype=np.uint8)
+            sent[:] = ~np.array(asleep).T[:, :, None]
         nothing = np.zeros(1, dtype=bool)
         self._filters.simulate(
             np.ascontiguousarray(y),
@@ -163,7 +205,7 @@ class SlotColumns(ErrorColumns):
             sample=np.full(1, -1),
             rebased=~nothing if framed else nothing,
             up=np.ascontiguousarray(np.broadcast_to(up[None, None, :, :, None], shape)),
-            sent=np.zeros((0,) * 5, dtype=np.uint8),
+            sent=sent,
             uniform=np.zeros((0,) * 5),
             begin=WHOLE,
             stop=WHOLE,
@@ -247,26 +289,41 @@ def _no_samples(local: FloatArray, blocks: int, filters: SlotFilters) -> SlotSam
     )  # fmt: skip
 
 
-def _arrivals(scenario: Scenario, run: Run, setup: SlotSetup) -> dict[int, np.ndarray]:
+def _arrivals(
+    scenario: Scenario, run: Run, setup: SlotSetup, lives: LifeTable
+) -> dict[int, np.ndarray]:
     """Return by slot which messages were used, (E, W) by exchange and directed link."""
     log, index = run.log, setup.index_of_direction
     sends, delivers = (log[log["kind"] == CODES[kind]] for kind in ("send", "deliver"))
     slots, phases = scenario.slot_plant.slots_of(sends["t"]), np.maximum(sends["phase"], 0)
     first_step = {phase: setup.phases.index(phase) for phase in set(setup.phases)}
     counts: dict[tuple[int, int, int], int] = {}
+    steps: dict[int, list[Step]] = {}
+    if len(lives.t):
+        steps = {k: list(steps_of(scenario, setup, k)) for k in np.unique(slots).tolist()}
     places: dict[tuple[int, int], tuple[int, int]] = {}
-    columns = (slots, phases, *(sends[name] for name in ("node", "peer", "message")))
-    for slot, phase, node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
+    columns = (slots, phases, *(sends[name] for name in ("node", "peer", "message", "t")))
+    for slot, phase, node, peer, number, t in zip(*(c.tolist() for c in columns), strict=True):
         w = index[node, peer]
+        if slot in steps:
+            # Who was down in a repetition did not send in it.
+            passed = sum(one.phase == phase and one.begin < t for one in steps[slot])
+            counts[slot, phase, w] = max(counts.get((slot, phase, w), 0), passed)
         # A link sends once in each repetition of an exchange.
         step = counts.get((slot, phase, w), 0)
         counts[slot, phase, w] = step + 1
         places[w, number] = slot, first_step[phase] + step
     shape = len(setup.fresh), len(setup.directions)
     arrivals: dict[int, np.ndarray] = {}
-    columns = tuple(delivers[name] for name in ("node", "peer", "message"))
-    for node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
+    columns = tuple(delivers[name] for name in ("t", "node", "peer", "message"))
+    nodes = scenario.topology.index
+    for t, node, peer, number in zip(*(c.tolist() for c in columns), strict=True):
         w = index[peer, node]
         slot, step = places[w, number]
+        if slot in steps:
+            # Who goes down before the step ends has lost what arrived.
+            changes = lives.t[lives.index == nodes[node]]
+            if ((changes > t) & (changes <= steps[slot][step].end)).any():
+                continue
         arrivals.setdefault(slot, np.zeros(shape, dtype=np.uint8))[step, w] = 1
     return arrivals
