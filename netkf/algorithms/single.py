@@ -19,6 +19,7 @@ from netkf.algorithms.kernels.pairs import no_pairs
 from netkf.algorithms.kernels.rates import RateRun
 from netkf.algorithms.kernels.root_flow import stack_tables
 from netkf.algorithms.kernels.run import (
+    ALIKE,
     ALL,
     ClockRun,
     SingleSlotRun,
@@ -206,6 +207,7 @@ class Surroundings:
             arrived=np.ones((degree, 1), dtype=np.uint8),
             sends=np.ones(1, dtype=np.uint8),
             uniform=np.zeros(1),
+            common=ALIKE,
             pairs=no_pairs() if self._pairs is None else self._pairs.none(),
             nonlinear=no_nonlinear(),
             reading=OWN,

@@ -77,6 +77,16 @@ def copy_row(struct: Struct, k: int, m: int) -> None:
             array[k] = array[m]
 
 
+def copy_part(struct: Struct, k: int, m: int, place: int, origin: int, _width: int) -> None:
+    """Copy component ``origin`` of entry ``m`` of each array of a struct, of ``_width`` components,
+    to component ``place`` of entry ``k``.
+    """
+    for name in struct.struct_fields:
+        array = getattr(struct, name)
+        if isinstance(array, np.ndarray):
+            array[k, place] = array[m, origin]
+
+
 def copy_arrays(target: Derived, source: Derived) -> None:
     """Copy all arrays of a struct into those of another one of its class and shapes."""
     for name in target.struct_fields:

@@ -19,7 +19,7 @@ from numba.extending import (
 )
 from numba.np.arrayobj import populate_array
 
-from netkf.linalg.generic import Generic, copy_arrays, copy_row, drop_lane, struct_like
+from netkf.linalg.generic import Generic, copy_arrays, copy_part, copy_row, drop_lane, struct_like
 from netkf.linalg.struct_types import StructType, class_of, load_field, struct_from_memory
 
 
@@ -114,6 +114,35 @@ def _copy_row(_: Any, struct: StructType, k: Any, m: Any) -> Any:
 @overload(copy_row, inline="always")
 def _overload_copy_row(struct, k, m):  # noqa: ANN001, ANN202, ARG001
     return lambda struct, k, m: _copy_row(struct, k, m)  # noqa: PLW0108
+
+
+@intrinsic
+def _copy_part(_: Any, struct: StructType, k: Any, m: Any, place: Any, origin: Any, w: Any) -> Any:
+    """Type and emit the copy of a component of entry m to one of entry k of all arrays."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        to, source, first, second, width = (
+            context.cast(builder, arg, kind, types.intp)
+            for arg, kind in zip(args[1:], sig.args[1:], strict=True)
+        )
+        for data, _, stride in _arrays_of(context, builder, sig.args[0], args[0]):
+            size = builder.sdiv(stride, width)
+            places = (
+                builder.add(builder.mul(row, stride), builder.mul(part, size))
+                for row, part in ((to, first), (source, second))
+            )
+            target, start = (builder.gep(data, [one]) for one in places)
+            cgutils.raw_memcpy(builder, target, start, size, 1)
+        return context.get_dummy_value()
+
+    return types.none(struct, k, m, place, origin, w), emit
+
+
+@overload(copy_part, inline="always")
+def _overload_copy_part(struct, k, m, place, origin, width):  # noqa: ANN001, ANN202, ARG001
+    return lambda struct, k, m, place, origin, width: _copy_part(  # noqa: PLW0108
+        struct, k, m, place, origin, width
+    )
 
 
 @intrinsic

@@ -17,6 +17,7 @@ import pytest
 import netkf
 from netkf.scenario.reading import from_table
 from tests.conftest import ROOT
+from tests.engines.agreement import assert_agree
 
 PAGE = (ROOT / "docs" / "writing_filters.md").read_text()
 NODES, LINKS, EPSILON = (1, 2, 3, 4), ((1, 2), (2, 3), (3, 4)), 0.3
@@ -114,7 +115,23 @@ def test_the_consensus_filter_of_the_page_speaks_of_common_blocks(
     assert run.count("send") == (0 if estimates == "own" else 6 * 4)
 
 
-CLOCKED = {
+@pytest.mark.parametrize("estimates", ["named", "own+neighbours"])
+@pytest.mark.parametrize("clocks", [False, True])
+def test_compiled_code_translates_as_python_does(
+    folder: Path, estimates: str, clocks: bool
+) -> None:
+    changes = {**CLOCKED, "network.channel": {}} if clocks else {}
+    lossy = {"network.channel.loss": {"kind": "bernoulli", "delivery": 0.7}}
+    one = scenario(folder, estimates, "kcf_kernels:Kcf", **changes, **lossy)
+    run = assert_agree(one)
+    assert run.count("deliver") > 5
+    late = one.replace({"network.channel.delay": {"kind": "constant", "seconds": 0.1}})
+    if clocks:
+        with pytest.raises(netkf.EngineError, match="translate and that take time"):
+            netkf.simulate(late, engine="compiled")
+
+
+CLOCKED: dict[str, Any] = {
     "plants.0": {"name": "pose", "nodes": list(NODES), "A": [[-0.4]], "B": [[0.6]], "cov": [[1.0]]},
     "plants.1": {"name": "target", "A": [[-0.1]], "B": [[0.3]], "cov": [[1.0]]},
     "network.activation": {"kind": "periodic", "period": 0.7, "at": "nodes"},

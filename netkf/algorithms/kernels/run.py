@@ -42,13 +42,15 @@ from netkf.algorithms.kernels.root_flow import (
 from netkf.linalg.addresses import NOTHING, address_of, call_at, reads_only
 from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.compiling import kernel
-from netkf.linalg.generic import drop_lane, generic
+from netkf.linalg.generic import copy_part, drop_lane, generic
 from netkf.linalg.lanes import ONE, Lanes, aligned, load, store
 from netkf.linalg.structs import MAX_UNROLLED, Size, Struct, sized
 
 MAX_RELATIVE_GAIN = 1.0
 """Largest integral of trace(P G), G = H' R^-1 H, over the increments that one update uses."""
 NO_CHANGES = np.zeros(0)
+ALIKE: IntArray = np.zeros((0, 0), dtype=np.int64)
+"""``run.common`` where all nodes estimate the same."""
 CLOSE = 1e-12
 """Share of a time by which sums of gaps may miss it."""
 ALL = -2
@@ -80,6 +82,8 @@ class SlotRun(Struct):
     receiver : for ``emit`` of an addressed filter, ``records.Kernels``
     sends : (L,), 1 on entry of ``emit``; it writes 0 where the node sends nothing
     uniform : (L,), uniform numbers for ``emit`` of a randomised filter
+    common : (W, n), for each link and component of the receiver's state which component of the
+             sender's it is, -1: none; (0, 0) where messages need no translation
     pairs : those of readings that are also about blocks which their node does not estimate
     nonlinear : NonlinearRows of the readings, where they are not linear
     offset : (n, L), by which ``shift`` moves estimates
@@ -116,6 +120,7 @@ class SlotRun(Struct):
     noise: FloatArray
     whitened: FloatArray
     total: FloatArray
+    common: IntArray
     pairs: Any
     nonlinear: Any
     reading: int
@@ -533,6 +538,18 @@ def emit(record: Any, h: int, m: int, run: Any) -> None:
     """Write the estimate of node ``h`` into payload ``m``."""
     payload = record.payload
     copy_estimate(run, payload.xhat, payload.root, m, record.xhat, record.root, h, True)
+
+
+@kernel
+def read_common(record: Any, m: int, k: int, run: Any) -> None:
+    """Let message ``k`` of the inbox be payload ``m``, what the receiver would say itself, with
+    what the sender says of states that both estimate.
+    """
+    width = len(run.size)
+    for i in range(width):
+        if run.common[run.link[k], i] >= 0:
+            copy_part(record.payload, m, run.message[k], i, run.common[run.link[k], i], width)
+    run.message[k] = m
 
 
 @kernel

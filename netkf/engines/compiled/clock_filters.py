@@ -24,7 +24,7 @@ from netkf.engines.compiled.batch_arrays import BatchArrays
 from netkf.engines.compiled.clock_loop import NO_MODELS, batch_loop, clock_loop, clock_verbs
 from netkf.engines.compiled.nonlinear_samples import nonlinear_sensors
 from netkf.engines.compiled.samples import entries_of
-from netkf.engines.compiled.slot_pairs import BlockColumns
+from netkf.engines.compiled.slot_pairs import BlockColumns, common_table
 from netkf.engines.compiled.state import (
     Filters,
     Instants,
@@ -64,9 +64,14 @@ class ClockFilters:
         models = changing_models(wide_models(scenario), scenario.followed_changes.tolist())
         links = _links_by_receiver(scenario)
         starts = list(zip(start.xhat, start.root, strict=True))
-        count = len(links["sender"])
+        count, self._common = len(links["sender"]), common_table(scenario)
         self.records = make_records(
-            scenario.node_filter, starts, infos, models, links=count, messages=messages
+            scenario.node_filter,
+            starts,
+            infos,
+            models,
+            links=count,
+            messages=self._room(messages),
         )
         self.record, self.start = self.records.struct, self.records.copied()
         self._first_models = np.ascontiguousarray(start.nodes["model"])
@@ -111,6 +116,7 @@ class ClockFilters:
             **self._inbox(messages),
             sends=np.ones(1, dtype=np.uint8),
             uniform=np.zeros(1),
+            common=self._common,
             nonlinear=no_nonlinear(),
             reading=0,
             first_y=0,
@@ -228,10 +234,14 @@ class ClockFilters:
                 sums.append(self.sums())
         return {name: np.array([one[name] for one in sums]) for name in self._conserved}
 
+    def _room(self, messages: int) -> int:
+        """Return for how many messages there must be room with those that are translated."""
+        return 2 * messages if len(self._common) else messages
+
     def grow(self, messages: int) -> None:
         """Make room for so many messages; those that are there stay."""
         messages = max(messages, len(self.run.message))
-        self.record.payload = resized(self.record.payload, messages)
+        self.record.payload = resized(self.record.payload, self._room(messages))
         for name, array in self._inbox(messages).items():
             setattr(self.run, name, array)
 

@@ -86,6 +86,7 @@ class ClockVerbs(Struct):
 
     copy : copies a payload to another one
     restart : copies all arrays of a record that is given in place of a run
+    translate : makes of a message of another node what the receiver reads in it
     linearise : makes linear readings of the samples of an instant that are not
     whole_gaps : whether a prediction over a gap is not that over its parts
     models : (N, words), the struct of each node's model, (0, 0) if that of the run is all's
@@ -100,6 +101,7 @@ class ClockVerbs(Struct):
     interval: int
     copy: int
     restart: int
+    translate: int
     linearise: int
     whole_gaps: int
     decides: int
@@ -148,6 +150,7 @@ def clock_verbs(
         interval=address_of(kernels.interval, record, run, number=True) if increments else NOTHING,
         copy=address_of(copy_payload, record, run, 2),
         restart=address_of(restart, record, record),
+        translate=address_of(standard.read_common, record, run, 2) if len(run.common) else NOTHING,
         linearise=NOTHING if linear else address_of(linearise_instant, record, no_table(), 2),
         whole_gaps=isinstance(run.model, RateTables),
         **{name: getattr(kernels, name) for name in FLAGS},
@@ -394,6 +397,10 @@ def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
         count, m = count + 1, message.next
     run.count = count
     choose_model(run, verbs, h)
+    for k in range(count if verbs.translate != NOTHING else 0):
+        # Behind all messages under way.
+        call_at_two(verbs.emit, record, h, len(run.message) + k, run)
+        call_at_two(verbs.translate, record, len(run.message) + k, k, run)
     call_at(verbs.absorb, record, h, run)
     # Messages return to the pool only now, since their payloads were read.
     m = node.inbox

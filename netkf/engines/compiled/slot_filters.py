@@ -66,7 +66,7 @@ class SlotFilters:
             setup.infos,
             changing_models(setup.model_pieces, setup.followed_slots),
             links=W,
-            messages=H + W if kernels.addressed else H,
+            messages=H + W if kernels.addressed or len(setup.common) else H,
             blocks=blocks,
             lanes=LANES,
         )
@@ -132,6 +132,7 @@ class SlotFilters:
             arrived=aligned((most, LANES), np.uint8),
             sends=aligned((LANES,), np.uint8),
             uniform=aligned((LANES,)),
+            common=setup.common,
             pairs=pairs,
             nonlinear=no_nonlinear(),
             reading=0,

@@ -114,6 +114,7 @@ class SlotVerbs(Struct):
     """Addresses of a filter's verbs, and what ``records.Kernels`` says of them as 0 or 1.
 
     linearise : of ``linearise_rows``, where readings are not linear
+    translate : of ``read_common``
     """
 
     predict: int
@@ -123,6 +124,7 @@ class SlotVerbs(Struct):
     observe: int
     shift: int
     linearise: int
+    translate: int
     decides: int
     addressed: int
 
@@ -152,6 +154,7 @@ def slot_verbs(kernels: Kernels, record: Any, run: Any, talks: bool, linear: boo
         observe=address_of(kernels.observe, record, run) if observes else NOTHING,
         shift=NOTHING,
         linearise=NOTHING if linear else address_of(linearise_rows, record, any_slot_run(run), 2),
+        translate=address_of(standard.read_common, record, run, 2) if len(run.common) else NOTHING,
         decides=kernels.decides,
         addressed=kernels.addressed,
     )
@@ -236,6 +239,10 @@ def exchange(
             run.reading = h
             choose_model(run, plan, h)
             fill_inbox(run, plan, b, s, e, h, verbs.addressed == 1)
+            # What is read of other blocks lies behind the messages of all nodes.
+            for k in range(run.count if verbs.translate != NOTHING else 0):
+                call_at_two(verbs.emit, record, h, nodes + k, run)
+                call_at_two(verbs.translate, record, nodes + k, k, run)
             call_at(verbs.absorb, record, h, run)
 
 

@@ -9,10 +9,12 @@ import numpy as np
 
 from netkf.algorithms.blocks import block_numbers
 from netkf.algorithms.kernels.pairs import Pairs, pairs_of
+from netkf.algorithms.kernels.run import ALIKE
+from netkf.algorithms.translation import read_vector
 from netkf.core.places import Place
 from netkf.engines.compiled.nonlinear_rows import NonlinearSetup, has_known_h
 from netkf.engines.compiled.own_sensors import is_own
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.scenario.model import PlacedSensor
 from netkf.scenario.scenario import Scenario
 
@@ -148,7 +150,9 @@ def matrix_of(sensor: Any, anchor: int, n: int) -> FloatArray:
 def blocks_refusal(scenario: Scenario) -> str | None:
     """Return what the compiled engine cannot do where nodes estimate different states."""
     if scenario.common_entries and scenario.node_filter.timing.talks:
-        return "filters whose messages other nodes must translate"
+        rule = _translation_refusal(scenario)
+        if rule is not None:
+            return rule
     if any(hasattr(sensor, "C") for sensor in scenario.sensors):
         return "nodes of different states with regressors"
     for node, view in zip(scenario.nodes, scenario.views or (), strict=True):
@@ -157,6 +161,37 @@ def blocks_refusal(scenario: Scenario) -> str | None:
                 key = f"sensors[{scenario.sensor_entries[placed.entry]}]"
                 return f"{key}, which reads other blocks than those of node {node} in its own way"
     return None
+
+
+def _translation_refusal(scenario: Scenario) -> str | None:
+    """Return what the compiled engine cannot do with messages that other nodes must translate."""
+    kernels = scenario.node_filter.kernels
+    if kernels is not None and kernels.of(not scenario.slotted).counts_sends:
+        return "filters whose messages other nodes must translate, and that count what they send"
+    if scenario.node_filter.needs.translate is not read_vector:
+        return "filters that say in Python how their messages are translated"
+    if not (scenario.slotted or scenario.network.channel.delay.fixed == 0.0):
+        return "messages that other nodes must translate and that take time"
+    if any(not len(theirs) for theirs, _ in scenario.common_entries.values()):
+        return "links of nodes that estimate nothing in common"
+    return None
+
+
+def common_table(scenario: Scenario) -> IntArray:
+    """Return for each directed link, by receiver and sender, and each component of the receiver's
+    state which component of the sender's it is, -1: none; (0, 0) if messages are read as they are.
+    """
+    if not (scenario.common_entries and scenario.node_filter.timing.talks):
+        return ALIKE
+    index = scenario.topology.index
+    ways = sorted(scenario.topology.directions, key=lambda way: (index[way[1]], index[way[0]]))
+    table = np.tile(np.arange(scenario.width), (len(ways), 1))
+    for w, way in enumerate(ways):
+        if way in scenario.common_entries:
+            theirs, mine = scenario.common_entries[way]
+            table[w] = -1
+            table[w, mine] = theirs
+    return table
 
 
 def _reads_in_its_own_way(

@@ -26,7 +26,7 @@ from netkf.engines.compiled.slot_messages import (
     SlotLinks,
     Stages,
 )
-from netkf.engines.compiled.slot_pairs import BlockColumns, SlotPairs
+from netkf.engines.compiled.slot_pairs import BlockColumns, SlotPairs, common_table
 from netkf.linalg.arrays import FloatArray, block_diagonal, enlarged
 from netkf.linalg.lanes import LANES, aligned, blocks_of
 from netkf.linalg.portable import cholesky, solve_lower
@@ -86,6 +86,7 @@ class SlotSetup:
         self.senders = link_senders(links, topology.directed, symmetric)
         self.directions: tuple[Link, ...] = self.senders.directions
         self.links = self._make_links(scenario)
+        self.common = common_table(scenario)
         self._set_channel(scenario)
         self.matching = matching_lists(scenario)
         self.is_drawn = self._draws_everything(scenario)
