@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from netkf.studies.compare import compare
     from netkf.studies.compare_filters import compare_filters
     from netkf.studies.consistency import consistency
+    from netkf.studies.likelihood import fit_noise, log_likelihood
     from netkf.studies.opening import open as open
     from netkf.studies.size import size
     from netkf.studies.sweep import sweep
@@ -50,8 +51,10 @@ _MODULE_OF = {
     "export_log": "netkf.logs.exporting",
     "first_difference": "netkf.trace.run",
     "fit_log": "netkf.logs.fitting",
+    "fit_noise": "netkf.studies.likelihood",
     "import_log": "netkf.logs.importing",
     "load": "netkf.scenario.reading",
+    "log_likelihood": "netkf.studies.likelihood",
     "check": "netkf.checks.check",
     "monte_carlo": "netkf.ensembles.monte_carlo",
     "open": "netkf.studies.opening",
@@ -87,8 +90,10 @@ __all__ = [
     "export_log",
     "first_difference",
     "fit_log",
+    "fit_noise",
     "import_log",
     "load",
+    "log_likelihood",
     "monte_carlo",
     "parts",
     "save",

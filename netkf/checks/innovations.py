@@ -12,6 +12,7 @@ covariance of the integral of the prediction error e: de = A e ds + dw with cov(
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -33,6 +34,7 @@ from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
 from netkf.trace.run import Run, first_difference
 
+LOG_2PI = math.log(2.0 * math.pi)
 MAX_EVENTS = 400_000
 """Largest number of events of a run that is replayed: that takes about half a minute."""
 MAX_LAG = 20
@@ -52,6 +54,9 @@ class Innovations(NamedTuple):
     rows       : (M,) length p of v
     nis        : (M,) v' S^-1 v, nan without a covariance
     whitened   : M arrays (p,), L^-1 v with S = L L'
+    values     : M arrays (p,), v
+    deviations : M arrays (p,), square roots of the diagonal of S
+    log_density : (M,) log density of v, normal with covariance S
     increments : number of readings that are increments
     """
 
@@ -60,16 +65,27 @@ class Innovations(NamedTuple):
     rows: np.ndarray
     nis: FloatArray
     whitened: list[FloatArray]
+    values: list[FloatArray]
+    deviations: list[FloatArray]
+    log_density: FloatArray
     increments: int = 0
 
 
 class Recorded(NamedTuple):
-    """The innovation (p,) of a reading in units of its covariance, nan without a finite P."""
+    """The innovation ``value`` (p,) of a reading, nan without a finite P, and the Cholesky factor
+    ``root`` (p, p) of its covariance.
+    """
 
     time: float
     node: int
-    whitened: FloatArray
+    value: FloatArray
+    root: FloatArray
     of_increments: bool
+
+    @property
+    def whitened(self) -> FloatArray:
+        """The innovation (p,) in units of its covariance."""
+        return np.asarray(np.linalg.solve(self.root, self.value))
 
 
 class TimedState(NamedTuple):
@@ -98,19 +114,18 @@ class ExpectedIncrements:
         B = np.concatenate([square_root(model.Q), np.zeros((n, n))])
         self._equation = Transitions(A, B)
 
-    def whitened_innovation(
+    def innovation(
         self, xhat: FloatArray, P: FloatArray, y: FloatArray, gap: float
-    ) -> FloatArray:
-        """Return y - H E[z] (p,) of increments y (p,) over ``gap`` seconds times the inverse
-        Cholesky factor of its covariance; ``xhat`` (n,) and ``P`` (n, n) are the estimate before
-        them.
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return y - H E[z] (p,) of increments y (p,) over ``gap`` seconds and the Cholesky factor
+        of its covariance; ``xhat`` (n,) and ``P`` (n, n) are the estimate before them.
         """
         n, H = self._n, self._H
         # Transition of (x, z) over the gap, and a square root of its noise covariance.
         F, root = (law[0] for law in self._equation.laws(np.array([gap])))
         J = F[n:, :n]  # integral of exp(A s) over the gap, so that E[z] = J xhat
         S = H @ (J @ P @ J.T + root[n:] @ root[n:].T) @ H.T + self._R * gap
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(S), y - H @ J @ xhat))
+        return y - H @ J @ xhat, np.linalg.cholesky(S)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,19 +179,21 @@ class Recorder(Filter):
         innovation = (self._of_sample if sampled else self._of_increments)(state, reading)
         if innovation is not None:
             time = reading.time if sampled else state.time
-            self.recorded.append(Recorded(time, state.node, innovation, not sampled))
+            self.recorded.append(Recorded(time, state.node, *innovation, not sampled))
         return state._replace(inner=self.inner.update(state.inner, reading))
 
-    def _of_sample(self, state: TimedState, reading: Any) -> FloatArray | None:
+    def _of_sample(self, state: TimedState, reading: Any) -> tuple[FloatArray, FloatArray] | None:
         xhat, P = self.inner.estimate(state.inner)
         if not len(reading.y):
             return None
         if P is None or not np.isfinite(P).all():
-            return np.full(len(reading.y), np.nan)
+            return np.full(len(reading.y), np.nan), np.eye(len(reading.y))
         S = reading.H @ P @ reading.H.T + reading.R
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(S), reading.y - reading.H @ xhat))
+        return reading.y - reading.H @ xhat, np.linalg.cholesky(S)
 
-    def _of_increments(self, state: TimedState, reading: Any) -> FloatArray | None:
+    def _of_increments(
+        self, state: TimedState, reading: Any
+    ) -> tuple[FloatArray, FloatArray] | None:
         (xhat, P), model = state.start, state.inner.model
         if P is None or not np.isfinite(P).all():
             return None
@@ -184,7 +201,7 @@ class Recorder(Filter):
             self.expected[id(model)] = ExpectedIncrements(model)
         # The first half of the moments is the integral of dy.
         y = reading.moments[: len(reading.moments) // 2]
-        return self.expected[id(model)].whitened_innovation(xhat, P, y, reading.gap)
+        return self.expected[id(model)].innovation(xhat, P, y, reading.gap)
 
     def emit(self, state: TimedState, exchange: Any) -> tuple[TimedState, Any]:
         """Return the state and the payload of its message, as the filter does."""
@@ -225,7 +242,13 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
         one for one in recorder.recorded if one.of_increments or one.time < scenario.horizon
     ]
     recorded.sort(key=lambda one: one.time)
-    nis = np.array([float(one.whitened @ one.whitened) for one in recorded])
+    return tabulate(recorded)
+
+
+def tabulate(recorded: Sequence[Recorded]) -> Innovations:
+    """Return innovations as a table; raises NetkfError if none is finite."""
+    whitened = [one.whitened for one in recorded]
+    nis = np.array([float(one @ one) for one in whitened])
     if not np.isfinite(nis).any():
         raise NetkfError(
             "there are no readings, or the filter gives no covariance to judge them by"
@@ -233,9 +256,13 @@ def compute_innovations(run: Run, max_events: int = MAX_EVENTS) -> Innovations:
     return Innovations(
         times=np.array([one.time for one in recorded]),
         nodes=np.array([one.node for one in recorded], dtype=np.int64),
-        rows=np.array([len(one.whitened) for one in recorded]),
+        rows=np.array([len(one) for one in whitened]),
         nis=nis,
-        whitened=[one.whitened for one in recorded],
+        whitened=whitened,
+        values=[one.value for one in recorded],
+        deviations=[np.sqrt((one.root**2).sum(axis=1)) for one in recorded],
+        log_density=-0.5 * (nis + [LOG_2PI * len(one) for one in whitened])
+        - [float(np.log(np.diag(one.root)).sum()) for one in recorded],
         increments=sum(one.of_increments for one in recorded),
     )
 

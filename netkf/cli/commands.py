@@ -407,9 +407,14 @@ COMMANDS = (
     ),
     Command(
         "fit",
-        "fit laws of losses to a recorded network, and look for its replay among their runs",
+        "fit laws of losses to a recorded network, and look for its replay among their runs; "
+        "or the noise of plant and sensors",
         (
-            _option("directory", "folder that import wrote", type=Path, metavar="DIR"),
+            _option(
+                "directory", "folder that import wrote, or a scenario", type=Path, metavar="DIR"
+            ),
+            _flag("--noise", "fit the noise of plant and sensors to the readings, Q and R"),
+            SCENARIO[1],
             _runs(
                 "runs of each law, with parameters drawn from their posterior (default: 200, or "
                 "fewer if these take minutes)",

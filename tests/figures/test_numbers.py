@@ -91,14 +91,14 @@ def test_increments_have_the_innovations_of_an_integrated_ornstein_uhlenbeck_pro
     """dx = a x ds + b dw and dy = h x ds + dv in closed form, over an interval of g seconds."""
     a, b, h, R, g, P, xhat, y = -0.7, 1.3, 0.8, 0.4, 0.6, 0.5, 2.0, 1.1
     model = FlowModel(*(np.array([[v]]) for v in (a, b * b, h, R)), 10.0, 1.0)
-    found = ExpectedIncrements(model).whitened_innovation(
+    found, root = ExpectedIncrements(model).innovation(
         np.array([xhat]), np.array([[P]]), np.array([y]), g
     )
     J = (math.exp(a * g) - 1.0) / a
     # int_0^g ((e^{a (g - s)} - 1) / a)^2 ds
     noise = ((math.exp(2.0 * a * g) - 1.0) / (2.0 * a) - 2.0 * J + g) / a**2
     S = h * h * (J * J * P + b * b * noise) + R * g
-    np.testing.assert_allclose(found, (y - h * J * xhat) / math.sqrt(S), rtol=1e-12)
+    np.testing.assert_allclose([found[0], root[0, 0]], [y - h * J * xhat, math.sqrt(S)], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("believed", "expected"), [(1.0, 1.0), (0.5, 2.0)])

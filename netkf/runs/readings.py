@@ -1,0 +1,141 @@
+"""The readings that sensors took in one run, with the states at their instants."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.plants.readings import covariance_of
+from netkf.rng.streams import Streams
+from netkf.runs.simulate import simulate
+from netkf.scenario.model import PlacedSensor
+from netkf.scenario.sampling import times_of_sensor
+from netkf.scenario.scenario import Scenario
+from netkf.trace.run import Run
+
+MAX_SLOTS = 5000
+"""Slots of a run, evenly spread, of which drawn readings are judged."""
+
+
+class SensorReading(NamedTuple):
+    """A reading y (p,) of node ``node`` (id), counted as filters count states: without the response
+    to an input that they know. ``H`` is (p, n), or a function that linearises, and ``R`` (p, p) as
+    filters believe it; ``number`` is that of its instant among those of the run, ``rows`` (p,) are
+    the components of the sensor that have a value.
+    """
+
+    number: int
+    node: int
+    placed: PlacedSensor
+    y: FloatArray
+    H: Any
+    R: FloatArray
+    rows: np.ndarray
+
+
+class Readings(NamedTuple):
+    """The instants (K,) of readings in seconds, and these in order of time and node.
+
+    run    : the run with samples at ``times``; None if all readings are recorded and none was asked
+             for
+    origin : (K, n) the known response to the input there
+    """
+
+    times: FloatArray
+    readings: list[SensorReading]
+    run: Run | None
+    origin: FloatArray
+
+
+def collect_readings(
+    scenario: Scenario,
+    seed: int,
+    replica: int,
+    placed: Mapping[int, tuple[PlacedSensor, ...]],
+    *,
+    simulated: bool = False,
+    all_slots: bool = False,
+) -> Readings:
+    """Return what the ``placed`` sensors, by node id, read in a ``replica`` after time 0; the run
+    is ``simulated`` too if readings are drawn. Raises ScenarioError and EngineError.
+    """
+    streams = Streams(seed, replica)
+    numbers = {
+        (node, one.ordinal): _instants(scenario, streams, node, one, all_slots)
+        for node, sensors in placed.items()
+        for one in sensors
+    }
+    plant: Any = scenario.plant
+    times_of = {
+        key: np.array([plant.slot_time(k) for k in ks]) if scenario.slotted else ks
+        for key, ks in numbers.items()
+    }
+    times = np.unique(np.concatenate([np.empty(0), *times_of.values()]))
+    drawn = any(
+        scenario.sensors[one.entry].is_random for sensors in placed.values() for one in sensors
+    )
+    run, states = None, np.zeros((len(times), plant.n))
+    if (simulated or drawn) and len(times):
+        run = simulate(dataclasses.replace(scenario, probe=times), seed, replica)
+        times = times[: len(run.times)]  # a run that diverges ends early
+        states = np.nan_to_num(run.x)
+    origin = np.zeros((len(times), plant.n))
+    responses = scenario.input_responses
+    if responses is not None and responses.believed is not None:
+        slots = np.round(times / plant.period).astype(int) if scenario.slotted else times
+        origin = responses.believed.states(slots)
+    readings = []
+    for node, sensors in placed.items():
+        for one in sensors:
+            key = node, one.ordinal
+            path = (scenario.slot_path if scenario.slotted else scenario.sample_path)(
+                streams, node, one
+            )
+            R = scenario.noise_covariance(one.entry, believed=True)
+            for k, (instant, time) in enumerate(zip(numbers[key], times_of[key], strict=True)):
+                number = int(np.searchsorted(times, time))
+                if number == len(times):
+                    break
+                x = states[number] - origin[number]
+                read: Any = path.reading(int(instant) if scenario.slotted else k, x)
+                y, H = (read, path.matrix(int(instant))) if scenario.slotted else read
+                C = covariance_of(path, int(instant) if scenario.slotted else k, R)
+                if len(y):
+                    rows = _components(scenario, node, one, instant, k, len(y))
+                    readings.append(SensorReading(number, node, one, y, H, C, rows))
+    readings.sort(key=lambda one: one.number)
+    return Readings(times, readings, run, origin)
+
+
+def _instants(
+    scenario: Scenario, streams: Streams, node: int, one: PlacedSensor, all_slots: bool
+) -> Any:
+    """Return the times (K,) of the samples of a sensor, or the numbers of its slots."""
+    if not scenario.slotted:
+        return times_of_sensor(scenario, streams, node, one)
+    plant, record = scenario.slot_plant, scenario.sensors[one.entry].record
+    if record is not None:
+        slots = np.array(sorted(record.slots(node, plant.period)), dtype=np.int64)
+        return slots[(slots > 0) & (slots * plant.period < scenario.horizon)]
+    count = round(scenario.horizon / plant.period)
+    slots = np.arange(1, count + (not plant.over(count, scenario.horizon)))
+    if len(slots) > MAX_SLOTS and not all_slots:
+        slots = slots[np.unique(np.linspace(0, len(slots) - 1, MAX_SLOTS).astype(int))]
+    return slots
+
+
+def _components(
+    scenario: Scenario, node: int, one: PlacedSensor, instant: Any, k: int, p: int
+) -> np.ndarray:
+    """Return which components (p,) of a sensor the ``p`` values of reading ``k`` are."""
+    record = scenario.sensors[one.entry].record
+    if record is None:
+        return np.arange(p)
+    numbers = (
+        record.slots(node, scenario.slot_plant.period)[int(instant)] if scenario.slotted else [k]
+    )
+    return np.nonzero(np.isfinite(record.rows(node).y[numbers]))[1]

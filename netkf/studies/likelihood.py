@@ -1,0 +1,495 @@
+"""``netkf.fit_noise`` and ``netkf.log_likelihood``: the noise of plant and sensors by likelihood.
+
+The likelihood is that of the readings of a run, all sensors together, under the model that the
+filters believe: the density of the innovations of the central Kalman filter, whose gaps between
+readings are discretised exactly (Schweppe, IEEE Trans. Inf. Theory 11, 1965). Variances are fitted
+as logarithms; their standard errors come from the Hessian at the maximum.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import ndtri
+
+from netkf.algorithms.baselines import Central
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import integer, number
+from netkf.core.notebook import NotebookTable
+from netkf.linalg.arrays import FloatArray
+from netkf.linalg.compiling import kernel
+from netkf.linalg.small import add_matmul, matmul
+from netkf.plants.transitions import Transitions
+from netkf.runs.readings import Readings, collect_readings
+from netkf.runs.simulate import require_scenario
+from netkf.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LOG_2PI = math.log(2.0 * math.pi)
+RANGE = 30.0
+"""Largest change of the logarithm of a variance that is searched."""
+NEGLIGIBLE = 1e-6
+"""Loss of log-likelihood below which a variance is 0 as far as the readings can tell."""
+STARTS = (0.0, -4.0, 4.0)
+"""Changes of the logarithms of the variances of plant and sensors that are tried at first."""
+
+
+class Variance(NamedTuple):
+    """A variance that is fitted: its name, its ``value`` in the scenario, and what it scales, a
+    part Q (n, n) of the plant's noise, from ``columns`` of B or in slots a part of Q, or components
+    (``rows``) of the noise of a ``[[sensors]]`` ``entry``.
+    """
+
+    name: str
+    value: float
+    Q: FloatArray | None = None
+    columns: tuple[int, ...] = ()
+    entry: int = -1
+    rows: tuple[int, ...] = ()
+
+
+@kernel(allocates=True)
+def filter_rows(
+    F: FloatArray,
+    Q: FloatArray,
+    laws: np.ndarray,
+    first: np.ndarray,
+    H: FloatArray,
+    y: FloatArray,
+    r: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    innovations: FloatArray,
+    variances: FloatArray,
+) -> None:
+    """Run a Kalman filter from the estimate ``x`` (n, 1), ``P`` (n, n) over K instants: a
+    prediction by law ``laws[k]`` of ``F`` and ``Q`` (L, n, n), then scalar readings ``y`` (M,) with
+    ``H`` (M, n) and variances ``r`` (M,), those from ``first[k]`` on. Write their innovations (M,)
+    and the variances of these.
+    """
+    n = len(x)
+    for k in range(len(laws)):
+        law = laws[k]
+        x, P = matmul(F[law], x), add_matmul(Q[law], matmul(F[law], P), F[law].T)
+        for row in range(first[k], first[k + 1]):
+            g, v, S = np.zeros(n), y[row], r[row]
+            for i in range(n):
+                for m in range(n):
+                    g[i] += 0.5 * (P[i, m] + P[m, i]) * H[row, m]
+                v -= H[row, i] * x[i, 0]
+                S += H[row, i] * g[i]
+            for i in range(n):
+                x[i, 0] += g[i] * v / S
+                for j in range(n):
+                    P[i, j] -= g[i] * g[j] / S
+            innovations[row], variances[row] = v, S
+
+
+class CentralModel:
+    """The central Kalman filter of a scenario over the readings of a ``replica``, as a function of
+    the variances of its noises.
+
+    times, nodes, sensors : (M,) seconds, ids and ``[[sensors]]`` entries of scalar readings
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, replica: int) -> None:
+        """Raises ScenarioError for a model that is not linear, or that changes."""
+        _require_central(scenario)
+        self._scenario = scenario
+        filtering = dataclasses.replace(scenario.filter, algorithm=Central(), estimates="all")
+        network = dataclasses.replace(scenario.network, activation=None, lives=(), radio=None)
+        central = dataclasses.replace(
+            scenario, filter=filtering, network=network, sensors=scenario.declared_sensors
+        )
+        got = collect_readings(central, seed, replica, central.placed_sensors, all_slots=True)
+        if not got.readings:
+            raise ScenarioError("sensors", "give no readings", None, "add a sensor or rows")
+        self._mean, self._cov = central.initial_estimate(central.nodes[0])
+        self._offset = got.origin
+        self.variances = tuple(_plant_variances(central)) + tuple(_sensor_variances(central))
+        self._lay_rows(central, got)
+        self._lay_laws(central, got.times)
+
+    def _lay_rows(self, scenario: Scenario, got: Readings) -> None:
+        """Lay out scalar readings: those of a noise that is not diagonal are decorrelated."""
+        index = {(v.entry, row): k for k, v in enumerate(self.variances) for row in v.rows}
+        H, y, of, owners, first = [], [], [], [], [0]
+        log_scale, k = 0.0, 0
+        for one in got.readings:
+            while k < one.number:
+                first.append(len(y))
+                k += 1
+            diagonal = np.diag(one.R)
+            entry = scenario.sensor_entries[one.placed.entry]
+            is_diagonal = np.array_equal(one.R, np.diag(diagonal))
+            root = np.diag(np.sqrt(diagonal)) if is_diagonal else np.linalg.cholesky(one.R)
+            # Rows of unit variance.
+            z, J = np.linalg.solve(root, one.y), np.linalg.solve(root, one.H)
+            log_scale += float(np.log(np.diag(root)).sum())
+            y += z.tolist()
+            H += list(J)
+            of += [index.get((entry, row), -1) for row in one.rows.tolist()]
+            owners += [(got.times[one.number], one.node, entry)] * len(z)
+        while k < len(got.times):
+            first.append(len(y))
+            k += 1
+        self.H, self.y, self._first = np.array(H), np.array(y), np.array(first)
+        self._of, self._log_scale = np.array(of), log_scale
+        self.times, self.nodes, self.sensors = map(np.array, zip(*owners, strict=True))
+
+    def _lay_laws(self, scenario: Scenario, times: FloatArray) -> None:
+        parts = [v.Q for v in self.variances if v.Q is not None]
+        if scenario.slotted:
+            F, Q = scenario.slot_belief
+            fixed = Q - sum(parts, np.zeros_like(Q))
+            slots = np.round(times / scenario.slot_plant.period).astype(int)
+            gaps, self._laws = np.unique(np.diff(slots, prepend=0), return_inverse=True)
+            powers = [np.linalg.matrix_power(F, int(g)) for g in gaps]
+            self._F = np.array(powers)
+            self._parts = np.array(
+                [[_accumulate(F, part, int(g)) for part in (*parts, fixed)] for g in gaps]
+            )
+            return
+        A, _ = scenario.belief
+        gaps, self._laws = np.unique(np.diff(times, prepend=0.0), return_inverse=True)
+        self._F = Transitions(A, np.zeros((len(A), 1))).transitions(gaps)
+        B = believed_noise(scenario)
+        roots = [
+            Transitions(A, B[:, v.columns]).laws(gaps)[1] for v in self.variances if v.Q is not None
+        ]
+        noises = [root @ np.swapaxes(root, 1, 2) for root in roots]
+        noises.append(np.zeros_like(self._F))
+        self._parts = np.stack(noises, axis=1)
+
+    def innovations(self, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return innovations (M,) of scalar readings in units of their noise, and the variances of
+        these, with the variances of the scenario times ``factors`` (J,).
+        """
+        plant = sum(v.Q is not None for v in self.variances)
+        weights = np.append(factors[:plant], 1.0)
+        Q = np.ascontiguousarray(np.einsum("j,ljab->lab", weights, self._parts))
+        r = np.append(factors, 1.0)[self._of]
+        v, S = np.empty(len(self.y)), np.empty(len(self.y))
+        x, P = np.array(self._mean)[:, None].copy(), np.array(self._cov)
+        filter_rows(self._F, Q, self._laws, self._first, self.H, self.y, r, x, P, v, S)
+        return v, S
+
+    def value(self, factors: FloatArray) -> float:
+        """Return the log-likelihood with the variances of the scenario times ``factors`` (J,)."""
+        with np.errstate(all="ignore"):
+            v, S = self.innovations(factors)
+            total = -0.5 * float((LOG_2PI + np.log(S) + v * v / S).sum()) - self._log_scale
+        return total if math.isfinite(total) else -math.inf
+
+
+def _require_central(scenario: Scenario) -> None:
+    """Raise ScenarioError unless the central filter is a Kalman filter with one model."""
+    plant = scenario.plant
+    for key, rule, remedy, wrong in (
+        ("plant", "must be linear", "simulate it linearised", not plant.linear),
+        ("sensors", "must be linear", "leave the others out", not scenario.has_linear_sensors),
+        (
+            "sensors",
+            "must take samples: increments have no density of their own",
+            "write sampling = { kind = ... }",
+            bool(scenario.increment_sensors),
+        ),
+        (
+            "plant.schedule",
+            "must be left out: one model is fitted",
+            "fit each stretch of time by itself",
+            len(plant.changes) > 0,
+        ),
+        (
+            "filter.model.input",
+            "must be true: an unknown input is no noise",
+            "leave it out",
+            scenario.misses_input,
+        ),
+    ):
+        if wrong:
+            raise ScenarioError(key, rule, None, remedy)
+
+
+def believed_noise(scenario: Scenario) -> FloatArray:
+    """Return B (n, m) that filters believe, in slots Q (n, n)."""
+    model, plant = scenario.filter.model, scenario.plant
+    if scenario.slotted:
+        return scenario.slot_belief[1]
+    B: FloatArray = plant.B if model.B is None else model.B  # type: ignore[attr-defined]
+    return B
+
+
+def _accumulate(F: FloatArray, Q: FloatArray, slots: int) -> FloatArray:
+    """Return the covariance (n, n) of the noise of so many slots."""
+    total = np.zeros_like(Q)
+    for _ in range(slots):
+        total = F @ total @ F.T + Q
+    return total
+
+
+def _plant_variances(scenario: Scenario) -> Iterator[Variance]:
+    """Yield the variances of the plant: those of the columns of B, in slots the diagonal of Q, or
+    its trace if it is not diagonal. Nodes whose blocks have one name share them.
+    """
+    noise, n = believed_noise(scenario), scenario.plant.n
+    groups: dict[tuple[str, str], list[tuple[FloatArray, int]]] = {}
+    for place in scenario.layout.places:
+        own, prefix = place.entries, f"{place.name}: " if scenario.plants else ""
+        if not scenario.slotted:
+            for k, j in enumerate(np.flatnonzero(noise[own].any(axis=0)).tolist()):
+                column = np.where(np.isin(np.arange(n), np.arange(n)[own]), noise[:, j], 0.0)
+                part = np.outer(column, column)
+                groups.setdefault((prefix, f"|B[:, {k}]|^2"), []).append((part, j))
+            continue
+        Q = noise[own, own]
+        is_diagonal = np.array_equal(Q, np.diag(np.diag(Q)))
+        entries = np.flatnonzero(np.diag(Q)).tolist() if is_diagonal else [-1]
+        for i in entries:
+            part = np.zeros((n, n))
+            part[own, own] = Q if i < 0 else np.diag(np.where(np.arange(len(Q)) == i, Q[i, i], 0.0))
+            groups.setdefault((prefix, "trace Q" if i < 0 else f"Q[{i}][{i}]"), []).append(
+                (part, i)
+            )
+    for (prefix, name), parts in groups.items():
+        total = np.sum([part for part, _ in parts], axis=0)
+        columns = tuple(j for _, j in parts)
+        yield Variance(prefix + name, float(np.trace(total)) / len(parts), total, columns)
+
+
+def _sensor_variances(scenario: Scenario) -> Iterator[Variance]:
+    """Yield the diagonal of R of each entry of ``[[sensors]]`` whose table brings no noise of its
+    own, or its trace if R is not diagonal.
+    """
+    seen = set()
+    for placed in itertools.chain.from_iterable(scenario.placed_sensors.values()):
+        entry, sensor = scenario.sensor_entries[placed.entry], scenario.sensors[placed.entry]
+        if entry in seen or (sensor.record is not None and sensor.record.has_noise):
+            continue
+        seen.add(entry)
+        R = scenario.noise_covariance(placed.entry, believed=True)
+        key, rows = f"sensors[{entry}].R", tuple(range(len(R)))
+        if np.array_equal(R, np.diag(np.diag(R))):
+            for i in rows:
+                yield Variance(f"{key}[{i}][{i}]", float(R[i, i]), entry=entry, rows=(i,))
+        else:
+            yield Variance(f"trace {key}", float(np.trace(R)), entry=entry, rows=rows)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NoiseFit(NotebookTable):
+    """The variances of a scenario's noises by likelihood.
+
+    table          : a row for each variance: ``name``, ``start`` in the scenario, ``value``, its
+                     standard error ``se``, and the ends ``low``, ``high`` of its interval at
+                     ``confidence``
+    log_likelihood : at the maximum; ``start_log_likelihood`` with the variances of the scenario
+    readings       : number of scalar readings
+    model          : the ``[filter.model]`` with the fitted matrices, B or Q, and R by entry
+    scenario       : the scenario with this model
+    """
+
+    name: str
+    table: pd.DataFrame
+    log_likelihood: float
+    start_log_likelihood: float
+    readings: int
+    confidence: float
+    model: dict[str, Any]
+    scenario: Scenario = field(repr=False)
+    notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return one line: the variances and the gain of log-likelihood."""
+        values = ", ".join(
+            f"{row.name} = {row.value:.4g}" for row in self.table.itertuples(index=False)
+        )
+        gain = self.log_likelihood - self.start_log_likelihood
+        return f"<netkf noise of {self.name!r}: {values}; log-likelihood +{gain:.4g}>"
+
+
+def log_likelihood(scenario: Scenario, seed: int | None = None, replica: int = 0) -> float:
+    """Return the log-likelihood of the readings of a ``replica`` after time 0, all sensors
+    together, under the linear model that the filters believe, whatever the filter and the network:
+    the log density of the innovations of the central Kalman filter.
+
+    Raises ScenarioError for a model that is not linear, or that changes, and for increments.
+    """
+    model = _central_model(scenario, seed, replica)
+    return model.value(np.ones(len(model.variances)))
+
+
+def _central_model(scenario: Scenario, seed: int | None, replica: int) -> CentralModel:
+    require_scenario(scenario, "the likelihood")
+    seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
+    return CentralModel(scenario, seed, integer(low=0)("replica", replica))
+
+
+def fit_noise(
+    scenario: Scenario,
+    seed: int | None = None,
+    replica: int = 0,
+    confidence: float = 0.95,
+) -> NoiseFit:
+    """Fit the noise of plant and sensors to the readings of a ``replica`` by the largest
+    ``log_likelihood``: the variance of each column of B (in slots of each entry of a diagonal Q,
+    else the size of Q), which for a random walk is its rate, and that of each component of the R of
+    each ``[[sensors]]`` entry (or the size of an R that is not diagonal). What is 0 stays 0.
+
+    ``confidence`` is that of the interval of each variance. Raises ScenarioError, see
+    ``log_likelihood``.
+    """
+    confidence = number(above=0.0, below=1.0)("confidence", confidence)
+    model = _central_model(scenario, seed, replica)
+    if not model.variances:
+        raise ScenarioError("plant", "has no noise to fit, nor have sensors", None, "give Q or R")
+    plant = sum(v.Q is not None for v in model.variances)
+    count = len(model.variances)
+    is_plant = np.arange(count) < plant
+    # The best of a few mixtures, from which to climb.
+    shifts = [np.where(is_plant, one, other) for one, other in itertools.product(STARTS, STARTS)]
+    start = max(shifts, key=lambda theta: model.value(np.exp(theta)))
+    best = _climb(model.value, start)
+    factors, free = np.exp(best), np.ones(count, dtype=bool)
+    top = model.value(factors)
+    for k in range(count):
+        without = np.where(np.arange(count) == k, 0.0, factors)
+        if model.value(without) >= top - NEGLIGIBLE:
+            factors, free[k] = without, False
+    deviations = _deviations(model.value, factors, free)
+    return _make_fit(scenario, model, factors, deviations, confidence)
+
+
+def _climb(value: Callable[[FloatArray], float], start: FloatArray) -> FloatArray:
+    """Return the logarithms (J,) of the factors of variances at a maximum of ``value``, from
+    ``start`` (J,): by a quasi-Newton method, and at last by Newton's.
+    """
+
+    def loss(theta: FloatArray) -> float:
+        return -max(value(np.exp(theta)), -1e300)
+
+    bounds = [(one - RANGE, one + RANGE) for one in start]
+    theta = minimize(
+        loss, start, jac=lambda t: _gradient(loss, t), method="L-BFGS-B", bounds=bounds
+    ).x
+    for _ in range(5):
+        gradient, curvature = _gradient(loss, theta), _hessian(loss, theta)
+        # A variance of 0 has no curvature.
+        moving = np.abs(np.diag(curvature)) > 1e-6
+        step = np.zeros_like(theta)
+        block = curvature[np.ix_(moving, moving)]
+        if not moving.any() or np.linalg.eigvalsh(block).min() <= 0.0:
+            break
+        step[moving] = np.linalg.solve(block, gradient[moving])
+        if not loss(theta - step) <= loss(theta):
+            break
+        theta = theta - step
+    return np.asarray(theta)
+
+
+def _gradient(loss: Callable[[FloatArray], float], theta: FloatArray) -> FloatArray:
+    step = 1e-5
+    shifts = step * np.eye(len(theta))
+    return np.array([(loss(theta + s) - loss(theta - s)) / (2.0 * step) for s in shifts])
+
+
+def _hessian(loss: Callable[[FloatArray], float], theta: FloatArray) -> FloatArray:
+    step, shifts = 1e-3, 1e-3 * np.eye(len(theta))
+    rows = [
+        (_gradient(loss, theta + s) - _gradient(loss, theta - s)) / (2.0 * step) for s in shifts
+    ]
+    return 0.5 * (np.array(rows) + np.array(rows).T)
+
+
+def _deviations(
+    value: Callable[[FloatArray], float], factors: FloatArray, free: np.ndarray
+) -> FloatArray:
+    """Return standard errors (J,) of the logarithms of factors, nan for those that are not
+    ``free``.
+    """
+
+    def loss(theta: FloatArray) -> float:
+        whole = factors.copy()
+        whole[free] = np.exp(theta)
+        return -value(whole)
+
+    deviations = np.full(len(factors), math.nan)
+    if free.any():
+        curvature = _hessian(loss, np.log(factors[free]))
+        with np.errstate(invalid="ignore"):
+            deviations[free] = np.sqrt(np.diag(np.linalg.pinv(curvature)))
+    return deviations
+
+
+def _make_fit(
+    scenario: Scenario,
+    model: CentralModel,
+    factors: FloatArray,
+    deviations: FloatArray,
+    confidence: float,
+) -> NoiseFit:
+    import pandas as pd
+
+    reach = float(ndtri(0.5 + 0.5 * confidence)) * deviations
+    starts = np.array([v.value for v in model.variances])
+    values = starts * factors
+    table = pd.DataFrame(
+        {
+            "name": [v.name for v in model.variances],
+            "start": starts,
+            "value": values,
+            "se": values * deviations,
+            "low": values * np.exp(-reach),
+            "high": values * np.exp(reach),
+        }
+    )
+    matrices = _fitted_matrices(scenario, model.variances, factors)
+    zero = [v.name for v, factor in zip(model.variances, factors, strict=True) if factor == 0.0]
+    notes = (f"as far as these readings tell, 0: {', '.join(zero)}",) if zero else ()
+    changed = {f"filter.model.{key}": value for key, value in matrices.items()}
+    # A reading without noise is refused.
+    is_usable = all(
+        v.Q is not None or factor for v, factor in zip(model.variances, factors, strict=True)
+    )
+    return NoiseFit(
+        scenario.name,
+        table,
+        model.value(factors),
+        model.value(np.ones(len(factors))),
+        len(model.y),
+        confidence,
+        matrices,
+        scenario.replace(changed) if is_usable else scenario,
+        notes,
+    )
+
+
+def _fitted_matrices(
+    scenario: Scenario, variances: tuple[Variance, ...], factors: FloatArray
+) -> dict[str, Any]:
+    """Return the entries of ``[filter.model]`` with variances times ``factors`` (J,)."""
+    noise = np.array(believed_noise(scenario))
+    given: Any = scenario.filter.model.R
+    R = [
+        np.array(given[k] if isinstance(given, tuple) else sensor.R if given is None else given)
+        for k, sensor in enumerate(scenario.declared_sensors)
+    ]
+    for one, factor in zip(variances, factors.tolist(), strict=True):
+        if one.Q is None:
+            rows = np.ix_(one.rows, one.rows)
+            R[one.entry][rows] *= factor
+        elif scenario.slotted:
+            noise += (factor - 1.0) * one.Q
+        else:
+            noise[:, one.columns] *= math.sqrt(factor)
+    key = "Q" if scenario.slotted else "B"
+    return {key: noise.tolist(), "R": [matrix.tolist() for matrix in R]}

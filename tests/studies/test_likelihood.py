@@ -1,0 +1,207 @@
+"""Likelihoods of readings against statsmodels and the innovations of filters; noises fitted."""
+
+import json
+import tomllib
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import netkf
+from netkf.checks.innovations import compute_innovations
+from netkf.cli.main import main
+from netkf.core.errors import ScenarioError
+from netkf.scenario.reading import from_table
+from netkf.scenario.writing import as_table, to_toml
+from netkf.studies.likelihood import fit_noise, log_likelihood
+from tests.studies.statsmodels_likelihood import (
+    LEVEL,
+    TREND,
+    level_readings,
+    reference,
+    trend_readings,
+)
+
+# As `python tests/studies/statsmodels_likelihood.py` prints it, with statsmodels 0.15.
+REFERENCE = {
+    "level": {
+        "start": -146.36946107177238,
+        "maximum": -141.94508064531573,
+        "values": [0.45734869994500504, 1.050470316185966],
+        "se": [0.17186776207431026, 0.23232777326296225],
+    },
+    "trend": {
+        "start": -154.71514985271543,
+        "maximum": -153.61281762616034,
+        "values": [0.03605388044624729, 0.4909653608931991, 1.8415022479173468],
+        "se": [0.02323360050183067, 0.10762410608888723, 0.38885837580254323],
+    },
+}
+
+
+def scenario(folder, plant, sensor, horizon, **changes):
+    table = {
+        "format": 1,
+        "name": "fitted",
+        "horizon": horizon,
+        "probe": horizon,
+        "plant": plant,
+        "sensors": [{"nodes": [0], **sensor}],
+        "network": {"graph": {"kind": "path", "nodes": 2}},
+        "filter": {"kind": "local"},
+        **changes,
+    }
+    return from_table({k: v for k, v in table.items() if v is not None}, folder)
+
+
+@pytest.fixture(scope="module")
+def level(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("level")
+    y = level_readings()
+    rows = {"t": np.arange(1, len(y) + 1), "node": 0, "y0": y}
+    pd.DataFrame(rows).to_csv(folder / "level.csv", index=False)
+    plant = {"kind": "unknown", "F": [[1.0]], "Q": [[LEVEL["q"]]], "period": 1.0}
+    plant |= {"mean": [LEVEL["mean"]], "cov": [[LEVEL["cov"]]]}
+    sensor = {"kind": "recorded", "path": "level.csv", "H": [[1.0]], "R": [[LEVEL["r"]]]}
+    return scenario(folder, plant, sensor, len(y) + 1.0)
+
+
+@pytest.fixture(scope="module")
+def trend(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trend")
+    t, y = trend_readings()
+    rows = {"t": t, "node": 0, "y0": y[:, 0], "y1": y[:, 1]}
+    pd.DataFrame(rows).to_csv(folder / "trend.csv", index=False)
+    plant = {"kind": "unknown", "A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [TREND["q"] ** 0.5]]}
+    plant |= {"mean": TREND["mean"], "cov": TREND["cov"]}
+    H, R = [[1.0, 0.0], [1.0, 0.0]], np.diag(TREND["r"]).tolist()
+    sensor = {"kind": "recorded", "path": "trend.csv", "H": H, "R": R}
+    return scenario(folder, plant, sensor, float(t[-1]) + 1.0)
+
+
+@pytest.mark.parametrize("name", ["level", "trend"])
+def test_likelihood_and_its_maximum_are_those_of_statsmodels(name, request):
+    given, right = request.getfixturevalue(name), REFERENCE[name]
+    assert log_likelihood(given) == pytest.approx(right["start"], abs=1e-8)
+    found = fit_noise(given)
+    assert found.start_log_likelihood == log_likelihood(given)
+    assert found.log_likelihood == pytest.approx(right["maximum"], abs=1e-8)
+    np.testing.assert_allclose(found.table["value"], right["values"], rtol=1e-6)
+    np.testing.assert_allclose(found.table["se"], right["se"], rtol=1e-4)
+    # The scenario it returns has the matrices that it says.
+    assert log_likelihood(found.scenario) == pytest.approx(found.log_likelihood, abs=1e-8)
+
+
+def test_statsmodels_still_says_so():
+    pytest.importorskip("statsmodels")
+    for name, found in reference().items():
+        assert found["start"] == pytest.approx(REFERENCE[name]["start"], abs=1e-9)
+        assert found["maximum"] == pytest.approx(REFERENCE[name]["maximum"], abs=1e-8)
+
+
+@pytest.mark.parametrize("name", ["level", "trend"])
+def test_likelihood_is_the_density_of_the_innovations_of_the_central_filter(name, request):
+    given = request.getfixturevalue(name)
+    central = given.replace({"filter": {"kind": "central"}})
+    assert compute_innovations(
+        netkf.simulate(central, engine="simpy")
+    ).log_density.sum() == pytest.approx(log_likelihood(given), abs=1e-8)
+
+
+def correlated(folder, **changes):
+    """Drawn readings of two nodes: noise that is not diagonal, an input, two plants' noises."""
+    plant = {"kind": "diffusion", "A": [[0.0, 1.0], [-1.0, -0.3]], "B": [[0.3, 0.0], [0.1, 0.4]]}
+    plant["input"] = {"kind": "sine", "G": [[0.0], [1.0]], "amplitude": [1.0], "frequency": [0.2]}
+    sensor = {"H": [[1.0, 0.0], [0.0, 1.0]], "R": [[0.3, 0.1], [0.1, 0.2]], "nodes": [0, 1]}
+    sensor["sampling"] = {"kind": "poisson", "rate": 3.0}
+    return scenario(folder, plant, sensor, 60.0, **changes)
+
+
+def test_drawn_readings_with_correlated_noise_and_an_input(tmp_path):
+    given = correlated(tmp_path)
+    central = given.replace({"filter": {"kind": "central"}})
+    density = compute_innovations(netkf.simulate(central, engine="simpy")).log_density.sum()
+    assert log_likelihood(given) == pytest.approx(density, abs=1e-7)
+    found = fit_noise(given)
+    assert found.table["name"].tolist() == ["|B[:, 0]|^2", "|B[:, 1]|^2", "trace sensors[0].R"]
+    assert found.log_likelihood > found.start_log_likelihood
+
+
+def test_intervals_hold_and_a_wrong_start_does_not_matter(tmp_path):
+    plant = {"kind": "diffusion", "A": [[0.0]], "B": [[0.8]], "cov": [[1.0]]}
+    sensor = {"H": [[1.0]], "R": [[0.5]], "sampling": {"kind": "periodic", "period": 0.5}}
+    given = scenario(tmp_path, plant, sensor, 100.0)
+    wrong = given.replace({"filter.model": {"B": [[8.0]], "R": [[5e-3]]}})
+    missed = 0
+    for seed in range(20):
+        found = fit_noise(given, seed=seed, confidence=0.9).table
+        missed += (found["low"] > [0.64, 0.5]).sum() + (found["high"] < [0.64, 0.5]).sum()
+    # 40 intervals at 90 %: 4 miss, more than 11 in one of 3000 such tests.
+    assert missed <= 11
+    again = fit_noise(wrong, seed=19).table
+    np.testing.assert_allclose(again["value"], found["value"], rtol=1e-5)
+
+
+def test_a_variance_that_readings_deny_is_zero(tmp_path):
+    plant = {"kind": "linear", "F": [[1.0]], "Q": [[0.0]], "period": 1.0, "cov": [[1.0]]}
+    given = scenario(tmp_path, plant, {"H": [[1.0]], "R": [[1.0]]}, 50.0)
+    model = {"Q": [[0.1]]}
+    fits = [fit_noise(given.replace({"filter.model": model}), seed=seed) for seed in range(6)]
+    zero = [found for found in fits if found.table["value"][0] == 0.0]
+    # The maximum is at 0 in about two of three.
+    assert 1 <= len(zero) <= 6
+    assert np.isnan(zero[0].table["se"][0])
+    assert "Q[0][0]" in zero[0].notes[0]
+    assert zero[0].scenario.filter.model.Q[0, 0] == 0.0
+
+
+def test_blocks_of_one_name_share_a_variance(tmp_path):
+    plants = [
+        {"name": "walk", "nodes": [0, 1], "kind": "diffusion", "A": [[0.0]], "B": [[0.5]]},
+        {"name": "all", "kind": "diffusion", "A": [[-0.1]], "B": [[1.0]]},
+    ]
+    clock = {"kind": "periodic", "period": 0.5}
+    sensors = [
+        {"nodes": [0, 1], "of": "walk", "H": [[1.0]], "R": [[0.2]], "sampling": clock},
+        {"nodes": [0], "of": "all", "H": [[1.0]], "R": [[0.1]], "sampling": clock},
+    ]
+    given = scenario(tmp_path, None, {}, 80.0, plants=plants, sensors=sensors)
+    found = fit_noise(given, seed=3, confidence=0.999)
+    names = ["walk: |B[:, 0]|^2", "all: |B[:, 0]|^2", "sensors[0].R[0][0]", "sensors[1].R[0][0]"]
+    assert found.table["name"].tolist() == names
+    assert (found.table["low"] < [0.25, 1.0, 0.2, 0.1]).all()
+    assert (found.table["high"] > [0.25, 1.0, 0.2, 0.1]).all()
+    assert log_likelihood(found.scenario, seed=3) == pytest.approx(found.log_likelihood, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"sensors.0.sampling": None}, "sensors"),
+        ({"plant.schedule": [{"from": 5.0, "A": [[0.0, 1.0], [-2.0, 0.0]]}]}, "plant.schedule"),
+        ({"filter.model": {"input": False}}, "filter.model.input"),
+    ],
+)
+def test_what_has_no_one_linear_model_is_refused(tmp_path, changes, key):
+    given = correlated(tmp_path)
+    if "sensors.0.sampling" in changes:
+        sensor = {"H": [[1.0, 0.0]], "R": [[0.3]]}
+        changes = {"sensors": [{"nodes": [0], **sensor}]}
+    with pytest.raises(ScenarioError, match=f"^{key}"):
+        log_likelihood(given.replace(changes))
+
+
+def test_the_command_prints_the_model_that_the_scenario_may_take(level, tmp_path, capsys):
+    path = tmp_path / "level.toml"
+    path.write_text(to_toml(as_table(level)))
+    (tmp_path / "level.csv").write_bytes((level._folder / "level.csv").read_bytes())
+    assert main(["fit", str(path), "--noise"]) == 0
+    model = tomllib.loads(capsys.readouterr().out.split("\n\n", 2)[2].split("\n", 1)[1])
+    found = fit_noise(level)
+    assert log_likelihood(level.replace({"filter.model": model["filter"]["model"]})) == (
+        pytest.approx(found.log_likelihood, abs=1e-8)
+    )
+    assert main(["fit", str(path), "--noise", "--json", "--set", "plant.Q=[[1.0]]"]) == 0
+    got = json.loads(capsys.readouterr().out)
+    assert [row["start"] for row in got["variances"]] == [1.0, 2.0]
+    assert main(["fit", str(path), "--noise", "--set", "filter.gain=1"]) == 2
