@@ -6,7 +6,8 @@
 The raw record is scenarios/data/ulb_library/readings.csv and heard.csv.gz. Each mote broadcasts
 with its reading, once a minute; the message reached those motes whose report in the next minute
 names the sender. Where a reading is missing but somebody names its mote, the mote broadcast at its
-usual second of that minute. Readings of the held-out motes are in no table and in no parameter.
+usual second of that minute. Readings of the held-out motes are in a table that no filter sees, and
+in no parameter.
 
 Errors are of the second hour, because the first one gave the parameters. What is estimated is the
 temperature that all motes share, so a mote differs from it by an offset. With the offset that the
@@ -58,8 +59,10 @@ def raw():
 
 
 def prepare(folder):
-    """Write the four tables of the scenario into a folder and print the parameters of its model."""
+    """Write the five tables of the scenario into a folder and print the parameters of its model."""
     readings, heard = raw()
+    held_out = readings[readings.node.isin(HELD_OUT)]
+    held_out[["t", "node", "y0"]].to_csv(folder / "held_out.csv", index=False)
     given = readings[~readings.node.isin(HELD_OUT)]
     given[["t", "node", "y0"]].to_csv(folder / "temperatures.csv", index=False)
     nodes = sorted(readings.node.unique())

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from netkf.logs.exporting import export_log
     from netkf.logs.fitting import fit_log
     from netkf.logs.importing import import_log
+    from netkf.runs.held_out import held_out_errors
     from netkf.runs.run import save
     from netkf.runs.simulate import simulate
     from netkf.scenario.model import Belief, Filtering, Network
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from netkf.studies.compare import compare
     from netkf.studies.compare_filters import compare_filters
     from netkf.studies.consistency import consistency
+    from netkf.studies.innovation_tests import innovations
     from netkf.studies.likelihood import fit_noise, log_likelihood
     from netkf.studies.opening import open as open
     from netkf.studies.size import size
@@ -52,7 +54,9 @@ _MODULE_OF = {
     "first_difference": "netkf.trace.run",
     "fit_log": "netkf.logs.fitting",
     "fit_noise": "netkf.studies.likelihood",
+    "held_out_errors": "netkf.runs.held_out",
     "import_log": "netkf.logs.importing",
+    "innovations": "netkf.studies.innovation_tests",
     "load": "netkf.scenario.reading",
     "log_likelihood": "netkf.studies.likelihood",
     "check": "netkf.checks.check",
@@ -91,7 +95,9 @@ __all__ = [
     "first_difference",
     "fit_log",
     "fit_noise",
+    "held_out_errors",
     "import_log",
+    "innovations",
     "load",
     "log_likelihood",
     "monte_carlo",

@@ -214,7 +214,13 @@ def test_the_tables_of_the_library_are_those_of_its_raw_record(tmp_path):
     library.main(["--prepare", "--folder", str(tmp_path)])
     made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     kept = SCENARIOS / "data" / "ulb_library"
-    assert set(made) == {"temperatures.csv", "pairs.csv", "broadcasts.csv", "missed.csv"}
+    assert set(made) == {
+        "temperatures.csv",
+        "held_out.csv",
+        "pairs.csv",
+        "broadcasts.csv",
+        "missed.csv",
+    }
     assert made == {name: (kept / name).read_bytes() for name in made}
 
 

@@ -270,6 +270,18 @@ COMMANDS = (
         ),
     ),
     Command(
+        "innovations",
+        "test if a run fits its model without knowing the truth: NIS, bias and whiteness by node",
+        (
+            _replica("run this replica of an ensemble (default: 0)"),
+            _confidence(0.99, "that no node is called broken if the model is right"),
+            SEED,
+            ENGINE,
+            ALL,
+            JSON,
+        ),
+    ),
+    Command(
         "compare",
         "compare finished runs side by side and mark significant differences",
         (_directories("run directory"), _confidence(0.95, "that all marks are right"), JSON),

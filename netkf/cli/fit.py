@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 
 from netkf.cli.options import parse_changes, print_json
 from netkf.cli.progress import ProgressLine
@@ -43,14 +44,13 @@ def _fit_noise(options: argparse.Namespace) -> int:
     """Print the variances of the noises and the model that has them."""
     from netkf.runs.tables import format_number, format_table
     from netkf.scenario.reading import load
-    from netkf.scenario.writing import to_toml
     from netkf.studies.likelihood import fit_noise
 
     path, changes = options.directory, parse_changes(options.set)
     path = path / "scenario.toml" if path.is_dir() else path
     found = fit_noise(load(path, changes, trust=options.trust), confidence=options.confidence)
     if options.json:
-        names = ("log_likelihood", "start_log_likelihood", "readings", "model", "notes")
+        names = ("log_likelihood", "start_log_likelihood", "readings", "changes", "notes")
         values = {name: getattr(found, name) for name in names}
         print_json({"variances": found.table.to_dict("records"), **values})
         return 0
@@ -66,5 +66,6 @@ def _fit_noise(options: argparse.Namespace) -> int:
         f"{found.confidence:g}"
     )
     print(*(f"note: {note}\n" for note in found.notes), sep="")
-    print(to_toml({"filter": {"model": found.model}}))
+    print("the scenario with them, as --set takes it:")
+    print(*(f"{key}={json.dumps(value)}" for key, value in found.changes.items()), sep="\n")
     return 0

@@ -23,6 +23,7 @@ import numpy as np
 from netkf.core.clock import Clock, generate_ticks
 from netkf.core.fields import (
     Component,
+    boolean,
     definite_covariance,
     field,
     instance_of,
@@ -58,6 +59,8 @@ class Sensor(Component):
 
     nodes: tuple[int, ...] = field(list_of(node_id(), "node ids"))
     fault: Fault | None = field(instance_of(Fault), default=None)
+    held_out: bool = field(boolean, default=False)
+    """Filters do not see its readings, with which their estimates are compared."""
 
     linear: ClassVar[bool] = True
     """Whether readings are linear in the state."""

@@ -92,7 +92,7 @@ def collect_readings(
     for node, sensors in placed.items():
         for one in sensors:
             key = node, one.ordinal
-            path = (scenario.slot_path if scenario.slotted else scenario.sample_path)(
+            path: Any = (scenario.slot_path if scenario.slotted else scenario.sample_path)(
                 streams, node, one
             )
             R = scenario.noise_covariance(one.entry, believed=True)

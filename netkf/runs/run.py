@@ -28,6 +28,7 @@ from netkf.runs.files import (
     write_json,
     write_scenario,
 )
+from netkf.runs.held_out import errors_of_replica
 from netkf.runs.parquet_files import ParquetSink
 from netkf.runs.provenance import machine, versions
 from netkf.runs.quantities import NetworkSink
@@ -211,6 +212,11 @@ class _Output:
         if status == "complete":
             usage = record_usage(self.scenario, self.links[0].sent if self.links else {})
             summary |= {"records": usage} if usage else {}
+            if self.scenario.held_out_sensors:
+                manifest = self.manifest
+                summary["held_out"] = errors_of_replica(
+                    self.scenario, manifest.seed, manifest.replica
+                )
         write_json(self.directory / "summary.json", summary)
         return summary
 

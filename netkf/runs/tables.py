@@ -11,6 +11,8 @@ from netkf.scenario.usage import usage_notes
 
 MAX_NODES = 30
 """Largest number of rows of a table of nodes; longer ones list the best and the worst nodes."""
+MAX_HELD_OUT = 12
+"""Nodes whose held-out readings are listed."""
 DRIFT_TOLERANCE = 1e-9
 """Relative drift of a conserved sum above which rounding cannot be the cause."""
 COLUMNS = {
@@ -92,11 +94,26 @@ def summary_table(
             f"{format_number(nees['low'])} .. {format_number(nees['high'])} where P is exact, here "
             f"{nees['inside']:.0%}"
         )
+    lines += _held_out_lines(summary.get("held_out", []))
     if "conserved" in summary:
         lines.append("mass: " + _describe_conserved(summary["conserved"]))
     lines += [*_quantity_lines(summary), _message_line(summary["messages"])]
     lines += [f"note: {note}" for note in usage_notes(summary.get("records", {}))]
     return "\n".join(lines)
+
+
+def _held_out_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield a line for each of the first nodes with held-out readings."""
+    for row in rows[:MAX_HELD_OUT]:
+        square, noise, expected = (
+            format_number(row[key]) for key in ("mean_square", "noise", "expected")
+        )
+        yield (
+            f"held out at node {row['node']}: mean squared error {square} over {row['readings']:,} "
+            f"values; H P H' + R says {expected}, of which R {noise}"
+        )
+    if len(rows) > MAX_HELD_OUT:
+        yield f"held out at {len(rows) - MAX_HELD_OUT} more nodes: see summary.json"
 
 
 def has_bound(summary: dict[str, Any]) -> bool:

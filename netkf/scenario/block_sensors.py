@@ -17,7 +17,7 @@ from netkf.plants.recorded import RecordedSensor
 from netkf.plants.relative import RelativePositionSensor, RelativeSensor
 
 STACKED = "_is_stacked"
-"""The attribute of sensors that read the stacked state."""
+"""The attribute of sensors that read the stacked state: the declared sensors they come from."""
 RELATIVE = (RelativeSensor, RelativePositionSensor)
 
 
@@ -43,7 +43,10 @@ def stacked_sensors(
     stacked, entries = [], []
     for k, sensor in enumerate(sensors):
         with errors_under(f"[{k}]"):
-            for one in _stacked(sensor, layout, topology):
+            for one in _of_blocks(sensor, layout, topology):
+                if one is not sensor:
+                    object.__setattr__(one, STACKED, sensors)
+                    object.__setattr__(one, "held_out", sensor.held_out)
                 stacked.append(one)
                 entries.append(k)
     return tuple(stacked), tuple(entries)
@@ -87,17 +90,6 @@ def estimated_blocks(
             raise ScenarioError("", rule, estimates, "give it one in [[plants]], or choose others")
         blocks.append(own)
     return tuple(blocks)
-
-
-def _stacked(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:
-    """Yield sensors of the stacked state; one that is such a sensor already is left as it is."""
-    if getattr(sensor, STACKED, False):
-        yield sensor
-        return
-    for one in _of_blocks(sensor, layout, topology):
-        if one is not sensor:
-            object.__setattr__(one, STACKED, True)
-        yield one
 
 
 def _of_blocks(sensor: Any, layout: Layout, topology: Topology) -> Iterator[Any]:

@@ -57,7 +57,12 @@ from netkf.plants.linear import LinearPlant, SlotPlant
 from netkf.plants.nonlinear import NonlinearSensor
 from netkf.plants.plant import Plant
 from netkf.plants.sensors import LinearSensor, Sensor
-from netkf.scenario.block_sensors import estimated_blocks, require_no_blocks, stacked_sensors
+from netkf.scenario.block_sensors import (
+    STACKED,
+    estimated_blocks,
+    require_no_blocks,
+    stacked_sensors,
+)
 from netkf.scenario.metrics import Metrics
 from netkf.scenario.names import bind_names
 from netkf.scenario.positions import placed_nodes, positions_of, table_of_positions
@@ -247,7 +252,10 @@ class ScenarioModel(Component):
             self.__dict__["topology"] = dataclasses.replace(self.topology, positions=located)
 
     def _stack_blocks(self) -> None:
-        declared, entries = self.sensors, tuple(range(len(self.sensors)))
+        # A copy of a scenario is given the sensors of the original, stacked already.
+        origins = (getattr(sensor, STACKED, None) for sensor in self.sensors)
+        declared = next((origin for origin in origins if origin is not None), self.sensors)
+        entries = tuple(range(len(self.sensors)))
         if not self.plants:
             if self.plant is None:
                 raise ScenarioError("plant", "is missing", None, "add [plant] or [[plants]]")
@@ -520,13 +528,28 @@ class ScenarioModel(Component):
 
     @cached_property
     def placed_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
-        """The sensors of each node that has any, by node id in increasing order."""
+        """The sensors of each node that has any, by node id in increasing order, but for those that
+        are held out.
+        """
+        return self._place_sensors(held_out=False)
+
+    @cached_property
+    def held_out_sensors(self) -> dict[int, tuple[PlacedSensor, ...]]:
+        """The sensors of each node that filters do not see, as ``placed_sensors``."""
+        return self._place_sensors(held_out=True)
+
+    def _place_sensors(self, held_out: bool) -> dict[int, tuple[PlacedSensor, ...]]:
+        # Sensors keep their numbers, and so their draws, whichever are held out.
         sensors_of_nodes: dict[int, list[PlacedSensor]] = {}
         for entry, sensor in enumerate(self.sensors):
             for node in sensor.nodes:
                 sensors = sensors_of_nodes.setdefault(node, [])
                 sensors.append(PlacedSensor(entry, len(sensors)))
-        return {node: tuple(sensors_of_nodes[node]) for node in sorted(sensors_of_nodes)}
+        chosen = {
+            node: tuple(p for p in placed if self.sensors[p.entry].held_out is held_out)
+            for node, placed in sorted(sensors_of_nodes.items())
+        }
+        return {node: placed for node, placed in chosen.items() if placed}
 
     @property
     def sensing_nodes(self) -> tuple[int, ...]:

@@ -369,7 +369,10 @@ def consistency(
     require_scenario(scenario, "consistency")
     if len(blocks_without_law(scenario)) == len(scenario.layout.places):
         rule = "states or readings are recorded, so the law of the errors is unknown"
-        raise ScenarioError("plant", rule, None, "simulate the plant and all readings")
+        remedy = (
+            "simulate the plant and all readings, or use netkf innovations, which needs no truth"
+        )
+        raise ScenarioError("plant", rule, None, remedy)
     count = integer(low=MIN_RUNS)("runs", runs)
     confidence = number(above=0.0, below=1.0)("confidence", confidence)
     task = partial(run_consistency, engine=choose_engine(engine, scenario))

@@ -13,6 +13,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from scipy.optimize import minimize
 from scipy.special import ndtri
 
 from netkf.algorithms.baselines import Central
+from netkf.checks.innovations import LOG_2PI, Innovations
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer, number
 from netkf.core.notebook import NotebookTable
@@ -34,7 +36,6 @@ from netkf.scenario.scenario import Scenario
 if TYPE_CHECKING:
     import pandas as pd
 
-LOG_2PI = math.log(2.0 * math.pi)
 RANGE = 30.0
 """Largest change of the logarithm of a variance that is searched."""
 NEGLIGIBLE = 1e-6
@@ -98,7 +99,7 @@ class CentralModel:
     """The central Kalman filter of a scenario over the readings of a ``replica``, as a function of
     the variances of its noises.
 
-    times, nodes, sensors : (M,) seconds, ids and ``[[sensors]]`` entries of scalar readings
+    times, nodes : (M,) seconds and ids of scalar readings
     """
 
     def __init__(self, scenario: Scenario, seed: int, replica: int) -> None:
@@ -106,10 +107,8 @@ class CentralModel:
         _require_central(scenario)
         self._scenario = scenario
         filtering = dataclasses.replace(scenario.filter, algorithm=Central(), estimates="all")
-        network = dataclasses.replace(scenario.network, activation=None, lives=(), radio=None)
-        central = dataclasses.replace(
-            scenario, filter=filtering, network=network, sensors=scenario.declared_sensors
-        )
+        network = dataclasses.replace(scenario.network, activation=None, radio=None)
+        central = dataclasses.replace(scenario, filter=filtering, network=network)
         got = collect_readings(central, seed, replica, central.placed_sensors, all_slots=True)
         if not got.readings:
             raise ScenarioError("sensors", "give no readings", None, "add a sensor or rows")
@@ -122,8 +121,9 @@ class CentralModel:
     def _lay_rows(self, scenario: Scenario, got: Readings) -> None:
         """Lay out scalar readings: those of a noise that is not diagonal are decorrelated."""
         index = {(v.entry, row): k for k, v in enumerate(self.variances) for row in v.rows}
-        H, y, of, owners, first = [], [], [], [], [0]
-        log_scale, k = 0.0, 0
+        H, of, owners, first = [], [], [], [0]
+        y, scales = list[float](), list[float]()
+        k = 0
         for one in got.readings:
             while k < one.number:
                 first.append(len(y))
@@ -134,17 +134,17 @@ class CentralModel:
             root = np.diag(np.sqrt(diagonal)) if is_diagonal else np.linalg.cholesky(one.R)
             # Rows of unit variance.
             z, J = np.linalg.solve(root, one.y), np.linalg.solve(root, one.H)
-            log_scale += float(np.log(np.diag(root)).sum())
+            scales += np.diag(root).tolist()
             y += z.tolist()
             H += list(J)
             of += [index.get((entry, row), -1) for row in one.rows.tolist()]
-            owners += [(got.times[one.number], one.node, entry)] * len(z)
+            owners += [(got.times[one.number], one.node)] * len(z)
         while k < len(got.times):
             first.append(len(y))
             k += 1
         self.H, self.y, self._first = np.array(H), np.array(y), np.array(first)
-        self._of, self._log_scale = np.array(of), log_scale
-        self.times, self.nodes, self.sensors = map(np.array, zip(*owners, strict=True))
+        self._of, self._scales = np.array(of), np.array(scales)
+        self.times, self.nodes = map(np.array, zip(*owners, strict=True))
 
     def _lay_laws(self, scenario: Scenario, times: FloatArray) -> None:
         parts = [v.Q for v in self.variances if v.Q is not None]
@@ -187,8 +187,20 @@ class CentralModel:
         """Return the log-likelihood with the variances of the scenario times ``factors`` (J,)."""
         with np.errstate(all="ignore"):
             v, S = self.innovations(factors)
-            total = -0.5 * float((LOG_2PI + np.log(S) + v * v / S).sum()) - self._log_scale
+            total = float(self._densities(v, S).sum())
         return total if math.isfinite(total) else -math.inf
+
+    def _densities(self, v: FloatArray, S: FloatArray) -> FloatArray:
+        return -0.5 * (LOG_2PI + np.log(S) + v * v / S) - np.log(self._scales)
+
+    def as_innovations(self) -> Innovations:
+        """Return the innovations of scalar readings, each given those before it."""
+        v, S = self.innovations(np.ones(len(self.variances)))
+        rows = np.ones(len(v), dtype=np.int64)
+        parts = v / np.sqrt(S), v * self._scales, np.sqrt(S) * self._scales
+        whitened, values, deviations = (list(part[:, None]) for part in parts)
+        nis, density = v * v / S, self._densities(v, S)
+        return Innovations(self.times, self.nodes, rows, nis, whitened, values, deviations, density)
 
 
 def _require_central(scenario: Scenario) -> None:
@@ -208,6 +220,12 @@ def _require_central(scenario: Scenario) -> None:
             "must be left out: one model is fitted",
             "fit each stretch of time by itself",
             len(plant.changes) > 0,
+        ),
+        (
+            "network.lives",
+            "must be left out: a node that is down reads nothing",
+            "fit without it",
+            bool(scenario.network.lives),
         ),
         (
             "filter.model.input",
@@ -294,8 +312,8 @@ class NoiseFit(NotebookTable):
                      ``confidence``
     log_likelihood : at the maximum; ``start_log_likelihood`` with the variances of the scenario
     readings       : number of scalar readings
-    model          : the ``[filter.model]`` with the fitted matrices, B or Q, and R by entry
-    scenario       : the scenario with this model
+    changes        : the fitted matrices by key of the scenario: filter.model.B or Q, and R
+    scenario       : the scenario with these
     """
 
     name: str
@@ -304,7 +322,7 @@ class NoiseFit(NotebookTable):
     start_log_likelihood: float
     readings: int
     confidence: float
-    model: dict[str, Any]
+    changes: dict[str, Any]
     scenario: Scenario = field(repr=False)
     notes: tuple[str, ...] = ()
 
@@ -374,13 +392,11 @@ def _climb(value: Callable[[FloatArray], float], start: FloatArray) -> FloatArra
     ``start`` (J,): by a quasi-Newton method, and at last by Newton's.
     """
 
-    def loss(theta: FloatArray) -> float:
+    def loss(theta: Any) -> float:
         return -max(value(np.exp(theta)), -1e300)
 
     bounds = [(one - RANGE, one + RANGE) for one in start]
-    theta = minimize(
-        loss, start, jac=lambda t: _gradient(loss, t), method="L-BFGS-B", bounds=bounds
-    ).x
+    theta = minimize(loss, start, jac=partial(_gradient, loss), method="L-BFGS-B", bounds=bounds).x
     for _ in range(5):
         gradient, curvature = _gradient(loss, theta), _hessian(loss, theta)
         # A variance of 0 has no curvature.
@@ -396,7 +412,7 @@ def _climb(value: Callable[[FloatArray], float], start: FloatArray) -> FloatArra
     return np.asarray(theta)
 
 
-def _gradient(loss: Callable[[FloatArray], float], theta: FloatArray) -> FloatArray:
+def _gradient(loss: Callable[[FloatArray], float], theta: Any) -> FloatArray:
     step = 1e-5
     shifts = step * np.eye(len(theta))
     return np.array([(loss(theta + s) - loss(theta - s)) / (2.0 * step) for s in shifts])
@@ -452,10 +468,9 @@ def _make_fit(
             "high": values * np.exp(reach),
         }
     )
-    matrices = _fitted_matrices(scenario, model.variances, factors)
+    changes = _changes(scenario, model.variances, factors)
     zero = [v.name for v, factor in zip(model.variances, factors, strict=True) if factor == 0.0]
     notes = (f"as far as these readings tell, 0: {', '.join(zero)}",) if zero else ()
-    changed = {f"filter.model.{key}": value for key, value in matrices.items()}
     # A reading without noise is refused.
     is_usable = all(
         v.Q is not None or factor for v, factor in zip(model.variances, factors, strict=True)
@@ -467,16 +482,16 @@ def _make_fit(
         model.value(np.ones(len(factors))),
         len(model.y),
         confidence,
-        matrices,
-        scenario.replace(changed) if is_usable else scenario,
+        changes,
+        scenario.replace(changes) if is_usable else scenario,
         notes,
     )
 
 
-def _fitted_matrices(
+def _changes(
     scenario: Scenario, variances: tuple[Variance, ...], factors: FloatArray
 ) -> dict[str, Any]:
-    """Return the entries of ``[filter.model]`` with variances times ``factors`` (J,)."""
+    """Return the keys of the scenario, with variances times ``factors`` (J,)."""
     noise = np.array(believed_noise(scenario))
     given: Any = scenario.filter.model.R
     R = [
@@ -485,11 +500,14 @@ def _fitted_matrices(
     ]
     for one, factor in zip(variances, factors.tolist(), strict=True):
         if one.Q is None:
-            rows = np.ix_(one.rows, one.rows)
-            R[one.entry][rows] *= factor
+            R[one.entry][np.ix_(one.rows, one.rows)] *= factor
         elif scenario.slotted:
             noise += (factor - 1.0) * one.Q
         else:
             noise[:, one.columns] *= math.sqrt(factor)
-    key = "Q" if scenario.slotted else "B"
-    return {key: noise.tolist(), "R": [matrix.tolist() for matrix in R]}
+    changes = {f"filter.model.{'Q' if scenario.slotted else 'B'}": noise.tolist()}
+    entries = sorted({one.entry for one in variances if one.Q is None})
+    # Of recorded readings R is what filters believe anyway.
+    if given is None and not any(scenario.declared_sensors[k].is_random for k in entries):
+        return changes | {f"sensors.{k}.R": R[k].tolist() for k in entries}
+    return changes | {"filter.model.R": [matrix.tolist() for matrix in R]}

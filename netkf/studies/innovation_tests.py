@@ -1,0 +1,382 @@
+"""``netkf.innovations``: does a run fit its model, node by node, without a true state?
+
+Innovations, readings minus their predictions in units of their covariance, are white with NIS
+chi-square if the model is right and the filter optimal. Each node is tested on its mean NIS, its
+bias, Ljung and Box's statistic (Biometrika 65, 1978) and on stretches of time that differ from the
+rest. Bonferroni's inequality makes all verdicts hold together at the stated confidence. Nodes that
+exchange estimates have correlated innovations: there only NIS and bias are tested, with as many
+independent readings as the correlation found leaves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.special import chndtrinc, gammainc, gammaincc, gammaincinv, ndtr, ndtri, stdtrit
+
+from netkf.algorithms.baselines import Central, Local
+from netkf.algorithms.intermittent import Intermittent
+from netkf.algorithms.registry import overridden
+from netkf.checks.innovations import MIN_READINGS, Innovations, autocorrelation, compute_innovations
+from netkf.core.errors import ScenarioError
+from netkf.core.fields import number
+from netkf.core.notebook import NotebookTable
+from netkf.laws.intervals import POWER
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.simulate import simulate
+from netkf.runs.summary import chi_square_interval
+from netkf.runs.tables import format_number, format_table, shorten_rows
+from netkf.scenario.scenario import Scenario
+from netkf.studies.likelihood import CentralModel
+from netkf.trace.run import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LAGS = 10
+"""Lags of Ljung and Box's statistic, at most a fifth of the readings."""
+MIN_INDEPENDENT = 20
+"""Least number of readings, less those that correlation takes away, that are judged."""
+STRETCHES = 64
+"""Parts of a run, of as many readings each, at whose ends a stretch of time may begin or end."""
+SHUFFLES = 20_000
+MAX_ROWS = 40  # rows that fit onto a screen
+DETECTABLE = ("nis_detectable", "bias_detectable", "correlation_detectable")
+
+
+class Law(NamedTuple):
+    """What innovations are if the model is right: "white", "exact" (of the right size, but
+    correlated), "smaller" (P is conservative), or "" (unknown, for a ``reason``).
+    """
+
+    kind: str
+    reason: str = ""
+
+
+class Stretch(NamedTuple):
+    """The readings ``first`` .. ``end`` - 1 of a node that differ most from what they should be,
+    and the probability ``p`` that some stretch differs as much by chance.
+    """
+
+    first: int
+    end: int
+    p: float
+
+
+def ljung_box(values: FloatArray, lags: int) -> float:
+    """Return n (n + 2) sum_k r_k^2 / (n - k) over ``lags`` of n ``values``, about their mean."""
+    n, r = len(values), autocorrelation(values - values.mean(), lags)
+    return float(n * (n + 2.0) * (r * r / (n - np.arange(1, lags + 1))).sum())
+
+
+def whiteness_p(columns: list[FloatArray], lags: int, level: float) -> tuple[float, float]:
+    """Return the sum of Ljung and Box's statistics of independent ``columns`` and its p. Chi-square
+    has too thin a tail for few readings: what it rejects at ``level`` is compared with shuffles.
+    """
+    total, freedom = sum(ljung_box(column, lags) for column in columns), lags * len(columns)
+    p = float(gammaincc(0.5 * freedom, 0.5 * total))
+    if not level**3 < p < level:
+        return total, p
+    random, exceeding, size = np.random.default_rng(1), 0, 500
+    for _ in range(SHUFFLES // size):
+        sums = np.zeros(size)
+        for column in columns:
+            x = random.permuted(np.tile(column - column.mean(), (size, 1)), axis=1)
+            n, power = len(column), float(column.var() * len(column))
+            for k in range(1, lags + 1):
+                r = np.einsum("ij,ij->i", x[:, k:], x[:, :-k]) / power
+                sums += n * (n + 2.0) * r * r / (n - k)
+        exceeding += int((sums >= total).sum())
+    return total, (exceeding + 1.0) / (SHUFFLES + 1.0)
+
+
+def find_stretch(nis: FloatArray, rows: np.ndarray, sums: FloatArray) -> Stretch:
+    """Return the stretch of M readings that differs most: by the likelihood of another variance, or
+    of another mean, in it. ``nis`` (M,) are chi-square with ``rows`` (M,) degrees of freedom if
+    nothing changes, ``sums`` (M,) normal with variance ``rows``.
+    """
+    ends = np.unique(np.linspace(0, len(nis), min(STRETCHES, len(nis)) + 1).astype(int))
+    cumulated = [np.append(0.0, np.cumsum(values))[ends] for values in (nis, rows, sums)]
+    j, k = np.triu_indices(len(ends), 1)
+    S, m, z = (values[k] - values[j] for values in cumulated)
+    scale = 0.5 * (S - m - m * np.log(np.maximum(S, 1e-300) / m))
+    gain = np.maximum(scale, 0.5 * z * z / m)
+    tails = np.minimum(gammaincc(0.5 * m, 0.5 * S), gammainc(0.5 * m, 0.5 * S))
+    tails = np.minimum(tails, ndtr(-np.abs(z) / np.sqrt(m)))
+    # A beginning or an end inside the run has to be worth the choice among so many.
+    gain += math.log(len(ends)) * ((j == 0) + (k == len(ends) - 1.0))
+    best = int(np.argmax(gain))
+    # Two tests of two sides for each stretch.
+    return Stretch(int(ends[j[best]]), int(ends[k[best]]), min(1.0, 4.0 * len(S) * tails.min()))
+
+
+@dataclass(frozen=True)
+class NodeInnovations:
+    """What the ``readings`` of a node say; what could not be tested is nan.
+
+    nis : mean NIS for each value read, which should lie in ``nis_low`` .. ``nis_high``; the test
+          finds a mean of ``nis_detectable`` with probability 0.9
+    bias : mean innovation of the ``component`` of readings (counted from 0) that stands out most,
+           in its unit, which should be within ``bias_reach`` of 0; ``bias_detectable`` is found
+           with probability 0.9
+    ljung_box, freedom, p_white : the statistic, its degrees of freedom and its p;
+        ``correlation_detectable`` at one lag is found with probability 0.9
+    log_likelihood : log density of the readings given those that the node knew before
+    since, until : seconds, where innovations are rejected: of the stretch that differs most, nan
+                   if it begins or ends with the readings
+    verdict : begins with BROKEN if the model does not explain the readings
+    """
+
+    node: int
+    readings: int
+    nis: float
+    nis_low: float
+    nis_high: float
+    nis_detectable: float
+    bias: float
+    bias_reach: float
+    bias_detectable: float
+    component: int
+    ljung_box: float
+    freedom: int
+    p_white: float
+    correlation_detectable: float
+    log_likelihood: float
+    since: float
+    until: float
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class InnovationTests(NotebookTable):
+    """Rows by node with readings (-1: all nodes, read by one filter); false if a node's innovations
+    contradict the model. All verdicts hold together at ``confidence`` if the model is right.
+    """
+
+    scenario: str
+    confidence: float
+    law: Law
+    rows: tuple[NodeInnovations, ...]
+
+    def __repr__(self) -> str:
+        """Return one line: how many nodes are broken."""
+        broken = sum(row.verdict.startswith("BROKEN") for row in self.rows)
+        return (
+            f"<netkf innovations of {self.scenario!r}: {broken} of {len(self.rows)} nodes BROKEN>"
+        )
+
+    def __bool__(self) -> bool:
+        return not any(row.verdict.startswith("BROKEN") for row in self.rows)
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """One row per node."""
+        import pandas as pd
+
+        return pd.DataFrame([vars(row) for row in self.rows])
+
+
+def innovations(run: Run | Scenario, confidence: float = 0.99) -> InnovationTests:
+    """Test the innovations of each node of a ``run``, or of one that is simulated from a scenario.
+    No true state is needed.
+
+    The innovations of the filter ``central`` are attributed to the nodes whose sensors gave the
+    readings, in their order within an instant. Raises NetkfError without readings or covariances.
+    """
+    confidence = number(above=0.0, below=1.0)("confidence", confidence)
+    if isinstance(run, Scenario):
+        run = simulate(run)
+    return judge_innovations(run.scenario, recorded_innovations(run), confidence)
+
+
+def recorded_innovations(run: Run) -> Innovations:
+    """Return the innovations of a run; those of a linear central filter by the nodes of readings.
+    Raises NetkfError without any.
+    """
+    scenario = run.scenario
+    if type(scenario.node_filter) is Central and scenario.is_linear:
+        try:
+            return CentralModel(scenario, run.seed, run.replica).as_innovations()
+        except ScenarioError:
+            pass  # increments, or a model that changes
+    return compute_innovations(run)
+
+
+def law_of(scenario: Scenario) -> Law:
+    """Return what the innovations of a scenario's filter are if its model is right."""
+    algorithm, linear = scenario.node_filter, scenario.plant.linear and scenario.has_linear_sensors
+    forgets = any(life.memory == "lost" for life in scenario.network.lives)
+    for reason, holds in (
+        ("the gate takes the largest readings away", scenario.filter.gate is not None),
+        ("P is that of a linearised model", not linear),
+        ("filters do not know the input", scenario.misses_input),
+        ("a node that restarts forgets", forgets),
+        ("it is not known what P of a user's filter is", overridden(algorithm)),
+    ):
+        if holds:
+            return Law("", reason)
+    if isinstance(algorithm, (Local, Intermittent)):
+        return Law("white")
+    if algorithm.analysis.swaps:
+        return Law("exact")
+    if algorithm.analysis.P_by_design[not scenario.slotted] == "larger":
+        return Law("smaller")
+    return Law("", "P of this filter is not promised to describe its errors")
+
+
+def judge_innovations(
+    scenario: Scenario, recorded: Innovations, confidence: float
+) -> InnovationTests:
+    """Return the verdicts on ``recorded`` innovations of a run of ``scenario``."""
+    law, is_finite = law_of(scenario), np.isfinite(recorded.nis)
+    nodes = np.unique(recorded.nodes[is_finite]).tolist()
+    level = (1.0 - confidence) / max(1, len(nodes)) / (4 if law.kind == "white" else 2)
+    rows = [
+        _judge_node(
+            recorded, node, np.flatnonzero(is_finite & (recorded.nodes == node)), law, level
+        )
+        for node in nodes
+    ]
+    return InnovationTests(scenario.name, confidence, law, tuple(rows))
+
+
+def _judge_node(
+    recorded: Innovations, node: int, chosen: np.ndarray, law: Law, level: float
+) -> NodeInnovations:
+    """Return the row of a node with the ``chosen`` readings, each of whose tests rejects a right
+    model with probability ``level``.
+    """
+    nis, rows, is_white = recorded.nis[chosen], recorded.rows[chosen], law.kind == "white"
+    freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
+    whitened = [recorded.whitened[i] for i in chosen]
+    columns = [
+        np.array([one[c] for one in whitened if len(one) > c]) for c in range(int(rows.max()))
+    ]
+    # Correlated readings count as fewer independent ones.
+    inflation = 1.0 if is_white else _inflation(columns)
+    counted = freedom / inflation
+    low, high, detectable = 0.0, math.inf, math.inf
+    if counted > 0.0:
+        low, high = (float(end) for end in chi_square_interval(counted, 1.0 - level))
+        detectable = high / (2.0 * float(gammaincinv(0.5 * counted, 1.0 - POWER)) / counted)
+    bias, reach, found, component = _bias(recorded, chosen, inflation, level)
+    lags = min(LAGS, len(chosen) // 5)
+    columns = [column for column in columns if len(column) >= MIN_READINGS]
+    statistic = p = correlation = math.nan
+    if columns:
+        statistic, p = whiteness_p(columns, lags, level)
+        correlation = _detectable_correlation(sum(map(len, columns)), lags * len(columns), level)
+    stretch = find_stretch(nis, rows, np.array([one.sum() for one in whitened]))
+    reasons = []
+    if law.kind and mean > high:
+        reasons.append(f"NIS {mean:.3g} above {high:.3g}: errors are larger than P says")
+    if law.kind in ("white", "exact") and mean < low:
+        reasons.append(f"NIS {mean:.3g} below {low:.3g}: errors are smaller than P says")
+    if law.kind and abs(bias) > reach:
+        reasons.append(f"bias {bias:.3g} +- {reach:.2g}")
+    if is_white and p < level:
+        reasons.append("innovations are correlated")
+    if is_white and not reasons and stretch.p < level:
+        reasons.append("some innovations are not like the others")
+    times = recorded.times[chosen]
+    since = times[stretch.first] if reasons and stretch.first else math.nan
+    until = times[stretch.end - 1] if reasons and stretch.end < len(times) else math.nan
+    verdict = "consistent" if law.kind else "not judged"
+    if reasons:
+        ends = (("since", since), ("until", until))
+        span = [f"{word} {time:g} s" for word, time in ends if math.isfinite(time)]
+        verdict = f"BROKEN: {', '.join(['; '.join(reasons), *span])}"
+    elif law.kind and not counted:
+        verdict = "not judged: too few independent readings"
+    elif law.kind == "smaller" and mean < low:
+        verdict = "as expected: P is conservative by design"
+    return NodeInnovations(
+        node, len(chosen), mean, low, high, detectable, bias, reach, found, component, statistic,
+        lags * len(columns), p, correlation, float(recorded.log_density[chosen].sum()),
+        float(since), float(until), verdict,
+    )  # fmt: skip
+
+
+def _inflation(columns: list[FloatArray]) -> float:
+    """Return by how much autocorrelation increases the variance of the sum of a series, the largest
+    of ``columns``: 1 + 2 sum r_k up to the first r_k that is negative (Geyer, Stat. Sci. 7, 1992),
+    and a little more, since r_k of few values are too small. It is inf where fewer than
+    MIN_INDEPENDENT readings would be left. That of the sum of squares is smaller.
+    """
+    largest = 1.0
+    for column in columns:
+        r = autocorrelation(column - column.mean(), max(1, len(column) // 4))
+        found = 1.0 + 2.0 * float(r[: int(np.argmax(np.append(r, -1.0) <= 0.0))].sum())
+        largest = max(largest, found * (1.0 + 4.0 * (found - 1.0) / len(column)))
+        if len(column) < MIN_INDEPENDENT * found:
+            return math.inf
+    return largest
+
+
+def _bias(
+    recorded: Innovations, chosen: np.ndarray, inflation: float, level: float
+) -> tuple[float, float, float, int]:
+    """Return the bias of the component that stands out most, how far it may be from 0, what is
+    found with probability POWER, and the component; ``inflation`` is that of the variance.
+    """
+    best = math.nan, math.inf, math.nan, 0
+    count = int(recorded.rows[chosen].max())
+    for c in range(count):
+        kept = [i for i in chosen if recorded.rows[i] > c]
+        v = np.array([recorded.values[i][c] for i in kept])
+        weights = np.array([recorded.deviations[i][c] for i in kept]) ** -2.0
+        bias, error = float(weights @ v / weights.sum()), math.sqrt(inflation / weights.sum())
+        quantile = -float(ndtri(level / count / 2.0))
+        if inflation > 1.0:  # estimated from as many independent values
+            freedom = max(len(v) / inflation - 1.0, 1.0)
+            quantile = -float(stdtrit(freedom, level / count / 2.0))
+        reach = quantile * error
+        if c == 0 or abs(bias) / reach > abs(best[0]) / best[1]:
+            best = bias, reach, reach + float(ndtri(POWER)) * error, c
+    return best
+
+
+def _detectable_correlation(count: int, freedom: int, level: float) -> float:
+    """Return the correlation at one lag that Ljung and Box's test of so many values rejects at
+    ``level`` with probability POWER: its square times ``count`` is the noncentrality. Shuffles
+    reject what chi-square does at a tenth of the level.
+    """
+    critical = 2.0 * float(gammaincinv(0.5 * freedom, 1.0 - 0.1 * level))
+    return min(1.0, math.sqrt(float(chndtrinc(critical, freedom, 1.0 - POWER)) / count))
+
+
+def format_innovations(tests: InnovationTests, full: bool = True) -> str:
+    """Return a row per node, those that are broken first unless ``full``, and a legend."""
+    listed = sorted(tests.rows, key=lambda row: not (full or row.verdict.startswith("BROKEN")))
+    header = ["node", "readings", "NIS", "bias", "Ljung-Box p", "log-likelihood", "verdict"]
+    rows = [
+        [
+            str(row.node),
+            f"{row.readings:,}",
+            format_number(row.nis),
+            f"{format_number(row.bias)} +- {row.bias_reach:.2g}",
+            format_number(row.p_white),
+            f"{row.log_likelihood:.6g}",
+            row.verdict,
+        ]
+        for row in listed
+    ]
+    words = {
+        "white": "if the model is right, NIS is 1 on average and innovations are white",
+        "exact": "if the model is right, NIS is 1 on average; exchanges correlate innovations, so "
+        "that whiteness is not tested",
+        "smaller": "if the model is right, NIS is at most 1 on average, for P is conservative by "
+        "design; exchanges correlate innovations, so that whiteness is not tested",
+        "": f"no node is judged: {tests.law.reason}",
+    }
+    lines = [format_table(header, rows if full else shorten_rows(rows, MAX_ROWS)), ""]
+    lines.append(f"{words[tests.law.kind]}; all together at confidence {tests.confidence:g}")
+    if tests.law.kind:
+        largest = [max(getattr(row, name) for row in tests.rows) for name in DETECTABLE]
+        text = "found with probability 0.9 at every node: a mean NIS of {:.3g}, a bias of {:.3g}"
+        text += ", a correlation at one lag of {:.3g}" * (tests.law.kind == "white")
+        lines.append(text.format(*largest))
+    return "\n".join(lines)

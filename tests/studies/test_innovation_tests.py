@@ -1,0 +1,241 @@
+"""Innovations of single runs against plain formulas; healthy models are accused as rarely as
+stated, broken ones with the power that is stated, at the node and from the time on.
+"""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.signal
+import scipy.stats
+
+import netkf
+from netkf.checks.innovations import Innovations
+from netkf.cli.main import main
+from netkf.scenario.reading import from_table
+from netkf.studies.innovation_tests import (
+    find_stretch,
+    judge_innovations,
+    ljung_box,
+    whiteness_p,
+)
+from tests.conftest import SCENARIOS
+
+WALK = {
+    "format": 1,
+    "name": "walk",
+    "horizon": 60.0,
+    "probe": 60.0,
+    "plant": {"kind": "diffusion", "A": [[-0.1]], "B": [[0.5]], "cov": [[1.0]]},
+    "sensors": [
+        {
+            "nodes": [0, 1, 2],
+            "H": [[1.0]],
+            "R": [[0.4]],
+            "sampling": {"kind": "poisson", "rate": 2.0},
+        }
+    ],
+    "network": {"graph": {"kind": "cycle", "nodes": 3}},
+    "filter": {"kind": "local"},
+}
+
+
+def drawn(random, readings=120, nodes=4, rows=1, change=None):
+    """White innovations of nodes, some of which ``change(node, times, z)`` replaces."""
+    parts = []
+    for node in range(nodes):
+        z, times = random.standard_normal((readings, rows)), np.arange(readings) + 0.5
+        parts.append((times, node, z if change is None else change(node, times, z)))
+    z = np.concatenate([part[2] for part in parts])
+    times = np.concatenate([part[0] for part in parts])
+    owners = np.repeat(np.arange(nodes), readings)
+    order, ones = np.argsort(times, kind="stable"), [np.ones(rows)] * len(z)
+    nis = (z**2).sum(axis=1)
+    log_density = scipy.stats.norm.logpdf(z).sum(axis=1)
+    return Innovations(
+        times[order], owners[order], np.full(len(z), rows), nis[order], list(z[order]),
+        list(z[order]), ones, log_density[order],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    return from_table(WALK, tmp_path_factory.mktemp("walk"))
+
+
+def broken(tests):
+    return [row.node for row in tests.rows if row.verdict.startswith("BROKEN")]
+
+
+def test_the_statistic_is_that_of_ljung_and_box():
+    values = np.random.default_rng(1).normal(3.0, 2.0, 50).cumsum()
+    d, n, h = values - values.mean(), len(values), 7
+    total = 0.0
+    for k in range(1, h + 1):
+        r = sum(d[i] * d[i - k] for i in range(k, n)) / sum(d * d)
+        total += r**2 / (n - k)
+    assert ljung_box(values, h) == pytest.approx(n * (n + 2) * total)
+    statistic, p = whiteness_p([values], h, 0.01)
+    assert statistic == ljung_box(values, h)
+    assert p == pytest.approx(scipy.stats.chi2.sf(statistic, h))
+
+
+def test_short_series_of_white_noise_are_rejected_as_rarely_as_stated():
+    """Chi-square alone rejects 30 values about three times as often at 0.002."""
+    random, level = np.random.default_rng(2), 0.002
+    columns = random.standard_normal((2000, 30))
+    chi_square = [scipy.stats.chi2.sf(ljung_box(one, 6), 6) for one in columns]
+    rejected = sum(
+        whiteness_p([one], 6, level)[1] < level
+        for one, p in zip(columns, chi_square, strict=True)
+        if p < level
+    )
+    assert sum(p < level for p in chi_square) > 8
+    assert rejected <= 11  # more in one of 1000 tests
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_right_models_are_accused_as_rarely_as_stated(walk, rows):
+    random = np.random.default_rng(3)
+    accused = sum(
+        not judge_innovations(walk, drawn(random, rows=rows, nodes=2), 0.8) for _ in range(60)
+    )
+    assert accused <= 20  # at most 20 % are; more in one of 100 tests
+
+
+def test_what_is_stated_as_detectable_is_found(walk):
+    random = np.random.default_rng(4)
+    row = judge_innovations(walk, drawn(random), 0.99).rows[2]
+
+    def larger(node, times, z):
+        return z * np.sqrt(row.nis_detectable) if node == 2 else z
+
+    def biased(node, times, z):
+        return z + row.bias_detectable if node == 2 else z
+
+    def correlated(node, times, z):
+        rho = row.correlation_detectable
+        return np.sqrt(1.0 - rho**2) * scipy.signal.lfilter([1.0], [1.0, -rho], z, axis=0)
+
+    for change in (larger, biased, correlated):
+        found = [
+            broken(judge_innovations(walk, drawn(random, change=change), 0.99)) for _ in range(20)
+        ]
+        assert sum(2 in nodes for nodes in found) >= 14  # 18 are expected; fewer in one of 500
+
+
+@pytest.mark.parametrize("kind", ["noise", "offset"])
+def test_a_fault_is_found_at_its_node_since_its_beginning(walk, kind):
+    def fault(node, times, z):
+        late = (node == 1) & (times[:, None] > 80.0)
+        return np.where(late, 3.0 * z if kind == "noise" else z + 2.0, z)
+
+    random = np.random.default_rng(5)
+    for _ in range(4):
+        tests = judge_innovations(walk, drawn(random, change=fault), 0.99)
+        assert broken(tests) == [1]
+        assert tests.rows[1].since == pytest.approx(80.0, abs=8.0)
+        assert np.isnan(tests.rows[1].until)
+
+
+def test_a_fault_that_passes_is_found_by_its_stretch(walk):
+    def fault(node, times, z):
+        return np.where((node == 3) & (abs(times[:, None] - 50.0) < 5.0), 4.0 * z, z)
+
+    tests = judge_innovations(walk, drawn(np.random.default_rng(6), change=fault), 0.99)
+    assert broken(tests) == [3]
+    assert (tests.rows[3].since, tests.rows[3].until) == pytest.approx((45.5, 54.5), abs=3.0)
+
+
+def test_the_stretch_is_the_best_of_all_and_its_p_counts_them():
+    z = np.random.default_rng(7).standard_normal(40)
+    z[20:30] *= 5.0
+    found = find_stretch(z**2, np.ones(40, dtype=int), z)
+    gains, tails = {}, []
+    for j in range(40):
+        for k in range(j + 1, 41):
+            S, m, mean = (z[j:k] ** 2).sum(), k - j, z[j:k].sum()
+            gains[j, k] = max(0.5 * (S - m - m * np.log(S / m)), 0.5 * mean**2 / m)
+            law = scipy.stats.chi2(m)
+            tails += [law.sf(S), law.cdf(S), scipy.stats.norm.sf(abs(mean) / m**0.5)]
+    assert (found.first, found.end) == max(gains, key=gains.get)
+    assert found.p == pytest.approx(4 * 820 * min(tails))
+
+
+@pytest.mark.parametrize("kind", ["local", "central", "intermittent", "gossip", "diffusion"])
+def test_runs_of_filters_with_the_right_model_are_not_accused(walk, kind):
+    activation = (
+        {"kind": "readings"} if kind == "intermittent" else {"kind": "poisson", "rate": 2.0}
+    )
+    at = {"at": "nodes"} if kind == "diffusion" else {}
+    talks = {} if kind in ("local", "central") else {"network.activation": {**activation, **at}}
+    given = walk.replace({**talks, "filter": {"kind": kind}})
+    runs = [netkf.simulate(given, seed=seed, engine="simpy") for seed in range(3)]
+    tests = [netkf.innovations(run, 0.999) for run in runs]
+    assert all(tests)
+    assert {one.law.kind for one in tests} == {
+        {"gossip": "exact", "diffusion": "smaller"}.get(kind, "white")
+    }
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        ("local", {"R": [[0.04]]}),
+        ("local", {"B": [[0.05]]}),
+        ("central", {"R": [[0.04]]}),
+        ("central", {"B": [[0.05]]}),
+        ("diffusion", {"R": [[0.04]]}),
+    ],
+)
+def test_a_wrong_noise_is_found(walk, kind, wrong):
+    talks = {"network.activation": {"kind": "poisson", "rate": 2.0, "at": "nodes"}}
+    given = walk.replace(
+        {**(talks if kind == "diffusion" else {}), "filter": {"kind": kind, "model": wrong}}
+    )
+    assert not netkf.innovations(netkf.simulate(given, engine="simpy"))
+
+
+def test_slots_and_records_without_truth(tmp_path):
+    """A record of a random walk: the right model, one with a sensor that sticks, a wrong Q."""
+    random, slots = np.random.default_rng(8), np.arange(1, 200)
+    x = np.cumsum(random.normal(0.0, 0.5, len(slots)))
+    y = x + random.normal(0.0, 1.0, (2, len(slots)))
+    stuck = y.copy()
+    stuck[1, 120:] = stuck[1, 120]
+    for name, values in (("right", y), ("stuck", stuck)):
+        rows = [pd.DataFrame({"t": slots, "node": i, "y0": values[i]}) for i in (0, 1)]
+        pd.concat(rows).to_csv(tmp_path / f"{name}.csv", index=False)
+    table = {
+        **WALK,
+        "horizon": 200.0,
+        "plant": {"kind": "unknown", "F": [[1.0]], "Q": [[0.25]], "period": 1.0, "cov": [[0.01]]},
+        "sensors": [{"kind": "recorded", "path": "right.csv", "H": [[1.0]], "R": [[1.0]]}],
+        "network": {"graph": {"kind": "path", "nodes": 2}},
+        "filter": {"kind": "central"},
+    }
+    given = from_table(table, tmp_path)
+    tests = netkf.innovations(given)
+    assert tests
+    assert sum(row.log_likelihood for row in tests.rows) == pytest.approx(
+        netkf.log_likelihood(given), abs=1e-8
+    )
+    found = netkf.innovations(given.replace({"sensors.0.path": "stuck.csv"}))
+    assert 1 in broken(found)
+    assert found.rows[1].since == pytest.approx(121.0, abs=15.0)
+    assert not netkf.innovations(given.replace({"plant.Q": [[2.5e-3]]}))
+
+
+def test_the_command_says_which_node(capsys):
+    path = str(SCENARIOS / "ulb_library.toml")
+    arguments = ["innovations", path, "--set", 'filter={kind="central"}', "--set", "horizon=2400.0"]
+    assert main(arguments) == 1
+    out, err = capsys.readouterr()
+    assert "node 1, 2, 3" in err
+    assert "found with probability 0.9 at every node" in out
+    assert main([*arguments, "--json"]) == 1
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    # Mote 9 reads .6 degrees less than the others.
+    assert min(rows, key=lambda row: row["bias"])["node"] == 9
+    assert main(["innovations", path, "--set", "sensors=[]"]) == 2
