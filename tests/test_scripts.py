@@ -217,6 +217,7 @@ def test_the_tables_of_the_library_are_those_of_its_raw_record(tmp_path):
     assert set(made) == {
         "temperatures.csv",
         "held_out.csv",
+        "first.csv",
         "pairs.csv",
         "broadcasts.csv",
         "missed.csv",
@@ -236,6 +237,14 @@ def test_errors_at_motes_that_are_never_read_are_those_that_pages_name(monkeypat
         "diffusion, the scenario's": 0.097,
         "covariance intersection": 0.116,
         "all readings": 0.095,
+    }
+
+
+def test_with_a_walking_offset_for_each_mote_filters_are_nearer_than_the_plain_mean():
+    found = script("analysis", "ulb_library").offsets(fit=False)
+    assert {name: round(float(error), 3) for name, error in found.items()} == {
+        "diffusion": 0.079,
+        "all readings": 0.087,
     }
 
 
