@@ -121,14 +121,23 @@ def tick_times(scenario: Any, streams: Streams) -> FloatArray:
     run in continuous time. Nodes that transmit after samples do so at sample times.
     """
     clock = scenario.network.activation
-    instants = [np.empty(0)]
-    for entity in clock.entities(scenario.topology) if isinstance(clock, LinkClock) else ():
-        phase = partial(streams.generator, "phase", *entity)
-        random = streams.generator("clock", *entity)
-        own = node_time(scenario, streams, owner_of(clock, entity))
-        ahead = own.ahead(clock)
-        until = own.until(scenario.horizon, ahead)
-        instants.append(own.instants(generate_ticks(clock, entity, phase, random, until), ahead))
+    entities = clock.entities(scenario.topology) if isinstance(clock, LinkClock) else ()
+    instants = [np.empty(0), *(ticks_of(scenario, streams, entity) for entity in entities)]
     return np.asarray(
         scenario.time_grid.before(scenario.horizon, np.unique(np.concatenate(instants)))
     )
+
+
+def ticks_of(scenario: Any, streams: Streams, entity: tuple[int, ...]) -> FloatArray:
+    """Return the increasing instants (K,), in seconds, at which the clock of an ``entity`` of the
+    network ticks in one run.
+    """
+    clock = scenario.network.activation
+    phase, random = (
+        partial(streams.generator, "phase", *entity),
+        streams.generator("clock", *entity),
+    )
+    own = node_time(scenario, streams, owner_of(clock, entity))
+    ahead = own.ahead(clock)
+    until = own.until(scenario.horizon, ahead)
+    return own.instants(generate_ticks(clock, entity, phase, random, until), ahead)

@@ -96,6 +96,7 @@ def is_immediate(scenario: Scenario) -> bool:
         and scenario.plant.linear
         and not scenario.links_move
         and not scenario.network.lives
+        and not scenario.network.clocks
         and not scenario.sampled_sensors
         and not len(scenario.followed_changes)
         and ticks_apart(network.activation)

@@ -35,6 +35,7 @@ from netkf.engines.compiled.ticks import NO_LINKS, Schedule
 from netkf.engines.compiled.truth import PathStates
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
+from netkf.network.node_clocks import NodeTime
 from netkf.plants.diffusion import NO_TIMES
 from netkf.plants.paths import BLOCK
 from netkf.plants.transitions import frame_period
@@ -184,7 +185,7 @@ def drawn_together(scenario: Scenario) -> bool:
     """
     if scenario.views is not None or len(scenario.plant.changes) or scenario.links_move:
         return False
-    if scenario.network.lives:
+    if scenario.network.lives or scenario.network.clocks:
         return False
     if not scenario.sampled_sensors:
         return uses_grid(scenario)
@@ -251,6 +252,7 @@ class BatchDraws:
     lives = NO_LIVES
 
     def __init__(self, scenario: Scenario, seed: int, replicas: range) -> None:
+        self.clocks: dict[int, NodeTime] = {}
         streams = ReplicaStreams(seed, replicas.start, len(replicas))
         self.ticks = Schedule(scenario, streams, is_immediate(scenario)).all()
         self._paths: Paths | None = None

@@ -46,6 +46,7 @@ from netkf.engines.compiled.events import (
     count_sample,
     ends_instant,
     find_shortage,
+    local_time,
     max_readings,
     next_event,
     next_reached,
@@ -58,6 +59,7 @@ from netkf.engines.compiled.events import (
     record_links,
     seek_piece,
     store_sample,
+    told_age,
 )
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.message_queue import push, release, sort_indices, take
@@ -175,7 +177,6 @@ def clock_loop(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs)
         seek_piece(state, now)
         if passes_over(state, event):
             continue
-        run.now = now
         predict_participants(state, record, run, verbs, event, now)
         if event == ON_TICK:
             on_tick(state, record, run, verbs, now)
@@ -223,7 +224,7 @@ def predict_participants(
 def on_probe(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs) -> bool:
     """Store a sample of all nodes; return False if there is no space for another one."""
     for h in range(len(state.nodes) if verbs.observe != NOTHING else 0):
-        choose_model(run, verbs, h)
+        choose_model(state, run, verbs, h)
         call_at(verbs.observe, record, h, run)
     record_links(state, -1 - state.probe_at, state.probes[state.probe_at])
     store_sample(state, state.run, 0, state.samples)
@@ -234,13 +235,16 @@ def on_probe(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs) -
 def predict_node(
     state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, h: int, time: float
 ) -> None:
-    """Predict node ``h`` to ``time`` (seconds) unless it is there already, using its increments."""
+    """Predict node ``h`` to ``time`` (seconds) unless it is there already, using its increments;
+    what passes for it is time by its clock.
+    """
+    time = local_time(state, h, time)
     node, now, model, least = state.nodes[h], state.now[h], run.model, 0.0
     # ``not <`` also returns for a time that is nan.
     if not now < time:
         return
     state.now[h] = time
-    choose_model(run, verbs, h)
+    choose_model(state, run, verbs, h)
     if node.sensors == node.sensor:
         run.gap = time - now
         call_at(verbs.predict, record, h, run)
@@ -266,8 +270,9 @@ def predict_node(
 
 
 @kernel(inlined=True)
-def choose_model(run: ClockRun, verbs: ClockVerbs, h: int) -> None:
-    """Make the model of node ``h`` that of the run, where nodes have own ones."""
+def choose_model(state: Simulation, run: ClockRun, verbs: ClockVerbs, h: int) -> None:
+    """Make the time of node ``h`` that of the run, and its model where nodes have own ones."""
+    run.now = state.now[h]
     if len(verbs.models) > 0:
         run.model = struct_like(run.model, verbs.models[h])
 
@@ -286,7 +291,7 @@ def on_sample(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
         call_at_two(verbs.linearise, record, h, instant, instants.nonlinear)
     whiten_instant(state, run, OWN, instant)
     run.reading = OWN
-    choose_model(run, verbs, h)
+    choose_model(state, run, verbs, h)
     call_at(verbs.update, record, h, run)
     state.nodes[h].reading = instant
     state.instant_at += 1
@@ -332,7 +337,7 @@ def send_all(
     m = take(state)
     arrives = becomes == SOME_ARRIVE or verbs.counts_sends == 1 or verbs.decides == 1
     run.sends[0] = 1
-    choose_model(run, verbs, h)
+    choose_model(state, run, verbs, h)
     if arrives and verbs.addressed == 0:
         call_at_two(verbs.emit, record, h, m, run)
     if verbs.decides == 1 and run.sends[0] == 0:
@@ -382,7 +387,7 @@ def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
     m = node.inbox
     while m != -1:
         message = pool[m]
-        age = snapped(now - message.sent, state.per_second)
+        age = told_age(state, m, now)
         oldest = max(oldest, age)
         w = message.direction
         run.message[count], run.link[count] = m, state.incoming[w]
@@ -396,7 +401,7 @@ def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
                 whiten_pairs(state, run, count + 1, message.tag)
         count, m = count + 1, message.next
     run.count = count
-    choose_model(run, verbs, h)
+    choose_model(state, run, verbs, h)
     for k in range(count if verbs.translate != NOTHING else 0):
         # Behind all messages under way.
         call_at_two(verbs.emit, record, h, len(run.message) + k, run)

@@ -73,9 +73,9 @@ class CompiledEngine(Engine):
             family, part = unknown[0]
             return f'engine "compiled" cannot run the {family} {name_of(family, part)!r}; {remedy}'
         network, rule = scenario.network, ""
-        changing = network.clocks or network.radio or network.quantise
+        changing = network.radio or network.quantise
         if changing or scenario.filter.gate is not None:
-            rule = "clocks of nodes, radios, messages of few bits or a gate"
+            rule = "radios, messages of few bits or a gate"
         elif network.lives and scenario.slotted and scenario.views is not None:
             rule = "nodes that are down at times and estimate different states in slots"
         if rule:

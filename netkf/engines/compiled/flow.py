@@ -55,6 +55,7 @@ from netkf.engines.compiled.visits import Visits, empty_visits
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.lanes import with_spare
 from netkf.linalg.structs import sized
+from netkf.network.node_clocks import node_times
 from netkf.plants.driven import DrivenTruth
 from netkf.plants.paths import BLOCK
 from netkf.rng.streams import Streams
@@ -120,6 +121,8 @@ class Source:
             x = states.local_states(sampled) if is_driven else states.states(sampled)[0]
             samples.read(x, sampled, -math.inf, math.inf)
         self.lives = life_table(scenario, streams)
+        index = scenario.topology.index
+        self.clocks = {index[i]: c for i, c in node_times(scenario, streams).items()}
         known = {"instants": samples.instants, "truth": self.states, "lives": self.lives}
         self._ticks = Schedule(scenario, streams, **known)
 
@@ -217,6 +220,8 @@ class Workspace:
         scratch, flow_arrays = self._scratch
         nodes = start.nodes.copy()
         nodes["down"] = draws.lives.down
+        for place, clock in draws.clocks.items():
+            nodes["offset"][place], nodes["pace"][place] = clock.offset, clock.pace
         n = start.xhat.shape[1]
         xhat, root = self._begin_estimates(instants, together)
         state: Simulation = (Simulation.of_size(n) if self._unrolled else Simulation)(
@@ -225,7 +230,7 @@ class Workspace:
             nodes=nodes,
             xhat=xhat,
             root=root,
-            now=np.zeros(len(xhat)),
+            now=self._scenario.time_grid.snap(np.resize(nodes["offset"], len(xhat))),
             table=start.table,
             gains=start.gains,
             entities=entities,
@@ -392,7 +397,8 @@ class FlowRun:
             assert self._clocked is not None
             fresh, first = (self._scenario.fresh_estimate(node, t)[0] for t in (time, 0.0))
             self._clocked.restart(h, fresh - first)
-            state.now[h] = time
+            clock = self._draws.clocks.get(h)
+            state.now[h] = time if clock is None else clock.shows(time)
 
     def _enlarge_pool(self) -> None:
         add_messages(self._state, self._state.most_messages)

@@ -88,9 +88,13 @@ def kernel_sensors(scenario: Scenario) -> KernelSensors | None:
     placed, tables = _placed_sensors(scenario), _sensor_tables(scenario)
     parts = [scenario.sensors[p.entry] for _, p in placed]
     # By exact type: a subclass may override the law.
-    if not placed or any(
-        type(part) is not LinearSensor or is_own(part) or not is_kernel_clock(part.sampling)
-        for part in parts
+    if (
+        not placed
+        or scenario.network.clocks
+        or any(
+            type(part) is not LinearSensor or is_own(part) or not is_kernel_clock(part.sampling)
+            for part in parts
+        )
     ):
         return None
     keys, entries = [(node, p.ordinal) for node, p in placed], [p.entry for _, p in placed]

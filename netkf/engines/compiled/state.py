@@ -34,7 +34,7 @@ def _record_type(integers: str, floats: str = "") -> np.dtype:
     return np.dtype([*fields, *((name, np.float64) for name in floats.split())])
 
 
-NODE = _record_type("model id sensor sensors inbox last sent reading down")
+NODE = _record_type("model id sensor sensors inbox last sent reading down", "offset pace")
 """One filter.
 
 model : index of its model
@@ -44,6 +44,7 @@ inbox, last : first and last message of its inbox, -1: none
 sent : number of transmissions so far
 reading : index of the instant of its newest sample
 down : 1 while it neither senses, sends nor hears
+offset, pace : at time t its clock shows ``offset + pace t``, seconds
 """
 
 DIRECTED_LINK = _record_type("sender receiver messages", "weight")
@@ -224,7 +225,7 @@ class Simulation(Struct):
     size, nodes : n as a type (linalg.structs), and NODE records (N,)
     plant : likewise the number of states of the plant, of which filters may estimate a part
     xhat, root : (G N, n) and (G N, n, n)
-    now : time (G N,) in seconds that each estimate refers to
+    now : time (G N,) in seconds, by the node's clock, that each estimate refers to
     table, gains : tables of all models, the last without sensors, for messages under way
     clock_kind : kind of its clocks, an index in CLOCKS
 
@@ -361,6 +362,7 @@ def filters_at_start(scenario: Scenario) -> Filters:
     # ``sensor`` of the first node stays 0.
     nodes["sensors"], nodes["sensor"][1:] = after, after[:-1]
     nodes["inbox"] = nodes["reading"] = -1
+    nodes["pace"] = 1.0
     # One table for each distinct model; those of models that are not linear are not used.
     table, gains = _stack_model_tables([[_linear(m) for m in piece] for piece in pieces])
     n = len(models[0].information)

@@ -11,12 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.core.clock import generate_ticks
 from netkf.core.instants import snapped
 from netkf.engines.compiled.life_tables import NO_LIVES, LifeTable, links_of_lives
 from netkf.engines.compiled.moving_links import MovingLinks, moving_links
@@ -37,6 +35,7 @@ from netkf.network.clocks import LinkClock, Periodic, Poisson, Renewal
 from netkf.rng.draws import Ziggurat, fill_units, next_exponential, next_unit, ziggurat
 from netkf.rng.numbers import NormalZiggurat, next_gamma, normal_ziggurat
 from netkf.rng.streams import ReplicaStreams, Streams
+from netkf.scenario.positions import ticks_of
 from netkf.scenario.scenario import Scenario
 
 TICKS, MIN_TICKS_PER_ENTITY, MAX_WINDOW_TICKS = 1 << 15, 4, 1 << 20
@@ -338,12 +337,14 @@ def ticks_apart(clock: object) -> bool:
 
 
 def _is_listed(scenario: Scenario) -> bool:
-    """Return True if Python lists the ticks: of a user's clock or channel, of nodes that move, or
-    after samples.
+    """Return True if Python lists the ticks: of a user's clock or channel, of nodes that move or
+    whose clocks are wrong, or after samples.
     """
     network = scenario.network
-    return scenario.links_move or not (
-        is_kernel_clock(network.activation) and is_kernel_channel(network.channel)
+    return (
+        scenario.links_move
+        or bool(network.clocks)
+        or not (is_kernel_clock(network.activation) and is_kernel_channel(network.channel))
     )
 
 
@@ -361,13 +362,7 @@ def _list_ticks(
     if not isinstance(clock, LinkClock):
         return []
     return [
-        generate_ticks(
-            clock,
-            entity,
-            partial(one.generator, "phase", *entity),
-            one.generator("clock", *entity),
-            scenario.horizon,
-        )
+        ticks_of(scenario, one, entity)
         for one in streams.per_replica
         for entity in senders.entities
     ]
