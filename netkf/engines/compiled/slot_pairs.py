@@ -170,8 +170,9 @@ def _translation_refusal(scenario: Scenario) -> str | None:
         return "filters whose messages other nodes must translate, and that count what they send"
     if scenario.node_filter.needs.translate is not read_vector:
         return "filters that say in Python how their messages are translated"
-    if not (scenario.slotted or scenario.network.channel.delay.fixed == 0.0):
-        return "messages that other nodes must translate and that take time"
+    is_fresh = scenario.network.channel.delay.fixed == 0.0 and not scenario.network.clocks
+    if not (scenario.slotted or is_fresh):
+        return "messages that other nodes must translate and that take time, or seem to"
     if any(not len(theirs) for theirs, _ in scenario.common_entries.values()):
         return "links of nodes that estimate nothing in common"
     return None
