@@ -395,8 +395,8 @@ def begin_belief_propagation(
 
 
 MODES = (
-    "whose evidence that lasts is kept in coordinates of the modes of one plant, of which a change "
-    "would mix those that have decayed with others and lose their digits"
+    "whose evidence that lasts is kept in coordinates of the modes of one plant: in others those "
+    "that have decayed would mix with the rest, and lose their digits"
 )
 
 

@@ -513,7 +513,7 @@ SLOTS = Kernels(
     observe=observe,
     under_clocks=running_sums.KERNELS,
 )
-LIMIT = "whose asymptotic gains are the limit of one plant, at which none is right after a change"
+LIMIT = "whose asymptotic gains are the limit of one plant, and wrong until the next has its own"
 PARTS = (
     "whose totals keep information under way in parts by the rates at which modes decay: those of "
     "other modes do not follow from them"
