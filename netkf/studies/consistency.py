@@ -34,6 +34,7 @@ from netkf.runs.simulate import choose_engine, require_scenario, simulate
 from netkf.runs.summary import NO_COVARIANCE, nees_bounds
 from netkf.scenario.records import blocks_without_law, nodes_with_law, unjudged_line
 from netkf.scenario.scenario import Scenario
+from netkf.studies.innovation_tests import find_stretch
 from netkf.studies.innovations import (
     ClockedInnovations,
     JudgedBlock,
@@ -410,7 +411,9 @@ def judge_consistency(
     shares_inside = inside / np.where(usable, usable, np.nan)
     # Bonferroni over the blocks.
     rows = [
-        _judge_block(scenario, runs, (k, block), float(shares_inside[k]), level / len(blocks))
+        _judge_block(
+            scenario, runs, (k, block), float(shares_inside[k]), level / len(blocks), means[:, k]
+        )
         for k, block in enumerate(blocks)
     ]
     largest = int(np.argmax(sizes))
@@ -445,8 +448,11 @@ def _judge_block(
     judged: tuple[int, JudgedBlock],
     share_inside: float,
     level: float,
+    means: FloatArray,
 ) -> NodeConsistency:
-    """Return the row of a block and its number, whose interval misses by chance ``level``."""
+    """Return the row of a block and its number, whose interval misses by chance ``level``;
+    ``means`` (T,) are NEES over the runs.
+    """
     i, block = judged
     n = len(block.entries)
     nees = np.array([run.nees[i] for run in runs])
@@ -465,6 +471,8 @@ def _judge_block(
     else:
         mean = float(expected.mean()) if is_known else None
         verdict = _verdict(scenario, n, (excess, width), mean)
+        if abs(excess) > width:
+            verdict += _tell_since(scenario, means / float(right.mean()), len(runs) * n)
     return NodeConsistency(
         node=scenario.nodes[block.node],
         nees=float(nees.mean()),
@@ -477,6 +485,19 @@ def _judge_block(
         block=block.block,
         n=n,
     )
+
+
+def _tell_since(scenario: Scenario, ratios: FloatArray, freedom: int) -> str:
+    """Return since when, and until when, ratios (T,) of NEES to what it should be are not near 1;
+    empty if always.
+    """
+    times, known = scenario.times[scenario.times > 0.0][: len(ratios)], np.isfinite(ratios)
+    if not known.any():
+        return ""
+    times, nees = times[known], freedom * ratios[known]
+    first, end, _ = find_stretch(nees, np.full(len(nees), freedom), np.zeros(len(nees)))
+    since = f", since {times[first]:g} s" if first else ""
+    return since + (f", until {times[end - 1]:g} s" if end < len(times) else "")
 
 
 def _verdict(

@@ -272,15 +272,15 @@ def _judge_node(
     stretch = find_stretch(nis, rows, np.array([one.sum() for one in whitened]))
     reasons = []
     if law.kind and mean > high:
-        reasons.append(f"NIS {mean:.3g} above {high:.3g}: errors are larger than P says")
+        reasons.append(f"NIS above {high:.3g}")
     if law.kind in ("white", "exact") and mean < low:
-        reasons.append(f"NIS {mean:.3g} below {low:.3g}: errors are smaller than P says")
+        reasons.append(f"NIS below {low:.3g}")
     if law.kind and abs(bias) > reach:
-        reasons.append(f"bias {bias:.3g} +- {reach:.2g}")
+        reasons.append("biased")
     if is_white and p < level:
-        reasons.append("innovations are correlated")
+        reasons.append("correlated")
     if is_white and not reasons and stretch.p < level:
-        reasons.append("some innovations are not like the others")
+        reasons.append("some readings are not like the others")
     times = recorded.times[chosen]
     since = times[stretch.first] if reasons and stretch.first else math.nan
     until = times[stretch.end - 1] if reasons and stretch.end < len(times) else math.nan
@@ -288,7 +288,7 @@ def _judge_node(
     if reasons:
         ends = (("since", since), ("until", until))
         span = [f"{word} {time:g} s" for word, time in ends if math.isfinite(time)]
-        verdict = f"BROKEN: {', '.join(['; '.join(reasons), *span])}"
+        verdict = f"BROKEN: {', '.join([*reasons, *span])}"
     elif law.kind and not counted:
         verdict = "not judged: too few independent readings"
     elif law.kind == "smaller" and mean < low:

@@ -191,7 +191,7 @@ class CentralModel:
         return total if math.isfinite(total) else -math.inf
 
     def _densities(self, v: FloatArray, S: FloatArray) -> FloatArray:
-        return -0.5 * (LOG_2PI + np.log(S) + v * v / S) - np.log(self._scales)
+        return np.asarray(-0.5 * (LOG_2PI + np.log(S) + v * v / S) - np.log(self._scales))
 
     def as_innovations(self) -> Innovations:
         """Return the innovations of scalar readings, each given those before it."""
@@ -382,7 +382,9 @@ def fit_noise(
     for k in range(count):
         without = np.where(np.arange(count) == k, 0.0, factors)
         if model.value(without) >= top - NEGLIGIBLE:
-            factors, free[k] = without, False
+            free[k] = False
+            # Filters need some noise of every reading.
+            factors = without if k < plant else factors
     deviations = _deviations(model.value, factors, free)
     return _make_fit(scenario, model, factors, deviations, confidence)
 
@@ -469,12 +471,8 @@ def _make_fit(
         }
     )
     changes = _changes(scenario, model.variances, factors)
-    zero = [v.name for v, factor in zip(model.variances, factors, strict=True) if factor == 0.0]
+    zero = [v.name for v, one in zip(model.variances, deviations, strict=True) if np.isnan(one)]
     notes = (f"as far as these readings tell, 0: {', '.join(zero)}",) if zero else ()
-    # A reading without noise is refused.
-    is_usable = all(
-        v.Q is not None or factor for v, factor in zip(model.variances, factors, strict=True)
-    )
     return NoiseFit(
         scenario.name,
         table,
@@ -483,7 +481,7 @@ def _make_fit(
         len(model.y),
         confidence,
         changes,
-        scenario.replace(changes) if is_usable else scenario,
+        scenario.replace(changes),
         notes,
     )
 

@@ -165,6 +165,20 @@ def test_errors_that_are_not_what_they_should_be_are_found(gossip, factor, words
         assert np.mean([row.inside for row in found.rows]) > 0.97
 
 
+def test_a_broken_node_is_named_with_its_time(gossip):
+    random, n, nodes = np.random.default_rng(9), 4, len(gossip.nodes)
+    runs = []
+    for _ in range(40):
+        samples = random.chisquare(n, size=(16, nodes))
+        samples[9:, 2] *= 2.0  # from 10 s on
+        nothing = np.full(nodes, np.nan)
+        told = samples.mean(axis=0), np.full(nodes, 4.0), nothing, nothing
+        runs.append(RunConsistency(samples, *told, np.array([np.inf]), np.array([True])))
+    verdicts = [row.verdict for row in judge_consistency(gossip, runs, 0.999).rows]
+    assert verdicts.pop(2) == "BROKEN: errors are larger than expected, since 10 s"
+    assert set(verdicts) == {"consistent"}
+
+
 def test_the_command_and_the_table_of_a_run_say_so(capsys, tmp_path):
     short = ["--set", "horizon=6.0", "--set", "probe=1.0"]
     arguments = ["consistency", GOSSIP, *short, "--runs", "10", "--workers", "1"]

@@ -203,3 +203,14 @@ def test_the_command_prints_the_model_that_the_scenario_may_take(level, tmp_path
     got = json.loads(capsys.readouterr().out)
     assert [row["start"] for row in got["variances"]] == [1.0, 2.0]
     assert main(["fit", str(path), "--noise", "--set", "filter.gain=1"]) == 2
+
+
+def test_a_sensor_without_noise_keeps_a_little(tmp_path):
+    """Readings of the state itself: R is 0 as far as they tell, and filters still run."""
+    plant = {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
+    given = scenario(tmp_path, plant, {"H": [[1.0]], "R": [[1e-6]]}, 100.0)
+    found = fit_noise(given.replace({"filter.model": {"R": [[1.0]]}}))
+    assert found.notes
+    assert 0.0 < found.table["value"][1] < 1e-3
+    assert found.table["value"][0] == pytest.approx(1.0, rel=0.5)
+    assert np.isfinite(netkf.simulate(found.scenario, engine="simpy").xhat).all()
