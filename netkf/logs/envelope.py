@@ -18,6 +18,7 @@ from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate
 from netkf.linalg.arrays import FloatArray
 from netkf.logs.outcomes import Chain
+from netkf.network.losses import GilbertElliott
 from netkf.network.scheduled import ScheduledLoss
 from netkf.runs.connectivity import ConnectivitySink
 from netkf.runs.files import write_text
@@ -47,9 +48,10 @@ Interval = tuple[float, float, tuple[str, str], int]
 class Law(NamedTuple):
     """A law of losses fitted to a log.
 
-    values : of NAMES; per-link: the deliveries of the L ``links``
-    counts : packets and those heard, (1, 2) or (L, 2), as independent ones: deliveries have the
-             posterior Beta(heard + 1/2, lost + 1/2)
+    values : of NAMES; per-link: the deliveries of the L ``links``; per-link-bursts: to_bad of each
+             and to_good of each; of ``rows``: K deliveries
+    counts : tries and successes of each value, (1, 2) to (2 L, 2), as independent ones: it has the
+             posterior Beta(successes + 1/2, failures + 1/2)
     cov    : of the other laws: covariance of the values, of a chain of their logits, whose
              posterior is Gaussian
     rows   : of deliveries that change: which of the values (K,) a link has when
@@ -81,6 +83,9 @@ class Law(NamedTuple):
     def describe(self) -> str:
         """Return the parameters as text."""
         values = [f"{value:.3g}" for value in self.values]
+        if self.kind == "per-link-bursts":
+            bad, good = np.split(self.values, 2)
+            return f"mean burst {1.0 / max(good):.3g} to {1.0 / min(good):.3g} on {len(bad)} links"
         parts = {"per-link": "links", "scheduled": "windows of time", "hopping": "channels"}
         if self.kind in parts:
             low, high = min(self.values), max(self.values)
@@ -90,21 +95,27 @@ class Law(NamedTuple):
 
     @property
     def file(self) -> str:
-        """The name of the table of a law with ``rows``."""
-        return f"fit_{self.kind}.csv"
+        """The name of the table of the law, "" if it has none."""
+        is_table = self.rows or self.kind == "per-link-bursts"
+        return f"fit_{self.kind.replace('-', '_')}.csv" if is_table else ""
 
-    def schedule(self, values: FloatArray) -> str:
-        """Return the table from,until,sender,receiver,delivery of a law with ``rows``."""
+    def text(self, values: FloatArray) -> str:
+        """Return the table of a law with a ``file``."""
         own = values.tolist()
-        lines = [f"{a!r},{b!r},{i},{j},{own[k]!r}" for a, b, (i, j), k in self.rows]
-        return "\n".join(["from,until,sender,receiver,delivery", *lines, ""])
+        if self.rows:
+            lines = [f"{a!r},{b!r},{i},{j},{own[k]!r}" for a, b, (i, j), k in self.rows]
+            return "\n".join(["from,until,sender,receiver,delivery", *lines, ""])
+        both = zip(self.links, own, own[len(self.links) :], strict=False)
+        lines = [f"{i},{j},{bad!r},{max(good, 1e-9)!r}" for (i, j), bad, good in both]
+        return "\n".join(["sender,receiver,to_bad,to_good", *lines, ""])
 
     def loss_table(self, values: FloatArray) -> dict[str, Any]:
-        """Return the table network.channel.loss with these ``values``; that of a law with ``rows``
-        refers to its file.
+        """Return the table network.channel.loss with these ``values``, which may refer to the
+        ``file``.
         """
-        if self.rows:
-            return {"kind": "scheduled", "path": self.file}
+        if self.file:
+            kind = "scheduled" if self.rows else "gilbert-elliott"
+            return {"kind": kind, "path": self.file}
         own = values.tolist()
         table = {} if self.kind == "per-link" else dict(zip(NAMES[self.kind], own, strict=True))
         if self.kind == "distance":
@@ -112,14 +123,14 @@ class Law(NamedTuple):
         return {"kind": self.kind, **table}
 
     def apply(self, scenario: Scenario, values: FloatArray, folder: Path) -> Scenario:
-        """Return a scenario whose losses are those of the law with ``values``, with the table of a
-        law with ``rows`` in an empty ``folder``.
+        """Return a scenario whose losses are those of the law with ``values``, and its ``file`` in
+        an empty ``folder``.
         """
         changed: dict[str, Any] = {"network.channel.loss": self.loss_table(values)}
-        if self.rows:
-            write_text(folder / self.file, self.schedule(values))
-            loss = ScheduledLoss(path=SourceFile(self.file, folder))
-            changed = {"network.channel.loss": loss}
+        if self.file:
+            write_text(folder / self.file, self.text(values))
+            make = ScheduledLoss if self.rows else GilbertElliott
+            changed = {"network.channel.loss": make(path=SourceFile(self.file, folder))}
         if self.kind == "per-link":
             changed["network.graph"] = edges_with(
                 scenario, dict(zip(self.links, values, strict=True))

@@ -43,6 +43,7 @@ NEEDS = {
     "bernoulli": ("links", "time", "fate", "constancy", "channel"),
     "per-link": ("time", "fate", "constancy", "channel"),
     "gilbert-elliott": ("links", "fate", "constancy", "channel"),
+    "per-link-bursts": ("memory", "fate", "constancy", "channel"),
     "shared": ("links", "time", "constancy", "channel"),
     "distance": ("distance", "time", "fate", "constancy", "channel"),
     "scheduled": ("links", "time", "fate", "channel"),
@@ -397,6 +398,11 @@ def _fit_laws(
     if bursty:
         chain = stats.fit_chain(outcomes)
         laws.append(Law("gilbert-elliott", chain.values, chain.likelihood, cov=chain.cov))
+        # Of each link heard packets that turn to lost ones, and the other way.
+        turns = np.concatenate(np.split(_transitions(outcomes), 2, axis=1))
+        values = (turns[:, 1] + 0.5) / (turns[:, 0] + 1.0)
+        fit = _likelihood(turns[:, 1], np.maximum(turns[:, 0], 1.0))
+        laws.append(Law("per-link-bursts", values, fit, turns))
     if distance is not None and len(count) > 2:
         values, cov = stats.fit_distance(distance, count, heard, shrink)
         p = expit((values[0] - distance) / values[1])
@@ -497,8 +503,8 @@ def _write(
             write_text(folder / name, table.to_csv(index=False))
     base, paths = as_table(scenario), {}
     for law in laws:
-        if law.rows:
-            write_text(folder / law.file, law.schedule(law.values))
+        if law.file:
+            write_text(folder / law.file, law.text(law.values))
         document = {**base, "name": f"{scenario.name}-{law.kind}"}
         document["claim"] = f"losses by the law {law.kind}, fitted to the log of {scenario.name}"
         network = {**base["network"]}

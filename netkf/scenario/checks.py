@@ -14,6 +14,7 @@ from netkf.core.errors import ScenarioError, errors_under
 from netkf.core.fields import Component
 from netkf.linalg.spectra import growth_rate
 from netkf.network.clocks import LinkClock
+from netkf.network.losses import GilbertElliott
 from netkf.network.matchings import Matching, RecordedSlots
 from netkf.plants.curves import NonlinearDiffusion
 from netkf.plants.diffusion import Diffusion
@@ -253,6 +254,19 @@ def _check_lives(scenario: DerivedScenario) -> None:
         raise ScenarioError("network.lives", rule, sorted(owners), "remove it")
 
 
+def _check_shared_states(scenario: DerivedScenario) -> None:
+    channel, topology = scenario.network.channel, scenario.topology
+    both = getattr(scenario.network.activation, "at", "links") == "links" and channel.symmetric
+    if not isinstance(channel.loss, GilbertElliott) or not both or topology.directed:
+        return
+    for i, j in topology.links:
+        if channel.loss.of((i, j)).transitions != channel.loss.of((j, i)).transitions:
+            rule = "must give both directions of a link one to_bad and one to_good, since they are "
+            rule += "in one state (symmetric = true)"
+            remedy = "correct the rows, or write symmetric = false in network.channel"
+            raise ScenarioError("network.channel.loss.path", rule, [i, j], remedy)
+
+
 def _check_clocks(scenario: DerivedScenario) -> None:
     owners: dict[int, int] = {}
     for k, entry in enumerate(scenario.network.clocks):
@@ -330,6 +344,7 @@ def _check_network(scenario: DerivedScenario) -> None:
         if part is not None:
             with errors_under(key):
                 part.check(topology)
+    _check_shared_states(scenario)
     _check_lives(scenario)
     _check_clocks(scenario)
     _check_quantisation(scenario)

@@ -253,6 +253,31 @@ def test_what_nobody_reported_counts_as_lost_and_holes_do_not(tmp_path):
     assert "per-link" in repr(fit)
 
 
+def test_links_with_bursts_of_their_own(tmp_path):
+    """The table of chains holds what follows what in the record, and its runs are like the log."""
+    random, rows, bad = np.random.default_rng(5), ["t,src,dst,seq,heard"], {}
+    for k in range(400):
+        for i in range(3):
+            for j in {0, 1, 2} - {i}:
+                to_bad, to_good = 0.02 + 0.03 * i, 0.1 + 0.2 * j
+                was = bad.get((i, j), False)
+                bad[i, j] = random.random() >= to_good if was else random.random() < to_bad
+                rows.append(f"{k + 0.2 * i + 1},{i},{j},{k},{int(not bad[i, j])}")
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    netkf.import_log(tmp_path / "log.csv", "csv", tmp_path / "out")
+    fit = netkf.fit_log(tmp_path / "out", runs=6, workers=1)
+    law = fit.laws.set_index("law").loc["per-link-bursts"]
+    assert law["rejected_by"] == ""
+    assert law["bic"] < fit.laws.set_index("law").loc["per-link", "bic"]
+    table = pd.read_csv(tmp_path / "out" / "fit_per_link_bursts.csv")
+    np.testing.assert_allclose(table["to_good"], fit.links["to_good"], atol=0.02)
+    np.testing.assert_allclose(table["to_bad"], 0.02 + 0.03 * table["sender"], atol=0.04)
+    own = fit.envelope[fit.envelope["law"] == "per-link-bursts"]
+    assert (own["p"] > 0.005).all()
+    loss = netkf.load(fit.scenarios["per-link-bursts"]).network.channel.loss
+    assert loss.of((0, 1)).to_bad == table["to_bad"][0]
+
+
 def test_channels_and_stretches_are_kept_apart():
     rows = [
         {"sender": "a", "receiver": r, "message": k, "t": k, "transmission": k, "delivered": 1.0}

@@ -79,6 +79,9 @@ BURSTS = (
     "sender,receiver,to_bad,to_good,deliver_bad\n0,1,0.1,0.3,0.2\n0,2,0.1,0.3,0.0\n"
     "1,0,0.9,0.2,0.1\n"
 )
+ALL_BURSTS = "sender,receiver,mean_loss,mean_burst\n" + "".join(
+    f"{i},{j},{0.2 + 0.02 * i},{2 + j}\n" for i in range(5) for j in range(5) if i != j
+)
 HOPS = "channel,delivery\n11,0.2\n15,1.0\n26,0.6\n"
 KINDS = {
     "shared": ('loss = { kind = "shared", delivery = 0.6, share = 0.7 }', {}),
@@ -87,13 +90,18 @@ KINDS = {
         {"s.csv": SCHEDULE},
     ),
     "bursts per link": (
-        'loss = { kind = "gilbert-elliott", path = "b.csv", mean_loss = 0.3, mean_burst = 4.0 }',
+        'symmetric = false, loss = { kind = "gilbert-elliott", path = "b.csv", mean_loss = 0.3, '
+        "mean_burst = 4.0 }",
         {"b.csv": BURSTS},
     ),
     "shared bursts": (
         'symmetric = false, loss = { kind = "gilbert-elliott", to_bad = 0.1, to_good = 0.3, '
         "deliver_bad = 0.3, shared = true }",
         {},
+    ),
+    "bursts by a table alone": (
+        'symmetric = false, loss = { kind = "gilbert-elliott", path = "b.csv" }',
+        {"b.csv": ALL_BURSTS},
     ),
     "hopping": ('channels = { hopping = [11, 15, 26, 11], path = "h.csv" }', {"h.csv": HOPS}),
 }
@@ -311,6 +319,11 @@ REFUSALS = {
         "sender,receiver,mean_loss,mean_burst\n0,1,0.2,3\n0,2,0.2,4\n",
         "must give all links of a sender the same transitions",
     ),
+    "directions that cannot differ": (
+        'loss = { kind = "gilbert-elliott", path = "s.csv", mean_loss = 0.1, mean_burst = 2.0 }',
+        "sender,receiver,to_bad,to_good\n0,1,0.2,0.3\n1,0,0.2,0.4\n",
+        "must give both directions of a link one to_bad and one to_good",
+    ),
     "a channel without rows": (
         'channels = { hopping = [11, 12], path = "s.csv" }',
         "channel,delivery\n11,0.5\n",
@@ -323,7 +336,7 @@ REFUSALS = {
 def test_refusals(scenario_of, case):
     channel, rows, words = REFUSALS[case]
     with pytest.raises(netkf.ScenarioError) as caught:
-        scenario_of(CLOCKS, channel, {"s.csv": rows})
+        scenario_of(CLOCKS, channel, {"s.csv": rows}, at="links")
     assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 

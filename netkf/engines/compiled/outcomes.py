@@ -283,7 +283,8 @@ def channel_streams(
     """
     none: np.ndarray = np.empty((0, WIDTH), dtype=np.uint64)
     loss, delay = channel.loss, channel.delay
-    to_bad, to_good = loss.transitions if isinstance(loss, GilbertElliott) else (0.0, 1.0)
+    chain = loss.chain if isinstance(loss, GilbertElliott) else None
+    to_bad, to_good = (chain.to_bad, chain.to_good) if chain is not None else (0.0, 1.0)
     law, scale, width = FIXED, float(delay.fixed or 0.0), 0.0
     if listed:
         law = LISTED
