@@ -52,8 +52,8 @@ def mismatch_note(scenario: Scenario) -> str:
     """Return a note for users on P and its bound if the filters' model may differ from the truth;
     else an empty text.
     """
-    for _, evidence in scenario.departures:
-        return evidence
+    if scenario.departures:
+        return "; ".join(evidence for _, evidence in scenario.departures)
     if not scenario.is_linear:
         names = {"dynamics": scenario.plant.linear, "readings": scenario.has_linear_sensors}
         parts = " and ".join(name for name, is_linear in names.items() if not is_linear)
