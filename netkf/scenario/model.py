@@ -70,6 +70,7 @@ from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
 
 EVERY_READING, HEALTHY = "every reading is used", "all sensors are healthy"
+RIGHT_CLOCKS = "clocks of nodes are right"
 """Assumptions of all filters, see ``ScenarioModel.departures``."""
 
 
@@ -405,7 +406,7 @@ class ScenarioModel(Component):
                 "clocks of nodes are wrong and filters believe them: estimates are of another "
                 "time, and P does not count it"
             )
-            found.append(("clocks of nodes are right", evidence))
+            found.append((RIGHT_CLOCKS, evidence))
         if self.faults:
             nodes = ", ".join(map(str, list(self.faults)[:5])) + ", ..." * (len(self.faults) > 5)
             evidence = (

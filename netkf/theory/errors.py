@@ -15,6 +15,7 @@ from netkf.algorithms.filter import takes_columns
 from netkf.algorithms.registry import built_in_class, overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
+from netkf.scenario.model import RIGHT_CLOCKS
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.theory.common.block_columns import ClockBlocks, SlotBlocks
@@ -123,13 +124,15 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         )
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
-    require_linear(scenario)
+    require_linear(scenario, accepted=RIGHT_CLOCKS)
     forgets = any(life.memory == "lost" for life in scenario.network.lives)
     in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
-    matters = scenario.network.lives and (scenario.slotted or forgets)
-    if matters and (in_python or scenario.views is not None):
+    reasons = [evidence for _, evidence in scenario.departures]
+    if scenario.network.lives and (scenario.slotted or forgets):
+        reasons.append(LIVES)
+    if reasons and (in_python or scenario.views is not None):
         rule = "exact errors are known of filters whose verbs are affine kernels of one state"
-        raise TheoryError(f"{LIVES}: {rule}; {CONSISTENCY}")
+        raise TheoryError(f"{reasons[0]}: {rule}; {CONSISTENCY}")
     if scenario.links_follow_state:
         raise TheoryError("the true state says who hears whom: events tell of it")
     if scenario.slotted:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from netkf.linalg.arrays import FloatArray, IntArray
+from netkf.network.node_clocks import node_times
 from netkf.plants.transitions import Transitions
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -70,7 +71,8 @@ class ClockColumns(LoggedColumns):
             scenario, forms, _most_messages(self._log, self._delivered), rows
         )
         self.estimators = self._filters.estimators
-        self._times = [0.0] * self.estimators
+        self._clocks = node_times(scenario, Streams(run.seed, run.replica))
+        self._times = [self._shown(h, 0.0) for h in range(self.estimators)]
         super().__init__()
         self._now = 0.0
         self._free = list(range(self._filters.messages))[::-1]
@@ -84,8 +86,9 @@ class ClockColumns(LoggedColumns):
         movable = not len(plant.changes) and np.array_equal(scenario.belief[0], plant.A)
         lost = [life.nodes for life in scenario.network.lives if life.memory == "lost"]
         self._forgetful = frozenset(node for nodes in lost for node in nodes)
-        # A node that begins again does so with a mean that does not move along.
-        movable = movable and not lost
+        # A node that begins again does so with a mean that does not move along, and one whose clock
+        # is wrong is at another time.
+        movable = movable and not lost and not self._clocks
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
         self._begin_piece(0)
@@ -143,7 +146,7 @@ class ClockColumns(LoggedColumns):
             self._absorb(node, time)
         elif kind in (RESTART, JOIN) and node in self._forgetful:
             fresh, first = (self._scenario.fresh_estimate(node, t)[0] for t in (time, 0.0))
-            self._times[self._index[node]] = time
+            self._times[self._index[node]] = self._shown(self._index[node], time)
             self._filters.restart(self._index[node], fresh - first)
 
     def _move_truth(self, time: float) -> None:
@@ -196,11 +199,25 @@ class ClockColumns(LoggedColumns):
         self._keep_digits(flows.reading)
 
     def _gap(self, h: int, time: float) -> float:
-        """Return by how many seconds node h has to be predicted to ``time``, where it is then."""
+        """Return by how many seconds of its clock node h has to be predicted to ``time``, where it is
+        then.
+        """
         self._move_increments(time)
-        self._filters.run.now = time
-        gap, self._times[h] = time - self._times[h], time
+        shown = self._shown(h, time)
+        self._filters.run.now = shown
+        gap, self._times[h] = shown - self._times[h], shown
         return gap
+
+    def _shown(self, h: int, time: float) -> float:
+        """Return what the clock of node h shows at ``time``, both in seconds."""
+        clock = self._clocks.get(self._scenario.nodes[h])
+        return time if clock is None else clock.shows(time)
+
+    def _told_age(self, h: int, message: Sent, time: float) -> float:
+        """Return the age that the stamp of a message tells node h at ``time``."""
+        instant, shown = self._scenario.time_grid.instant, self._shown(h, time)
+        told = instant(shown - self._shown(message.sender, message.time))
+        return min(max(told, 0.0), instant(shown - self._shown(h, 0.0)))
 
     def _sense(self, h: int, time: float) -> None:
         observation: Observation | None = self._samples.get(time, {}).pop(h, None)
@@ -266,7 +283,7 @@ class ClockColumns(LoggedColumns):
 
     def _absorb(self, node: int, time: float) -> None:
         h, filters, scenario = self._index[node], self._filters, self._scenario
-        run, forms, grid = filters.run, self._forms_of_all, scenario.time_grid
+        run, forms = filters.run, self._forms_of_all
         gap = self._gap(h, time)
         all_heard = sorted(self._inboxes.pop(node), key=lambda m: (m.sender, m.time, m.number))
         inbox = all_heard
@@ -274,7 +291,7 @@ class ClockColumns(LoggedColumns):
             inbox = list({message.sender: message for message in inbox}.values())
         readings = []
         for k, message in enumerate(inbox):
-            run.message[k], run.age[k] = message.payload, grid.instant(time - message.time)
+            run.message[k], run.age[k] = message.payload, self._told_age(h, message, time)
             run.link[k] = self._link[message.sender, h]
             run.message_weight[k] = run.weight[run.link[k]]
             run.heard[k] = -1
