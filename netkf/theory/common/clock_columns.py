@@ -199,8 +199,8 @@ class ClockColumns(LoggedColumns):
         self._keep_digits(flows.reading)
 
     def _gap(self, h: int, time: float) -> float:
-        """Return by how many seconds of its clock node h has to be predicted to ``time``, where it is
-        then.
+        """Return by how many seconds, of its clock, node h is to be predicted to ``time``, where it
+        is then.
         """
         self._move_increments(time)
         shown = self._shown(h, time)
