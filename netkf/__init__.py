@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from netkf import parts, testing, theory
     from netkf.checks.check import check
     from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
-    from netkf.logs.exporting import export_log
+    from netkf.logs.exporting import export_log, export_recorded
     from netkf.logs.fitting import fit_log
     from netkf.logs.importing import import_log
     from netkf.runs.held_out import held_out_errors
@@ -51,6 +51,7 @@ _MODULE_OF = {
     "compare_filters": "netkf.studies.compare_filters",
     "consistency": "netkf.studies.consistency",
     "export_log": "netkf.logs.exporting",
+    "export_recorded": "netkf.logs.exporting",
     "first_difference": "netkf.trace.run",
     "fit_log": "netkf.logs.fitting",
     "fit_noise": "netkf.studies.likelihood",
@@ -92,6 +93,7 @@ __all__ = [
     "compare_filters",
     "consistency",
     "export_log",
+    "export_recorded",
     "first_difference",
     "fit_log",
     "fit_noise",

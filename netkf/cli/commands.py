@@ -442,11 +442,16 @@ COMMANDS = (
     ),
     Command(
         "export",
-        "write a run as a packet log, which import replays to the bit",
+        "write a run as a packet log, or as a scenario of what happened, which replay to the bit",
         (
             _option("directory", "run directory", type=Path, metavar="DIR"),
-            _option("--to", "format: a packet log", required=True, choices=["log"]),
-            _option("--out", "folder of the log", type=Path, required=True, metavar="LOG"),
+            _option(
+                "--to",
+                "a packet log, or a scenario with recorded outcomes, positions and lives",
+                required=True,
+                choices=["log", "recorded"],
+            ),
+            _option("--out", "new folder", type=Path, required=True, metavar="OUT"),
             _trust("DIR"),
         ),
         takes_scenario=False,

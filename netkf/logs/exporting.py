@@ -1,8 +1,11 @@
-"""``netkf export --to log``: a run as a packet log, which ``netkf import`` replays to the bit."""
+"""``netkf export``: a run as a packet log, which ``netkf import`` replays, and as a scenario of
+what happened in it: both to the bit.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,12 +15,129 @@ from netkf.core.fields import as_path
 from netkf.logs.importing import write_files
 from netkf.logs.recorded_network import Files
 from netkf.network.clocks import LinkClock
+from netkf.network.lives import lifetimes
+from netkf.rng.streams import Streams
+from netkf.scenario.positions import tick_times
+from netkf.scenario.sampling import all_sample_times
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolve_defaults, to_toml
+from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.trace.messages import LOST, UNDER_WAY, join_messages
 from netkf.trace.run import Run
 from netkf.trace.schema import CODES
+
+
+def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
+    """Write a run as its recorded twin into the new folder ``out``; return the paths.
+
+    ``scenario.toml`` is that of the run with what happened in place of its causes: which messages
+    were lost (``losses.csv``) and how long the others took (``delays.csv``), when nodes were down
+    (``lives.csv``), and where nodes were that their states placed (``positions.csv``). It has no
+    radios, hops and shared losses. With the same seed and replica its events and states are those
+    of the run.
+
+    Raises ScenarioError for a run without a scenario, TheoryError where the messages of the last
+    slot cannot be told, and WriteError.
+    """
+    folder, scenario = _new_folder(run, out)
+    table: Any = {**resolve_defaults(scenario), "seed": run.seed}
+    network: Any = table["network"]
+    files: Files = {}
+    network.pop("radio", None)
+    messages = join_messages(run.log)
+    if scenario.slotted:
+        # Samples at the horizon use messages that are not in the log of the run.
+        longer = join_messages(with_last_exchanges(scenario, run).log)
+        messages = np.concatenate([messages, longer[longer["sent"] >= scenario.horizon]])
+    if len(messages):
+        files |= _outcomes(scenario, messages, network.setdefault("channel", {}))
+    if scenario.network.lives:
+        files |= _lives(scenario, run, network)
+    if scenario.links_follow_state:
+        files |= _positions(scenario, run)
+        network["positions"] = "positions.csv"
+        for block in table.get("plants", []):
+            block.pop("position", None)
+    text = to_toml(table)
+    given = {source.name: source.full for source in source_files(scenario)}
+    files |= {name: path for name, path in given.items() if f'"{name}"' in text}
+    files["scenario.toml"] = text
+    write_files(folder, files)
+    return tuple(folder / name for name in files)
+
+
+def _new_folder(run: Run, out: str | Path) -> tuple[Path, Scenario]:
+    """Return the folder and the scenario of the run; raises ScenarioError."""
+    folder, scenario = as_path("out", out), run.scenario
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError("run", "must have its scenario", None, "take what simulate returns")
+    if folder.exists() and any(folder.iterdir() if folder.is_dir() else [folder]):
+        rule = "must be a new or empty folder"
+        raise ScenarioError(str(folder), rule, None, "choose another folder")
+    return folder, scenario
+
+
+def _outcomes(scenario: Scenario, messages: np.ndarray, channel: dict[str, Any]) -> Files:
+    """Return the tables of losses and delays, which the ``channel`` names from now on."""
+    # What was lost on arrival took its time: its hearer was down.
+    took = messages["ended"] - messages["sent"]
+    arrives = (messages["outcome"] != LOST) | (took > 0.0)
+    later = scenario.end_time + 1.0 - messages["sent"]
+    took = np.where(messages["outcome"] == UNDER_WAY, later, took)
+    rows = pd.DataFrame({name: messages[name] for name in ("sender", "receiver")})
+    rows["message"] = messages["number"]
+    losses = rows.assign(delivered=arrives.astype(int))
+    delays = rows.assign(seconds=[repr(t) for t in took.tolist()])[arrives]
+    channel.pop("channels", None)
+    channel["loss"] = {"kind": "recorded", "path": "losses.csv", "after": "refuse"}
+    channel["delay"] = {"kind": "recorded", "path": "delays.csv", "after": "refuse"}
+    return {"losses.csv": losses.to_csv(index=False), "delays.csv": delays.to_csv(index=False)}
+
+
+def _lives(scenario: Scenario, run: Run, network: dict[str, Any]) -> Files:
+    """Return the tables of lives, of nodes that keep their memory and of others."""
+    words = {"crash": "down", "restart": "up", "leave": "leave", "join": "join"}
+    files: Files = {}
+    entries = []
+    lives = lifetimes(scenario, Streams(run.seed, run.replica))
+    for memory in ("kept", "lost"):
+        own = {node: life for node, life in lives.items() if life.forgets == (memory == "lost")}
+        rows = [(0.0, node, "down") for node, life in own.items() if not life.up]
+        rows += [(c.time, node, words[c.kind]) for node, life in own.items() for c in life.changes]
+        if own:
+            name = f"lives_{memory}.csv"
+            files[name] = "t,node,what\n" + "".join(f"{t!r},{i},{w}\n" for t, i, w in sorted(rows))
+            entry = {"kind": "recorded", "nodes": list(own), "path": name, "memory": memory}
+            entries.append(entry)
+    network["lives"] = entries
+    return files
+
+
+def _positions(scenario: Scenario, run: Run) -> Files:
+    """Return the table of where all nodes were whenever someone looked."""
+    streams, positions = Streams(run.seed, run.replica), scenario.positions
+    if scenario.slotted:
+        truth: Any = scenario.slot_truth(streams)
+        slots = range(1 + int(scenario.end_time / scenario.slot_plant.period))
+        looks = [(scenario.slot_plant.slot_time(slot), slot) for slot in slots]
+    else:
+        truth = scenario.continuous_truth(streams)
+        sampled = all_sample_times(scenario.sample_times(streams))
+        times = [[0.0], tick_times(scenario, streams), sampled, scenario.times]
+        looks = [(t, t) for t in np.unique(np.concatenate(times)).tolist()]
+    lines = ["t,node,x,y"]
+    for t, when in looks:
+        x = truth.absolute(when)
+        for node in scenario.nodes:
+            point = positions.at(node, t, x) if positions.has(node) else ()
+            if len(point) > 2:
+                rule = "must place nodes by at most two coordinates, which tables have"
+                raise ScenarioError("position", rule, len(point), "export --to log")
+            if point:
+                place = [repr(float(z)) for z in (*point, 0.0)[:2]]
+                lines.append(f"{t!r},{node},{','.join(place)}")
+    return {"positions.csv": "\n".join(lines) + "\n"}
 
 
 def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
@@ -31,12 +151,7 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
 
     Raises ScenarioError for a run without a scenario or messages, and WriteError.
     """
-    folder, scenario = as_path("out", out), run.scenario
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("run", "must have its scenario", None, "take what simulate returns")
-    if folder.exists() and any(folder.iterdir() if folder.is_dir() else [folder]):
-        rule = "must be a new or empty folder"
-        raise ScenarioError(str(folder), rule, None, "choose another folder")
+    folder, scenario = _new_folder(run, out)
     messages = join_messages(run.log)
     if not len(messages):
         raise ScenarioError("run", "has no messages", None, "only runs with a network are logs")

@@ -290,6 +290,14 @@ def test_a_run_written_as_a_log_comes_back_to_the_bit(name, tmp_path):
     np.testing.assert_array_equal(run.P[:last], replay.P[:last])
     accounts = table(tmp_path / "out", "accounts.csv")
     assert (accounts["sent"] == accounts["heard"] + accounts["lost"]).all()
+    # What happened, in place of its causes: the last sample in slots too.
+    netkf.export_recorded(run, tmp_path / "twin")
+    twin = netkf.load(tmp_path / "twin" / "scenario.toml")
+    assert twin.network.channel.loss.path.name == "losses.csv"
+    replay = netkf.simulate(twin, replica=2, engine="simpy")
+    assert netkf.first_difference(run, replay) is None
+    np.testing.assert_array_equal(run.xhat, replay.xhat)
+    np.testing.assert_array_equal(run.P, replay.P)
 
 
 SENSORS = [{"nodes": [0], "H": [[1.0, 0.0]], "R": [[0.25]]}]

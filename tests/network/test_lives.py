@@ -430,6 +430,25 @@ def test_a_node_that_forgets_begins_with_its_mean_whatever_drives_the_plant(
     np.testing.assert_allclose(run.xhat[at, node], expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("engine", ["simpy", "compiled"])
+@pytest.mark.parametrize("slots", [True, False])
+def test_recorded_twins_replay_to_the_bit(tmp_path, slots, engine):
+    for k in (0, 2, 4):
+        scenario = combined(tmp_path, slots, "hcmci" if slots else "hybrid", k)
+        if k == 2 and engine == "simpy":
+            radio = {"bits_per_second": 2000.0, "queue": "drop"}
+            scenario = scenario.replace({"network.radio": radio})
+        run = netkf.simulate(scenario, seed=k, replica=1, engine=engine)
+        path = netkf.export_recorded(run, tmp_path / f"twin{k}")[-1]
+        twin = netkf.load(path)
+        assert twin.network.radio is None
+        assert {life.__class__.__name__ for life in twin.network.lives} == {"RecordedLife"}
+        replay = netkf.simulate(twin, replica=1, engine=engine)
+        assert replay.fingerprint == run.fingerprint
+        np.testing.assert_array_equal(replay.xhat, run.xhat)
+        np.testing.assert_array_equal(replay.P, run.P)
+
+
 def test_crashes_have_their_law():
     life = Crashes(nodes=(0,), mean_up=3.0, mean_down=1.0)
     changes = life.changes(0, lambda: np.random.default_rng(4), 20_000.0)

@@ -224,6 +224,18 @@ def test_table_of_delivery_is_linear_and_ends_are_constant():
     assert DistanceLoss(delivery=LOGISTIC).delivery_probability(at[-1]) < 1e-300
 
 
+@pytest.mark.parametrize("clock", ["nodes", "readings", "broadcast"])
+def test_recorded_places_replay_to_the_bit(tmp_path, clock):
+    graph, lossy = {"kind": "range", "nodes": 4, "radius": 3.0}, {"kind": "bernoulli"}
+    moving = scenario(tmp_path, clock, lossy | {"delivery": 0.8}, graph, **robots(clock))
+    run = netkf.simulate(moving, seed=3)
+    twin = netkf.load(netkf.export_recorded(run, tmp_path / "twin")[-1])
+    assert not twin.links_follow_state
+    replay = netkf.simulate(twin)
+    assert replay.fingerprint == run.fingerprint
+    np.testing.assert_array_equal(replay.xhat, run.xhat)
+
+
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("source", ["table", "state"])
 def test_nothing_is_sent_out_of_range(tmp_path, clock, source):

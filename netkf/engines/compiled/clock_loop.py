@@ -331,7 +331,7 @@ def send_all(
     """
     first, after, outcome = links
     ticks, broadcast = state.ticks, state.clock_kind >= NODES
-    becomes = reached(state, outcome, after - first)
+    becomes = reached(state, first, after, outcome)
     if becomes == NONE_SENT and not broadcast:
         return
     m = take(state)

@@ -219,15 +219,17 @@ def on_sense(state: Simulation, now: float) -> None:
 
 
 @kernel
-def reached(state: Simulation, first: int, count: int) -> int:
-    """Return what becomes of ``count`` messages whose outcomes begin at ``delay[first]``:
-    SOME_ARRIVE, ALL_LOST, or NONE_SENT.
+def reached(state: Simulation, first: int, after: int, outcome: int) -> int:
+    """Return what becomes of the messages on the directed links ``outgoing[first:after]`` whose
+    outcomes begin at ``delay[outcome]``: SOME_ARRIVE, ALL_LOST, or NONE_SENT.
     """
     found = NONE_SENT
-    for m in range(first, first + count):
-        if state.ticks.delay[m] >= 0.0:
+    for m in range(after - first):
+        delay = state.ticks.delay[outcome + m]
+        hearer = state.directions[state.outgoing[first + m]].receiver
+        if delay > 0.0 or (delay == 0.0 and state.nodes[hearer].down == 0):
             return SOME_ARRIVE
-        if state.ticks.delay[m] != OUT_OF_RANGE:
+        if delay != OUT_OF_RANGE:
             found = ALL_LOST
     return found
 
@@ -238,7 +240,7 @@ def next_reached(state: Simulation) -> int:
     ticks = state.ticks
     entity = state.entities[ticks.entity[state.tick_at]]
     first = state.first_delay + ticks.first_outcome[state.tick_at]
-    return int(reached(state, first, entity.after - entity.first))
+    return int(reached(state, entity.first, entity.after, first))
 
 
 @kernel
