@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from netkf.core.errors import quote
 from netkf.core.printable import MAX_NAME
-from netkf.figures.names import FIGURE_NAMES, FORMATS
+from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
 ENGINES = ("auto", "simpy", "processes", "compiled")
 MAX_RUNS = 100_000_000  # larger numbers are typing errors
@@ -151,7 +151,7 @@ def _replica(text: str) -> Option:
 CHANGES = "override a key of the scenario; VALUE is written as in TOML"
 UNTIL = "begin with --runs and add runs until every row is decided"
 FOLDER = "folder of the files (default: the current one)"
-FIGURES = f"figures to draw: {', '.join(FIGURE_NAMES)} (default: all)"
+FIGURES = f"figures to draw: {', '.join((*FIGURE_NAMES, *FIT_FIGURES))} (default: all)"
 SCENARIO = (
     _option("scenario", "scenario file (TOML)", type=Path),
     _option("--set", CHANGES, action="append", default=[], metavar="KEY.PATH=VALUE"),

@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from netkf.core.errors import ScenarioError, suggest_nearest
-from netkf.figures.names import FIGURE_NAMES, FORMATS
+from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
 
 def _run(options: argparse.Namespace) -> int:
     """Draw figures of directories into files and print their paths; return the exit status."""
+    from netkf.logs.fitting import read_fit
     from netkf.studies.opening import open as open_directory
 
     if find_spec("matplotlib") is None:
@@ -27,7 +29,9 @@ def _run(options: argparse.Namespace) -> int:
             out = directory / "figures"
         else:
             out = options.out / directory.name if has_several else options.out
-        result = open_directory(directory, trust=options.trust)
+        result: Any = read_fit(directory)
+        if result is None:
+            result = open_directory(directory, trust=options.trust)
         # After all that can be refused: importing matplotlib takes a second.
         from netkf.figures.catalogue import plot_to_files
 
@@ -58,8 +62,9 @@ def _figure_names(text: str) -> list[str]:
     if not names:
         raise ScenarioError("--figure", "must name figures", text, "leave it out to draw all")
     for name in names:
-        if name not in FIGURE_NAMES:
-            hint = suggest_nearest(name, FIGURE_NAMES)
-            remedy = f"{hint}figures are {', '.join(FIGURE_NAMES)}"
+        known = (*FIGURE_NAMES, *FIT_FIGURES)
+        if name not in known:
+            hint = suggest_nearest(name, known)
+            remedy = f"{hint}figures are {', '.join(known)}"
             raise ScenarioError("figure", "is not known", name, remedy)
     return names

@@ -8,10 +8,12 @@ from typing import Any
 
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.figures.consistency import nees_figure, nis_figure, whiteness_figure
+from netkf.figures.envelope import envelope_figure
 from netkf.figures.error import error_figure, quantiles_figure, ratios_figure
 from netkf.figures.figure_data import FigureData, UnavailableError, reduce_result
-from netkf.figures.names import FORMATS
+from netkf.figures.names import FIT_FIGURES, FORMATS
 from netkf.figures.network import network_figure
+from netkf.figures.outcomes import fate_figure, losses_figure, matrix_figure
 from netkf.figures.pictures import overview
 from netkf.figures.plane import plane_figure
 from netkf.figures.stability import (
@@ -39,16 +41,19 @@ FIGURES: Mapping[str, Callable[[FigureData], Picture]] = {
     "stability": stability_figure,
     "law": law_figure,
     "delivery": delivery_figure,
+    "matrix": matrix_figure,
+    "fate": fate_figure,
+    "losses": losses_figure,
 }
-"""The figures of runs and ensembles; a sweep has ``stability`` only."""
+"""The figures of runs and ensembles; a sweep has ``stability`` only, a fit ``envelope``."""
 
 ACRONYMS = ("nees", "nis")
 """Names of figures that sentences write in capitals."""
 
 
 def plot(result: Any, figure: str = "error") -> Picture:
-    """Return a figure of a run, an ensemble or a sweep that was read from its directory, as a
-    matplotlib Figure (``savefig`` writes it).
+    """Return a figure of a run, an ensemble, a fit, or a sweep that was read from its directory,
+    as a matplotlib Figure (``savefig`` writes it).
 
     If the result lacks the data of that figure, it shows a sentence that says so. Raises
     ScenarioError for an unknown name, and if ``result`` is not a result.
@@ -63,11 +68,15 @@ class FigureSet:
         # A sweep is known by its attributes: its class is in a room above this one.
         is_sweep = hasattr(result, "keys") and hasattr(result, "table")
         self._sweep: Any = result if is_sweep else None
-        self._data = None if is_sweep else reduce_result(result)
+        self._envelope = getattr(result, "envelope", None)
+        is_table = is_sweep or self._envelope is not None
+        self._data = None if is_table else reduce_result(result)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the figures of this kind of result."""
+        if self._envelope is not None:
+            return FIT_FIGURES
         return ("stability",) if self._sweep is not None else tuple(FIGURES)
 
     def draw(self, name: str, *, omit_slow: bool = False) -> Picture:
@@ -82,6 +91,8 @@ class FigureSet:
             raise ScenarioError("figure", "is not known", name, remedy)
         with style_context():
             try:
+                if self._envelope is not None:
+                    return envelope_figure(self._envelope)
                 if self._sweep is not None:
                     sweep = self._sweep
                     return sweep_figure(sweep.scenario.name, sweep.table, sweep.keys, sweep.status)
@@ -94,6 +105,8 @@ class FigureSet:
             except UnavailableError as unavailable:
                 reason = str(unavailable)
                 headline = f"No {name.upper() if name in ACRONYMS else name} to show"
+                if self._envelope is not None:
+                    return message_figure(headline, reason, [])
                 if self._data is None:
                     caption = [f"{self._sweep.scenario.name}, a sweep."]
                     return message_figure(headline, reason, caption)

@@ -4,6 +4,8 @@ FORMATS = ("png", "svg", "pdf")
 """Formats of picture files, which are their suffixes."""
 FIGURE_NAMES = (
     *("overview", "error", "quantiles", "ratios", "network", "plane", "nees", "nis", "whiteness"),
-    *("age", "links", "stability", "law", "delivery"),
+    *("age", "links", "stability", "law", "delivery", "matrix", "fate", "losses"),
 )
 """The figures of runs and ensembles; a sweep has ``stability`` only."""
+FIT_FIGURES = ("envelope",)
+"""The figures of a fit."""

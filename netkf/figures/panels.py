@@ -21,6 +21,7 @@ from netkf.figures.style import (
 )
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.labels import covariance_bias
+from netkf.runs.outcomes import downtimes
 from netkf.runs.summary import (
     CONFIDENCE,
     NO_COVARIANCE,
@@ -82,6 +83,16 @@ def root_interval(root: FloatArray, se: FloatArray) -> tuple[FloatArray, FloatAr
     return np.sqrt(low), np.sqrt(high)
 
 
+def shade_downtimes(axes: Any, data: FigureData) -> None:
+    """Shade the times at which a node of a run was down, darker where several were."""
+    if data.run is None or not data.scenario.network.lives:
+        return
+    label, end = "a node down", data.scenario.horizon
+    for down in downtimes(data.scenario, data.run.seed, data.run.replica):
+        axes.axvspan(down.begin, min(down.end, end), color=INK, alpha=0.12, lw=0, label=label)
+        label = "_"  # only one for the legend
+
+
 def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
     """Draw the error of each node and the RMS error of all over time; without ground truth the
     first component of the estimates instead.
@@ -94,6 +105,7 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
             return
         draw_nodes(axes, data, data.first_component, se=None)
         axes.set(ylabel="estimate, first component", xlabel=SECONDS)
+        shade_downtimes(axes, data)
         draw_legend(axes)
         return
     error = np.sqrt(data.sq_error)
@@ -109,6 +121,7 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
         _draw_bound(axes, data.times, roots)
     set_scale(axes, np.concatenate(curves))
     axes.set(ylabel="error |x - xhat|" if data.runs == 1 else RMS_ERROR, xlabel=SECONDS)
+    shade_downtimes(axes, data)
     draw_legend(axes)
 
 
@@ -123,6 +136,7 @@ def draw_covariances(axes: Any, data: FigureData) -> None:
     bound = data.promised.bound
     set_scale(axes, root if bound is None else np.concatenate([root, np.sqrt(bound)]))
     axes.set(ylabel=ROOT_TRACE, xlabel=SECONDS)
+    shade_downtimes(axes, data)
     draw_legend(axes)
 
 
@@ -176,4 +190,5 @@ def draw_nees(axes: Any, data: FigureData) -> None:
     set_scale(axes, np.append(values, high))
     name = "NEES" if len(ends) == 1 else "NEES / n"
     axes.set(ylabel=name if runs == 1 else f"mean {name} of {runs:,} runs", xlabel=SECONDS)
+    shade_downtimes(axes, data)
     draw_legend(axes)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from netkf.figures.figure_data import FigureData, UnavailableError
-from netkf.figures.panels import select_evenly
+from netkf.figures.panels import select_evenly, shade_downtimes
 from netkf.figures.style import (
     EXACT,
     FAINT,
@@ -121,7 +121,7 @@ def age_figure(data: FigureData) -> Picture:
     means = np.array([float(age.mean(np.array([0.0, end]))[0]) for age in ages])
     figure = new_figure(8.4, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.6, 1.0])
-    _draw_ages(left, np.linspace(0.0, end, AGE_BINS + 1), ages)
+    _draw_ages(left, data, np.linspace(0.0, end, AGE_BINS + 1), ages)
     _draw_age_distribution(right, ages, means, end)
     worst = int(means.argmax())
     headline = f"On average the freshest message that a node has heard is {means.mean():.3g} s old"
@@ -135,7 +135,7 @@ def age_figure(data: FigureData) -> Picture:
     return figure
 
 
-def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
+def _draw_ages(axes: Any, data: FigureData, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
     """Draw median, 90% range and largest age of information in bins between ``edges`` (B + 1,)."""
     # Samples of a sawtooth at the times of a grid would alias with the clocks; means do not.
     centres = 0.5 * (edges[:-1] + edges[1:])
@@ -152,6 +152,7 @@ def _draw_ages(axes: Any, edges: FloatArray, ages: list[AgeSawtooth]) -> None:
     axes.plot(centres, median, color=INK, lw=1.2, label=f"{typical}, on average")
     axes.set(xlabel=SECONDS, ylabel="age of information, seconds")
     axes.set_ylim(0.0, 1.05 * max(float(largest.max()), 1e-12))
+    shade_downtimes(axes, data)
     draw_legend(axes)
 
 
@@ -235,6 +236,7 @@ def links_figure(data: FigureData) -> Picture:
     axes.set_ylim(-0.8, len(selection) - 0.2)
     axes.invert_yaxis()
     axes.set_xlim(0.0, end)
+    shade_downtimes(axes, data)
     axes.set(xlabel=SECONDS, ylabel="sender to receiver")
     draw_legend(axes)
     lost = sum(len(direction.lost) for direction in directions)

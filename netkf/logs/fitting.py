@@ -20,7 +20,7 @@ from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress
 from netkf.linalg.arrays import FloatArray
 from netkf.logs import outcomes as stats
-from netkf.logs.envelope import Interval, Law, compare_with_laws
+from netkf.logs.envelope import COLUMNS, Interval, Law, compare_with_laws
 from netkf.logs.outcomes import Outcomes, Test, make_outcomes
 from netkf.logs.packets import UNREPORTED, parse_numbers, read_texts
 from netkf.network.recorded import RecordedDelay, RecordedLoss
@@ -100,6 +100,30 @@ class LogFit(NotebookTable):
         return (
             f"<netkf fit of {self.scenario.name!r}: {len(self.links)} links, not rejected: {kept}>"
         )
+
+
+@dataclass(frozen=True)
+class StoredFit:
+    """The ``envelope`` of a fit that is read back from its directory, as in :class:`LogFit`."""
+
+    envelope: pd.DataFrame
+
+
+def read_fit(directory: Path) -> StoredFit | None:
+    """Return what ``netkf fit`` left in a directory, None if it left nothing; raises ScenarioError
+    for a damaged file.
+    """
+    path = directory / FILES[-1]
+    if not path.is_file():
+        return None
+    try:
+        table = pd.read_csv(path)
+        if not len(table) or list(table.columns) != COLUMNS or table["inside"].dtype != bool:
+            raise ValueError
+    except ValueError:  # of pandas too
+        rule = "is not a table that netkf fit left"
+        raise ScenarioError(str(path), rule, None, "run netkf fit again") from None
+    return StoredFit(table)
 
 
 def fit_log(

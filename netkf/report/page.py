@@ -31,6 +31,7 @@ from netkf.report.mending import (
     explain_worst,
     mending_section,
 )
+from netkf.report.outcome_figure import outcome_figures
 from netkf.report.packing import Packer
 from netkf.runs.documents import FINAL_STATUSES, DamagedError
 from netkf.runs.files import require_own, write_text
@@ -307,6 +308,9 @@ def _main_sections(
     figures = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
     if figures:
         parts.append(section("figures", "Errors of the filters", figures))
+    losses = "".join(outcome_figures(source.run, source.label) for source in sources)
+    if losses:
+        parts.append(section("losses", "Losses", losses))
     results = "".join(_result_tables(source) for source in sources)
     parts.append(section("verdicts", "Verdicts and averages", results))
     scenarios = ""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from netkf.core.printable import shorten
 from netkf.network.deliveries import MessageKey
 from netkf.runs.files import to_json_value
+from netkf.runs.outcomes import Downtime
 from netkf.runs.tables import format_number, format_table, shorten_rows
 from netkf.studies.message_sets import SmallestSet
 
@@ -101,7 +102,8 @@ class Why:
     information that had reached it from each node, ``what_ifs`` P and error in replays, the run as
     it was first, and ``smallest`` the smallest set of missing messages that would have sufficed
     (None if the filter gives no P). ``missing`` has all messages that were not used, by their
-    identity, and ``notes`` sentences on the limits of the replays.
+    identity, ``down`` the nodes that were down at that instant, and ``notes`` sentences on the
+    limits of the replays.
     """
 
     scenario: str
@@ -113,6 +115,7 @@ class Why:
     what_ifs: tuple[WhatIf, ...]
     smallest: SmallestSet | None
     missing: dict[MessageKey, Missing] = field(repr=False)
+    down: tuple[Downtime, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -166,6 +169,7 @@ class Why:
             ],
             "what_ifs": [{**vars(w), "messages": self._entries(w.messages)} for w in self.what_ifs],
             "smallest": None,
+            "down": [one._asdict() for one in self.down],
             "notes": self.notes,
         }
         if self.smallest is not None:
@@ -212,6 +216,12 @@ class Why:
             sentence += ": the filter gives no covariance"
         error = f"; its error is {self.error:.3g}" if math.isfinite(self.error) else ""
         yield f"{sentence}{error}."
+        for one in self.down[:MAX_LISTED]:
+            since = f"since {one.begin:.6g} s, {self.at - one.begin:.4g} s before ({one.kind})"
+            subject = "It was itself" if one.node == self.node else f"Node {one.node} was"
+            yield f"{subject} down {since if one.kind else 'since the beginning'}."
+        if len(self.down) > MAX_LISTED:
+            yield f"{len(self.down) - MAX_LISTED} other nodes were down too."
 
     def _heard_sentences(self) -> Iterator[str]:
         neighbours = [s for s in self.sources if s.neighbour]

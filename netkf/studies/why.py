@@ -15,6 +15,7 @@ from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.network.deliveries import MessageKey
 from netkf.network.graphs import Topology
+from netkf.runs.outcomes import downtimes
 from netkf.scenario.scenario import Scenario
 from netkf.studies.explanation import GOOD_ENOUGH, InformationSource, Missing, WhatIf, Why
 from netkf.studies.information import (
@@ -117,6 +118,11 @@ def why(
         what_ifs=what_ifs,
         smallest=smallest,
         missing=evidence.missing,
+        down=tuple(
+            one
+            for one in downtimes(run_scenario, run.seed, run.replica)
+            if one.begin <= at < one.end
+        ),
         notes=_replay_notes(evidence, left_out),
     )
 

@@ -1,0 +1,121 @@
+"""What became of the messages and the nodes of one run: matrices of delivery and of shared fate,
+losses over time, and when nodes were down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from netkf.linalg.arrays import FloatArray
+from netkf.network.lives import lifetimes
+from netkf.rng.streams import Streams
+from netkf.scenario.scenario import Scenario
+from netkf.trace.messages import DELIVERED, UNDER_WAY, join_messages
+
+
+class Downtime(NamedTuple):
+    """A node (id) is down from ``begin`` to ``end`` (seconds, inf: to the end of the run), since it
+    made an event of this ``kind``; "" if it was down from the beginning.
+    """
+
+    node: int
+    begin: float
+    end: float
+    kind: str
+
+
+def downtimes(scenario: Scenario, seed: int, replica: int) -> list[Downtime]:
+    """Return when the nodes of a run are down, ordered by node and time."""
+    found = []
+    for node, life in sorted(lifetimes(scenario, Streams(seed, replica)).items()):
+        begin, kind = (math.nan, "") if life.up else (0.0, "")
+        for change in life.changes:
+            if change.up:
+                found.append(Downtime(node, begin, change.time, kind))
+                begin = math.nan
+            else:
+                begin, kind = change.time, change.kind
+        if not math.isnan(begin):
+            found.append(Downtime(node, begin, math.inf, kind))
+    return found
+
+
+class Outcomes(NamedTuple):
+    """The M messages of a run with an outcome: index of ``sender`` and ``receiver`` (M,), ``sent``
+    (M,) in seconds, ``phase`` (M,), and ``heard`` (M,) bool.
+    """
+
+    sender: np.ndarray
+    receiver: np.ndarray
+    sent: FloatArray
+    phase: np.ndarray
+    heard: np.ndarray
+
+
+def outcomes_of(log: np.ndarray, nodes: Sequence[int]) -> Outcomes:
+    """Return the messages of EVENT rows ``log`` that were heard, lost or late."""
+    messages = join_messages(log)
+    messages = messages[messages["outcome"] != UNDER_WAY]
+    return Outcomes(
+        sender=np.searchsorted(nodes, messages["sender"]),
+        receiver=np.searchsorted(nodes, messages["receiver"]),
+        sent=messages["sent"],
+        phase=messages["phase"],
+        heard=messages["outcome"] == DELIVERED,
+    )
+
+
+def delivery_matrix(outcomes: Outcomes, size: int) -> FloatArray:
+    """Return the share of messages from node i to node j of N = ``size`` that were heard, (N, N),
+    nan where none was sent.
+    """
+    code = outcomes.sender * size + outcomes.receiver
+    sent, heard = (
+        np.bincount(code, weights, size * size).reshape(size, size)
+        for weights in (np.ones(len(code)), outcomes.heard)
+    )
+    with np.errstate(invalid="ignore"):
+        return np.asarray(heard / sent)
+
+
+def fate_matrix(outcomes: Outcomes, size: int) -> FloatArray:
+    """Return the correlation of the outcomes of hearers i and j of the same broadcasts, (N, N), nan
+    where they have none or one of them heard all, or nothing.
+
+    Outcomes are taken about the mean of their link, and pooled over the senders.
+    """
+    mean = delivery_matrix(outcomes, size)
+    gap = outcomes.heard - mean[outcomes.sender, outcomes.receiver]
+    order = np.lexsort((outcomes.receiver, outcomes.phase, outcomes.sent, outcomes.sender))
+    sender, sent, phase = (a[order] for a in (outcomes.sender, outcomes.sent, outcomes.phase))
+    again = (np.diff(sender) == 0) & (np.diff(sent) == 0) & (np.diff(phase) == 0)
+    broadcast = np.cumsum(np.append(0, ~again)) if len(order) else np.empty(0, dtype=int)
+    gaps = np.zeros((int(broadcast[-1]) + 1 if len(order) else 0, size))
+    is_hearer = np.zeros_like(gaps)
+    gaps[broadcast, outcomes.receiver[order]] = gap[order]
+    is_hearer[broadcast, outcomes.receiver[order]] = 1.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # Sums over the broadcasts that both may hear.
+        squares = (gaps**2).T @ is_hearer
+        correlation = (gaps.T @ gaps) / np.sqrt(squares * squares.T)
+    return np.where(is_hearer.T @ is_hearer > 0.0, correlation, math.nan)
+
+
+def loss_windows(
+    outcomes: Outcomes, size: int, edges: FloatArray
+) -> tuple[list[tuple[int, int]], FloatArray]:
+    """Return the directed links (indices of sender and receiver) that sent anything, and for each
+    the share lost of what was sent between neighbouring ``edges`` (B + 1,) in seconds, (L, B), nan
+    where nothing was.
+    """
+    codes, link = np.unique(outcomes.sender * size + outcomes.receiver, return_inverse=True)
+    bins = np.clip(np.searchsorted(edges, outcomes.sent, side="right") - 1, 0, len(edges) - 2)
+    cell, count = link * (len(edges) - 1) + bins, len(codes) * (len(edges) - 1)
+    sent, lost = (np.bincount(cell, w, count) for w in (np.ones(len(cell)), ~outcomes.heard))
+    links = [divmod(code, size) for code in codes.tolist()]
+    with np.errstate(invalid="ignore"):
+        return links, (lost / sent).reshape(len(codes), -1)
