@@ -113,7 +113,8 @@ class Run(NotebookTable):
     def plot(self, figure: str = "error") -> Any:
         """Return a figure of the run as a matplotlib Figure, the one of ``netkf plot --figure``:
         overview, error, quantiles, ratios, network, plane, nees, nis, whiteness, age, links,
-        stability, law or delivery. Raises ScenarioError for another name or without matplotlib.
+        stability, law, delivery, matrix, fate or losses. Raises ScenarioError for another name or
+        without matplotlib.
         """
         return plot_by_name(self, figure)
 
