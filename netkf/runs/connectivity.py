@@ -64,6 +64,7 @@ class ConnectivitySink(Sink):
             self._strength = "weak"
         self._heard: list[np.ndarray] = []
         self._sent, self._samples = 0, list[tuple[FloatArray, np.ndarray]]()
+        self._alike = 0
         self.count = self.connected = self.components = 0
         self.up = np.zeros(len(self._ends), dtype=np.int64)
         self.nodes_connected = np.zeros(len(topology.nodes), dtype=np.int64)
@@ -78,6 +79,9 @@ class ConnectivitySink(Sink):
         self, t: FloatArray, x: FloatArray, xhat: FloatArray, P: FloatArray, error: FloatArray
     ) -> None:
         """Look at all links at T times t (T,) in seconds with the true states x (T, n)."""
+        if not self.changes:
+            self._alike += len(t)
+            return
         at_once = max(1, MAX_AT_ONCE // max(1, len(self._ends)))
         for k in range(0, len(t), at_once):
             part = slice(k, k + at_once)
@@ -119,27 +123,30 @@ class ConnectivitySink(Sink):
 
     def _look(self, t: FloatArray, links: np.ndarray) -> None:
         """Count the samples at ``t`` (T,), when these ``links`` (T, D) are up if their ends are."""
-        if not self.changes:  # one look is enough
-            links, weights = links[:1], np.array([len(t)])
-            nodes = np.ones((len(links), len(self.nodes_connected)), dtype=bool)
-        else:
-            nodes = self._nodes_up(t)
-            links &= nodes[:, self._ends[:, 0]] & nodes[:, self._ends[:, 1]]
-            states = np.packbits(np.concatenate([links, nodes], axis=1), axis=1)
-            _, first, weights = np.unique(states, axis=0, return_index=True, return_counts=True)
-            links, nodes = links[first], nodes[first]
-        for up, alive, weight in zip(links, nodes, weights.tolist(), strict=True):
-            _, labels = self._parts(up)
-            sizes = np.bincount(labels[alive], minlength=1)
-            parts = int((sizes > 0).sum())
-            self.count += weight
-            self.connected += weight * (parts == 1)
-            self.components += weight * parts
-            self.up += weight * up
-            self.nodes_connected[alive] += weight * (sizes[labels[alive]] == sizes.max())
+        nodes = self._nodes_up(t)
+        links &= nodes[:, self._ends[:, 0]] & nodes[:, self._ends[:, 1]]
+        states = np.packbits(np.concatenate([links, nodes], axis=1), axis=1)
+        _, first, weights = np.unique(states, axis=0, return_index=True, return_counts=True)
+        for k, weight in zip(first.tolist(), weights.tolist(), strict=True):
+            self._add(links[k], nodes[k], weight)
+
+    def _add(self, up: np.ndarray, alive: np.ndarray, weight: int) -> None:
+        """Count ``weight`` samples with the links ``up`` (D,) and the nodes ``alive`` (N,)."""
+        _, labels = self._parts(up)
+        sizes = np.bincount(labels[alive], minlength=1)
+        parts = int((sizes > 0).sum())
+        self.count += weight
+        self.connected += weight * (parts == 1)
+        self.components += weight * parts
+        self.up += weight * up
+        self.nodes_connected[alive] += weight * (sizes[labels[alive]] == sizes.max())
 
     def finish(self) -> None:
-        """Look at the samples that waited for all messages."""
+        """Look at the samples that waited for all messages, or are alike."""
+        if self._alike:
+            nodes = np.ones(len(self.nodes_connected), dtype=bool)
+            self._add(np.ones(len(self._ends), dtype=bool), nodes, self._alike)
+            self._alike = 0
         for t, links in self._samples:
             newest = np.stack([*self.newest_heard(t)], axis=1) if len(self._ends) else links * 1.0
             interval = self._scenario.horizon * len(self._ends) / max(self._sent, 1)
