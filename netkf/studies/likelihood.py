@@ -105,7 +105,6 @@ class CentralModel:
     def __init__(self, scenario: Scenario, seed: int, replica: int) -> None:
         """Raises ScenarioError for a model that is not linear, or that changes."""
         _require_central(scenario)
-        self._scenario = scenario
         filtering = dataclasses.replace(scenario.filter, algorithm=Central(), estimates="all")
         network = dataclasses.replace(scenario.network, activation=None, radio=None)
         central = dataclasses.replace(scenario, filter=filtering, network=network)
@@ -113,7 +112,6 @@ class CentralModel:
         if not got.readings:
             raise ScenarioError("sensors", "give no readings", None, "add a sensor or rows")
         self._mean, self._cov = central.initial_estimate(central.nodes[0])
-        self._offset = got.origin
         self.variances = tuple(_plant_variances(central)) + tuple(_sensor_variances(central))
         self._lay_rows(central, got)
         self._lay_laws(central, got.times)
@@ -121,13 +119,9 @@ class CentralModel:
     def _lay_rows(self, scenario: Scenario, got: Readings) -> None:
         """Lay out scalar readings: those of a noise that is not diagonal are decorrelated."""
         index = {(v.entry, row): k for k, v in enumerate(self.variances) for row in v.rows}
-        H, of, owners, first = [], [], [], [0]
+        H, of, owners = [], [], []
         y, scales = list[float](), list[float]()
-        k = 0
         for one in got.readings:
-            while k < one.number:
-                first.append(len(y))
-                k += 1
             diagonal = np.diag(one.R)
             entry = scenario.sensor_entries[one.placed.entry]
             is_diagonal = np.array_equal(one.R, np.diag(diagonal))
@@ -138,13 +132,13 @@ class CentralModel:
             y += z.tolist()
             H += list(J)
             of += [index.get((entry, row), -1) for row in one.rows.tolist()]
-            owners += [(got.times[one.number], one.node)] * len(z)
-        while k < len(got.times):
-            first.append(len(y))
-            k += 1
-        self.H, self.y, self._first = np.array(H), np.array(y), np.array(first)
+            owners += [(one.number, got.times[one.number], one.node)] * len(z)
+        numbers = np.array([number for number, _, _ in owners])
+        self.H, self.y = np.array(H), np.array(y)
+        # The first row of each instant, and their number.
+        self._first = np.searchsorted(numbers, np.arange(len(got.times) + 1))
         self._of, self._scales = np.array(of), np.array(scales)
-        self.times, self.nodes = map(np.array, zip(*owners, strict=True))
+        _, self.times, self.nodes = map(np.array, zip(*owners, strict=True))
 
     def _lay_laws(self, scenario: Scenario, times: FloatArray) -> None:
         parts = [v.Q for v in self.variances if v.Q is not None]
@@ -153,8 +147,7 @@ class CentralModel:
             fixed = Q - sum(parts, np.zeros_like(Q))
             slots = np.round(times / scenario.slot_plant.period).astype(int)
             gaps, self._laws = np.unique(np.diff(slots, prepend=0), return_inverse=True)
-            powers = [np.linalg.matrix_power(F, int(g)) for g in gaps]
-            self._F = np.array(powers)
+            self._F = np.array([np.linalg.matrix_power(F, int(g)) for g in gaps])
             self._parts = np.array(
                 [[_accumulate(F, part, int(g)) for part in (*parts, fixed)] for g in gaps]
             )
@@ -205,34 +198,15 @@ class CentralModel:
 
 def _require_central(scenario: Scenario) -> None:
     """Raise ScenarioError unless the central filter is a Kalman filter with one model."""
-    plant = scenario.plant
-    for key, rule, remedy, wrong in (
-        ("plant", "must be linear", "simulate it linearised", not plant.linear),
-        ("sensors", "must be linear", "leave the others out", not scenario.has_linear_sensors),
-        (
-            "sensors",
-            "must take samples: increments have no density of their own",
-            "write sampling = { kind = ... }",
-            bool(scenario.increment_sensors),
-        ),
-        (
-            "plant.schedule",
-            "must be left out: one model is fitted",
-            "fit each stretch of time by itself",
-            len(plant.changes) > 0,
-        ),
-        (
-            "network.lives",
-            "must be left out: a node that is down reads nothing",
-            "fit without it",
-            bool(scenario.network.lives),
-        ),
-        (
-            "filter.model.input",
-            "must be true: an unknown input is no noise",
-            "leave it out",
-            scenario.misses_input,
-        ),
+    plant, leave_out = scenario.plant, "leave it out"
+    increments = "must take samples: increments have no density of their own"
+    for wrong, key, rule, remedy in (
+        (not plant.linear, "plant", "must be linear", "simulate it linearised"),
+        (not scenario.has_linear_sensors, "sensors", "must be linear", "leave the others out"),
+        (scenario.increment_sensors, "sensors", increments, "write sampling = { kind = ... }"),
+        (len(plant.changes), "plant.schedule", "would be a second model", "fit each by itself"),
+        (scenario.network.lives, "network.lives", "would leave out readings", leave_out),
+        (scenario.misses_input, "filter.model.input", "must be true: no noise", leave_out),
     ):
         if wrong:
             raise ScenarioError(key, rule, None, remedy)
