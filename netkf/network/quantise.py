@@ -59,59 +59,35 @@ class Encoder:
         its arrays, in tuples and messages of kernels alike.
         """
         if isinstance(payload, np.ndarray):
-            return self._encode_array(payload)
+            return self._encode_array(payload) if payload.dtype == np.float64 else (payload, 0)
         if hasattr(payload, "fields"):
-            encoded, counts = self._encode_all(payload.fields.values())
-            return payload.with_fields(dict(zip(payload.fields, encoded, strict=True))), counts
+            # Messages of kernels: rows of single payloads, with an axis of lanes behind.
+            rows = {
+                name: [self.encode(row[..., 0]) for row in values]
+                for name, values in payload.fields.items()
+            }
+            arrays = {k: np.array([row for row, _ in v])[..., None] for k, v in rows.items()}
+            return payload.with_fields(arrays), sum(n for v in rows.values() for _, n in v)
         if isinstance(payload, tuple):
-            parts, count = self._encode_all(payload)
+            parts = [self.encode(part) for part in payload]
             make = getattr(payload, "_make", tuple)
-            return make(parts), count
+            return make([part for part, _ in parts]), sum(count for _, count in parts)
         return payload, 0
 
-    def _encode_all(self, values: Any) -> tuple[list[Any], int]:
-        pairs = [self.encode(value) for value in values]
-        return [value for value, _ in pairs], sum(count for _, count in pairs)
-
-    def _encode_array(self, values: np.ndarray) -> tuple[np.ndarray, int]:
-        if values.dtype != np.float64:
-            return values, 0
-        sent = _sent_entries(values)
+    def _encode_array(self, values: FloatArray) -> tuple[FloatArray, int]:
+        is_square = values.ndim == 2 and values.shape[0] == values.shape[1]
+        is_symmetric = is_square and np.array_equal(values, values.T)
+        sent: np.ndarray = np.ones(values.shape, dtype=bool)
+        # Of triangular and symmetric matrices a message needs a triangle.
+        if is_square and (is_symmetric or not np.triu(values, 1).any()):
+            sent = np.tri(len(values), dtype=bool)
+        elif is_square and not np.tril(values, -1).any():
+            sent = np.tri(len(values), dtype=bool).T
         received = values.copy()
         received[sent], count = self._quantisation.apply(values[sent], self._random)
-        mirror = np.swapaxes(received, *_axes(values)) if _is_symmetric(values) else None
-        return (received if mirror is None else np.where(sent, received, mirror)), count
-
-
-def _axes(values: np.ndarray) -> tuple[int, int]:
-    """Return the axes of matrices: those of messages of kernels are between two others."""
-    return (1, 2) if values.ndim == 4 else (-2, -1)
-
-
-def _is_matrix(values: np.ndarray) -> bool:
-    first, second = _axes(values) if values.ndim > 1 else (0, 0)
-    return values.ndim in (2, 4) and values.shape[first] == values.shape[second]
-
-
-def _is_symmetric(values: np.ndarray) -> bool:
-    return _is_matrix(values) and np.array_equal(values, np.swapaxes(values, *_axes(values)))
-
-
-def _sent_entries(values: np.ndarray) -> np.ndarray:
-    """Return a mask of the numbers that a message needs: of triangular and symmetric matrices those
-    of a triangle.
-    """
-    if not _is_matrix(values):
-        return np.ones(values.shape, dtype=bool)
-    n = values.shape[_axes(values)[0]]
-    lower = np.tri(n, dtype=bool)
-    if values.ndim == 4:
-        lower = lower[None, :, :, None]
-    lower = np.broadcast_to(lower, values.shape)
-    upper = np.swapaxes(lower, *_axes(values))
-    if not values[~lower].any() or _is_symmetric(values):
-        return lower
-    return upper if not values[~upper].any() else np.ones(values.shape, dtype=bool)
+        # A diagonal matrix is triangular.
+        is_full = is_symmetric and np.triu(values, 1).any()
+        return np.where(sent, received, received.T) if is_full else received, count
 
 
 def encoders(scenario: Any, streams: Any) -> dict[int, Encoder]:

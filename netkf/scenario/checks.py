@@ -5,6 +5,9 @@ Rules of a single part, such as the range of a number, are checked by the part's
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from netkf.algorithms.filter import compiled_kernels
@@ -225,19 +228,31 @@ def _list_ids(nodes: tuple[int, ...]) -> str:
     return ", ".join(map(str, nodes)) if len(nodes) <= 8 else f"{nodes[0]} .. {nodes[-1]}"
 
 
-def _check_lives(scenario: DerivedScenario) -> None:
+def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) -> None:
+    """Raise ScenarioError unless nodes are in one each of the ``entries`` of ``network.name``, and
+    their sensors take samples.
+    """
     owners: dict[int, int] = {}
-    lives = scenario.network.lives
-    for k, life in enumerate(lives):
-        for node in life.nodes:
+    for k, entry in enumerate(entries):
+        for node in entry.nodes:
+            key = f"network.{name}[{k}].nodes"
             if owners.setdefault(node, k) != k:
-                rule = f"must not have a node of network.lives[{owners[node]}]"
-                remedy = "give each node one entry"
-                raise ScenarioError(f"network.lives[{k}].nodes", rule, node, remedy)
-            if not scenario.slotted and node in scenario.increment_sensors:
-                rule = "cannot have a life where sensors give increments, only where they sample"
+                rule = f"must not have a node of network.{name}[{owners[node]}]"
+                raise ScenarioError(key, rule, node, "give each node one entry")
+            if node in scenario.increment_sensors:
+                rule = (
+                    "cannot have a node whose sensors give increments, only one where they sample"
+                )
                 remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
-                raise ScenarioError(f"network.lives[{k}].nodes", rule, node, remedy)
+                raise ScenarioError(key, rule, node, remedy)
+    if owners and scenario.node_filter.timing.pooled:
+        rule = f"has no meaning for the {filter_name(scenario)}, which is in no node"
+        raise ScenarioError(f"network.{name}", rule, sorted(owners), "remove it")
+
+
+def _check_lives(scenario: DerivedScenario) -> None:
+    lives = scenario.network.lives
+    _check_owners(scenario, "lives", lives)
     kernels, forget = scenario.node_filter.kernels, [life.memory == "lost" for life in lives]
     changes = len(scenario.plant.changes) or not scenario.plant.linear
     if (
@@ -249,9 +264,6 @@ def _check_lives(scenario: DerivedScenario) -> None:
         rule = "must be kept where late readings are used and the plant changes or is not linear"
         remedy = 'write "kept", or late = "drop" in [filter]'
         raise ScenarioError(f"network.lives[{forget.index(True)}].memory", rule, "lost", remedy)
-    if owners and scenario.node_filter.timing.pooled:
-        rule = f"has no meaning for the {filter_name(scenario)}, which is in no node"
-        raise ScenarioError("network.lives", rule, sorted(owners), "remove it")
 
 
 def _check_shared_states(scenario: DerivedScenario) -> None:
@@ -268,30 +280,18 @@ def _check_shared_states(scenario: DerivedScenario) -> None:
 
 
 def _check_clocks(scenario: DerivedScenario) -> None:
-    owners: dict[int, int] = {}
-    for k, entry in enumerate(scenario.network.clocks):
-        key = f"network.clocks[{k}].nodes"
-        for node in entry.nodes:
-            if owners.setdefault(node, k) != k:
-                rule = f"must not have a node of network.clocks[{owners[node]}]"
-                raise ScenarioError(key, rule, node, "give each node one entry")
-            if node in scenario.increment_sensors:
-                rule = "cannot have a clock where sensors give increments, only where they sample"
-                remedy = 'write sampling = { kind = "periodic", period = ... } in its [[sensors]]'
-                raise ScenarioError(key, rule, node, remedy)
-            placed = scenario.placed_sensors.get(node, ())
-            if any(scenario.sensors[p.entry].record is not None for p in placed):
-                rule = "cannot have a clock where readings are recorded, with the stamps they have"
-                raise ScenarioError(key, rule, node, "correct the times of the table instead")
-    why = None
+    clocks, why = scenario.network.clocks, None
+    _check_owners(scenario, "clocks", clocks)
+    nodes = [node for entry in clocks for node in entry.nodes]
+    placed = [p for node in nodes for p in scenario.placed_sensors.get(node, ())]
     if scenario.slotted:
         why = "belongs to continuous time: slots begin for all nodes at once"
-    elif scenario.node_filter.timing.pooled:
-        why = f"has no meaning for the {filter_name(scenario)}, which is in no node"
+    elif any(scenario.sensors[p.entry].record is not None for p in placed):
+        why = "cannot be of nodes whose readings are recorded, with the stamps they have"
     elif scenario.input_responses is not None or len(scenario.followed_changes):
         why = "cannot stand beside inputs or changes of a linear plant that filters know"
-    if owners and why is not None:
-        raise ScenarioError("network.clocks", why, sorted(owners), "remove it")
+    if clocks and why is not None:
+        raise ScenarioError("network.clocks", why, sorted(nodes), "remove it")
 
 
 def _check_faults(scenario: DerivedScenario) -> None:
