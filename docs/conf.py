@@ -42,7 +42,7 @@ nitpick_ignore_regex = [
     (
         r"py:class",
         r"ndarray|ArrayLike|FloatArray|IntArray|Edge|Entry|Link|SourceFile|Executor|Path"
-        r"|Progress|Coupling|StackedStates|Key|DiffusionChange|LinearChange|dict\[.*",
+        r"|Progress|Coupling|StackedStates|Key|DiffusionChange|LinearChange|Course|Fault|Drawn|dict\[.*",
     ),
     # parts of the inside: states of filters, paths of sensors, base classes without public members
     (r"py:class", r"netkf\.(algorithms|core|linalg|rng|network|plants|engines|trace|scenario)\..*"),
