@@ -60,6 +60,7 @@ from netkf.scenario.registry import kind_name
 from netkf.scenario.scenario import Scenario
 from netkf.theory import assumptions
 from netkf.theory.common.blocks import have_one_view, run_of_view, scenario_of_view
+from netkf.theory.common.columns import has_columns
 from netkf.theory.common.evidence import CONSISTENCY, LIVES
 from netkf.trace.nees import without_padding
 from netkf.trace.run import Run
@@ -136,7 +137,7 @@ def find_checks(scenario: Scenario) -> PaperChecks:
     if not scenario.is_linear:
         return WITHOUT_PAPER
     # Papers are about plants that do not change and are drawn; the equations hold for all.
-    if len(scenario.plant.changes) or not scenario.is_random:
+    if len(scenario.plant.changes) or not scenario.is_random or scenario.network.lives:
         return UNDER_CLOCKS
     promised = promised_filter(scenario.filter.algorithm)
     # Without messages the equations of a Kalman filter are all that is promised.
@@ -472,8 +473,11 @@ def _require_earlier(scenario: Scenario, earlier: Verdict | None, seed: int, run
 
 def _require_laws(scenario: Scenario) -> None:
     find_checks(scenario)
-    if scenario.network.lives:
-        raise TheoryError(f"{LIVES}, so nothing is promised; {CONSISTENCY}")
+    if scenario.network.lives and not (
+        scenario.is_linear and has_columns(scenario) and scenario.views is None
+    ):
+        rule = "promises survive it of filters whose verbs are affine kernels of one linear state"
+        raise TheoryError(f"{LIVES}: {rule}; {CONSISTENCY}")
     if scenario.network.clocks or scenario.faults:
         evidence = scenario.departures[0][1]
         raise TheoryError(f"{evidence}, so nothing is promised; {CONSISTENCY}")

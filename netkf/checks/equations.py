@@ -33,7 +33,7 @@ from netkf.core.errors import TheoryError
 from netkf.network.clocks import LinkClock
 from netkf.scenario.records import unjudged_line
 from netkf.scenario.scenario import Scenario
-from netkf.theory.common.evidence import nonlinear_rows
+from netkf.theory.common.evidence import MEMORY, nonlinear_rows
 from netkf.theory.one_bit.covariances import bit_covariances
 from netkf.trace.run import Run
 
@@ -70,7 +70,7 @@ ERRORS = (
 UPPER_BOUND = Promise(
     "P is at least the covariance of the error, given the events",
     "derived",
-    (KNOWN, START, REACH),
+    (KNOWN, START, REACH, MEMORY),
     check_upper_bound,
     exact=True,
 )
@@ -109,7 +109,9 @@ def _mass_conserved(samples: RunSamples, level: float) -> Finding:
     return compare_identities(drift, np.ones_like(drift), terms, MASS_TOLERANCE, message)
 
 
-MASS_CONSERVED = Promise("mass is conserved", "P (67), derived", (), _mass_conserved, exact=True)
+MASS_CONSERVED = Promise(
+    "mass is conserved", "P (67), derived", (MEMORY,), _mass_conserved, exact=True
+)
 
 
 def summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
@@ -122,7 +124,9 @@ def summarise_drift(scenario: Scenario, run: Run) -> ReplicaSummary:
 
 def _promises_under_clocks(scenario: Scenario) -> tuple[Promise, ...]:
     conserved = with_promised_filter(scenario).node_filter.analysis.conserved
-    mass = () if conserved is nothing_conserved else (MASS_CONSERVED,)
+    # In slots mass is lost with messages, as P says, and who is down hears none.
+    dissipates = conserved is nothing_conserved or (scenario.slotted and scenario.network.lives)
+    mass = () if dissipates else (MASS_CONSERVED,)
     bound = () if design_of(scenario) == "smaller" else (UPPER_BOUND,)
     unjudged = unjudged_line(scenario)
     left_out = Promise(

@@ -14,6 +14,7 @@ from netkf.theory.common.evidence import (
     TRUE_MODEL,
     AssumptionRow,
     judge_plant,
+    life_rows,
     no_channel_law,
     nonlinear_rows,
     true_model_row,
@@ -64,7 +65,7 @@ def assumption_rows(scenario: Scenario) -> list[AssumptionRow]:
         rows = [row for row in assumption_rows(scenario.last_piece) if row[0] != TRUE_MODEL]
         known = true_model_row(scenario, ANY, "the same matrices at all times")
         return [(CONSTANT, ANY, False, evidence), known, *rows]
-    nonlinear = nonlinear_rows(scenario)
+    nonlinear = [*life_rows(scenario), *nonlinear_rows(scenario)]
     if not scenario.plant.linear:
         return [*nonlinear, *start_rows(scenario, ANY)]
     paper_rows = theory_of(scenario).slot_rows

@@ -312,6 +312,9 @@ def network_promises(samples: PartSamples) -> list[Promise]:
     that the runs can test; parts without a stated law have none.
     """
     scenario = samples.scenario
+    if scenario.network.lives:
+        # Who is down does not tick, and what it would hear is lost.
+        return _clock_promises(SENSORS, samples)
     promises = [*_clock_promises(NETWORK, samples), *_clock_promises(SENSORS, samples)]
     drawn = samples.pairs is not None and scenario.node_filter.timing.talks
     if drawn and pair_probabilities(scenario) is not None:

@@ -55,9 +55,13 @@ TIME_TOLERANCE = 1e-9
 def event_fault(scenario: Scenario, run: Run) -> str:
     """Return one line about the first fault of the record of a run's events; empty without one."""
     # Links are looked at at ticks and at samples, before or after other events of the instant.
-    log = run.log[run.log["kind"] != CODES["link"]]
+    others = ("link", "crash", "restart", "join", "leave")
+    log = run.log[~np.isin(run.log["kind"], [CODES[kind] for kind in others])]
     rules = [_ordered, _numbered, _decided, _absorbed]
     rules += [_read_in_slots, _sent_in_slots] if scenario.slotted else [_read, _ticked, _caused]
+    if scenario.network.lives:
+        # What is read, sent, lost and absorbed depends on who is up.
+        log, rules = log[log["kind"] != LOST], rules[:2]
     for rule in rules:
         for fault in rule(scenario, run, log):
             return fault

@@ -18,6 +18,7 @@ UNKNOWN_LAW = "the state or readings are recorded: their law is not known"
 FOLLOWS_DATA = "not linear in the state: gains, P and errors follow the data"
 LIVES = "nodes are down at times (network.lives)"
 CONSISTENCY = "netkf consistency compares P with the errors of many runs"
+MEMORY = "nodes keep what they know"
 TRUE_MODEL = "the filters know the plant and the sensors"
 
 
@@ -50,6 +51,24 @@ def _refused_spread(scenario: Scenario) -> str:
         f"; after a healthy one that is ignored the error covariance is P + (g - 1) K S K', "
         f"g = {spreads}"
     )
+
+
+def life_rows(scenario: Scenario) -> list[AssumptionRow]:
+    """Return rows on nodes that are down at times; [] without ``network.lives``."""
+    rows: list[AssumptionRow] = []
+    if scenario.network.lives:
+        evidence = f"{LIVES}: equations hold along the events, bounds on the law of arrivals do not"
+        rows.append(("nodes are up all the time", "all papers", False, evidence))
+    lost = [life.nodes for life in scenario.network.lives if life.memory == "lost"]
+    forgetful = sorted(node for nodes in lost for node in nodes)
+    if forgetful:
+        nodes = ", ".join(map(str, forgetful[:5])) + ", ..." * (len(forgetful) > 5)
+        evidence = (
+            f"node {nodes} begins again with the mean and covariance of time 0, whatever the state "
+            "is by then: P may be too small after that"
+        )
+        rows.append((MEMORY, "all papers", False, evidence))
+    return rows
 
 
 def require_linear(scenario: Scenario, accepted: str = "") -> None:
