@@ -29,6 +29,8 @@ for _kind, _action in (
     ACTIONS[CODES[_kind]] = _action
 OF_SENDER = np.isin(np.arange(len(CODES)), [CODES["send"], CODES["lost"]])
 """Kinds of events of a message that are events of its sender; others are of the receiver."""
+MAX_DENSE = 1000
+"""Nodes up to which links are found in a table of all pairs."""
 CAPACITY = 64
 """Messages under way for which there is room at first."""
 
@@ -96,6 +98,10 @@ class Ages:
         self._forgetful = np.isin(self._nodes, forgetful)
         ends = np.searchsorted(self._nodes, np.array(links, dtype=np.int64).reshape(-1, 2))
         self._links = ends[:, 0] * len(nodes) + ends[:, 1]
+        self._link: np.ndarray | None = None
+        if len(nodes) <= MAX_DENSE:
+            self._link = np.zeros(len(nodes) ** 2, dtype=np.int64)
+            self._link[self._links] = np.arange(len(links))
         shape = len(nodes), len(sources)
         own = np.full(len(nodes), -1)
         own[np.searchsorted(self._nodes, sources)] = np.arange(len(sources))
@@ -129,25 +135,41 @@ class Ages:
 
     def add(self, rows: np.ndarray) -> None:
         """Follow the next block of EVENT ``rows`` (K,)."""
-        action = ACTIONS[rows["kind"]]
-        rows, action = rows[action > 0], action[action > 0]
-        node, peer = (np.searchsorted(self._nodes, rows[name]) for name in ("node", "peer"))
-        time, of_sender = rows["t"].copy(), OF_SENDER[rows["kind"]]
+        kept = np.flatnonzero(ACTIONS[rows["kind"]])
+        # Column by column: copies of whole rows take longer.
+        kind, ids, peers, t, number, phase = (
+            rows[name][kept] for name in ("kind", "node", "peer", "t", "message", "phase")
+        )
+        action, time = ACTIONS[kind], t
+        node, peer = self._index(ids), self._index(peers)
         # A message has a link, other events have none.
-        sender, receiver = np.where(of_sender, node, peer), np.where(of_sender, peer, node)
-        link = np.searchsorted(self._links, sender * len(self._nodes) + receiver)
-        sensed = action == SENSE
-        time[sensed] = self._read_at(rows["node"][sensed], rows["t"][sensed])
-        action[sensed & np.isnan(time)] = 0
-        action[(action == FORGET) & ~self._forgetful[np.minimum(node, len(self._nodes) - 1)]] = 0
-        phases = {phase: self._tells_all(phase) for phase in np.unique(rows["phase"]).tolist()}
-        tells_all = np.isin(rows["phase"], [phase for phase, whole in phases.items() if whole])
-        columns = action, time, node, link, rows["message"].copy(), tells_all
+        of_sender = OF_SENDER[kind]
+        code = np.where(of_sender, node, peer) * len(self._nodes)
+        code += np.where(of_sender, peer, node)
+        link = np.searchsorted(self._links, code) if self._link is None else self._link[code]
+        sensed = np.flatnonzero(action == SENSE)
+        time[sensed] = self._read_at(ids[sensed], t[sensed])
+        action[sensed[np.isnan(time[sensed])]] = 0
+        if self._forgetful.any():
+            action[(action == FORGET) & ~self._forgetful[node]] = 0
+        else:
+            action[action == FORGET] = 0
+        tells_all = np.ones(len(phase), dtype=bool)
+        for one in range(int(phase.min(initial=0)), int(phase.max(initial=0)) + 1):
+            if not self._tells_all(one):
+                tells_all[phase == one] = False
+        columns = action, time, node, link, number, tells_all
         done = 0
-        while done < len(rows):
+        while done < len(kept):
             done = follow(self._state, *columns, done)
-            if done < len(rows):
+            if done < len(kept):
                 self._grow(len(self._columns["number"]))
+
+    def _index(self, ids: np.ndarray) -> np.ndarray:
+        """Return the indices (K,) of nodes, of -1 any."""
+        if int(self._nodes[-1]) == len(self._nodes) - 1 and self._nodes[0] == 0:
+            return np.maximum(ids, 0)
+        return np.searchsorted(self._nodes, ids)
 
     def finish(self, end: float) -> tuple[FloatArray, FloatArray]:
         """Return the mean from 0 to ``end`` seconds and the largest value (N, S) of the age of each
