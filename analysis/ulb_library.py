@@ -17,7 +17,9 @@ the same knowledge of that mote.
 """
 
 import argparse
-import tomllib
+import re
+import shutil
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,6 @@ import scipy.linalg
 from scipy.optimize import minimize
 
 import netkf
-from netkf.scenario.reading import from_table
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 FILE, DATA = SCENARIOS / "ulb_library.toml", SCENARIOS / "data" / "ulb_library"
@@ -46,6 +47,28 @@ FILTERS = {
     },
     "all readings": {"filter": {"kind": "central"}},
 }
+
+# As likely as any for the readings that filters are given: what --offsets prints.
+MOTES = """
+[[plants]]
+name = "rate"
+kind = "unknown"
+A    = [[-8.04e-4]]
+B    = [[1.51e-6]]
+mean = [0.0]
+cov  = [[2.5e-7]]
+
+[[plants]]
+name     = "mote"
+nodes    = [1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20]
+kind     = "unknown"
+A        = [[0.0]]
+B        = [[1.149e-3]]
+mean     = [22.0]
+cov      = [[0.077]]
+coupling = [{ from = "rate", A = [[1.0]] }]
+
+"""
 
 
 def raw():
@@ -153,42 +176,49 @@ def errors():
     return found
 
 
+def with_offsets(folder):
+    """Return the scenario, written into a folder with its tables, with MOTES in place of its plant
+    and with the first readings of all motes.
+    """
+    before, rest = FILE.read_text().split("[plant]\n")
+    sensors, network = rest[rest.index("[[sensors]]") :].split("[network]")
+    for name in ("H", "R"):
+        sensors = re.sub(rf"^{name} .*$", "", sensors, flags=re.MULTILINE)
+    sensors = re.sub(
+        r"^nodes", 'of = "mote"\nH = [[1.0]]\nR = [[8.62e-5]]\nnodes', sensors, flags=re.M
+    )
+    held = sensors[sensors.rindex("[[sensors]]") :]
+    first = held.replace("held_out.csv", "first.csv").replace("= true", "= false")
+    shutil.copytree(DATA, folder / "data" / "ulb_library")
+    (folder / FILE.name).write_text(f"{before}{MOTES}{sensors}{first}[network]{network}")
+    return netkf.load(folder / FILE.name)
+
+
 def offsets(fit=True):
     """Give each mote a temperature of its own, which follows the rate that all share and walks at
     random; fit the three variances, unless ``fit`` is False, and print the RMS errors at the
     held-out motes over the second hour, whose first readings filters are given; return these.
     """
-    table = tomllib.loads(FILE.read_text())
-    del table["plant"]
-    nodes = sorted(int(node) for node in raw()[0].node.unique())
-    # As likely as any for the readings that filters are given: what --offsets prints.
-    rate = {"A": [[-8.04e-4]], "B": [[1.51e-6]], "mean": [0.0], "cov": [[2.5e-7]]}
-    mote = {"A": [[0.0]], "B": [[1.149e-3]], "mean": [22.0], "cov": [[0.077]]}
-    mote["coupling"] = [{"from": "rate", "A": [[1.0]]}]
-    table["plants"] = [
-        {"name": "rate", "kind": "unknown", **rate},
-        {"name": "mote", "nodes": nodes, "kind": "unknown", **mote},
-    ]
-    given, held = table["sensors"]
-    of_mote = {"of": "mote", "H": [[1.0]], "R": [[8.62e-5]]}
-    first = {**held, "path": "data/ulb_library/first.csv", "held_out": False}
-    table["sensors"] = [{**one, **of_mote} for one in (given, first, held)]
-    scenario = from_table(table, SCENARIOS)
-    if fit:
-        alone = scenario.replace({"sensors.1.held_out": True})
-        found = netkf.fit_noise(alone)
-        print(found.table.to_string(index=False))
-        print(f"log-likelihood {found.log_likelihood:.1f}, of the scenario", end=" ")
-        print(f"{netkf.log_likelihood(netkf.load(FILE)):.1f}")
-    errors = {}
-    for name, changes in {"diffusion": {}, "all readings": {"filter": {"kind": "central"}}}.items():
-        run = netkf.simulate(scenario.replace({"probe": MINUTE, **changes}))
-        readings = raw()[0].pivot(index="minute", columns="node", values="y0")
-        blocks = {n: run.block("mote", n) for n in HELD_OUT}
-        estimates = {n: pd.Series(block.xhat[1:, 0]) for n, block in blocks.items()}
-        errors[name] = line(f"{name}, an offset for each mote", estimates, readings)
-        claimed = np.sqrt(np.mean([block.P[60:, 0, 0] for block in blocks.values()]))
-        print(f"{'claims':>38}{'':24} {claimed:7.3f}")
+    with tempfile.TemporaryDirectory() as folder:
+        scenario = with_offsets(Path(folder))
+        if fit:
+            alone = scenario.replace({"sensors.2.held_out": True})
+            found = netkf.fit_noise(alone)
+            print(found.table.to_string(index=False))
+            print(f"log-likelihood {found.log_likelihood:.1f}, of the scenario", end=" ")
+            print(f"{netkf.log_likelihood(netkf.load(FILE)):.1f}")
+        errors = {}
+        for name, changes in {
+            "diffusion": {},
+            "all readings": {"filter": {"kind": "central"}},
+        }.items():
+            run = netkf.simulate(scenario.replace({"probe": MINUTE, **changes}))
+            readings = raw()[0].pivot(index="minute", columns="node", values="y0")
+            blocks = {n: run.block("mote", n) for n in HELD_OUT}
+            estimates = {n: pd.Series(block.xhat[1:, 0]) for n, block in blocks.items()}
+            errors[name] = line(f"{name}, an offset for each mote", estimates, readings)
+            claimed = np.sqrt(np.mean([block.P[60:, 0, 0] for block in blocks.values()]))
+            print(f"{'claims':>38}{'':24} {claimed:7.3f}")
     return errors
 
 
