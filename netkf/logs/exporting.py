@@ -124,7 +124,7 @@ def _positions(scenario: Scenario, run: Run) -> Files:
     else:
         truth = scenario.continuous_truth(streams)
         sampled = all_sample_times(scenario.sample_times(streams))
-        times = [[0.0], tick_times(scenario, streams), sampled, scenario.times]
+        times: list[Any] = [[0.0], tick_times(scenario, streams), sampled, scenario.times]
         looks = [(t, t) for t in np.unique(np.concatenate(times)).tolist()]
     lines = ["t,node,x,y"]
     for t, when in looks:

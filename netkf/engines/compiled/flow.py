@@ -384,7 +384,7 @@ class FlowRun:
 
     def _change_life(self) -> None:
         state, lives, k = self._state, self._draws.lives, self._state.life_at
-        time, h, kind = float(lives.t[k]), int(lives.index[k]), int(lives.kind[k])
+        time, h, kind = float(lives.t[k]), int(lives.node[k]), int(lives.kind[k])
         node = self._scenario.nodes[h]
         state.life_at = k + 1
         if state.traced:

@@ -19,13 +19,13 @@ from netkf.trace.schema import CODES
 class LifeTable(NamedTuple):
     """The K changes of one run by (time, node): when nodes go up or down.
 
-    t, index, kind : (K,), seconds, index of the node, and kind of the event
+    t, node, kind : (K,), seconds, index of the node, and kind of the event
     restarts : (K,) bool, whether the node goes up and begins again
     down : (N,), 1 for nodes that are down at first; (1,) without lives
     """
 
     t: FloatArray
-    index: IntArray
+    node: IntArray
     kind: IntArray
     restarts: np.ndarray
     down: np.ndarray
@@ -36,15 +36,15 @@ class LifeTable(NamedTuple):
         """
         if not len(self.t) and not self.down.any():
             return np.zeros(len(times), dtype=bool)
-        passed = np.searchsorted(self.t[self.index == node], times, side="right")
+        passed = np.searchsorted(self.t[self.node == node], times, side="right")
         down: np.ndarray = (passed + self.down[node]) % 2 == 1
         return down
 
 
+NOBODY: IntArray = np.zeros(0, dtype=np.int64)
 NO_LIVES = LifeTable(
-    np.zeros(0), *(np.zeros(0, dtype=np.int64) for _ in range(2)), np.zeros(0, dtype=bool),
-    np.zeros(1, dtype=np.int64),
-)  # fmt: skip
+    np.zeros(0), NOBODY, NOBODY, np.zeros(0, dtype=bool), np.zeros(1, dtype=np.int64)
+)
 
 
 def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
@@ -57,11 +57,11 @@ def life_table(scenario: Scenario, streams: Streams) -> LifeTable:
         for node, life in lives.items()
         for change in life.changes
     )
-    t, node, kind, restarts = zip(*rows, strict=True) if rows else ((),) * 4
+    t, nodes, kinds, restarts = zip(*rows, strict=True) if rows else ((),) * 4
     down = np.zeros(len(index), dtype=np.int64)
     down[[index[i] for i, life in lives.items() if not life.up]] = 1
-    integers = (np.array(column, dtype=np.int64) for column in (node, kind))
-    return LifeTable(np.array(t, dtype=float), *integers, np.array(restarts, dtype=bool), down)
+    node, kind = (np.array(column, dtype=np.int64) for column in (nodes, kinds))
+    return LifeTable(np.array(t, dtype=float), node, kind, np.array(restarts, dtype=bool), down)
 
 
 def links_of_lives(

@@ -122,7 +122,7 @@ def slot_restarts(scenario: Scenario, lives: LifeTable) -> dict[int, list[int]]:
     """Return by slot the indices of the nodes that begin again when it begins."""
     found: dict[int, list[int]] = {}
     slots = scenario.slot_plant.slots_of(lives.t[lives.restarts])
-    for slot, h in zip(slots.tolist(), lives.index[lives.restarts].tolist(), strict=True):
+    for slot, h in zip(slots.tolist(), lives.node[lives.restarts].tolist(), strict=True):
         found.setdefault(slot, []).append(h)
     return found
 
@@ -421,7 +421,7 @@ class SlotEvents:
         lives = self.lives
         while self._life_at < len(lives.t) and lives.t[self._life_at] <= until:
             k, self._life_at = self._life_at, self._life_at + 1
-            node = self._scenario.nodes[lives.index[k]]
+            node = self._scenario.nodes[lives.node[k]]
             now = float(lives.t[k])
             if now < self._scenario.horizon:
                 self._append_row((now, int(lives.kind[k]), node, -1, -1, -1, NAN))

@@ -322,7 +322,7 @@ def _arrivals(
         slot, step = places[w, number]
         if slot in steps:
             # Who goes down before the step ends has lost what arrived.
-            changes = lives.t[lives.index == nodes[node]]
+            changes = lives.t[lives.node == nodes[node]]
             if ((changes > t) & (changes <= steps[slot][step].end)).any():
                 continue
         arrivals.setdefault(slot, np.zeros(shape, dtype=np.uint8))[step, w] = 1
