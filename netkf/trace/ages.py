@@ -169,7 +169,7 @@ class Ages:
         """Return the indices (K,) of nodes, of -1 any."""
         if int(self._nodes[-1]) == len(self._nodes) - 1 and self._nodes[0] == 0:
             return np.maximum(ids, 0)
-        return np.searchsorted(self._nodes, ids)
+        return np.asarray(np.searchsorted(self._nodes, ids))
 
     def finish(self, end: float) -> tuple[FloatArray, FloatArray]:
         """Return the mean from 0 to ``end`` seconds and the largest value (N, S) of the age of each
