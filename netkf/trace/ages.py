@@ -168,7 +168,7 @@ class Ages:
     def _index(self, ids: np.ndarray) -> np.ndarray:
         """Return the indices (K,) of nodes, of -1 any."""
         if int(self._nodes[-1]) == len(self._nodes) - 1 and self._nodes[0] == 0:
-            return np.maximum(ids, 0)
+            return np.asarray(np.maximum(ids, 0))
         return np.asarray(np.searchsorted(self._nodes, ids))
 
     def finish(self, end: float) -> tuple[FloatArray, FloatArray]:
