@@ -560,7 +560,14 @@ class BlockCrossCovariances(Filter):
 
     steps: int = field(integer(low=1, high=MAX_STEPS), default=8)
 
-    needs = Needs(one_way=True, samples=True, blocks=True, own_blocks=True, check=require_both_ways)
+    needs = Needs(
+        one_way=True,
+        samples=True,
+        blocks=True,
+        own_blocks=True,
+        memory="whose neighbours keep factors of the estimate that is forgotten",
+        check=require_both_ways,
+    )
     # To one receiver, of whom it says two factors and two cores.
     analysis = Analysis(
         paper="block_cross_covariances",

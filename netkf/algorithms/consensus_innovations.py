@@ -451,6 +451,7 @@ class ConsensusInnovations(Filter):
             fixed_sensors=True,
             linear_plant=True,
             every_reading=True,
+            awake=True,
             common_start=True,
             network=True,
             notes=self._scenario_notes,

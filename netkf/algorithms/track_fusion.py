@@ -342,7 +342,9 @@ class BarShalomCampo(Filter):
         fixed_sensors=True,
         linear_plant=True,
         every_reading=True,
+        awake=True,
         common_start=True,
+        memory="whose cross-covariances are those of tracks that began together",
         network=True,
     )
     kernels = Kernels(

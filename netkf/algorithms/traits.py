@@ -19,6 +19,7 @@ class Needs:
     inverts_under_clocks : the same, in continuous time only
     one_model : why it cannot follow changes of the plant, the end of a sentence; "": it can
     one_model_under_clocks : the same, in continuous time only
+    memory : why its nodes may not forget what they know, the end of a sentence; "": they may
     samples : it cannot use increment sensors
     fixed_sensors : it computes with H before there are readings, so H must not vary: no nonlinear
                     sensors, regressors or columns phi
@@ -26,6 +27,7 @@ class Needs:
                    linear
     every_reading : in slots its gains and P count a reading of every sensor in every slot, so that
                     no row of a recorded sensor may be missing
+    awake : in slots its P counts the readings of nodes that are down, too
     common_start : all nodes must begin with the same mean and the same covariance
     ways_between_all : a directed graph must lead from every node to every other one
     reads_what_it_sends : a node uses of its readings only what it sends, so that every node with a
@@ -53,10 +55,12 @@ class Needs:
     inverts_under_clocks: bool = False
     one_model: str = ""
     one_model_under_clocks: str = ""
+    memory: str = ""
     samples: bool = False
     fixed_sensors: bool = False
     linear_plant: bool = False
     every_reading: bool = False
+    awake: bool = False
     common_start: bool = False
     ways_between_all: bool = False
     reads_what_it_sends: bool = False

@@ -264,6 +264,11 @@ def _check_lives(scenario: DerivedScenario) -> None:
         rule = "must be kept where late readings are used and the plant changes or is not linear"
         remedy = 'write "kept", or late = "drop" in [filter]'
         raise ScenarioError(f"network.lives[{forget.index(True)}].memory", rule, "lost", remedy)
+    needs = scenario.node_filter.needs
+    if any(forget) and needs.memory:
+        rule = f"must be kept with the {filter_name(scenario)}, {needs.memory}"
+        key = f"network.lives[{forget.index(True)}].memory"
+        raise ScenarioError(key, rule, "lost", 'write "kept", or choose another filter')
 
 
 def _check_shared_states(scenario: DerivedScenario) -> None:

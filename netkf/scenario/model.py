@@ -71,6 +71,7 @@ from netkf.scenario.time_grid import choose_grid, snap_limits
 
 EVERY_READING, HEALTHY = "every reading is used", "all sensors are healthy"
 RIGHT_CLOCKS = "clocks of nodes are right"
+ALL_READ = "nodes take all readings that gains and P count"
 """Assumptions of all filters, see ``ScenarioModel.departures``."""
 
 
@@ -407,6 +408,13 @@ class ScenarioModel(Component):
                 "time, and P does not count it"
             )
             found.append((RIGHT_CLOCKS, evidence))
+        down = {node for life in self.network.lives for node in life.nodes}
+        if self.slotted and self.node_filter.needs.awake and down & set(self.placed_sensors):
+            evidence = (
+                "nodes with sensors are down at times (network.lives), and gains and P count their "
+                "readings all the same: P is too small"
+            )
+            found.append((ALL_READ, evidence))
         if self.faults:
             nodes = ", ".join(map(str, list(self.faults)[:5])) + ", ..." * (len(self.faults) > 5)
             evidence = (

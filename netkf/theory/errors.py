@@ -15,7 +15,7 @@ from netkf.algorithms.filter import takes_columns
 from netkf.algorithms.registry import built_in_class, overridden
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray
-from netkf.scenario.model import RIGHT_CLOCKS
+from netkf.scenario.model import ALL_READ, RIGHT_CLOCKS
 from netkf.scenario.scenario import Scenario
 from netkf.theory.common.arrivals import with_last_exchanges
 from netkf.theory.common.block_columns import ClockBlocks, SlotBlocks
@@ -124,7 +124,7 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         )
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
-    require_linear(scenario, accepted=RIGHT_CLOCKS)
+    require_linear(scenario, accepted=(RIGHT_CLOCKS, ALL_READ))
     forgets = any(life.memory == "lost" for life in scenario.network.lives)
     in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
     reasons = [evidence for _, evidence in scenario.departures]

@@ -322,7 +322,8 @@ def combined(folder, slots, filter_, k, plant=""):
         'kind = "duty"\nnodes = [0, 2]\nperiod = 3.0\nup = 2.0\nphase = 1.0',
         'kind = "recorded"\nnodes = [1, 2]\npath = "l.csv"',
     )[k % 3]
-    lives = f'[[network.lives]]\n{life}\nmemory = "{("lost", "kept")[k // 3 % 2]}"'
+    memory = "kept" if filter_ == "push-sum" else ("lost", "kept")[k // 3 % 2]
+    lives = f'[[network.lives]]\n{life}\nmemory = "{memory}"'
     (folder / "l.csv").write_text(TABLE)
     ends = [(i, j) for i, j in ((0, 1), (1, 0), (1, 2), (2, 1)) for _ in range(12)]
     rows = [f"{i},{j},{m % 12},{(m * m // 3) % 2}" for m, (i, j) in enumerate(ends)]
@@ -521,6 +522,32 @@ def test_refusals(scenario_of, case):
         scenario_of(CLOCKS, recorded()[0], {"l.csv": rows})
     assert words in str(caught.value)
     assert "network.lives[0].path" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("slots", "filter_"),
+    [
+        (True, 'kind = "push-sum"\ngamma = 2\ndelta = 3.0'),
+        (False, 'kind = "push-sum"'),
+        (True, 'kind = "track-fusion"\nrule = "cross-covariance"'),
+    ],
+)
+def test_nodes_whose_memory_is_that_of_others_too_do_not_forget(scenario_of, slots, filter_):
+    text = (SLOTS if slots else CLOCKS).replace('kind = "{filter}"', filter_)
+    with pytest.raises(netkf.ScenarioError, match=r"network.lives\[0\].memory: must be kept with"):
+        scenario_of(text, *recorded("lost"))
+    assert scenario_of(text, *recorded("kept")).network.lives
+
+
+def test_readings_that_are_counted_but_not_taken(scenario_of):
+    """P of these filters counts a reading of every sensor in every slot."""
+    text = SLOTS.replace('kind = "{filter}"', 'kind = "push-sum"\ngamma = 2\ndelta = 3.0')
+    scenario = scenario_of(text.replace("F = [[1.1]]", "F = [[0.9]]"), *recorded("kept"))
+    assert "gains and P count their readings all the same" in scenario.departures[0][1]
+    with pytest.raises(netkf.TheoryError, match=r"P is too small, so nothing is promised"):
+        netkf.check(scenario, runs=10)
+    at_rest = scenario_of(text.replace("nodes = [0, 1, 2]\nH", "nodes = [0]\nH"), *recorded("kept"))
+    assert not at_rest.departures
 
 
 def test_a_node_has_one_life(scenario_of):

@@ -71,12 +71,12 @@ def life_rows(scenario: Scenario) -> list[AssumptionRow]:
     return rows
 
 
-def require_linear(scenario: Scenario, accepted: str = "") -> None:
+def require_linear(scenario: Scenario, accepted: tuple[str, ...] = ()) -> None:
     """Raise TheoryError if dynamics or readings are not linear, or anything departs from what
-    filters assume but for the assumption ``accepted``.
+    filters assume but for the assumptions ``accepted``.
     """
     for assumption, *_, evidence in nonlinear_rows(scenario):
-        if assumption != accepted:
+        if assumption not in accepted:
             raise TheoryError(evidence)
 
 
