@@ -49,7 +49,7 @@ nitpick_ignore_regex = [
     (
         r"py:class",
         r"netkf\.theory\..*|.*\.(ReplicaResult|PromisedTraces|Probe|Target|MessageKey|Quantity)"
-        r"|.*\.LogFit",
+        r"|.*\.(LogFit|Downtime|innovation_tests\.Law)",
     ),
 ]
 
