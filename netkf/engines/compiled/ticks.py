@@ -467,6 +467,23 @@ def _delivery(scenario: Scenario) -> FloatArray:
     return delivery_table(scenario, scenario.network.channel.loss, directions)
 
 
+def _listed_ticks(
+    scenario: Scenario,
+    streams: Streams | ReplicaStreams,
+    senders: Senders,
+    instants: Instants | None,
+    lives: LifeTable,
+) -> list[FloatArray] | None:
+    """Return the ticks of each entity of each run, None where kernels draw them."""
+    if senders.entities and senders.at != "readings" and not _is_listed(scenario):
+        return None
+    listed = _list_ticks(scenario, streams, senders, instants)
+    if senders.at != "readings":
+        return listed
+    # Who is down takes no sample, after which to transmit.
+    return [t[~lives.is_down(h, t)] for h, t in enumerate(listed)]
+
+
 class Schedule:
     """The ticks of some runs of a scenario, and which of their messages arrive: window by window,
     or all at once. ``bits``: the outcomes of a tick are one integer with a bit for each of its
@@ -486,26 +503,19 @@ class Schedule:
     ) -> None:
         senders, channel = senders_of(scenario), scenario.network.channel
         self._runs, sizes = streams.runs, np.diff(senders.first)
-        listed, outcomes, delivery = None, [], np.ones((2, len(senders.directions)))
-        if not senders.entities or senders.at == "readings" or _is_listed(scenario):
-            listed = _list_ticks(scenario, streams, senders, instants)
-            if senders.at == "readings":
-                # Who is down takes no sample, after which to transmit.
-                listed = [t[~lives.is_down(h, t)] for h, t in enumerate(listed)]
+        listed = _listed_ticks(scenario, streams, senders, instants, lives)
+        if listed is None:
+            rates = _rates(scenario)
+        else:
             numbers = np.array([len(t) for t in listed], dtype=np.int64).reshape(self._runs, -1)
             rates = numbers.mean(axis=0) / scenario.horizon
-        else:
-            rates = _rates(scenario)
         self._moving: MovingLinks | None = None
         if scenario.links_move and listed is not None:
             self._moving = moving_links(scenario, senders, listed, truth, lives.is_down)
-        elif senders.entities and is_kernel_channel(channel):
+        delivery, outcomes = np.ones((2, len(senders.directions))), []
+        if senders.entities and is_kernel_channel(channel) and self._moving is None:
             delivery = _delivery(scenario)
-        if (
-            listed is not None
-            and senders.entities
-            and (self._moving or not is_kernel_channel(channel))
-        ):
+        elif senders.entities and listed is not None:
             heard = self._moving
             if scenario.network.lives and heard is None:
                 heard = links_of_lives(senders, listed, lives, scenario.topology.index)
