@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,27 +88,48 @@ def collect_readings(
     if responses is not None and responses.believed is not None:
         slots = np.round(times / plant.period).astype(int) if scenario.slotted else times
         origin = responses.believed.states(slots)
-    readings = []
-    for node, sensors in placed.items():
-        for one in sensors:
-            key = node, one.ordinal
-            path: Any = (scenario.slot_path if scenario.slotted else scenario.sample_path)(
-                streams, node, one
-            )
-            R = scenario.noise_covariance(one.entry, believed=True)
-            for k, (instant, time) in enumerate(zip(numbers[key], times_of[key], strict=True)):
-                number = int(np.searchsorted(times, time))
-                if number == len(times):
-                    break
-                x = states[number] - origin[number]
-                read: Any = path.reading(int(instant) if scenario.slotted else k, x)
-                y, H = (read, path.matrix(int(instant))) if scenario.slotted else read
-                C = covariance_of(path, int(instant) if scenario.slotted else k, R)
-                if len(y):
-                    rows = _components(scenario, node, one, instant, k, len(y))
-                    readings.append(SensorReading(number, node, one, y, H, C, rows))
+    readings = [
+        reading
+        for node, sensors in placed.items()
+        for one in sensors
+        for reading in _readings_of(
+            scenario,
+            streams,
+            (node, one),
+            numbers[node, one.ordinal],
+            np.searchsorted(times, times_of[node, one.ordinal]),
+            states - origin,
+        )
+    ]
     readings.sort(key=lambda one: one.number)
     return Readings(times, readings, run, origin)
+
+
+def _readings_of(
+    scenario: Scenario,
+    streams: Streams,
+    sensor: tuple[int, PlacedSensor],
+    instants: Any,
+    places: np.ndarray,
+    states: FloatArray,
+) -> Iterator[SensorReading]:
+    """Yield what a ``sensor`` of a node reads at its ``instants`` (K,), times or slots, where the
+    states are rows ``places`` (K,) of ``states``; there may be none of the last.
+    """
+    node, one = sensor
+    path: Any = (scenario.slot_path if scenario.slotted else scenario.sample_path)(
+        streams, node, one
+    )
+    R = scenario.noise_covariance(one.entry, believed=True)
+    for k, (instant, place) in enumerate(zip(instants, places.tolist(), strict=True)):
+        if place == len(states):
+            break
+        at = int(instant) if scenario.slotted else k
+        read: Any = path.reading(at, states[place])
+        y, H = (read, path.matrix(at)) if scenario.slotted else read
+        if len(y):
+            rows = _components(scenario, node, one, instant, k, len(y))
+            yield SensorReading(place, node, one, y, H, covariance_of(path, at, R), rows)
 
 
 def _instants(

@@ -270,34 +270,36 @@ def _judge_node(
         statistic, p = whiteness_p(columns, lags, level)
         correlation = _detectable_correlation(sum(map(len, columns)), lags * len(columns), level)
     stretch = find_stretch(nis, rows, np.array([one.sum() for one in whitened]))
-    reasons = []
-    if law.kind and mean > high:
-        reasons.append(f"NIS above {high:.3g}")
-    if law.kind in ("white", "exact") and mean < low:
-        reasons.append(f"NIS below {low:.3g}")
-    if law.kind and abs(bias) > reach:
-        reasons.append("biased")
-    if is_white and p < level:
-        reasons.append("correlated")
+    contradictions = (
+        (f"NIS above {high:.3g}", bool(law.kind) and mean > high),
+        (f"NIS below {low:.3g}", law.kind in ("white", "exact") and mean < low),
+        ("biased", bool(law.kind) and abs(bias) > reach),
+        ("correlated", is_white and p < level),
+    )
+    reasons = [reason for reason, holds in contradictions if holds]
     if is_white and not reasons and stretch.p < level:
         reasons.append("some readings are not like the others")
     times = recorded.times[chosen]
     since = times[stretch.first] if reasons and stretch.first else math.nan
     until = times[stretch.end - 1] if reasons and stretch.end < len(times) else math.nan
-    verdict = "consistent" if law.kind else "not judged"
-    if reasons:
-        ends = (("since", since), ("until", until))
-        span = [f"{word} {time:g} s" for word, time in ends if math.isfinite(time)]
-        verdict = f"BROKEN: {', '.join([*reasons, *span])}"
-    elif law.kind and not counted:
-        verdict = "not judged: too few independent readings"
-    elif law.kind == "smaller" and mean < low:
-        verdict = "as expected: P is conservative by design"
+    ends = (("since", since), ("until", until))
+    reasons += [f"{word} {time:g} s" for word, time in ends if math.isfinite(time)]
+    verdict = f"BROKEN: {', '.join(reasons)}" if reasons else _unbroken(law, counted, mean < low)
     return NodeInnovations(
         node, len(chosen), mean, low, high, detectable, bias, reach, found, component, statistic,
         lags * len(columns), p, correlation, float(recorded.log_density[chosen].sum()),
         float(since), float(until), verdict,
     )  # fmt: skip
+
+
+def _unbroken(law: Law, counted: float, is_small: bool) -> str:
+    """Return the verdict on a node whose innovations do not contradict the model."""
+    if not law.kind:
+        return "not judged"
+    if not counted:
+        return "not judged: too few independent readings"
+    expected = "as expected: P is conservative by design"
+    return expected if law.kind == "smaller" and is_small else "consistent"
 
 
 def _inflation(columns: list[FloatArray]) -> float:
