@@ -631,7 +631,7 @@ class ScenarioModel(Component):
             numbers = self.node_filter.analysis.payload_numbers(int(self.sizes[index]), rows, phase)
             coded = self.network.quantise
             size = radio.bytes_per_number if coded is None else coded.bits / 8.0
-            self._message_sizes[node, phase] = float(math.ceil(size * numbers))
+            self._message_sizes[node, phase] = size * numbers
         return self._message_sizes[node, phase]
 
     @cached_property

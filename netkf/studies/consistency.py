@@ -471,7 +471,7 @@ def _judge_block(
     else:
         mean = float(expected.mean()) if is_known else None
         verdict = _verdict(scenario, n, (excess, width), mean)
-        if abs(excess) > width:
+        if verdict.startswith("BROKEN"):
             verdict += _tell_since(scenario, means / float(right.mean()), len(runs) * n)
     return NodeConsistency(
         node=scenario.nodes[block.node],

@@ -64,8 +64,10 @@ def compared(trials):
         values = []
         for mean in (BEFORE, AFTER):
             square, worst, nees = (drawn(random, mean) for _ in range(3))
-            values.append(FilterValues(square, worst, nees, np.zeros(RUNS, dtype=bool)))
-        for name, quantity in estimate_quantities(values[1], values[0], 1, MISS).items():
+            diverged = np.zeros(RUNS, dtype=bool)
+            values.append(FilterValues(square, nees, worst[:, None], diverged))
+        names = ("worst_instant",)
+        for name, quantity in estimate_quantities(values[1], values[0], 1, names, MISS).items():
             found.setdefault(name, []).append((quantity.low, quantity.high))
     truths = {"rms_error": AFTER**0.5 - BEFORE**0.5}
     return {
