@@ -265,6 +265,7 @@ def test_every_script_of_the_pages_is_run():
 
 
 @pytest.mark.parametrize("name", DRAWINGS)
+@pytest.mark.slow
 def test_the_drawings_of_the_pages_are_drawn(tmp_path, monkeypatch, name):
     folder = ROOT / "docs" / "figures"
     monkeypatch.syspath_prepend(str(folder))

@@ -253,6 +253,7 @@ def exact_covariances(F, slots):
 
 
 @pytest.mark.parametrize("name", MODES)
+@pytest.mark.slow
 def test_evidence_is_kept_for_a_thousand_slots(name, tmp_path):
     F, engines = MODES[name], ("compiled", "simpy") if "fast" in name else ("compiled",)
     plant = {**STILL, "F": F, "cov": [[1.0, 0.0], [0.0, 1.0]]}

@@ -146,6 +146,7 @@ def test_pairs_take_turns_and_third_nodes_are_approximated(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("changes", "verdict"), [(TWO, "holds"), ({}, "not promised")])
+@pytest.mark.slow
 def test_check_knows_of_how_many_nodes_p_is_right(
     tmp_path: Path, changes: dict[str, object], verdict: str
 ) -> None:

@@ -105,6 +105,7 @@ def test_single_gaps(kind, noise, n, R, size):
         ("unstable", "none", 4, 1e3, 1e-6, 1e-9),
     ],
 )
+@pytest.mark.slow
 def test_many_short_gaps_mixed_with_samples(kind, noise, n, R, size, sample):
     random = np.random.default_rng(n)
     A, Q = system(kind, noise, n, random)

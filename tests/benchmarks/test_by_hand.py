@@ -117,6 +117,7 @@ MAKE = [
 
 @pytest.mark.parametrize("make", MAKE)
 @pytest.mark.usefixtures("slower")
+@pytest.mark.slow
 def test_means_over_runs_agree(make):
     case, runs = make()
     call, results = jobs.prepared(case, 4 * runs)

@@ -41,6 +41,7 @@ def subtracted(run):
     return dataclasses.replace(run, error=error, exact_errors=False)
 
 
+@pytest.mark.slow
 def test_no_promise_is_broken_by_rounding(unstable):
     found = netkf.check(unstable, 10, workers=1)
     assert found, [row for row in found.rows if row.verdict == "broken"]

@@ -106,6 +106,7 @@ def test_slots_are_the_plain_recursion(scenario_of, tmp_path, then):
 
 
 @pytest.mark.parametrize("text", [SLOTS, CLOCKS], ids=["slots", "clocks"])
+@pytest.mark.slow
 def test_a_healthy_reading_is_refused_as_often_as_theory_says(scenario_of, text):
     # Refused readings that are inflated leave the filter nearly consistent: the share is at least
     # that of a consistent one, and near to it.

@@ -74,7 +74,13 @@ def assert_batch(scenario, runs=9):
     return batch
 
 
-@pytest.mark.parametrize("name", INNER)
+LONG = ("belief-propagation", "cross-covariance", "hcmci", "consensus")
+"""Inner filters that take long to compile, and are compiled without a trigger anyway."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in INNER]
+)
 def test_both_engines_send_the_same(name, tmp_path):
     """Node 2 has two sensors, node 4 none."""
     for seed, (channel, n) in enumerate(zip(CHANNELS, (2, 5, 1, 2), strict=True)):

@@ -93,7 +93,12 @@ RUN = ["run", RING, "--runs", "9999", "--trace", "full", "--no-plot"]
 
 
 @pytest.mark.parametrize(
-    ("number", "group"), [(signal.SIGTERM, False), (signal.SIGTERM, True), (signal.SIGINT, True)]
+    ("number", "group"),
+    [
+        (signal.SIGTERM, False),
+        pytest.param(signal.SIGTERM, True, marks=pytest.mark.slow),
+        (signal.SIGINT, True),
+    ],
 )
 def test_an_interrupted_command_ends(tmp_path, number, group):
     """Ctrl-C reaches all processes of a terminal, and what ends a job those of the job."""

@@ -70,6 +70,7 @@ def results_without(names, function, folder):
 
 
 @pytest.mark.parametrize("names", [*([name] for name in HIDE), list(HIDE)], ids="-".join)
+@pytest.mark.slow
 def test_a_name_that_is_missing_costs_time_and_nothing_else(names, tmp_path):
     got = results_without(names, results, tmp_path)
     np.testing.assert_allclose(got, results(), rtol=1e-12)

@@ -178,6 +178,7 @@ class Fast(Contacts):
         (Fast, ["clocks tick at the rates of the scenario"]),
     ],
 )
+@pytest.mark.slow
 def test_check_knows_the_intervals(cls, broken, make):
     _, contacts = make({"kind": "poisson", "rate": 3.0})
     clock = cls(path=contacts.network.activation.path, clock=Poisson(rate=3.0))

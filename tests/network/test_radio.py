@@ -75,6 +75,7 @@ def test_waiting_is_that_of_the_queue(scenario_of):
     assert expected > 9.0 * deviation
 
 
+@pytest.mark.slow
 def test_a_busy_radio_drops(scenario_of):
     # Of Poisson arrivals at a single server the share rho / (1 + rho) finds it busy.
     radio = f'bits_per_second = {128 / AIR}, queue = "drop"'
@@ -95,6 +96,7 @@ def test_an_infinite_rate_is_no_radio(scenario_of):
     assert len(set(prints)) == 1
 
 
+@pytest.mark.slow
 def test_all_frames_must_arrive(scenario_of):
     # 2 numbers of 10 bytes in frames of 8 bytes: 3 frames.
     loss = 'kind = "bernoulli", delivery = 0.8'

@@ -317,6 +317,7 @@ def test_no_message_is_left_out_below_the_limit_and_few_beyond():
         assert len(thinned.messages) <= 110
 
 
+@pytest.mark.slow
 def test_a_page_of_fifty_nodes_and_100_000_events_is_small_and_complete(tmp_path):
     changes = {
         "network.graph": {"kind": "regular", "nodes": 50, "degree": 4, "seed": 1},

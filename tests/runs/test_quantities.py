@@ -191,6 +191,7 @@ CLOSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CLOSED)
 def test_mean_ages_by_closed_forms(case, tmp_path):
     clock, nodes, p, expected = CLOSED[case]

@@ -136,6 +136,7 @@ def test_a_device_that_never_ends_is_no_scenario(tmp_path):
         netkf.load(tmp_path / "ring.toml", changes)
 
 
+@pytest.mark.slow
 def test_large_tables_are_refused_or_read_in_bounded_memory(tmp_path):
     """A table of 4 MB, and one whose size alone is too large."""
     (tmp_path / "ring.toml").write_text((SCENARIOS / RING).read_text())

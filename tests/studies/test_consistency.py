@@ -219,6 +219,7 @@ def test_the_summary_of_many_runs_has_chi_square_bounds(tmp_path, capsys):
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.slow
 def test_errors_beyond_all_numbers_are_reported_without_a_warning():
     # Too few exchanges for a long path: the estimates grow by a factor a slot.
     nodes = 40

@@ -357,6 +357,7 @@ def test_where_the_bound_says_no_it_is_simulated(short):
         assert (square[worst] + 4.0 * error[worst] > 2.89) or word == "reached"
 
 
+@pytest.mark.slow
 def test_a_target_under_burst_losses_takes_a_handful_of_runs(ring):
     """Eight nodes of a grid: 600 runs with squared errors leave this undecided."""
     made = ring.replace(

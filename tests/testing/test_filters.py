@@ -75,7 +75,13 @@ def test_every_kind_of_filter_is_here():
             assert type(part) is KINDS["filter"][name]
 
 
-@pytest.mark.parametrize("name", SOUND)
+LONG = ("block-belief-propagation", "block-cross-covariances", "block-intersection")
+"""Filters whose check is slow."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SOUND]
+)
 def test_our_own_filters_keep_the_contract(name):
     for part in SOUND[name]:
         assert check_filter(part) is None

@@ -128,6 +128,7 @@ def found_by(checker, part):
     return found
 
 
+@pytest.mark.slow
 def test_one_lossier_direction_is_found():
     assert found_by(_check_channel, OneLossier(0.8)) >= 7
 

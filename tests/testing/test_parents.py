@@ -146,6 +146,7 @@ def compare(cls, settings, same_as_parent=None):
 
 
 @pytest.mark.parametrize("name", ADJUSTED)
+@pytest.mark.slow
 def test_an_adjustment_that_changes_numbers_is_named(name):
     cls, settings, words = ADJUSTED[name]
     with pytest.raises(AssertionError) as caught:

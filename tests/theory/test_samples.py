@@ -117,6 +117,7 @@ ONE_WAY = [(i, r) for i, some in BROADCASTS.items() for r in some]
 
 
 @pytest.mark.parametrize("at", ["directions", "nodes", "readings"])
+@pytest.mark.slow
 def test_the_mean_of_many_runs_stays_below(build, at):
     activation = {"kind": "poisson", "rate": 2.0, "at": at}
     links = [(i, 2.0, some) for i, some in BROADCASTS.items()]
