@@ -171,3 +171,8 @@ def build(tmp_path):
         return from_table({**table, **tables}, tmp_path)
 
     return make
+
+
+def with_slow(names, slow):
+    """Return parameters ``names``, of which those in ``slow`` are marked so."""
+    return [pytest.param(n, marks=pytest.mark.slow) if n in slow else n for n in names]

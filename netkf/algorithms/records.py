@@ -18,7 +18,7 @@ import numpy as np
 
 from netkf.algorithms.kernels import run as standard
 from netkf.algorithms.kernels.neighbours import combine_convex
-from netkf.linalg.arrays import FloatArray
+from netkf.linalg.arrays import FloatArray, IntArray
 from netkf.linalg.lanes import aligned
 from netkf.linalg.structs import Struct, StructClass
 
@@ -200,6 +200,12 @@ class Records:
     arrays: dict[str, np.ndarray]
     links: tuple[str, ...] = ()
     past: tuple[str, ...] = ()
+
+    def place(self, name: str, h: int, first: IntArray) -> int | slice:
+        """Return where the array ``name`` has what node ``h`` knows: its row, or the rows of its
+        links, which begin with ``first[h]``.
+        """
+        return slice(first[h], first[h + 1]) if name in self.links else h
 
     def copied(self) -> Any:
         """Return the struct of the first block with its own copies of the arrays of nodes and

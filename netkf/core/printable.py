@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 MAX_NAME = 200
 """Longest name of a node, in characters."""
 
@@ -24,6 +26,11 @@ def printable(text: str, keep: str = "\n\t") -> str:
 def one_line(text: object) -> str:
     """Return a text as :func:`printable` does, with line breaks and tabs escaped too."""
     return printable(str(text), keep="")
+
+
+def list_some(values: Sequence[object], most: int) -> str:
+    """Return ``values`` as a list, "1, 2, ..." where there are more than ``most``."""
+    return ", ".join(map(str, values[:most])) + ", ..." * (len(values) > most)
 
 
 def shorten(text: object, max_length: int = 200) -> str:

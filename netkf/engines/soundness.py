@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from netkf.core.printable import list_some
 from netkf.linalg.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -119,5 +120,4 @@ def _describe_break(xhat: FloatArray, P: FloatArray, without: bool) -> str:
 
 
 def _fill_in(reason: str, nodes: Sequence[int]) -> str:
-    listed = ", ".join(map(str, nodes[:MAX_NAMED])) + (", ..." if len(nodes) > MAX_NAMED else "")
-    return reason.format(f"node{'s' if len(nodes) > 1 else ''} {listed}")
+    return reason.format(f"node{'s' if len(nodes) > 1 else ''} {list_some(nodes, MAX_NAMED)}")

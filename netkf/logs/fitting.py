@@ -372,7 +372,7 @@ def _link_table(
     whole = rows["packets"] + rows["unknown"]
     rows["at_least"] = heard / whole
     rows["at_most"] = (heard + rows["unknown"] + rows["unreported"]) / whole
-    moves = _transitions(outcomes)
+    moves = outcomes.transitions
     for k, name in enumerate(("to_bad", "to_good")):
         tries, turns = moves[:, 2 * k], moves[:, 2 * k + 1]
         with np.errstate(invalid="ignore"):
@@ -383,20 +383,6 @@ def _link_table(
     if distance is not None:
         rows["distance"] = distance
     return rows
-
-
-def _transitions(outcomes: Outcomes) -> FloatArray:
-    """Return, of each link, packets heard that have a next one, those of them whose next is lost,
-    packets lost that have one, and those whose next is heard, (L, 4).
-    """
-    moves = np.zeros((len(outcomes.links), 4))
-    for group in outcomes.groups:
-        last, now = group.x[:-1], group.x[1:]
-        both = np.isfinite(last + now) & group.follows[1:, None]
-        for k, flags in enumerate((last == 1, (last == 1) & (now == 0), last == 0)):
-            moves[group.links, k] += (both & flags).sum(axis=0)
-        moves[group.links, 3] += (both & (last == 0) & (now == 1)).sum(axis=0)
-    return moves
 
 
 def _fit_laws(
@@ -423,7 +409,7 @@ def _fit_laws(
         chain = stats.fit_chain(outcomes)
         laws.append(Law("gilbert-elliott", chain.values, chain.likelihood, cov=chain.cov))
         # Of each link heard packets that turn to lost ones, and the other way.
-        turns = np.concatenate(np.split(_transitions(outcomes), 2, axis=1))
+        turns = np.concatenate(np.split(outcomes.transitions, 2, axis=1))
         values = (turns[:, 1] + 0.5) / (turns[:, 0] + 1.0)
         fit = _likelihood(turns[:, 1], np.maximum(turns[:, 0], 1.0))
         laws.append(Law("per-link-bursts", values, fit, turns))

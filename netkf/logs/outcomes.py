@@ -111,6 +111,20 @@ class Outcomes:
         return total
 
     @cached_property
+    def transitions(self) -> FloatArray:
+        """Of each link packets heard that have a next one, those of them whose next is lost,
+        packets lost that have one, and those whose next is heard, (L, 4).
+        """
+        moves = np.zeros((len(self.links), 4))
+        for group in self.groups:
+            last, now = group.x[:-1], group.x[1:]
+            both = np.isfinite(last + now) & group.follows[1:, None]
+            for k, flags in enumerate((last == 1, (last == 1) & (now == 0), last == 0)):
+                moves[group.links, k] += (both & flags).sum(axis=0)
+            moves[group.links, 3] += (both & (last == 0) & (now == 1)).sum(axis=0)
+        return moves
+
+    @cached_property
     def by_channel(self) -> np.ndarray:
         """``counts`` for each channel, (C, L, 2)."""
         names = sorted(set(self.channels))

@@ -199,6 +199,13 @@ class Topology:
         return sorted(components, key=len, reverse=True)
 
 
+def demand_in_graph(nodes: Sequence[int], topology: Topology) -> None:
+    """Raise ScenarioError unless all ``nodes`` are in the graph."""
+    for k, node in enumerate(nodes):
+        if node not in topology.index:
+            raise ScenarioError(f"nodes[{k}]", "must be a node of the graph", node, "remove it")
+
+
 def demand_links(source: SourceFile, lines: Mapping[Link, int], topology: Topology) -> None:
     """Raise ScenarioError if a file, such as one of recorded exchanges, names a pair (sender,
     receiver) that is not a link of the graph; ``lines`` has a line number of each pair.

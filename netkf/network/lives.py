@@ -26,7 +26,7 @@ from netkf.core.fields import (
     positive,
     source_file,
 )
-from netkf.network.graphs import Topology
+from netkf.network.graphs import Topology, demand_in_graph
 
 UP, DOWN = ("restart", "join"), ("crash", "leave")
 """Kinds of the events with which a node is up, and down."""
@@ -67,9 +67,7 @@ class Life(Component):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless all nodes are in the graph."""
-        for k, node in enumerate(self.nodes):
-            if node not in topology.index:
-                raise ScenarioError(f"nodes[{k}]", "must be a node of the graph", node, "remove it")
+        demand_in_graph(self.nodes, topology)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.core.clock import Clock
-from netkf.core.errors import ScenarioError
 from netkf.core.fields import (
     Component,
     Rule,
@@ -24,7 +23,7 @@ from netkf.core.laws import Lattice
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import LinkClock
 from netkf.network.contacts import Contacts
-from netkf.network.graphs import Topology
+from netkf.network.graphs import Topology, demand_in_graph
 
 MAX_OFFSET, MAX_DRIFT, MAX_SIGMA = 1e6, 0.5, 0.1
 """Largest offset (seconds) and drift (relative), and standard deviation of a drift that is drawn:
@@ -75,9 +74,7 @@ class NodeClock(Component):
 
     def check(self, topology: Topology) -> None:
         """Raise ScenarioError unless all nodes are in the graph."""
-        for k, node in enumerate(self.nodes):
-            if node not in topology.index:
-                raise ScenarioError(f"nodes[{k}]", "must be a node of the graph", node, "remove it")
+        demand_in_graph(self.nodes, topology)
 
 
 class NodeTime(NamedTuple):

@@ -105,8 +105,7 @@ class NetworkSink(Sink):
         self.connectivity = ConnectivitySink(scenario, lives)
         self._counts_own = transmissions is None
         self._transmissions = transmissions or Transmissions()
-        forgetful = [node for node, life in lives.items() if life.forgets]
-        self._ages = _make_ages(scenario, forgetful)
+        self._ages = _make_ages(scenario)
         self._last = 0.0
 
     def events(self, rows: np.ndarray) -> None:
@@ -156,7 +155,7 @@ def _joules(energy: Energy, size: float, frames: int) -> float:
     return energy.joules_per_packet * frames + energy.joules_per_byte * size
 
 
-def _make_ages(scenario: Scenario, forgetful: Sequence[int]) -> Ages | None:
+def _make_ages(scenario: Scenario) -> Ages | None:
     """Return the ages of a run; None if nodes do not talk or nobody asks for those of so many."""
     sources, timing = scenario.sensing_nodes, scenario.node_filter.timing
     asked = scenario.metrics.network or len(scenario.nodes) * len(sources) <= MAX_PAIRS
@@ -167,7 +166,7 @@ def _make_ages(scenario: Scenario, forgetful: Sequence[int]) -> Ages | None:
         sorted(sources),
         scenario.topology.directions,
         sorted(scenario.increment_sensors),
-        forgetful,
+        scenario.forgetful_nodes,
         scenario.node_filter.analysis.swaps,
         scenario.node_filter.analysis.tells_estimates,
         lambda nodes, times: _read_at(scenario, nodes, times),

@@ -241,14 +241,14 @@ def _create_output(
     manifest.write("interrupted", {})
     write_scenario(directory, scenario, seed)
     samples = SummarySink()
-    network = NetworkSink(scenario, seed, replica, samples.transmissions)
+    wanted = scenario.metrics.network is not False
     return _Output(
         directory=directory,
         scenario=scenario,
         samples=samples,
         tables=ParquetSink(directory, scenario, replica) if tables else None,
         links=[SentPerLink()] if is_recorded else [],
-        network=[] if scenario.metrics.network is False else [network],
+        network=[NetworkSink(scenario, seed, replica, samples.transmissions)] if wanted else [],
         manifest=manifest,
     )
 

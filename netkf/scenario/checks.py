@@ -253,31 +253,29 @@ def _check_owners(scenario: DerivedScenario, name: str, entries: Sequence[Any]) 
 def _check_lives(scenario: DerivedScenario) -> None:
     lives = scenario.network.lives
     _check_owners(scenario, "lives", lives)
-    kernels, forget = scenario.node_filter.kernels, [life.memory == "lost" for life in lives]
+    lost = [k for k, life in enumerate(lives) if life.memory == "lost"]
+    if not lost:
+        return
+    kernels, needs = scenario.node_filter.kernels, scenario.node_filter.needs
     changes = len(scenario.plant.changes) or not scenario.plant.linear
-    if (
-        any(forget)
-        and changes
-        and kernels is not None
-        and kernels.of(not scenario.slotted).remembers
-    ):
+    rule = remedy = ""
+    if changes and kernels is not None and kernels.of(not scenario.slotted).remembers:
         rule = "must be kept where late readings are used and the plant changes or is not linear"
         remedy = 'write "kept", or late = "drop" in [filter]'
-        raise ScenarioError(f"network.lives[{forget.index(True)}].memory", rule, "lost", remedy)
-    needs = scenario.node_filter.needs
-    if any(forget) and needs.memory:
+    elif needs.memory:
         rule = f"must be kept with the {filter_name(scenario)}, {needs.memory}"
-        key = f"network.lives[{forget.index(True)}].memory"
-        raise ScenarioError(key, rule, "lost", 'write "kept", or choose another filter')
+        remedy = 'write "kept", or choose another filter'
+    if rule:
+        raise ScenarioError(f"network.lives[{lost[0]}].memory", rule, "lost", remedy)
 
 
 def _check_shared_states(scenario: DerivedScenario) -> None:
-    channel, topology = scenario.network.channel, scenario.topology
-    both = getattr(scenario.network.activation, "at", "links") == "links" and channel.symmetric
-    if not isinstance(channel.loss, GilbertElliott) or not both or topology.directed:
+    network, topology = scenario.network, scenario.topology
+    loss = network.channel.loss
+    if not isinstance(loss, GilbertElliott) or not network.one_fate or topology.directed:
         return
     for i, j in topology.links:
-        if channel.loss.of((i, j)).transitions != channel.loss.of((j, i)).transitions:
+        if loss.of((i, j)).transitions != loss.of((j, i)).transitions:
             rule = "must give both directions of a link one to_bad and one to_good, since they are "
             rule += "in one state (symmetric = true)"
             remedy = "correct the rows, or write symmetric = false in network.channel"

@@ -871,6 +871,12 @@ class DerivedScenario(ScenarioModel):
         views = self.model_views
         return mean - (origin if views is None else origin[views[self.topology.index[node]]]), cov
 
+    def prior_shift(self, node: int, when: float) -> FloatArray:
+        """Return by how much the mean of ``fresh_estimate`` at ``when`` differs from that at 0."""
+        # As a slot 0 is an index.
+        start = 0 if self.slotted else 0.0
+        return self.fresh_estimate(node, when)[0] - self.fresh_estimate(node, start)[0]
+
     @property
     def other_starts(self) -> list[int]:
         """The ids of nodes whose filters do not start with mean and covariance of x(0)."""

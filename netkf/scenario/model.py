@@ -38,6 +38,7 @@ from netkf.core.fields import (
 )
 from netkf.core.instants import OnGrid, TimeGrid
 from netkf.core.places import Place
+from netkf.core.printable import list_some
 from netkf.linalg.arrays import FloatArray, readonly_array
 from netkf.network.channels import Channel
 from netkf.network.clocks import LinkClock
@@ -104,6 +105,12 @@ class Network(Component):
     radio: Radio | None = field(instance_of(Radio), default=None)
     quantise: Quantisation | None = field(instance_of(Quantisation), default=None)
     energy: Energy | None = field(instance_of(Energy), default=None)
+
+    @property
+    def one_fate(self) -> bool:
+        """True if both directions of a link are activated together, with one draw for both."""
+        clock = self.activation
+        return self.channel.symmetric and (not isinstance(clock, LinkClock) or clock.at == "links")
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,6 +404,12 @@ class ScenarioModel(Component):
         return choose_grid(self)
 
     @cached_property
+    def forgetful_nodes(self) -> tuple[int, ...]:
+        """The nodes (ids, in order) that forget what they know when they are down."""
+        lost = [life.nodes for life in self.network.lives if life.memory == "lost"]
+        return tuple(sorted(node for nodes in lost for node in nodes))
+
+    @cached_property
     def departures(self) -> tuple[tuple[str, str], ...]:
         """What filters assume, and why it is not so: clocks, sensors, messages and
         gates.
@@ -416,10 +429,9 @@ class ScenarioModel(Component):
             )
             found.append((ALL_READ, evidence))
         if self.faults:
-            nodes = ", ".join(map(str, list(self.faults)[:5])) + ", ..." * (len(self.faults) > 5)
             evidence = (
-                f"sensors of node {nodes} are bad for a time (sensors.fault): errors have a part "
-                "that neither filters nor P know of"
+                f"sensors of node {list_some(list(self.faults), 5)} are bad for a time "
+                "(sensors.fault): errors have a part that neither filters nor P know of"
             )
             found.append((HEALTHY, evidence))
         if self.network.quantise is not None:

@@ -208,12 +208,11 @@ def recorded_innovations(run: Run) -> Innovations:
 def law_of(scenario: Scenario) -> Law:
     """Return what the innovations of a scenario's filter are if its model is right."""
     algorithm, linear = scenario.node_filter, scenario.plant.linear and scenario.has_linear_sensors
-    forgets = any(life.memory == "lost" for life in scenario.network.lives)
     for reason, holds in (
         ("the gate takes the largest readings away", scenario.filter.gate is not None),
         ("P is that of a linearised model", not linear),
         ("filters do not know the input", scenario.misses_input),
-        ("a node that restarts forgets", forgets),
+        ("a node that restarts forgets", bool(scenario.forgetful_nodes)),
         ("it is not known what P of a user's filter is", overridden(algorithm)),
     ):
         if holds:

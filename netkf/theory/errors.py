@@ -125,10 +125,9 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
         raise TheoryError("the run is of another scenario: its nodes or its state differ")
     require_linear(scenario, accepted=(RIGHT_CLOCKS, ALL_READ))
-    forgets = any(life.memory == "lost" for life in scenario.network.lives)
     in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
     reasons = [evidence for _, evidence in scenario.departures]
-    if scenario.network.lives and (scenario.slotted or forgets):
+    if scenario.network.lives and (scenario.slotted or scenario.forgetful_nodes):
         reasons.append(LIVES)
     if reasons and (in_python or scenario.views is not None):
         rule = "exact errors are known of filters whose verbs are affine kernels of one state"

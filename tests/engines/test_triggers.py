@@ -11,6 +11,7 @@ from netkf.algorithms.stochastic_trigger import StochasticTrigger
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.trace.schema import CODES
 from tests.algorithms.test_literature import GRAPH, scenario_of
+from tests.conftest import with_slow
 from tests.engines.agreement import assert_agree
 
 CONSENSUS = {"kind": "event-triggered", "trigger": "consensus", "thresholds": [1.0, 3.0]}
@@ -78,9 +79,7 @@ LONG = ("belief-propagation", "cross-covariance", "hcmci", "consensus")
 """Inner filters that take long to compile, and are compiled without a trigger anyway."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in INNER]
-)
+@pytest.mark.parametrize("name", with_slow(INNER, LONG))
 def test_both_engines_send_the_same(name, tmp_path):
     """Node 2 has two sensors, node 4 none."""
     for seed, (channel, n) in enumerate(zip(CHANNELS, (2, 5, 1, 2), strict=True)):

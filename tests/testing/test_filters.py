@@ -7,6 +7,7 @@ import pytest
 from netkf import parts
 from netkf.algorithms.filter import commutes
 from netkf.testing import check_filter
+from tests.conftest import with_slow
 from tests.testing.broken_filters import BROKEN
 
 SOUND = {
@@ -79,9 +80,7 @@ LONG = ("block-belief-propagation", "block-cross-covariances", "block-intersecti
 """Filters whose check is slow."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SOUND]
-)
+@pytest.mark.parametrize("name", with_slow(SOUND, LONG))
 def test_our_own_filters_keep_the_contract(name):
     for part in SOUND[name]:
         assert check_filter(part) is None

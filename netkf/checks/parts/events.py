@@ -179,7 +179,7 @@ def loss_law(scenario: Scenario) -> LossLaw:
         chain=stated_law(channel.loss, "loss") if one_step else None,
         steady=has_constant_losses(scenario),
         symmetric=channel.symmetric,
-        shared=bool(at_once and channel.symmetric and (opposite >= 0).any()),
+        shared=bool(scenario.network.one_fate and (opposite >= 0).any()),
         opposite=opposite,
         at_once=at_once and not channel.symmetric,
         links=links,

@@ -149,9 +149,8 @@ class ClockFilters:
 
     def restart(self, h: int, moved: FloatArray) -> None:
         """Let node ``h`` begin again, in coordinates that have ``moved`` (n',) since time 0."""
-        first, links = self.run.first, self.records.links
         for name in self.records.arrays:
-            place = slice(first[h], first[h + 1]) if name in links else h
+            place = self.records.place(name, h, self.run.first)
             getattr(self.record, name)[place] = getattr(self.start, name)[place]
         if moved.any():
             self.run.offset[:, 0] = 0.0

@@ -395,8 +395,7 @@ class FlowRun:
         state.nodes["down"][h] ^= 1
         if lives.restarts[k]:
             assert self._clocked is not None
-            fresh, first = (self._scenario.fresh_estimate(node, t)[0] for t in (time, 0.0))
-            self._clocked.restart(h, fresh - first)
+            self._clocked.restart(h, self._scenario.prior_shift(node, time))
             clock = self._draws.clocks.get(h)
             state.now[h] = time if clock is None else clock.shows(time)
 

@@ -168,9 +168,8 @@ class SlotFilters:
 
     def restart(self, h: int, moved: FloatArray) -> None:
         """Let filter ``h`` begin again, in coordinates that have ``moved`` (n,) since slot 0."""
-        first, links = self._setup.links.first, self.records.links
         for name, array in self.records.arrays.items():
-            place = slice(first[h], first[h + 1]) if name in links else h
+            place = self.records.place(name, h, self._setup.links.first)
             array[:, place] = self._start[name][:, place]
         if moved.any():
             self.shift_lane(h, slice(None), moved)

@@ -298,10 +298,8 @@ class SlotRuns:
 
     def _moved(self, h: int) -> FloatArray:
         """Return by how much the prior of a filter differs in the coordinates of this slot."""
-        node, predicts = self.setup.infos[h].node, self.setup.algorithm.timing.predicts
-        slots = self._slot - (not predicts), 0
-        fresh, first = (self._scenario.fresh_estimate(node, slot)[0] for slot in slots)
-        return fresh - first
+        slot = self._slot - (not self.setup.algorithm.timing.predicts)
+        return self._scenario.prior_shift(self.setup.infos[h].node, slot)
 
     def _next_messages(self, max_events: int, timed: bool) -> tuple[SlotTimes, SlotMessages]:
         setup, events = self.setup, self._events

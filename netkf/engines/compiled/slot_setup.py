@@ -71,7 +71,7 @@ class SlotSetup:
         self.frame = frame_slots(scenario.linear_plant.F) or 0 if scenario.exact_errors else 0
         # A filter that all nodes share estimates the whole state.
         self.views = None if algorithm.timing.pooled else scenario.views
-        self.forgets = any(life.memory == "lost" for life in scenario.network.lives)
+        self.forgets = bool(scenario.forgetful_nodes)
         self.width = self.n if self.views is None else scenario.width
         self._set_slots(scenario)
         self._set_stages(scenario)

@@ -84,11 +84,10 @@ class ClockColumns(LoggedColumns):
         # The state grows by less than e in between; other filters do not commute with a shift.
         rate = max(np.abs(plant.A).sum(axis=0).max(), CHECKS / scenario.horizon)
         movable = not len(plant.changes) and np.array_equal(scenario.belief[0], plant.A)
-        lost = [life.nodes for life in scenario.network.lives if life.memory == "lost"]
-        self._forgetful = frozenset(node for nodes in lost for node in nodes)
+        self._forgetful = frozenset(scenario.forgetful_nodes)
         # A node that begins again does so with a mean that does not move along, and one whose clock
         # is wrong is at another time.
-        movable = movable and not lost and not self._clocks
+        movable = movable and not self._forgetful and not self._clocks
         self._checked, self._unit = 0.0, 1.0 / rate if movable else np.inf
         self._changes = plant.changes[plant.changes < scenario.horizon].tolist()
         self._begin_piece(0)
@@ -145,9 +144,8 @@ class ClockColumns(LoggedColumns):
         elif kind == ABSORB and node in self._inboxes:
             self._absorb(node, time)
         elif kind in (RESTART, JOIN) and node in self._forgetful:
-            fresh, first = (self._scenario.fresh_estimate(node, t)[0] for t in (time, 0.0))
             self._times[self._index[node]] = self._shown(self._index[node], time)
-            self._filters.restart(self._index[node], fresh - first)
+            self._filters.restart(self._index[node], self._scenario.prior_shift(node, time))
 
     def _move_truth(self, time: float) -> None:
         """Move the true state to ``time``, with an input for each noise of the plant."""

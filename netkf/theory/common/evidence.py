@@ -6,6 +6,7 @@ A record is one outcome and does not show the law that it came from: the verdict
 from __future__ import annotations
 
 from netkf.core.errors import TheoryError
+from netkf.core.printable import list_some
 from netkf.network.recorded import RecordedDelay, RecordedLoss
 from netkf.scenario.model import EVERY_READING, HEALTHY
 from netkf.scenario.scenario import Scenario
@@ -59,13 +60,10 @@ def life_rows(scenario: Scenario) -> list[AssumptionRow]:
     if scenario.network.lives:
         evidence = f"{LIVES}: equations hold along the events, bounds on the law of arrivals do not"
         rows.append(("nodes are up all the time", "all papers", False, evidence))
-    lost = [life.nodes for life in scenario.network.lives if life.memory == "lost"]
-    forgetful = sorted(node for nodes in lost for node in nodes)
-    if forgetful:
-        nodes = ", ".join(map(str, forgetful[:5])) + ", ..." * (len(forgetful) > 5)
+    if scenario.forgetful_nodes:
         evidence = (
-            f"node {nodes} begins again with the mean and covariance of time 0, whatever the state "
-            "is by then: P may be too small after that"
+            f"node {list_some(scenario.forgetful_nodes, 5)} begins again with the mean and "
+            "covariance of time 0, whatever the state is by then: P may be too small after that"
         )
         rows.append((MEMORY, "all papers", False, evidence))
     return rows

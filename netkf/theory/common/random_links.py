@@ -171,9 +171,8 @@ def directions_of(
     if loss.state_of != "link":
         raise TheoryError("the links of a sender share their bursts, which is not known here")
     links, index = list(weights), scenario.topology.index
-    clock: Any = scenario.network.activation
     # One draw decides about both directions of a link that are activated and lost together.
-    together = channel.symmetric and (not isinstance(clock, LinkClock) or clock.at == "links")
+    together = scenario.network.one_fate
     owners = [min(link, link[::-1]) if together else link for link in links]
     at = {owner: k for k, owner in enumerate(dict.fromkeys(owners))}
     source = np.array([at[owner] for owner in owners], dtype=np.int64)

@@ -96,17 +96,15 @@ class SlotColumns(ErrorColumns):
     def _restart(self, slot: int) -> None:
         """Let the nodes begin again that do so when a slot begins."""
         setup, records, scenario = self._setup, self._filters.records, self._scenario
-        first = setup.links.first
         before = max(slot - (not scenario.node_filter.timing.predicts), 0)
         for h in self._restarts.get(slot, ()):
             for name, array in records.arrays.items():
-                place = slice(first[h], first[h + 1]) if name in records.links else h
+                place = records.place(name, h, setup.links.first)
                 array[:, place] = self._start[name][place][..., ZERO : ZERO + 1]
                 array[0, place] = self._start[name][place]
-            node = setup.infos[h].node
-            fresh, of_start = (scenario.fresh_estimate(node, k)[0] for k in (before, 0))
-            if (fresh != of_start).any():
-                self._filters.shift_lane(h, MEAN, fresh - of_start)
+            moved = scenario.prior_shift(setup.infos[h].node, before)
+            if moved.any():
+                self._filters.shift_lane(h, MEAN, moved)
 
     def replay(self) -> Iterator[None]:
         """Replay the events of the run; yield at each of ``run.times``."""
