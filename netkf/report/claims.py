@@ -19,7 +19,7 @@ from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_sampl
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
 from netkf.runs.tables import format_number, format_with_error
-from netkf.studies.compare import Comparison
+from netkf.studies.compare import MESSAGES, Comparison, Entry
 from netkf.studies.compare_filters import ComparedFilter
 from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
@@ -85,21 +85,43 @@ def describe_differences(
     """Return sentences on how two sources differ, or ``comparison``, the reason why not known."""
     if isinstance(comparison, str):
         return [comparison]
-    sentences = []
-    for quantity, node, (value_of_A, value_of_B) in comparison.rows:
-        # ``real``: the interval of the difference excludes 0. Node -1 stands for all nodes.
-        if value_of_B.real and node < 0:
-            name = LABELS.get(quantity, f"messages {quantity}")
-            sentences.append(
-                f"Certain: {name} of B is {format_number(value_of_B.value)}, of A "
-                f"{format_number(value_of_A.value)}; the difference lies in "
-                f"{format_number(value_of_B.low)} .. {format_number(value_of_B.high)}"
-            )
-    if not sentences and min(comparison.runs) < 2:
-        sentences = ["Single runs have no intervals, so no difference is certain"]
-    elif not sentences:
-        sentences = ["No difference is certain"]
+    of_all = {row.quantity: row.entries for row in comparison.rows if row.node < 0}
+    measure = "rms_error" if of_all["rms_error"][0].value is not None else "mean_trace"
+    sentences = [_describe_winner(measure, *of_all[measure])]
+    # ``real``: the interval of the difference excludes 0.
+    others = [
+        f"{quantity_label(name)} ({format_number(b.value)} against {format_number(a.value)})"
+        for name, (a, b) in of_all.items()
+        if b.real and name != measure
+    ]
+    if others:
+        sentences.append(f"Other certain differences of B from A: {', '.join(others)}")
     return sentences + _describe_first_difference(first, second)
+
+
+def quantity_label(name: str) -> str:
+    """Return a quantity of summaries in words."""
+    words = f"messages {name}" if name in MESSAGES else name.replace("_", " ")
+    return LABELS.get(name, words)
+
+
+def _describe_winner(name: str, a: Entry, b: Entry) -> str:
+    """Return which of two values, of A and of B, is smaller, and if that is certain."""
+    label = quantity_label(name)
+    if a.value is None or b.value is None:
+        return f"The {label} of {'A' if a.value is None else 'B'} is unknown"
+    if a.value == b.value:
+        return f"A and B have the same {label}, {format_number(a.value)}"
+    (better, less), (worse, more) = sorted([("A", a.value), ("B", b.value)], key=lambda e: e[1])
+    sentence = f"{better} has the smaller {label}: {format_number(less)} against "
+    sentence += f"{format_number(more)} of {worse}"
+    sentence += f" ({100.0 * (less / more - 1.0):.3g} %)" if more > 0.0 else ""
+    if b.low is None:
+        return f"{sentence}. Single runs have no intervals, so no difference is certain"
+    ends = f"{format_number(b.low)} .. {format_number(b.high)}"
+    of_squares = " of mean squares" if "squares" in b.method else ""
+    certain = "certain" if b.real else "not certain"
+    return f"{sentence}; that is {certain}: the difference{of_squares}, B - A, lies in {ends}"
 
 
 def _describe_first_difference(first: ReportSource, second: ReportSource) -> list[str]:

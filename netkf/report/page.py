@@ -246,23 +246,31 @@ def _assemble_page(
 
 
 def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | None) -> str:
-    parts = []
-    for letter, entry in zip("AB", entries, strict=False):
-        source = entry.source
-        prefix = f"{letter}: " if len(entries) > 1 else ""
-        element = "h2" if len(entries) > 1 else "h1"
-        status = "" if source.status == "complete" else f" ({source.status})"
-        title = f"{prefix}{source.scenario.name}{status}"
-        parts.append(f"<{element}>{text(title)}</{element}>")
-        if source.scenario.claim:
-            parts.append(paragraph(f"Claim of the scenario: {source.scenario.claim}", "claim"))
-        parts.append(bullets((line + "." for line in _source_sentences(entry)), "findings"))
-    heading = "<h1>Two runs on one clock</h1>" if len(entries) > 1 else ""
+    sources = [entry.source for entry in entries]
+    names = list(dict.fromkeys(source.scenario.name for source in sources))
+    title, parts = names[0], []
+    if len(entries) > 1:
+        title = f"{' and '.join(names)}: A against B"
     if comparison is not None:
-        first, second = (entry.source for entry in entries)
-        sentences = describe_differences(comparison, first, second)
-        heading += bullets((line + "." for line in sentences), "findings")
-    return f'<header class="top">{heading}{"".join(parts)}</header>'
+        sentences = describe_differences(comparison, *sources)
+        parts.append(bullets((line + "." for line in sentences), "findings"))
+        if isinstance(comparison, Comparison):
+            parts.append(tables.differences_table(comparison))
+    claims = list(dict.fromkeys(s.scenario.claim for s in sources if s.scenario.claim))
+    parts += [paragraph(f"Claim of the scenario: {claim}", "claim") for claim in claims]
+    columns = []
+    for k, entry in enumerate(entries):
+        status = "" if entry.source.status == "complete" else f" ({entry.source.status})"
+        findings = bullets((line + "." for line in _source_sentences(entry)), "findings")
+        if len(entries) > 1:
+            heading = text(f"{'AB'[k]}: {entry.source.label}{status}")
+            findings = f'<div><h2 class="run-{"ab"[k]}">{heading}</h2>{findings}</div>'
+        else:
+            title += status
+        columns.append(findings)
+    joined = "".join(columns)
+    parts.append(f'<div class="views">{joined}</div>' if len(entries) > 1 else joined)
+    return f'<header class="top"><h1>{text(title)}</h1>{"".join(parts)}</header>'
 
 
 def _source_sentences(entry: _AnalysedSource) -> list[str]:
@@ -308,9 +316,10 @@ def _main_sections(
     figures = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
     if figures:
         parts.append(section("figures", "Errors of the filters", figures))
-    losses = "".join(outcome_figures(source.run, source.label) for source in sources)
-    if losses:
-        parts.append(section("losses", "Losses", losses))
+    losses = [outcome_figures(source.run, source.label) for source in sources]
+    if any(losses):
+        columns = "".join(f"<div>{one}</div>" for one in losses)
+        parts.append(section("losses", "Losses", f'<div class="views">{columns}</div>'))
     results = "".join(_result_tables(source) for source in sources)
     parts.append(section("verdicts", "Verdicts and averages", results))
     scenarios = ""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
+from netkf.core.printable import shorten
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
@@ -30,6 +31,15 @@ from netkf.trace.nees import traces
 
 MAX_ROWS = 2_000
 """Rows of a table on a page."""
+HEADLINE = {
+    "rms_error": "RMS error",
+    "worst_instant": "largest error at any sample",
+    "mean_trace": "mean trace P",
+    "mean_nees": "mean NEES",
+    "transmissions": "transmissions",
+    "lost": "messages lost",
+}
+"""Quantities with which a page of two runs begins."""
 VERDICT_ORDER = ("broken", "undecided", "holds", "not promised")
 INTERVAL_WIDTH = 2.0
 """Standard errors on each side of an interval in a curve."""
@@ -115,6 +125,21 @@ def _bound_notes(source: ReportSource) -> list[str]:
     return notes
 
 
+def differences_table(comparison: Comparison) -> str:
+    """Return the keys in which two directories, A and B, differ, and their averages, as HTML."""
+    rows = [[key, *(shorten(value) for value in values)] for key, values in comparison.settings]
+    for quantity, node, entries in comparison.rows:
+        if node < 0 and quantity in HEADLINE and entries[0].value is not None:
+            values = [format_with_error(entry.value, entry.se) for entry in entries]
+            rows.append([HEADLINE[quantity], *values])
+    caption = "Keys that differ, and errors" if comparison.settings else "The same keys; errors"
+    return table_box(caption, ["", *_lettered(comparison)], rows)
+
+
+def _lettered(comparison: Comparison) -> list[str]:
+    return [f"{k}: {label}" for k, label in zip("AB", comparison.directories, strict=True)]
+
+
 def comparison_section(comparison: Comparison) -> str:
     """Return the differences of two directories, A and B, as HTML."""
     rows = []
@@ -122,10 +147,7 @@ def comparison_section(comparison: Comparison) -> str:
         label = quantity if node < 0 else f"{quantity} of node {node}"
         values = [format_with_error(entry.value, entry.se) for entry in (first, second)]
         rows.append([label, *values, *_difference_cells(second)])
-    names = [
-        f"{letter}: {label}" for letter, label in zip("AB", comparison.directories, strict=True)
-    ]
-    header = ["quantity", *names, "B - A", "interval", "certain?"]
+    header = ["quantity", *_lettered(comparison), "B - A", "interval", "certain?"]
     if min(comparison.runs) > 1:
         count = sum(entries[1].real is True for _, _, entries in comparison.rows)
         sentence = (

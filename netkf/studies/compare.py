@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,11 +36,14 @@ from netkf.runs.documents import (
 from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.runs.quantities import quantities_in
 from netkf.runs.stored import AVERAGES_FORM, MANIFEST_FORM, SUMMARY_FORM, read_checked_document
+from netkf.scenario.writing import toml_text
 from netkf.studies.metrics import mean_over_runs
 
 AVERAGES = ("rms_error", "mean_trace", "mean_nees")
 MESSAGES = ("sent", "delivered", "lost")
 TRACES = ("bound", "limit", "central")
+TITLES = ("name", "claim")
+"""Keys of scenarios that change no run."""
 DIAGONAL = re.compile(r"P(\d+)_?\1$")
 """Columns of the diagonal of P: P11, or P1_1 where there are more than ten states."""
 ROW: dict[str, Any] = {**AVERAGES_FORM, "bound": NUMBER, "bound_se?": NUMBER}
@@ -80,13 +84,25 @@ class ComparedRow(NamedTuple):
     entries: tuple[Entry, ...]
 
 
+class ComparedSetting(NamedTuple):
+    """A ``key`` of scenarios that differ in it, with its value in every directory as TOML, "-"
+    where a scenario does not have it.
+    """
+
+    key: str
+    values: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class RunDirectory:
-    """The directory of a finished run or ensemble: its manifest and its summary."""
+    """The directory of a finished run or ensemble: its manifest, its summary, and the keys of its
+    scenario with all defaults, as TOML by path.
+    """
 
     directory: Path
     manifest: dict[str, Any]
     summary: dict[str, Any]
+    settings: dict[str, str]
 
     @property
     def runs(self) -> int:
@@ -176,7 +192,31 @@ def read_directory(directory: Path) -> RunDirectory:
             numbers = [key for name in quantities_in(row) for key in (name, f"{name}_se")]
             require_form(row, {f"{key}?": NUMBER for key in numbers})
         check_files(directory, manifest, ["scenario.toml", "summary.json"])
-    return RunDirectory(directory, manifest, summary)
+        try:
+            tables = tomllib.loads((directory / "scenario.toml").read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise DamagedError(f"scenario.toml: {error}") from None
+    tables |= {key: manifest[key] for key in ("seed", "replica") if key in manifest}
+    return RunDirectory(directory, manifest, summary, dict(_leaves(tables, "")))
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, str]]:
+    """Yield the paths of keys below ``path`` with their values as TOML; entries of lists of tables
+    are numbered, ``sensors.0.R``.
+    """
+    if isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value):
+        value = {str(k): entry for k, entry in enumerate(value)}
+    if not isinstance(value, dict):
+        yield path, toml_text(value)
+        return
+    for key, entry in value.items():
+        yield from _leaves(entry, f"{path}.{key}" if path else key)
+
+
+def _differing_settings(runs: Sequence[RunDirectory]) -> tuple[ComparedSetting, ...]:
+    keys = dict.fromkeys(key for run in runs for key in run.settings if key not in TITLES)
+    rows = (ComparedSetting(k, tuple(run.settings.get(k, "-") for run in runs)) for k in keys)
+    return tuple(row for row in rows if len(set(row.values)) > 1)
 
 
 @contextmanager
@@ -194,7 +234,8 @@ class Comparison(NotebookTable):
     """Quantities of several directories side by side.
 
     All marks of certain differences are right with probability ``confidence``. ``notes`` are those
-    of the summaries, on what their averages leave out.
+    of the summaries, on what their averages leave out; ``settings`` the keys in which the scenarios
+    differ.
     """
 
     directories: tuple[str, ...]
@@ -203,6 +244,7 @@ class Comparison(NotebookTable):
     confidence: float
     rows: tuple[ComparedRow, ...]
     notes: tuple[tuple[str, ...], ...] = ()
+    settings: tuple[ComparedSetting, ...] = ()
 
     def __repr__(self) -> str:
         real = sum(any(entry.real for entry in row.entries) for row in self.rows)
@@ -228,7 +270,8 @@ class Comparison(NotebookTable):
             {"quantity": q, "node": node, "entries": [entry._asdict() for entry in entries]}
             for q, node, entries in self.rows
         ]
-        return {**vars(self), "rows": rows}
+        settings = [setting._asdict() for setting in self.settings]
+        return {**vars(self), "rows": rows, "settings": settings}
 
 
 def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comparison:
@@ -248,7 +291,9 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
     runs = [read_directory(as_path("directories", directory)) for directory in directories]
     confidence = number(above=0.0, below=1.0)("--confidence", confidence)
     first = runs[0]
-    quantities = [(q, -1) for q in (*AVERAGES, *MESSAGES)]
+    more = dict.fromkeys(q for run in runs for q in quantities_in(run.summary["overall"]))
+    known = [q for q in more if any(run.value(q, -1)[0] is not None for run in runs)]
+    quantities = [(q, -1) for q in (*AVERAGES, *known, *MESSAGES)]
     if all(run.nodes == first.nodes for run in runs):
         quantities += [("rms_error", node) for node in first.nodes]
     level = (1.0 - confidence) / (len(quantities) * max(1, len(runs) - 1))
@@ -257,14 +302,6 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         for q, node in quantities
     ]
     rows += [ComparedRow(q, -1, tuple(Entry(*run.value(q, -1)) for run in runs)) for q in TRACES]
-    # Shown, not judged.
-    more = dict.fromkeys(q for run in runs for q in quantities_in(run.summary["overall"]))
-    entries = {q: tuple(Entry(*run.value(q, -1)) for run in runs) for q in more}
-    rows[len(AVERAGES) : len(AVERAGES)] = [
-        ComparedRow(q, -1, found)
-        for q, found in entries.items()
-        if any(entry.value is not None for entry in found)
-    ]
     return Comparison(
         directories=tuple(str(run.directory) for run in runs),
         names=tuple(str(run.manifest.get("name", "")) for run in runs),
@@ -272,6 +309,7 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         confidence=confidence,
         rows=tuple(rows),
         notes=tuple(tuple(run.summary.get("notes", ())) for run in runs),
+        settings=_differing_settings(runs),
     )
 
 

@@ -220,6 +220,17 @@ def format_comparison(comparison: Comparison) -> str:
             numbered, comparison.directories, comparison.names, comparison.runs, strict=True
         )
     ]
+    differing = [
+        [shorten(key, 60), *(shorten(value, MAX_LENGTH) for value in values)]
+        for key, values in comparison.settings
+    ]
+    if len(differing) > MAX_ROWS // 2:
+        left_out = f"({len(differing) - MAX_ROWS // 2} more; --json has all)"
+        differing[MAX_ROWS // 2 :] = [[left_out, *[""] * len(numbered)]]
+    if differing:
+        lines += ["", format_table(["key that differs", *numbered], differing, left_columns=1)]
+    elif len(numbered) > 1:
+        lines += ["", "the scenarios have the same keys"]
     rows = [
         [
             row.quantity if row.node < 0 else f"{row.quantity} of node {row.node}",

@@ -402,6 +402,14 @@ def test_two_runs_show_their_differences(ensembles):
     value = comparison.rows[0].entries[1]
     assert f"{value.low:.4g} .. {value.high:.4g}" in page.shown
     assert len(page.data["runs"]) == 2
+    # First the winner, then the key that differs and both errors, before anything of one run.
+    head = page.shown[: page.shown.index("The network in motion")]
+    better, worse = (e.value for e in comparison.rows[0].entries[::-1])
+    assert better < worse
+    winner = f"B has the smaller RMS error: {better:.4g} against {worse:.4g} of A"
+    places = [winner, "network.activation.rate", "RMS error", "A: ", "Over 12 runs"]
+    found = [head.index(place) for place in places[:2]] + [head.rindex(places[-1])]
+    assert found == sorted(found)
 
 
 def test_intervals_of_differences_over_time(ensembles):

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 
 import netkf
 from netkf.cli.main import main
@@ -91,7 +92,9 @@ def test_sweeps_and_comparisons_show_them(tmp_path, capsys):
     shown = ("worst_instant", "quantile_99", "time_above", *NETWORK[:-1])
     for name in shown:
         assert [entry.value for entry in rows[name]] == [s["overall"][name] for s in summaries]
-        assert not any(entry.real for entry in rows[name])
+        one, two = ((entry.value, entry.se * 2.0, 4) for entry in rows[name])
+        p = scipy.stats.ttest_ind_from_stats(*two, *one, equal_var=False).pvalue
+        assert rows[name][1].real == (p < 0.05 / (len(found.rows) - 3))
     assert "joules" not in rows
     scenario = netkf.load(RING).replace({"metrics.level": 1.5, "metrics.network": True})
     row = netkf.sweep(scenario, {"seed": [1]}, runs=4).iloc[0]

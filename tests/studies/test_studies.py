@@ -617,7 +617,7 @@ def test_pairs_are_compared_run_by_run(ensembles):
         for s in (slow, fast)
     ]
     gaps = traces[1] - traces[0]
-    judged = 6 + 6
+    judged = 6 + 4 + 6  # with the worst instant and three quantiles
     low, high = scipy.stats.ttest_1samp(gaps, 0.0).confidence_interval(1.0 - 0.1 / judged)
     assert entry.method == "paired"
     assert (entry.low, entry.high) == pytest.approx((low, high))
@@ -632,8 +632,34 @@ def test_others_are_compared_by_their_standard_errors(ensembles):
     test = scipy.stats.ttest_ind_from_stats(
         two.value, two.se * np.sqrt(8), 8, one.value, one.se * np.sqrt(8), 8, equal_var=False
     )
-    assert two.real == (test.pvalue < 0.1 / 12)
+    assert two.real == (test.pvalue < 0.1 / 16)
     assert found["sent", -1][1].real
+    summaries = [
+        json.loads((ensembles / name / "summary.json").read_text())["overall"]
+        for name in ("slow", "bare")
+    ]
+    for name in ("worst_instant", "quantile_99"):
+        a, b = ((s[name], s[f"{name}_se"] * np.sqrt(8), 8) for s in summaries)
+        test = scipy.stats.ttest_ind_from_stats(*b, *a, equal_var=False)
+        assert found[name, -1][1].real == (test.pvalue < 0.1 / 16)
+
+
+def test_a_comparison_begins_with_the_keys_that_differ(ensembles, tmp_path, capsys):
+    directories = [str(ensembles / name) for name in ("slow", "fast")]
+    found = compare(directories)
+    assert found.settings == ((RATE, ("1.0", "8.0")),)
+    assert main(["compare", *directories]) == 0
+    printed = capsys.readouterr().out
+    assert printed.index(RATE) < printed.index("rms_error")
+    assert compare(directories[:1] * 2).settings == ()
+    other = ["--set", "sensors.0.R=[[0.5]]", "--set", "filter={kind='local'}", "--seed", "3"]
+    out = str(tmp_path / "other")
+    assert main(["run", RING, *other, "--set", "horizon=3.0", "--no-plot", "--out", out]) == 0
+    keys = {row.key: row.values for row in compare([ensembles / "single", out]).settings}
+    assert keys["sensors.0.R"] == ("[[0.25]]", "[[0.5]]")
+    assert keys["filter.epsilon"] == ("0.3", "-")
+    assert (keys["seed"], keys["filter.kind"]) == (("1", "3"), ('"hybrid"', '"local"'))
+    assert "claim" not in keys
 
 
 def test_equal_ensembles_and_single_runs_are_not_marked(ensembles):

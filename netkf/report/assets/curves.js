@@ -3,8 +3,9 @@ const Curves = (() => {
   const HEIGHT = 240, WHOLE = ["node", "lag (readings)"]; // labels of axes with whole numbers
   const DASHES = { solid: [], dashed: [7, 4], dotted: [2, 3] };
 
-  // series: { label, x, y, low, high, colour, dash, width, points, dots }, all over the same x where
-  // there is a band; `dots` has no line. `timed` curves follow the clock.
+  // series: { label, x, y, low, high, colour, dash, width, points, dots, mark }, all over the same x
+  // where there is a band; `dots` has no line, nor has `mark` (dot, ring, tick), whose limits are
+  // bars. `timed` curves follow the clock.
   function figure(app, { title, note, unit, xlabel, series, lines, band, timed }) {
     const box = Format.element("div", { class: "plot" });
     const whole = Format.element("figure", { class: "curve" },
@@ -26,12 +27,12 @@ const Curves = (() => {
       return {
         width, height: HEIGHT, padding: [12, 12, 0, 0], legend: { show: false },
         cursor: { drag: { x: false, y: false }, y: false },
-        scales: { x: { time: false }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
+        scales: { x: { time: false, ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
         axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
           ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],
         bands: bandsOf(series),
-        hooks: { drawClear: [(u) => drawBand(u, band, steep)], draw: [(u) => overlay(u, lines, timed ? app.time : null, steep)] },
+        hooks: { drawClear: [(u) => drawBand(u, band, steep)], draw: [(u) => overlay(u, lines, timed ? app.time : null, steep), (u) => drawMarks(u, series, steep)] },
       };
     }
     return { whole, build, redraw: () => plot && plot.redraw(false) };
@@ -61,9 +62,9 @@ const Curves = (() => {
 
   function expanded(series) {
     return series.flatMap((s) => {
-      const line = { label: s.label, stroke: () => colour(s.colour), width: s.width || 1.5, dash: DASHES[s.dash || "solid"], points: { show: Boolean(s.points || s.dots), size: s.dots ? 4 : 7 }, spanGaps: false, ...(s.dots ? { paths: () => null } : {}) };
+      const line = { label: s.label, stroke: () => colour(s.colour), width: s.width || 1.5, dash: DASHES[s.dash || "solid"], points: { show: Boolean(s.points || s.dots), size: s.dots ? 4 : 7 }, spanGaps: false, ...(s.dots || s.mark ? { paths: () => null } : {}) };
       const edge = { ...line, width: 0, stroke: "transparent", points: { show: false } };
-      return s.low ? [line, edge, edge] : [line];
+      return s.low ? [line, { ...edge, paths: line.paths }, { ...edge, paths: line.paths }] : [line];
     });
   }
 
@@ -71,7 +72,7 @@ const Curves = (() => {
     const found = [];
     let at = 1;
     for (const s of series) {
-      if (s.low) found.push({ series: [at + 2, at + 1], fill: () => faded(colour(s.colour)) });
+      if (s.low && !s.mark) found.push({ series: [at + 2, at + 1], fill: () => faded(colour(s.colour)) });
       at += s.low ? 3 : 1;
     }
     return found;
@@ -112,6 +113,27 @@ const Curves = (() => {
     ctx.restore();
   }
 
+  function drawMarks(u, series, steep) {
+    const { ctx } = u, size = 4 * devicePixelRatio;
+    ctx.save();
+    ctx.lineWidth = 1.8 * devicePixelRatio;
+    for (const s of series.filter((one) => one.mark)) {
+      ctx.strokeStyle = ctx.fillStyle = colour(s.colour);
+      const at = (value) => u.valToPos(scaled(value, steep), "y", true);
+      Array.from(s.x).forEach((value, k) => {
+        const x = u.valToPos(value, "x", true), y = at(s.y[k]);
+        if (!Number.isFinite(y)) return;
+        ctx.beginPath();
+        if (s.mark === "tick") { ctx.moveTo(x - size, y); ctx.lineTo(x + size, y); }
+        else ctx.arc(x, y, size, 0, 2 * Math.PI);
+        if (s.low) { ctx.moveTo(x, at(s.low[k])); ctx.lineTo(x, at(s.high[k])); }
+        ctx.stroke();
+        if (s.mark === "dot") ctx.fill();
+      });
+    }
+    ctx.restore();
+  }
+
   function overlay(u, lines, time, steep) {
     const { ctx, bbox } = u;
     ctx.save();
@@ -136,7 +158,7 @@ const Curves = (() => {
     const list = Format.element("ul", { class: "series" });
     for (const s of [...series, ...(lines || [])]) {
       const sample = Format.element("svg", { width: 34, height: 10, "aria-hidden": "true" },
-        s.dots ? Format.element("circle", { cx: 17, cy: 5, r: 2.5, class: "swatch " + s.colour, "stroke-width": 2 }) : Format.element("line", { x1: 0, x2: 34, y1: 5, y2: 5, class: "swatch " + s.colour, "stroke-width": Math.max(2, s.width || 1.5),
+        s.dots || (s.mark && s.mark !== "tick") ? Format.element("circle", { cx: 17, cy: 5, r: s.mark ? 3.5 : 2.5, class: "swatch " + s.colour, "stroke-width": 2, fill: s.mark === "ring" ? "none" : colour(s.colour) }) : Format.element("line", { x1: 0, x2: 34, y1: 5, y2: 5, class: "swatch " + s.colour, "stroke-width": Math.max(2, s.width || 1.5),
           "stroke-dasharray": DASHES[s.dash || "solid"].join(" ") || null }));
       list.append(Format.element("li", {}, sample, " " + s.label + (s.y && s.y.length === undefined ? " " + Format.number(s.y) : "")));
     }

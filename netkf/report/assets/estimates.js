@@ -41,13 +41,21 @@ const Estimates = (() => {
       if (k < 0) return Theme.write(context, "no sample before this time", 12, 30);
       const nodes = run.nodes.map((_, i) => State.sampleOf(run, k, i));
       const x = State.truthAt(run, k), [a, b] = app.axes;
-      if (a === b) drawIntervals(context, width, height, nodes, x, a);
-      else drawEllipses(context, width, height, nodes, x, a, b);
+      if (a === b) drawIntervals(context, width, height, nodes, x, a, spanOf(t, a));
+      else drawEllipses(context, width, height, nodes, x, [a, b], [spanOf(t, a), spanOf(t, b)]);
     }
 
-    function drawEllipses(context, width, height, nodes, x, a, b) {
-      const spans = app.range === "run" ? [wholeRange(run, a), wholeRange(run, b)]
-        : [rangeNow(run, nodes, x, a), rangeNow(run, nodes, x, b)];
+    // Runs side by side have one range.
+    function spanOf(t, a) {
+      const spans = app.runs.filter((one) => a < one.n).map((one) => {
+        const k = State.sampleAt(one, t);
+        return app.range === "run" || k < 0 ? wholeRange(one, a)
+          : rangeNow(one, one.nodes.map((_, i) => State.sampleOf(one, k, i)), State.truthAt(one, k), a);
+      });
+      return [Math.min(...spans.map((s) => s[0])), Math.max(...spans.map((s) => s[1]))];
+    }
+
+    function drawEllipses(context, width, height, nodes, x, [a, b], spans) {
       const axes = frame(context, width, height, spans, ["x" + a, "x" + b]);
       nodes.forEach((s, i) => { if (i !== app.nodeOf(run)) ellipse(context, axes, s, a, b, false); });
       if (app.nodeOf(run) >= 0) ellipse(context, axes, nodes[app.nodeOf(run)], a, b, true);
@@ -68,8 +76,7 @@ const Estimates = (() => {
       if (chosen) Theme.write(context, "node " + s.node, axes.x(s.xhat[a]) + 7, axes.y(s.xhat[b]) - 8);
     }
 
-    function drawIntervals(context, width, height, nodes, x, a) {
-      const span = app.range === "run" ? wholeRange(run, a) : rangeNow(run, nodes, x, a);
+    function drawIntervals(context, width, height, nodes, x, a, span) {
       const axes = frame(context, width, height, [[-0.7, run.N - 0.3], span], ["", "x" + a], run.names);
       if (x) {
         context.strokeStyle = Theme.colours.green;

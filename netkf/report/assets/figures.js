@@ -1,6 +1,8 @@
 // The figures of a page: which curves there are. How they look is in curves.js.
 const Figures = (() => {
+  // One colour is one run in every figure of two runs: what is claimed is dashed, bounds are dotted.
   const COLOURS = ["blue", "red"];
+  const coloured = (runs, r, alone) => (runs.length > 1 ? COLOURS[r] : alone);
   const root = (values) => Array.from(values, (v) => Math.sqrt(v));
 
   function letter(runs, r) {
@@ -60,8 +62,8 @@ const Figures = (() => {
         series.push({ label: name + "square root of trace P, all nodes; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
       }
       if (!run.truth && i >= 0 && run.samples.one_state) series.push({ label: name + "distance of node " + run.names[i] + "'s estimate from the mean of all nodes'", x, y: apart(run, i), colour, width: 2.5 });
-      if (i >= 0) series.push({ label: name + "square root of trace P of node " + run.names[i], x, y: root(column(run, traces(run), i)), colour: r ? "orange" : "green", width: 2, dash: "dashed" });
-      if (i >= 0 && run.samples.bound) series.push({ label: name + "square root of the bound H(12) on the mean of trace P", x, y: root(column(run, run.samples.bound, i)), colour: "ink", width: 2, dash: r ? "dashed" : "solid" });
+      if (i >= 0) series.push({ label: name + "square root of trace P of node " + run.names[i], x, y: root(column(run, traces(run), i)), colour: coloured(runs, r, "green"), width: 2, dash: "dashed" });
+      if (i >= 0 && run.samples.bound) series.push({ label: name + "square root of the bound H(12) on the mean of trace P", x, y: root(column(run, run.samples.bound, i)), colour: coloured(runs, r, "ink"), width: 2, dash: runs.length > 1 ? "dotted" : "solid" });
     });
     for (const [label, value] of Object.entries(runs[0].limits)) lines.push({ label: label + ", square root:", y: Math.sqrt(value), colour: "purple", dash: lines.length ? "dotted" : "dashed" });
     const truth = runs.some((run) => run.truth);
@@ -110,8 +112,8 @@ const Figures = (() => {
       const at = [...parts.keys()].sort((a, b) => a - b), name = letter(runs, r), [mean, low, high] = v.means[i];
       const whose = i < 0 ? "of all nodes together" : "of node " + run.names[i];
       series.push({ label: name + "each reading " + whose, x, y: rows.map((k) => v.nis[k]), colour: COLOURS[r], dots: true });
-      series.push({ label: name + "mean of each " + Format.number(wide) + " s", x: at.map((k) => (k + 0.5) * wide), y: at.map((k) => parts.get(k)[0] / parts.get(k)[1]), colour: r ? "orange" : "ink", width: 2 });
-      lines.push({ label: name + "mean of all (where P is exact " + Format.number(low) + " .. " + Format.number(high) + "):", y: mean, colour: r ? "orange" : "purple", dash: "dotted" });
+      series.push({ label: name + "mean of each " + Format.number(wide) + " s", x: at.map((k) => (k + 0.5) * wide), y: at.map((k) => parts.get(k)[0] / parts.get(k)[1]), colour: coloured(runs, r, "ink"), width: 2 });
+      lines.push({ label: name + "mean of all (where P is exact " + Format.number(low) + " .. " + Format.number(high) + "):", y: mean, colour: coloured(runs, r, "purple"), dash: "dotted" });
     });
     if (!series.length) return null;
     lines.push({ label: "expected where P is exact:", y: 1, colour: "green", dash: "dashed" });
@@ -149,12 +151,11 @@ const Figures = (() => {
 
   function traffic(app, runs) {
     const dashes = { delivered: "solid", lost: "dashed", late: "dotted", "under way": "dotted" };
-    const colours = [{ delivered: "blue", lost: "red", late: "orange", "under way": "purple" },
-      { delivered: "purple", lost: "green", late: "ink", "under way": "orange" }];
+    const colours = { delivered: "blue", lost: "red", late: "orange", "under way": "purple" };
     const series = [];
     runs.forEach((run, r) => {
       for (const [kind, dash] of Object.entries(dashes)) {
-        const colour = colours[r][kind];
+        const colour = coloured(runs, r, colours[kind]);
         const y = run.traffic[kind], wide = run.horizon / y.length;
         if (!y.some(Boolean)) continue;
         series.push({ label: letter(runs, r) + kind, x: y.map((_, k) => (k + 0.5) * wide), y, colour, dash, width: 1.8 });
@@ -165,19 +166,20 @@ const Figures = (() => {
     return { title: "Traffic", unit: "messages per " + wide + " s", timed: true, series, note: "All messages, by when they were sent." };
   }
 
+  // Nodes have no order: dots with error bars, those of two runs beside each other.
   function averages(app, summaries) {
-    const series = [];
+    const series = [], many = summaries.length > 1;
     summaries.forEach((rows, r) => {
       if (!rows) return;
-      const x = rows.map((row) => row.node), name = summaries.length > 1 ? "AB"[r] + ": " : "";
+      const x = rows.map((row) => row.node + (many ? 0.24 * r - 0.12 : 0)), name = many ? "AB"[r] + ": " : "";
       const of = (key) => rows.map((row) => row[key]);
       const wide = (key, side) => rows.map((row) => (row[key + "_se"] ? row[key] + side * 2 * row[key + "_se"] : row[key]));
       if (of("rms_error").some(Number.isFinite)) {
-        const band = rows.some((row) => row.rms_error_se) ? { low: wide("rms_error", -1), high: wide("rms_error", 1) } : {};
-        series.push({ label: name + "RMS error" + (band.low ? ", shaded: two standard errors" : ""), x, y: of("rms_error"), ...band, colour: COLOURS[r], points: true });
+        const bars = rows.some((row) => row.rms_error_se) ? { low: wide("rms_error", -1), high: wide("rms_error", 1) } : {};
+        series.push({ label: name + "RMS error" + (bars.low ? ", bars: two standard errors" : ""), x, y: of("rms_error"), ...bars, colour: COLOURS[r], mark: "dot" });
       }
-      series.push({ label: name + "square root of mean trace P", x, y: root(of("mean_trace")), colour: r ? "orange" : "green", dash: "dashed", points: true });
-      if (of("bound").some(Number.isFinite)) series.push({ label: name + "square root of its bound", x, y: root(of("bound").map((v) => v ?? NaN)), colour: "ink", dash: "dotted", points: true });
+      series.push({ label: name + "square root of mean trace P", x, y: root(of("mean_trace")), colour: coloured(summaries, r, "green"), mark: "ring" });
+      if (of("bound").some(Number.isFinite)) series.push({ label: name + "square root of its bound", x, y: root(of("bound").map((v) => v ?? NaN)), colour: coloured(summaries, r, "ink"), mark: "tick" });
     });
     return series.length ? { title: "Averages per node", unit: "root mean square", xlabel: "node", series, note: "Over time; the numbers stand in the table." } : null;
   }
@@ -190,8 +192,8 @@ const Figures = (() => {
       const name = ensembles.length > 1 ? "AB"[r] + ": " : "", x = found.times;
       const add = (label, [y, low, high], colour, dash) => series.push({ label: name + label, x, y, low, high, colour, dash, width: 2 });
       if (entry.square[0].some(Number.isFinite)) add("mean squared error of node " + app.nodeId, entry.square, COLOURS[r], "solid");
-      add("mean trace P of node " + app.nodeId, entry.trace, r ? "orange" : "green", "dashed");
-      if (entry.bound) series.push({ label: name + "bound H(12)", x, y: entry.bound, colour: "ink", dash: "dotted", width: 2 });
+      add("mean trace P of node " + app.nodeId, entry.trace, coloured(ensembles, r, "green"), "dashed");
+      if (entry.bound) series.push({ label: name + "bound H(12)", x, y: entry.bound, colour: coloured(ensembles, r, "ink"), dash: "dotted", width: 2 });
     });
     return series.length ? { title: "Mean over the runs", unit: "squared units", timed: true, series, note: "Shaded: at least two standard errors on each side." } : null;
   }
@@ -213,8 +215,8 @@ const Figures = (() => {
     if (!entry) return null;
     const [y, low, high] = entry, x = found.times;
     const sure = y.map((v, k) => (low[k] > 0 || high[k] < 0 ? v : NaN));
-    const series = [{ label: "B - A, mean squared error of node " + app.nodeId + "; shaded: interval", x, y, low, high, colour: "blue" }];
-    if (sure.some(Number.isFinite)) series.push({ label: "certain: the interval leaves out 0", x, y: sure, colour: "red", points: true, width: 3 });
+    const series = [{ label: "B - A, mean squared error of node " + app.nodeId + "; shaded: interval", x, y, low, high, colour: "purple" }];
+    if (sure.some(Number.isFinite)) series.push({ label: "certain: the interval leaves out 0", x, y: sure, colour: "ink", points: true, width: 3 });
     const title = sure.some(Number.isFinite) ? "Where they differ for certain" : "The difference over time, nowhere certain";
     return { title, unit: "squared units", timed: true, series, lines: [{ label: "no difference", y: 0, colour: "ink", dash: "dotted" }],
       note: "All intervals, of all nodes and times, hold together with probability " + found.confidence + "." };

@@ -134,15 +134,15 @@ function options(select, entries) {
   select.replaceChildren(...entries.map(([value, words]) => Format.element("option", { value }, words)));
 }
 
+// Networks side by side, and estimates: what is compared has the same scales.
 function buildViews() {
-  find("views").replaceChildren(...app.runs.flatMap((run, r) => {
-    const name = app.runs.length > 1 ? "AB"[r] + ", " + run.label + ": " : "";
-    const about = (run.truth ? "each node stands for the truth, its ellipse lies where its error puts it" : "ellipses show how certain a node is; there is no truth") + ". Colour: " + (run.truth ? "error" : "square root of trace P");
-    return [
-      viewBox(run, name + "Network:", about, Network.view, true),
-      viewBox(run, name + "Estimates:", "of every node at the last sample, with 95 % by its P" + (run.truth ? ", beside the truth" : ""), Estimates.view, false),
-    ];
-  }));
+  const name = (run, r) => (app.runs.length > 1 ? "AB"[r] + ", " + run.label + ": " : "");
+  const about = (run) => (run.truth ? "each node stands for the truth, its ellipse lies where its error puts it" : "ellipses show how certain a node is; there is no truth") + ". Colour: " + (run.truth ? "error" : "square root of trace P");
+  app.views = [];
+  find("views").replaceChildren(
+    ...app.runs.map((run, r) => viewBox(run, name(run, r) + "Network:", about(run), Network.view, true)),
+    ...app.runs.map((run, r) => viewBox(run, name(run, r) + "Estimates:", "of every node at the last sample, with 95 % by its P" + (run.truth ? ", beside the truth" : ""), Estimates.view, false)),
+  );
 }
 
 function viewBox(run, title, about, make, pick) {

@@ -6,7 +6,7 @@ const Network = (() => {
   const HEIGHT = 420, CAPTION = 36; // pixels; the scale of colours has the lowest of them
 
   function view(run, canvas, app) {
-    const shades = shadeRange(run);
+    const shades = shadeRange(app.runs);
     let places = [], radius = 8, spacing = 40, laid = "", named = true, shrunk = [1, 1];
 
     function layout(width, whole) {
@@ -53,7 +53,7 @@ const Network = (() => {
     // Each node stands for the truth; its ellipse lies where the error puts it. Where one would
     // leave the canvas, as after the start, all are drawn smaller, and the caption says so.
     function drawEllipses(context, k, width, height) {
-      const x = State.truthAt(run, k), usual = glyphScale(run, app.axes, spacing);
+      const x = State.truthAt(run, k), usual = glyphScale(app.runs, app.axes, spacing);
       const room = [places.map(([px]) => Math.min(px, width - px)), places.map(([, py]) => Math.min(py, height - py))];
       shrunk = usual.map((scale, d) => shrinking(run, k, x, app.axes[d], scale, room[d]));
       const scale = usual.map((size, d) => size * shrunk[d]);
@@ -210,19 +210,20 @@ const Network = (() => {
   }
 
   // Nine of ten samples lie below the end of the scale: one wild node does not make all others light.
-  function shadeRange(run) {
+  // Runs side by side have one scale.
+  function shadeRange(runs) {
     const values = [];
-    for (let k = 0; k < run.samples.count; k++) {
+    for (const run of runs) for (let k = 0; k < run.samples.count; k++) {
       for (let i = 0; i < run.N; i++) values.push(shade(run, k, i));
     }
     const sorted = values.filter(Number.isFinite).sort((a, b) => a - b);
     return sorted[Math.floor(0.9 * (sorted.length - 1))] || 1;
   }
 
-  // Pixels per unit of each of two components: the same for all nodes and times, so that sizes
+  // Pixels per unit of each of two components: the same for all nodes, times and runs, so that sizes
   // compare, and one for each component, which may have different units.
-  function glyphScale(run, axes, spacing) {
-    return axes.map((c) => (0.4 * spacing) / usualSize(run, c));
+  function glyphScale(runs, axes, spacing) {
+    return axes.map((c) => (0.4 * spacing) / Math.max(...runs.map((run) => usualSize(run, c))));
   }
 
   // The part of its usual size at which every ellipse stays on the canvas: 1, or one over a whole
