@@ -255,6 +255,7 @@ DRAWINGS = {
     "hybrid": ["--runs", "2", "--rates", "8"],
     "ieee14": ["--runs", "1"],
     "intermittent": [],
+    "networks": ["--runs", "2"],
     "push_sum": ["--gains", "2"],
 }
 

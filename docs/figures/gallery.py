@@ -5,7 +5,7 @@ from pathlib import Path
 
 import networkx
 import numpy as np
-from look import BLUE, GREEN, GREY, ORANGE, draw, options
+from look import BLUE, GREEN, GREY, ORANGE, PINK, draw, options, page_code
 
 import netkf
 from netkf import theory
@@ -96,11 +96,45 @@ def exact_decay(start, times):
     return np.array([trace @ (np.exp(values * t) * begin) for t in times])
 
 
+def delays(figure, runs, points):
+    """The mean covariance with late readings, over the delivery and the length of the buffer."""
+    page = page_code("## Consensus on predictions")
+    left, right = figure.subplots(1, 2)
+    deliveries = 1.0 / 3.0 + np.geomspace(0.004, 2.0 / 3.0, points)
+    for mean_delay, color in ((0.3, GREEN), (1.0, BLUE), (3.0, PINK)):
+        found = [page["mean_late"](1.5, float(p), mean_delay) for p in deliveries]
+        left.plot(deliveries, found, color=color, label=f"mean delay {mean_delay:g} s")
+    left.axvline(1.0 / 3.0, color=GREY, ls=":")
+    left.set(xlabel="probability that a message ever arrives", ylabel="mean of P")
+    left.set(yscale="log", ylim=(0.8, 200.0), xlim=(0.3, 1.0))
+    left.set_title("all delays end at one delivery, 1/3")
+    left.legend()
+    buffers = np.linspace(0.0, 10.0, 10 * points + 1)[1:]
+    found = np.array([page["mean_late"](1.5, 0.9, 3.0, float(b)) for b in buffers])
+    steps = np.isfinite(found)
+    right.plot(buffers[steps], found[steps], color=PINK, label="mean delay 3 s, delivery 0.9")
+    for k, buffer in enumerate((3.0, 4.0, 6.0, 8.0)):
+        ensemble = netkf.monte_carlo(page["late_readings"](1.5, 0.9, 3.0, buffer), runs, workers=1)
+        late = ensemble.times >= 30.0
+        mean = ensemble.mean_P[late, 1, 0, 0].mean()
+        se = ensemble.se_P[late, 1, 0, 0].mean() * np.sqrt(5.0 / late.sum())  # 5 s: one memory
+        label = f"mean of {runs} runs, 95 %" if k == 0 else None
+        right.errorbar(buffer, mean, 1.96 * se, fmt="o", color=ORANGE, ms=4, label=label)
+    shortest = -3.0 * np.log(1.0 - 1.0 / 2.7)
+    right.axvline(shortest, color=GREY, ls=":")
+    right.text(
+        shortest - 0.1, 3.1, f"no mean below {shortest:.2f} s", color=GREY, rotation=90, ha="right"
+    )
+    right.set(xlabel="length of the buffer, seconds", xlim=(0.0, 10.0), ylim=(3.0, 15.0))
+    right.set_title("a short buffer is as good as a long one")
+    right.legend()
+
+
 def main(arguments=None):
     chosen = options(__doc__, arguments, runs=400, points=30)
-    for name, function in (("arrivals", arrivals), ("averaging", averaging)):
+    for function in (arrivals, averaging, delays):
         drawn = partial(function, runs=chosen.runs, points=chosen.points)
-        draw(chosen.out, f"gallery_{name}", drawn, (6.4, 3.6))
+        draw(chosen.out, f"gallery_{function.__name__}", drawn, (6.4, 3.6))
 
 
 if __name__ == "__main__":

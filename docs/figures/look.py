@@ -1,6 +1,7 @@
 """The look of the drawings on the pages of the papers, and how they are written."""
 
 import argparse
+import re
 from pathlib import Path
 
 import matplotlib as mpl
@@ -37,3 +38,13 @@ def draw(folder, name, function, size):
         figure = Figure(figsize=size, layout="constrained")
         function(figure)
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+
+
+def page_code(before):
+    """Return the names that docs/gallery.md defines up to a heading; its checks do not run."""
+    page, names = (HERE.parent / "gallery.md").read_text(encoding="utf-8"), {}
+    exec("import netkf, networkx, numpy as np", names)
+    for code in re.findall(r"```python\n(.*?)```", page.partition(before)[0], re.DOTALL):
+        if "print(" not in code:
+            exec(code, names)
+    return names
