@@ -199,12 +199,12 @@ class BlockBeliefPropagation(Filter):
         marked = state.marked(_time(state, exchange), self.window)
         n = state.n
 
-        def told(belief: Path) -> Path:
+        def past_of(belief: Path) -> Path:
             return Path(belief.x[:-n], belief.P[:-n, :-n])
 
-        without = {sender: told(marked.belief(without=sender)) for sender in marked.heard}
+        without = {sender: past_of(marked.belief(without=sender)) for sender in marked.heard}
         message = PathMessage(
-            marked.times, told(marked.belief()), without, marked.seen, state.blocks
+            marked.times, past_of(marked.belief()), without, marked.seen, state.blocks
         )
         return marked if exchange.slot >= 0 else state, message
 

@@ -172,7 +172,7 @@ def hear(record: Any, h: int, run: Any, k: int, q: int) -> None:
             count += 1
     if count > 0:
         if run.age[k] > 0.0:
-            predict_told(record, h, run, k)
+            predict_sent_blocks(record, h, run, k)
         use_common(record, run.link[k])
         fuse(f, count, record.rule)
     # A reading that took time is of a state that noise has moved since, which is in errors too.
@@ -207,7 +207,7 @@ def set_covariances(
 
 
 @kernel
-def predict_told(record: Any, h: int, run: Any, k: int) -> None:
+def predict_sent_blocks(record: Any, h: int, run: Any, k: int) -> None:
     """Predict what message ``k`` tells of blocks that both estimate to now, as node ``h`` predicts
     its own. The noise of the plant since is in the errors of both.
     """
@@ -348,7 +348,7 @@ class BlockIntersection(Filter):
 
     @property
     def analysis(self) -> Analysis:
-        """That P is no smaller than the covariance of the error, unless the rule is naive."""
+        """The claim that P is no smaller than the covariance of the error; none of a naive rule."""
         design = ("", "") if self.rule == "naive" else ("larger", "larger")
         return Analysis(P_by_design=design, affine=True)
 

@@ -138,23 +138,23 @@ class Recorder(Filter):
 
     @property
     def timing(self) -> Timing:
-        """That of the filter, whose states are inside."""
+        """The filter's own, of the states that are inside."""
         rule, silent = interval_rule(self.inner), may_be_silent(self.inner)
         return replace(self.inner.timing, interval=lambda state: rule(state.inner), decides=silent)
 
     @property
     def needs(self) -> Needs:
-        """Those of the filter."""
+        """The filter's own."""
         return self.inner.needs
 
     @property
     def link_weights(self) -> Weights:
-        """Those of the filter."""
+        """The filter's own."""
         return self.inner.link_weights
 
     @property
     def analysis(self) -> Analysis:
-        """That of the filter, whose states are inside."""
+        """The filter's own, of the states that are inside."""
         given = self.inner.analysis
         return replace(
             given,

@@ -75,8 +75,8 @@ class FigureData:
 
     @property
     def nees_unit(self) -> tuple[int, Any]:
-        """What NEES should be, and by what it is divided for that, of all or of each node (N,): n
-        and 1, or 1 and n where nodes have states of different size.
+        """The expected NEES, and its divisor, of all or of each node (N,): n and 1, or 1 and n
+        where nodes have states of different size.
         """
         sizes = self.scenario.sizes
         return (int(sizes[0]), 1.0) if np.ptp(sizes) == 0 else (1, sizes)

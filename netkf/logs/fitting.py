@@ -289,19 +289,19 @@ def run_tests(
         "memory": stats.test_memory(steady),
         "fate": fate,
         "constancy": constancy,
-        "links": stats.test_alike(ASSUMPTIONS["links"], counts, pooled, spread, 1),
+        "links": stats.test_identical(ASSUMPTIONS["links"], counts, pooled, spread, 1),
     }
     parts = outcomes.by_channel.astype(float)
     if len(parts) > 1:
         own = np.tile(counts[:, 1] / np.maximum(counts[:, 0], 1.0), (len(parts), 1)).ravel()
         name, flat = ASSUMPTIONS["channel"], parts.reshape(-1, 2)
         spreads = np.tile(spread, len(parts))
-        found["channel"] = stats.test_alike(name, flat, own, spreads, len(counts))
+        found["channel"] = stats.test_identical(name, flat, own, spreads, len(counts))
     found |= _direction_test(outcomes, counts, slack)
     if distance is not None and len(counts) > 2:
         values, _ = stats.fit_distance(distance, counts[:, 0], counts[:, 1], slack)
         curve = expit((values[0] - distance) / values[1])
-        found["distance"] = stats.test_alike(ASSUMPTIONS["distance"], counts, curve, spread, 2)
+        found["distance"] = stats.test_identical(ASSUMPTIONS["distance"], counts, curve, spread, 2)
     return found, share, time, edges
 
 
@@ -318,7 +318,7 @@ def _direction_test(outcomes: Outcomes, counts: FloatArray, slack: float) -> dic
     spread = np.full(len(order), slack)
     name = ASSUMPTIONS["directions"]
     return {
-        "directions": stats.test_alike(name, counts[order], expected, spread, len(both)),
+        "directions": stats.test_identical(name, counts[order], expected, spread, len(both)),
     }
 
 

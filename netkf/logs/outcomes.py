@@ -112,8 +112,8 @@ class Outcomes:
 
     @cached_property
     def transitions(self) -> FloatArray:
-        """Of each link packets heard that have a next one, those of them whose next is lost,
-        packets lost that have one, and those whose next is heard, (L, 4).
+        """Counts by link (L, 4): packets heard that have a next one, those of them whose next is
+        lost, packets lost that have one, and those whose next is heard.
         """
         moves = np.zeros((len(self.links), 4))
         for group in self.groups:
@@ -434,7 +434,7 @@ def test_constancy(outcomes: Outcomes, time: float) -> Test:
     return Test(name, what, deviation * math.sqrt(slow), p, unit, LAGS, 4)
 
 
-def test_alike(
+def test_identical(
     assumption: str, counts: FloatArray, expected: FloatArray, spread: FloatArray, used: int
 ) -> Test:
     """Test that deliveries of K links, or parts of links, are the ``expected`` ones (K,), where

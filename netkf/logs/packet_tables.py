@@ -82,16 +82,8 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
 
     Raises ScenarioError, with file and line, for a table that cannot be read.
     """
-    paths = [log]
-    if log.is_dir():
-        found = [p for ending in ("csv", "csv.gz", "tsv", "txt") for p in log.glob(f"*.{ending}")]
-        named = [path for path in found if path.name.partition(".")[0] == "packets"]
-        rest = [path for path in found if path.name.partition(".")[0] not in EXTRAS]
-        paths = sorted(named or rest)
-    if not paths:
-        raise ScenarioError(str(log), "has no table of packets", None, "check the folder")
     notes: list[str] = []
-    tables = _rename({path: read_texts(path) for path in paths}, columns)
+    tables = _rename({path: read_texts(path) for path in _packet_paths(log)}, columns)
     rows = _join([_read_rows(path, raw, notes) for path, raw in tables.items()])
     extras = {name: find_extra(log, name) for name in EXTRAS}
     resolution = find_resolution(rows.stamps)
@@ -120,6 +112,18 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     if extras["readings"] is not None:
         result.readings = read_readings(extras["readings"], origin)
     return result
+
+
+def _packet_paths(log: Path) -> list[Path]:
+    """Return the tables of packets of a log; raises ScenarioError if there is none."""
+    if not log.is_dir():
+        return [log]
+    found = [p for ending in ("csv", "csv.gz", "tsv", "txt") for p in log.glob(f"*.{ending}")]
+    named = [path for path in found if path.name.partition(".")[0] == "packets"]
+    rest = [path for path in found if path.name.partition(".")[0] not in EXTRAS]
+    if not (named or rest):
+        raise ScenarioError(str(log), "has no table of packets", None, "check the folder")
+    return sorted(named or rest)
 
 
 def find_extra(log: Path, name: str) -> Path | None:

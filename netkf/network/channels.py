@@ -141,7 +141,7 @@ def draws_per_link(channel: Channel) -> bool:
     return one_chain and channel.channels is None and not channel.draws_for_senders
 
 
-def are_alike(channel: Channel) -> bool:
+def has_identical_links(channel: Channel) -> bool:
     """Return True if neither fate nor delay of a message depends on its number, its time or the
     state of its link.
     """

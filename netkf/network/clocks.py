@@ -253,13 +253,13 @@ class Renewal(LinkClock):
 
     @property
     def gamma_scale(self) -> tuple[float, float]:
-        """What a gamma number of scale 1 is divided by and then multiplied with: a gap, seconds."""
+        """The divisor and the factor that make a gap, seconds, of a gamma number of scale 1."""
         shape = self.shape or 1.0
         return (shape * self.rate, 1.0) if self.rate else (1.0, self.mean_gap / shape)
 
     @property
     def weibull_scale(self) -> float:
-        """What a Weibull number of scale 1 is multiplied with: a gap, seconds."""
+        """The factor that makes a gap, seconds, of a Weibull number of scale 1."""
         return self.mean_gap / math.gamma(1.0 + 1.0 / (self.shape or 1.0))
 
     def mean_rate(self, entity: Entity) -> float:

@@ -612,17 +612,8 @@ class LinkTable:
         if minimum is not None and not self.has_probabilities:
             rule = "needs a column delivery_probability in the table"
             raise ScenarioError("minimum", rule, minimum, "add the column or leave minimum out")
-        named = {node for link in self.probability for node in link}
-        delivery = self.probability
-        # Unless links are listed both ways each row counts both ways.
-        if not self.directed and not any((j, i) in delivery for i, j in delivery):
-            delivery = delivery | {(j, i): p for (i, j), p in delivery.items()}
-        least = minimum or 0.0
-        links = {
-            (i, j)
-            for (i, j), p in delivery.items()
-            if p >= least and (self.directed or delivery.get((j, i), 0.0) >= least)
-        }
+        delivery = self._both_ways()
+        links = self._reliable(delivery, minimum or 0.0)
         if not links and not self.alone:
             key, rule = "path" if minimum is None else "minimum", "no link of the table is left"
             raise ScenarioError(key, rule, minimum, "lower minimum or add rows")
@@ -630,8 +621,8 @@ class LinkTable:
         one_way = [] if self.directed else sorted(p for p in delivery if p[::-1] not in delivery)
         if self.has_probabilities and links.intersection(one_way):
             raise self._unknown_direction(one_way)
-        nodes = {node for link in links for node in link} | self.alone
-        isolated = named - nodes
+        nodes = _ends(links) | self.alone
+        isolated = _ends(self.probability) - nodes
         _check_size(len(nodes), len(links))
         points, place_rows = _place_nodes(positions, nodes, isolated, self.names)
         return Topology(
@@ -648,6 +639,23 @@ class LinkTable:
             tables={"": self.rows} | ({} if place_rows is None else {".positions": place_rows}),
             names=self.names,
         )
+
+    def _both_ways(self) -> dict[Link, float]:
+        """Return the probability by direction: unless links are listed both ways, or are directed,
+        each row counts both ways.
+        """
+        listed = self.probability
+        if self.directed or any((j, i) in listed for i, j in listed):
+            return listed
+        return listed | {(j, i): p for (i, j), p in listed.items()}
+
+    def _reliable(self, delivery: dict[Link, float], minimum: float) -> set[Link]:
+        """Return the links whose ``delivery`` reaches the minimum, of undirected ones both ways."""
+        return {
+            link
+            for link, p in delivery.items()
+            if p >= minimum and (self.directed or delivery.get(link[::-1], 0.0) >= minimum)
+        }
 
     def _unknown_direction(self, one_way: list[Link]) -> ScenarioError:
         return ScenarioError(
@@ -750,6 +758,10 @@ def _read_positions(source: SourceFile) -> tuple[dict[int, tuple[float, float]],
     ids = columns.integers(names[0])
     first = first_rows(columns, ids, points, "a node must have one position")
     return {node: points[row] for node, row in first.items()}, ids
+
+
+def _ends(links: Iterable[Link]) -> set[int]:
+    return {node for link in links for node in link}
 
 
 def _isolated_note(nodes: Sequence[str], minimum: float) -> tuple[str, ...]:

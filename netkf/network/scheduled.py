@@ -59,8 +59,8 @@ class ScheduledLoss(Loss):
 
     @cached_property
     def _steps(self) -> tuple[dict[Link, tuple[FloatArray, FloatArray]], dict[Link, int]]:
-        """By directed link the times (K,) from which its probabilities (K,) hold, and the number of
-        the first line of each.
+        """Return by directed link the times (K,) from which its probabilities (K,) hold, and the
+        number of the first line of each.
         """
         table = _read_deliveries(self.path, ("from", "until", "sender", "receiver"))
         begins, ends, values = (table[name].tolist() for name in ("from", "until", "delivery"))

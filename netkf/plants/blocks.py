@@ -287,16 +287,7 @@ def stack(blocks: Sequence[Block], layout: Layout) -> Plant:
 def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
     slotted = isinstance(blocks[0].plant, SlotPlant)
     for k, block in enumerate(blocks):
-        plant = block.copies[0]
-        for key, given in (("coupling", block.coupling), ("schedule", plant.changes)):
-            if len(given):
-                rule = "must be left out where blocks are not linear, whose f says it with x and t"
-                raise ScenarioError(f"[{k}].{key}", rule, None, "write one f for all of it")
-        if plant.linear:
-            _check_gain(k, plant.input, plant.n)
-        else:
-            with errors_under(f"[{k}]"):
-                plant.check_dynamics()
+        _check_beside_nonlinear(k, block)
     plants, parts = _plants(blocks), []
     for plant in plants:
         u = plant.input
@@ -320,6 +311,20 @@ def _stack_nonlinear(blocks: Sequence[Block]) -> Plant:
         return NonlinearPlant(Q=noise, period=_one(blocks, "period"), **shared)
     curved = [block for block in blocks if not block.plant.linear]
     return NonlinearDiffusion(B=noise, step=_one(curved, "step"), **shared)
+
+
+def _check_beside_nonlinear(k: int, block: Block) -> None:
+    """Raise ScenarioError if block number ``k`` cannot stand among blocks that are not linear."""
+    plant = block.copies[0]
+    for key, given in (("coupling", block.coupling), ("schedule", plant.changes)):
+        if len(given):
+            rule = "must be left out where blocks are not linear, whose f says it with x and t"
+            raise ScenarioError(f"[{k}].{key}", rule, None, "write one f for all of it")
+    if plant.linear:
+        _check_gain(k, plant.input, plant.n)
+    else:
+        with errors_under(f"[{k}]"):
+            plant.check_dynamics()
 
 
 def _stacked_matrices(blocks: Sequence[Block], layout: Layout) -> dict[str, Any]:

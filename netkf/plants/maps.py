@@ -90,19 +90,8 @@ def check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction])
     if plant.input is not None and plant.input.G is not None:
         remedy = "leave it out: u is what f takes"
         raise ScenarioError("input.G", "means nothing with a nonlinear plant", None, remedy)
-    known = MOTIONS.get(plant.f) if isinstance(plant.f, str) else None
-    if known is not None and known.n != n:
-        key = "B" if hasattr(plant, "B") else "Q"
-        rule = f"must have {known.n} rows, for {known.states}"
-        raise ScenarioError(key, rule, f"{n} rows", f'that is the state of "{plant.f}"')
-    if known is not None and known.m != m:
-        rule = f'must have {known.m} components for "{plant.f}", {known.inputs}'
-        if not known.m:
-            raise ScenarioError("input", f'means nothing with "{plant.f}"', None, "leave it out")
-        got = f"{m} components" if m else None
-        remedy = 'give [plant.input], such as kind = "constant" and value = [v, w]'
-        raise ScenarioError("input", rule if m else f"is missing: it {rule}", got, remedy)
-    if known is not None:
+    if isinstance(plant.f, str) and plant.f in MOTIONS:
+        _check_motion(plant, MOTIONS[plant.f])
         return
     u = np.zeros(m) if plant.input is None else plant.input.at(0.0)
     x = plant.start_mean if len(plant.start_mean) == n else np.zeros(n)
@@ -118,6 +107,23 @@ def check_dynamics(plant: Any, functions: tuple[VectorFunction, VectorFunction])
         if not np.isfinite(value).all():
             rule = f"{name} must be finite at plant.mean, not {value.tolist()}"
             raise ScenarioError("f", rule, plant.f, "give plant.mean, or correct the class")
+
+
+def _check_motion(plant: Any, motion: Any) -> None:
+    """Raise ScenarioError if state or input have not the sizes of a built-in motion."""
+    n, m = plant.n, plant.m
+    if motion.n != n:
+        key = "B" if hasattr(plant, "B") else "Q"
+        rule = f"must have {motion.n} rows, for {motion.states}"
+        raise ScenarioError(key, rule, f"{n} rows", f'that is the state of "{plant.f}"')
+    if motion.m == m:
+        return
+    if not motion.m:
+        raise ScenarioError("input", f'means nothing with "{plant.f}"', None, "leave it out")
+    rule = f'must have {motion.m} components for "{plant.f}", {motion.inputs}'
+    got = f"{m} components" if m else None
+    remedy = 'give [plant.input], such as kind = "constant" and value = [v, w]'
+    raise ScenarioError("input", rule if m else f"is missing: it {rule}", got, remedy)
 
 
 class MapPath:

@@ -214,8 +214,8 @@ class RecordedStates(Plant):
 
     @property
     def headings(self) -> tuple[int, ...]:
-        """Which states are angles, that tables may count from anywhere: of a motion that netkf
-        knows, or that a class names.
+        """The states that are angles, which tables may count from anywhere: of a built-in motion,
+        or those that a class names.
         """
         f = getattr(self, "f", None)
         if isinstance(f, str):

@@ -282,8 +282,8 @@ class DerivedScenario(ScenarioModel):
 
     @cached_property
     def common_entries(self) -> dict[Link, tuple[np.ndarray, np.ndarray]]:
-        """Of links whose ends, (sender, receiver), estimate different states: the entries (k,) of
-        those that both estimate, in the state of the sender and in that of the receiver. Empty for
+        """The entries (k,) that both ends of a link (sender, receiver) estimate, in the state of
+        the sender and in that of the receiver, where the two estimate different states. Empty for
         filters whose messages say of which blocks they speak.
         """
         if self.views is None or self.node_filter.needs.blocks or self.node_filter.timing.pooled:
@@ -467,18 +467,7 @@ class DerivedScenario(ScenarioModel):
         """
         frames = self.exact_errors if frames is None else frames
         if isinstance(self.plant, NonlinearDiffusion):
-            if sampled is None:
-                sampled = all_sample_times(sample_times(self, streams))
-            if not self.plant.is_random:
-                require_states(self, sample_times(self, streams), streams)
-            if not self.plant.draws:
-                return self.plant.recorded_truth
-            random, *inside = map(streams.generator, ("plant", "samples", "probe"))
-            # Readings do not depend on when the network ticks.
-            ticks = tick_times(self, streams) if self.links_follow_state else np.empty(0)
-            shown = np.union1d(self.times, ticks)
-            curve = self.plant.curve(random, (sampled, inside[0]), (shown, inside[1]))
-            return self._with_given_states(curve)
+            return self._nonlinear_truth(self.plant, streams, sampled)
         plant, horizon = self.diffusion, self.horizon
         recorded, on_grid = not plant.is_random, uses_grid(self)
         if sampled is None or recorded:
@@ -507,6 +496,22 @@ class DerivedScenario(ScenarioModel):
             shown = times if self.links_follow_state else probes
             truth = driven(truth, responses, not plant.draws, forced, (times, shown))
         return self._with_given_states(truth)
+
+    def _nonlinear_truth(
+        self, plant: NonlinearDiffusion, streams: Streams, sampled: FloatArray | None
+    ) -> Any:
+        if sampled is None:
+            sampled = all_sample_times(sample_times(self, streams))
+        if not plant.is_random:
+            require_states(self, sample_times(self, streams), streams)
+        if not plant.draws:
+            return plant.recorded_truth
+        random, *inside = map(streams.generator, ("plant", "samples", "probe"))
+        # Readings do not depend on when the network ticks.
+        ticks = tick_times(self, streams) if self.links_follow_state else np.empty(0)
+        shown = np.union1d(self.times, ticks)
+        curve = plant.curve(random, (sampled, inside[0]), (shown, inside[1]))
+        return self._with_given_states(curve)
 
     def slot_truth(self, streams: Streams, frames: bool | None = None) -> Any:
         """Return the true state of one run in slots, a plants.linear.Truth; with ``frames``, by

@@ -371,7 +371,7 @@ class ScenarioModel(Component):
 
     @cached_property
     def positions(self) -> Positions:
-        """Where nodes are."""
+        """The positions of nodes."""
         return positions_of(self)
 
     @property
@@ -411,8 +411,8 @@ class ScenarioModel(Component):
 
     @cached_property
     def departures(self) -> tuple[tuple[str, str], ...]:
-        """What filters assume, and why it is not so: clocks, sensors, messages and
-        gates.
+        """Assumptions of filters that do not hold, each with its reason: clocks, sensors, messages
+        and gates.
         """
         found = []
         if self.network.clocks:

@@ -71,7 +71,7 @@ class Target(NamedTuple):
 
     @property
     def description(self) -> str:
-        """What the quantity is."""
+        """The quantity in words."""
         quantile = QUANTILE.fullmatch(self.quantity)
         if quantile:
             return f"error that is not exceeded in {quantile[1]} % of samples"

@@ -118,7 +118,7 @@ class Observed(Filter):
 
     @property
     def timing(self) -> Any:
-        """That of the user's filter."""
+        """The timing of the user's filter."""
         part, interval = self.watched.part, interval_rule(self.watched.part)
         return replace(
             part.timing,
@@ -138,7 +138,7 @@ class Observed(Filter):
 
     @property
     def analysis(self) -> Any:
-        """Whether a node stopped, checked."""
+        """The checked rule for whether a node has stopped."""
         return replace(super().analysis, stopped=lambda own: self._has_stopped(own.state))
 
     def init(self, model: Any, mean: FloatArray, cov: FloatArray, node: NodeInfo) -> ObservedState:

@@ -118,22 +118,7 @@ def _joint_moments(scenario: Scenario, run: Run, about_mean: bool) -> FloatArray
 
 def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
     """Return the errors at time 0 of all estimators (the filters of the nodes, or a pooled one)."""
-    if not isinstance(run, Run):
-        raise TheoryError(
-            f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
-        )
-    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
-        raise TheoryError("the run is of another scenario: its nodes or its state differ")
-    require_linear(scenario, accepted=(RIGHT_CLOCKS, ALL_READ))
-    in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
-    reasons = [evidence for _, evidence in scenario.departures]
-    if scenario.network.lives and (scenario.slotted or scenario.forgetful_nodes):
-        reasons.append(LIVES)
-    if reasons and (in_python or scenario.views is not None):
-        rule = "exact errors are known of filters whose verbs are affine kernels of one state"
-        raise TheoryError(f"{reasons[0]}: {rule}; {CONSISTENCY}")
-    if scenario.links_follow_state:
-        raise TheoryError("the true state says who hears whom: events tell of it")
+    _require_known_errors(scenario, run)
     if scenario.slotted:
         run = with_last_exchanges(scenario, run)
     reads_kernels = scenario.node_filter.kernels is not None and scenario.common_entries
@@ -154,6 +139,26 @@ def _errors_of(scenario: Scenario, run: Run) -> ErrorColumns:
         name = type(scenario.filter.algorithm).__name__
         raise TheoryError(f"no exact error covariance for {name}")
     return make(scenario, run)
+
+
+def _require_known_errors(scenario: Scenario, run: Run) -> None:
+    """Raise TheoryError if ``run`` is not one of the scenario, or its errors are not affine."""
+    if not isinstance(run, Run):
+        raise TheoryError(
+            f"run must be a netkf.Run, as netkf.simulate returns it, got a {type(run).__name__}"
+        )
+    if run.nodes != scenario.nodes or run.x.shape[1] != scenario.plant.n:
+        raise TheoryError("the run is of another scenario: its nodes or its state differ")
+    require_linear(scenario, accepted=(RIGHT_CLOCKS, ALL_READ))
+    in_python = takes_columns(scenario.node_filter) or not has_columns(scenario)
+    reasons = [evidence for _, evidence in scenario.departures]
+    if scenario.network.lives and (scenario.slotted or scenario.forgetful_nodes):
+        reasons.append(LIVES)
+    if reasons and (in_python or scenario.views is not None):
+        rule = "exact errors are known of filters whose verbs are affine kernels of one state"
+        raise TheoryError(f"{reasons[0]}: {rule}; {CONSISTENCY}")
+    if scenario.links_follow_state:
+        raise TheoryError("the true state says who hears whom: events tell of it")
 
 
 def require_known_filter(scenario: Scenario) -> None:

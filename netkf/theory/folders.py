@@ -27,7 +27,7 @@ from netkf.theory.stochastic_trigger.errors import (
     UNHEARD,
     all_hear_all,
     error_columns,
-    start_alike,
+    start_equal,
 )
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 from netkf.trace.run import Run
@@ -113,7 +113,7 @@ def _track_rows(scenario: Scenario) -> list[AssumptionRow]:
 
 def _silence_rows(scenario: Scenario) -> list[AssumptionRow]:
     """Return the rows under which errors under the stochastic trigger are as large as P says."""
-    source, heard, alike = "Han et al. 2015", all_hear_all(scenario), start_alike(scenario)
+    source, heard, alike = "Han et al. 2015", all_hear_all(scenario), start_equal(scenario)
     evidence = "silence is a decision" if heard else UNHEARD
     start = "with the same mean and covariance"
     if not alike:

@@ -335,10 +335,13 @@ def _sent_in_slots(scenario: Scenario, run: Run, log: Any) -> Iterator[str]:
         if messages > 2 * ticks or (messages < 2 * ticks and scenario.topology.radius is None):
             yield f"{messages:,} messages of {ticks:,} pairs"
         return
-    if isinstance(activation, RecordedSlots) or any(
-        isinstance(sensor, RecordedSensor) for sensor in scenario.sensors
-    ):
-        return
+    is_recorded = any(isinstance(sensor, RecordedSensor) for sensor in scenario.sensors)
+    if not (is_recorded or isinstance(activation, RecordedSlots)):
+        yield from _sent_in_rounds(scenario, log)
+
+
+def _sent_in_rounds(scenario: Scenario, log: Any) -> Iterator[str]:
+    algorithm, kinds = scenario.node_filter, log["kind"]
     phases = range((algorithm.timing.schedule or ()).count("exchange"))
     steps = [algorithm.timing.steps(phase) for phase in phases]
     rounds = log["phase"][kinds == ROUND]

@@ -58,8 +58,8 @@ from netkf.engines.compiled.events import (
     record_event_with_age,
     record_links,
     seek_piece,
+    stamped_age,
     store_sample,
-    told_age,
 )
 from netkf.engines.compiled.increments import fill_readings
 from netkf.engines.compiled.message_queue import push, release, sort_indices, take
@@ -387,7 +387,7 @@ def on_absorb(state: Simulation, record: Any, run: ClockRun, verbs: ClockVerbs, 
     m = node.inbox
     while m != -1:
         message = pool[m]
-        age = told_age(state, m, now)
+        age = stamped_age(state, m, now)
         oldest = max(oldest, age)
         w = message.direction
         run.message[count], run.link[count] = m, state.incoming[w]

@@ -285,7 +285,7 @@ def local_time(state: Simulation, h: int, time: float) -> float:
 
 
 @kernel
-def told_age(state: Simulation, m: int, now: float) -> float:
+def stamped_age(state: Simulation, m: int, now: float) -> float:
     """Return the age at ``now`` that the stamp of message ``m`` tells its receiver: from 0 to the
     time since the start, both by the receiver's clock.
     """
@@ -310,7 +310,7 @@ def arrive(state: Simulation, m: int, now: float) -> None:
         return
     age = snapped(now - message.sent, state.per_second)
     # ``not <=`` also rejects an age that is nan.
-    if not told_age(state, m, now) <= state.age_limit:
+    if not stamped_age(state, m, now) <= state.age_limit:
         record_event_with_age(state, now, LATE, receiver_id, sender_id, message.number, age)
         release(state, m)
         return

@@ -103,7 +103,7 @@ class SlotPairs:
 
     @cached_property
     def nonlinear(self) -> NonlinearSetup:
-        """What kernels know of those that are not linear."""
+        """The tables of nonlinear pairs that kernels read."""
         columns, w = self.columns, self.columns.entries.shape[1]
         entries = np.full((len(self.all), columns.width), -1)
         for k, pair in enumerate(self.all):

@@ -19,9 +19,9 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.channels import (
     ChannelDraw,
     ChannelSampler,
-    are_alike,
     broadcasts_of,
     conditions_of,
+    has_identical_links,
     transit_time,
 )
 from netkf.network.graphs import Link
@@ -90,7 +90,7 @@ class Transmitter:
         self._timeline, self._recorder = timeline, recorder
         self._channel = scenario.network.channel
         self._follows_distance = self._channel.loss.follows_distance
-        self._alike = are_alike(self._channel)
+        self._alike = has_identical_links(self._channel)
         self._conditions = conditions_of(self._channel.loss, streams, scenario.horizon)
         radio = scenario.network.radio
         self._airtime = None if radio is None else Airtime(radio)
@@ -187,7 +187,7 @@ class Transmitter:
             # The stored envelope may have been shifted since it was sent.
             envelope = self._under_way.pop((direction.link, envelope.number))
         age = self._instant(now - envelope.sent)
-        envelope = envelope._replace(age=self._told_age(direction.link, envelope.sent, age))
+        envelope = envelope._replace(age=self._stamped_age(direction.link, envelope.sent, age))
         if not self.up(receiver):
             if now < self._horizon or envelope.sent == now:
                 self._recorder.append((now, LOST, sender, receiver, envelope.number, phase, NAN))
@@ -212,7 +212,7 @@ class Transmitter:
                 self._recorder.append(row)
         return self._encoded[sender][1]
 
-    def _told_age(self, link: Link, sent: float, age: float) -> float:
+    def _stamped_age(self, link: Link, sent: float, age: float) -> float:
         """Return the age that the stamp of a message tells its receiver, whose filter believes it:
         from 0 to the time since the start, both by the receiver's clock.
         """

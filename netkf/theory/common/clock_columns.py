@@ -211,7 +211,7 @@ class ClockColumns(LoggedColumns):
         clock = self._clocks.get(self._scenario.nodes[h])
         return time if clock is None else clock.shows(time)
 
-    def _told_age(self, h: int, message: Sent, time: float) -> float:
+    def _stamped_age(self, h: int, message: Sent, time: float) -> float:
         """Return the age that the stamp of a message tells node h at ``time``."""
         instant, shown = self._scenario.time_grid.instant, self._shown(h, time)
         told = instant(shown - self._shown(message.sender, message.time))
@@ -289,7 +289,7 @@ class ClockColumns(LoggedColumns):
             inbox = list({message.sender: message for message in inbox}.values())
         readings = []
         for k, message in enumerate(inbox):
-            run.message[k], run.age[k] = message.payload, self._told_age(h, message, time)
+            run.message[k], run.age[k] = message.payload, self._stamped_age(h, message, time)
             run.link[k] = self._link[message.sender, h]
             run.message_weight[k] = run.weight[run.link[k]]
             run.heard[k] = -1

@@ -157,19 +157,7 @@ def directions_of(
     receiver), with the law of their losses; messages that take more than ``wait`` seconds are lost.
     Raises TheoryError without a known law.
     """
-    channel = scenario.network.channel
-    loss, delay = channel.loss, channel.delay.fixed
-    if lacks_channel_law(scenario) or has_recorded_broadcasts(scenario):
-        raise TheoryError(no_channel_law(scenario))
-    if delay is None:
-        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
-    if not has_constant_losses(scenario):
-        raise TheoryError("messages of one link are lost with different probabilities")
-    chained = isinstance(loss, GilbertElliott) and loss.chain is not None and not loss.independent
-    if not (chained or loss.independent):
-        raise TheoryError("losses depend on earlier ones in a way that is not known here")
-    if loss.state_of != "link":
-        raise TheoryError("the links of a sender share their bursts, which is not known here")
+    loss, delay = scenario.network.channel.loss, _known_delay(scenario)
     links, index = list(weights), scenario.topology.index
     # One draw decides about both directions of a link that are activated and lost together.
     together = scenario.network.one_fate
@@ -186,8 +174,27 @@ def directions_of(
         source,
         delivery,
         loss.fate_share if scenario.has_broadcasts else 0.0,
-        loss.transitions if isinstance(loss, GilbertElliott) and chained else None,
+        loss.transitions if isinstance(loss, GilbertElliott) and not loss.independent else None,
     )
+
+
+def _known_delay(scenario: Scenario) -> float:
+    """Return the delay of all messages, seconds; raises TheoryError without a known law of losses
+    and delays.
+    """
+    loss, delay = scenario.network.channel.loss, scenario.network.channel.delay.fixed
+    if lacks_channel_law(scenario) or has_recorded_broadcasts(scenario):
+        raise TheoryError(no_channel_law(scenario))
+    if delay is None:
+        raise TheoryError("exact mean squares are known for no delay or a fixed one, not a random")
+    if not has_constant_losses(scenario):
+        raise TheoryError("messages of one link are lost with different probabilities")
+    is_chain = isinstance(loss, GilbertElliott) and loss.chain is not None
+    if not (is_chain or loss.independent):
+        raise TheoryError("losses depend on earlier ones in a way that is not known here")
+    if loss.state_of != "link":
+        raise TheoryError("the links of a sender share their bursts, which is not known here")
+    return delay
 
 
 def nothing_is_lost(scenario: Scenario) -> bool:

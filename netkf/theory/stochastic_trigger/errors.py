@@ -46,7 +46,7 @@ def all_hear_all(scenario: Scenario) -> bool:
     return complete and all_messages_arrive(scenario)
 
 
-def start_alike(scenario: Scenario) -> bool:
+def start_equal(scenario: Scenario) -> bool:
     """Return True if all filters start alike; hearing everything, they have one estimate."""
     mean, cov = scenario.initial_estimate(scenario.nodes[0])
     starts = [scenario.initial_estimate(node) for node in scenario.nodes[1:]]
@@ -98,7 +98,7 @@ def error_columns(scenario: Scenario, run: Run) -> ErrorColumns:
         raise TheoryError(UNHEARD)
     if not scenario.filters_know_the_truth:
         raise TheoryError("the filters take silence for what their model says, which is not true")
-    if not start_alike(scenario):
+    if not start_equal(scenario):
         raise TheoryError(
             "the filters start with different estimates: silence is about the sender's prediction, "
             "and hearers take it to be about their own"
