@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from netkf.logs.exporting import export_log, export_recorded
     from netkf.logs.fitting import fit_log
     from netkf.logs.importing import import_log
+    from netkf.neighbours.datasets import export_netcdf
+    from netkf.neighbours.graphml import export_graphml
+    from netkf.neighbours.models import from_control, from_filterpy
+    from netkf.neighbours.perfetto import export_perfetto
+    from netkf.report.embedded import page
     from netkf.runs.held_out import held_out_errors
     from netkf.runs.run import save
     from netkf.runs.simulate import simulate
@@ -50,11 +55,16 @@ _MODULE_OF = {
     "compare": "netkf.studies.compare",
     "compare_filters": "netkf.studies.compare_filters",
     "consistency": "netkf.studies.consistency",
+    "export_graphml": "netkf.neighbours.graphml",
     "export_log": "netkf.logs.exporting",
+    "export_netcdf": "netkf.neighbours.datasets",
+    "export_perfetto": "netkf.neighbours.perfetto",
     "export_recorded": "netkf.logs.exporting",
     "first_difference": "netkf.trace.run",
     "fit_log": "netkf.logs.fitting",
     "fit_noise": "netkf.studies.likelihood",
+    "from_control": "netkf.neighbours.models",
+    "from_filterpy": "netkf.neighbours.models",
     "held_out_errors": "netkf.runs.held_out",
     "import_log": "netkf.logs.importing",
     "innovations": "netkf.studies.innovation_tests",
@@ -63,6 +73,7 @@ _MODULE_OF = {
     "check": "netkf.checks.check",
     "monte_carlo": "netkf.ensembles.monte_carlo",
     "open": "netkf.studies.opening",
+    "page": "netkf.report.embedded",
     "parts": "netkf.parts",
     "save": "netkf.runs.run",
     "simulate": "netkf.runs.simulate",
@@ -92,17 +103,23 @@ __all__ = [
     "compare",
     "compare_filters",
     "consistency",
+    "export_graphml",
     "export_log",
+    "export_netcdf",
+    "export_perfetto",
     "export_recorded",
     "first_difference",
     "fit_log",
     "fit_noise",
+    "from_control",
+    "from_filterpy",
     "held_out_errors",
     "import_log",
     "innovations",
     "load",
     "log_likelihood",
     "monte_carlo",
+    "page",
     "parts",
     "save",
     "simulate",
@@ -128,7 +145,22 @@ def _draw(*arguments: Any) -> Any:
     return plot(*arguments)
 
 
+def _to_xarray(result: Any) -> Any:
+    """Call ``neighbours.datasets.to_xarray`` for the core."""
+    from netkf.neighbours.datasets import to_xarray
+
+    return to_xarray(result)
+
+
+def _to_stonesoup(*arguments: Any) -> Any:
+    """Call ``neighbours.stone_soup.to_stonesoup`` for the core."""
+    from netkf.neighbours.stone_soup import to_stonesoup
+
+    return to_stonesoup(*arguments)
+
+
 WINGS.promise_traces, WINGS.draw = _promise_traces, _draw
+WINGS.to_xarray, WINGS.to_stonesoup = _to_xarray, _to_stonesoup
 
 
 def __getattr__(name: str) -> Any:

@@ -10,13 +10,14 @@ What a block is follows from its language and its first line:
 - `sh`: commands that set up a computer, of the script only;
 - `console`: commands after `$ `, each followed by what it prints;
 - `python` without a name: code that runs in one namespace a page; a `text` block directly below
-  is what it prints;
+  is what it prints; it is left out if it imports a package of OPTIONAL that is not installed;
 - `toml` without a name: part of a scenario file, which has to be TOML.
 
 In what is printed `...` stands for any text in a line and, alone, for any number of lines.
 """
 
 import contextlib
+import importlib.util
 import io
 import itertools
 import os
@@ -38,6 +39,7 @@ DOCS = ROOT / "docs"
 FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"# (\S+\.(?:py|toml|csv|sh))\n")
 STATUS = "echo $?"
+OPTIONAL = ("duckdb", "polars")  # blocks that import them are left out where they are not there
 LANGUAGES = {"python", "toml", "console", "sh", "text", "json"}
 
 
@@ -121,7 +123,7 @@ class Follower:
         elif block.language == "console":
             for command, shown in sessions(block):
                 compare(command, shown, self.give(command))
-        elif block.language == "python":
+        elif block.language == "python" and not needs_more(block):
             printed = captured(lambda: exec(compile(block.text, "page", "exec"), self.names))
             shown = after.text.splitlines() if after and after.language == "text" else None
             compare("the code", shown, printed)
@@ -156,6 +158,12 @@ class Follower:
             self.status = call() or 0
 
         return captured(run)
+
+
+def needs_more(block):
+    """Whether a block imports an optional package that is not installed."""
+    wanted = [name for name in OPTIONAL if f"import {name}\n" in block.text]
+    return any(importlib.util.find_spec(name) is None for name in wanted)
 
 
 def script(path, *words):

@@ -14,6 +14,7 @@ ELSEWHERE = {  # pages whose blocks have tests of their own
     "errors_in_the_papers.md": "test_errors_in_the_papers.py",
     "scenario_files.md": "test_docs.py",
 }
+NEEDS = {"formats.md": ("xarray", "h5netcdf", "stonesoup", "filterpy")}
 FOLLOWED = [page for page in PAGES if page.name not in ELSEWHERE and blocks(page)]
 
 
@@ -33,6 +34,8 @@ def follower(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("page", FOLLOWED, ids=page_name)
 def test_the_page_does_what_it_says(follower, page):
+    for package in NEEDS.get(page.name, ()):
+        pytest.importorskip(package)
     if page.parent.name != "tutorials":  # these begin with nothing, others beside the scenarios
         (follower.folder / "scenarios").symlink_to(ROOT / "scenarios")
     follower.follow(page)

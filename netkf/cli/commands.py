@@ -442,16 +442,24 @@ COMMANDS = (
     ),
     Command(
         "export",
-        "write a run as a packet log, or as a scenario of what happened, which replay to the bit",
+        "write a run in another form",
         (
             _option("directory", "run directory", type=Path, metavar="DIR"),
             _option(
                 "--to",
-                "a packet log, or a scenario with recorded outcomes, positions and lives",
+                "a packet log, or a scenario with recorded outcomes, positions and lives, which "
+                "replay to the bit; a netCDF file for xarray, also of an ensemble; the network "
+                "with what links carried; events and covariances for ui.perfetto.dev",
                 required=True,
-                choices=["log", "recorded"],
+                choices=["log", "recorded", "netcdf", "graphml", "perfetto"],
             ),
-            _option("--out", "new folder", type=Path, required=True, metavar="OUT"),
+            _option(
+                "--out",
+                "new folder (log, recorded), or new file (default: in DIR)",
+                type=Path,
+                metavar="OUT",
+            ),
+            _option("--window", "seconds to write (perfetto)", metavar="FROM:TO"),
             _trust("DIR"),
         ),
         takes_scenario=False,

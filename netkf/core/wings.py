@@ -13,10 +13,13 @@ class Wings:
 
     promise_traces : (scenario, times) -> PromisedTraces, see ``runs.summary``
     draw : (result, name of a figure) -> the figure, see ``figures.catalogue``
+    to_xarray, to_stonesoup : result -> objects of these libraries, see ``neighbours``
     """
 
     promise_traces: Callable[..., Any]
     draw: Callable[..., Any]
+    to_xarray: Callable[..., Any]
+    to_stonesoup: Callable[..., Any]
 
 
 WINGS = Wings()

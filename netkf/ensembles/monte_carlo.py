@@ -11,6 +11,7 @@ import numpy as np
 
 from netkf.core.fields import integer
 from netkf.core.notebook import NotebookTable
+from netkf.core.wings import WINGS
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress, replicate_blocks
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, block_statistics, merge
@@ -79,6 +80,14 @@ class Ensemble(NotebookTable):
         say so. Raises ScenarioError for another name or without matplotlib.
         """
         return plot_by_name(self, figure)
+
+    def to_xarray(self) -> Any:
+        """Return the ensemble as an ``xarray.Dataset``: mean_P, se_P, mean_error and se_error
+        [time, node, state, other_state], mean_nees and se_nees [time, node], runs [time],
+        averages over time [node] and of all nodes, and ``scenario``, its TOML text.
+        Raises ScenarioError without xarray.
+        """
+        return WINGS.to_xarray(self)
 
     def _notebook_table(self) -> pd.DataFrame:
         import pandas as pd

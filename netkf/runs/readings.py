@@ -59,9 +59,11 @@ def collect_readings(
     *,
     simulated: bool = False,
     all_slots: bool = False,
+    engine: str = "auto",
 ) -> Readings:
     """Return what the ``placed`` sensors, by node id, read in a ``replica`` after time 0; the run
-    is ``simulated`` too if readings are drawn. Raises ScenarioError and EngineError.
+    is ``simulated`` too, by an ``engine``, if readings are drawn. Raises ScenarioError and
+    EngineError.
     """
     streams = Streams(seed, replica)
     numbers = {
@@ -80,7 +82,7 @@ def collect_readings(
     )
     run, states = None, np.zeros((len(times), plant.n))
     if (simulated or drawn) and len(times):
-        run = simulate(dataclasses.replace(scenario, probe=times), seed, replica)
+        run = simulate(dataclasses.replace(scenario, probe=times), seed, replica, engine)
         times = times[: len(run.times)]  # a run that diverges ends early
         states = np.nan_to_num(run.x)
     origin = np.zeros((len(times), plant.n))

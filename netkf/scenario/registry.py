@@ -277,8 +277,9 @@ def _require_part(family: str, kind: str, cls: Any) -> type[Component] | None:
         for name in dir(cls)
         if getattr(getattr(cls, name, None), "__isabstractmethod__", False)
     )
-    # A filter has kernels, or says in Python what it does with messages.
-    if family == "filter" and getattr(cls, "kernels", None) is None:
+    # A filter has kernels, or says in Python what it does with messages, if it has any.
+    talks = getattr(getattr(cls, "timing", None), "talks", True)
+    if family == "filter" and getattr(cls, "kernels", None) is None and talks:
         missing += ["absorb"] * (vars(base)["absorb"] is getattr(cls, "absorb", None))
     rule = f"must define {', '.join(missing)}" if missing else ""
     try:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from netkf.core.errors import ScenarioError, errors_under, quote
+from netkf.core.extras import require
 from netkf.core.notebook import NotebookTable
 from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
@@ -118,6 +119,31 @@ class Run(NotebookTable):
         """
         return plot_by_name(self, figure)
 
+    def to_xarray(self) -> Any:
+        """Return the run as an ``xarray.Dataset`` with the dimensions time, node, state and event.
+
+        x [time, state], xhat and error [time, node, state], P [time, node, state, other_state],
+        sq_error and nees [time, node]; the columns of ``events`` as event_t, event_kind (codes
+        with CF flag_meanings) and so on [event]; ``scenario`` is its TOML text; node has names
+        and coordinates where nodes do. With ``[[plants]]`` entries of x have block and owner;
+        where nodes estimate some of them x is [time, entry], and view [node, state] says which.
+        Raises ScenarioError without xarray.
+        """
+        return WINGS.to_xarray(self)
+
+    def to_stonesoup(self, start: Any = None) -> Any:
+        """Return the run as objects of Stone Soup: ``truths``, ``detections`` and ``tracks``, each
+        a set, from which its metrics can be computed.
+
+        A ground truth path for each block of the state, one without ``[[plants]]``; a detection
+        for each reading after time 0, with its measurement model; a track for each node and each
+        block that it estimates, with ``metadata`` node, block and owner. ``start`` is the datetime
+        of time 0, by default 2000-01-01; times are rounded to microseconds. Readings are those of
+        the run, which is simulated again for them if they are drawn.
+        Raises ScenarioError without Stone Soup, and for sample times nearer than a microsecond.
+        """
+        return WINGS.to_stonesoup(self, start)
+
     def _notebook_table(self) -> pd.DataFrame:
         import pandas as pd
 
@@ -180,13 +206,8 @@ def plot_by_name(result: Any, figure: str) -> Any:
     """Return a figure of a result, drawn by netkf.figures; raises ScenarioError for another name
     and without matplotlib.
     """
-    try:
-        return WINGS.draw(result, figure)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "matplotlib":
-            raise
-        rule, remedy = "needs matplotlib", "install it: pip install 'netkf[plot]'"
-        raise ScenarioError("plot", rule, None, remedy) from None
+    require("matplotlib", "plot", "plot")
+    return WINGS.draw(result, figure)
 
 
 def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:

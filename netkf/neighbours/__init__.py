@@ -1,0 +1,1 @@
+"""Results and models in the forms of other libraries: the only room that speaks them."""

@@ -1,0 +1,78 @@
+"""The network of a run as GraphML, with what its links carried."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from netkf.neighbours.files import output_file, require_run
+from netkf.network.graphs import Link
+from netkf.runs.files import write_atomically
+from netkf.trace.messages import DELIVERED, LATE, LOST, by_link, join_messages
+from netkf.trace.run import Run
+
+if TYPE_CHECKING:
+    import networkx
+
+COUNTED = {"delivered": DELIVERED, "lost": LOST, "late": LATE}
+NO_MESSAGES = {"sent": 0, **dict.fromkeys(COUNTED, 0)}
+
+
+def export_graphml(run: Run, out: str | Path) -> tuple[Path, ...]:
+    """Write the network of a run, ``carried_network``, as a GraphML file and return its path:
+    ``out`` or, if that is a folder, ``out``/network.graphml.
+
+    Raises ScenarioError for a run without a scenario, and WriteError.
+    """
+    import networkx
+
+    graph = carried_network(run)
+    path = output_file(out, "network.graphml")
+    with write_atomically(path) as temporary:
+        networkx.write_graphml(graph, temporary)
+    return (path,)
+
+
+def carried_network(run: Run) -> networkx.Graph[Any]:
+    """Return the network of a run as a networkx graph, whose nodes are ids, or names where nodes
+    have these.
+
+    Nodes have ``sensors`` (their number) and, where they stay at one place, ``x`` and ``y``. Links
+    have the numbers of messages ``sent``, ``delivered``, ``lost`` and ``late``, from source to
+    target, ``mean_age`` in seconds of those that came, and ``delivery_probability`` if the graph
+    has a table of it. Undirected links have the same of the other direction, as ``sent_back`` and
+    so on; a table that says something else of that makes the graph a directed one, a link for each
+    direction. Where links follow the positions of nodes, those that carried something are there.
+    """
+    import networkx
+
+    scenario = require_run(run)
+    topology, delivery = scenario.topology, scenario.topology.delivery or {}
+    one_way = topology.directed or any(p != delivery.get((j, i)) for (i, j), p in delivery.items())
+    carried: dict[Link, dict[str, Any]] = {}
+    for messages in by_link(join_messages(run.log)):
+        counts: dict[str, Any] = {"sent": len(messages)}
+        for name, outcome in COUNTED.items():
+            counts[name] = int((messages["outcome"] == outcome).sum())
+        ages = messages["age"][np.isfinite(messages["age"])]
+        counts |= {"mean_age": float(ages.mean())} if len(ages) else {}
+        carried[int(messages["sender"][0]), int(messages["receiver"][0])] = counts
+    graph: networkx.Graph[Any] = networkx.DiGraph() if one_way else networkx.Graph()
+    labels = {node: str(node) for node in scenario.nodes}
+    for node, label in labels.items():
+        place = (topology.positions or {}).get(node)
+        xy = {} if place is None else {"x": float(place[0]), "y": float(place[1])}
+        graph.add_node(label, sensors=len(scenario.placed_sensors.get(node, ())), **xy)
+    for link in topology.directions if one_way else topology.links:
+        if topology.radius is not None and not {link, link[::-1]} & carried.keys():
+            continue
+        attributes = dict(carried.get(link, NO_MESSAGES))
+        if not one_way:
+            back = carried.get(link[::-1], NO_MESSAGES)
+            attributes |= {f"{name}_back": value for name, value in back.items()}
+        if link in delivery:
+            attributes["delivery_probability"] = float(delivery[link])
+        graph.add_edge(labels[link[0]], labels[link[1]], **attributes)
+    return graph

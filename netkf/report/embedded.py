@@ -1,0 +1,53 @@
+"""Pages in notebooks, without a file or a server."""
+
+from __future__ import annotations
+
+import html
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from netkf.core.fields import as_path
+from netkf.report.page import make_page
+from netkf.runs.files import write_text
+from netkf.runs.run import save
+from netkf.trace.run import Run
+
+
+@dataclass(frozen=True, repr=False)
+class Page:
+    """A page of results as ``html``, which a notebook shows."""
+
+    html: str
+
+    def __repr__(self) -> str:
+        return f"<netkf page, {len(self.html):,} characters>"
+
+    def _repr_html_(self) -> str:
+        source = html.escape(self.html)
+        return f'<iframe srcdoc="{source}" style="width: 100%; height: 45em; border: 0"></iframe>'
+
+    def save(self, path: str | Path) -> Path:
+        """Write the page to ``path``, in place of a file there, and return it; raises WriteError"""
+        path = as_path("path", path)
+        write_text(path, self.html)
+        return path
+
+
+def page(result: Any, other: Any = None, *, replica: int | None = None) -> Page:
+    """Return the page that ``netkf report`` writes of a result, or of two side by side: each is a
+    run in memory, what ``netkf.open`` returns, or a directory. ``replica`` is the run of an
+    ensemble to show. Scenarios are read without trust, see ``netkf.open``.
+
+    Raises ScenarioError for what is no result, and WriteError.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        directories = []
+        for k, one in enumerate([result] if other is None else [result, other]):
+            directory = getattr(one, "directory", one)
+            if isinstance(one, Run) and directory is one:
+                directory = save(one, one.scenario, Path(folder) / f"RUN{k + 1}")
+            directories.append(as_path("result", directory, "give a run or its directory"))
+        # The command on the page names no folder that is gone.
+        return Page(make_page(directories, replica).replace(f"{folder}/", ""))

@@ -1,0 +1,123 @@
+"""Scenarios of python-control, scipy.signal and filterpy, against their own filters."""
+
+import networkx
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy import signal
+
+import netkf
+
+A, B = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]])
+C = np.array([[1.0, 0.0], [0.0, 1.0]])
+R = np.diag([0.2, 0.5])
+
+
+def test_a_continuous_system_ends_at_the_covariance_of_lqe():
+    control = pytest.importorskip("control")
+    system = control.ss(A, B, C, np.zeros((2, 1)), name="pendulum")
+    _, P, _ = control.lqe(system, [[0.3]], R)
+    scenario = netkf.from_control(system, 0.3, R, {"horizon": 40.0}, G=system.B)
+    assert scenario.name == "pendulum"
+    run = netkf.simulate(scenario, engine="simpy")
+    for node in range(2):
+        np.testing.assert_allclose(run.P[-1, node], P, rtol=2e-3)
+
+
+def test_a_discrete_system_ends_at_the_covariance_of_dlqe():
+    control = pytest.importorskip("control")
+    system = control.sample_system(control.ss(A, B, C, np.zeros((2, 1))), 0.25)
+    _, prior, _ = control.dlqe(system.A, np.eye(2), system.C, 0.1 * np.eye(2), R)
+    posterior = np.linalg.inv(np.linalg.inv(prior) + C.T @ np.linalg.inv(R) @ C)
+    run = netkf.simulate(netkf.from_control(system, 0.1 * np.eye(2), R), engine="simpy")
+    assert run.times[1] == 0.25
+    np.testing.assert_allclose(run.P[-1, 0], posterior, rtol=1e-9)
+
+
+def test_scipy_systems_and_a_network():
+    system = signal.StateSpace(A, B, C, np.zeros((2, 1))).to_discrete(0.5)
+    graph = networkx.path_graph(["left", "middle", "right"])
+    changes = {
+        "network.graph": graph,
+        "sensors.0.nodes": ["left"],
+        "sensors.1.nodes": ["right"],
+        "plant.input": {"kind": "constant", "value": [2.0]},
+        "horizon": 20.0,
+    }
+    scenario = netkf.from_control(system, np.zeros((2, 2)), R, changes)
+    assert [str(node) for node in scenario.nodes] == ["left", "middle", "right"]
+    run = netkf.simulate(scenario, engine="simpy")
+    steps = len(run.times)
+    _, _, x = signal.dlsim(system, np.full((steps, 1), 2.0), t=run.times)
+    np.testing.assert_allclose(run.x, x, atol=1e-12)  # without noise, the response to the input
+    transfer = signal.dlti([1.0], [1.0, -0.5], dt=0.1)
+    assert netkf.from_control(transfer, 1.0, 1.0).plant.F.tolist() == [[0.5]]
+    correlated = netkf.from_control(system, np.eye(2), [[1.0, 0.3], [0.3, 1.0]])
+    assert [len(sensor.R) for sensor in correlated.sensors] == [2]
+
+
+def test_a_continuous_lti_has_the_covariance_of_its_lyapunov_equation():
+    system = signal.lti(A, B, C, np.zeros((2, 1)))
+    scenario = netkf.from_control(system, 0.3, 1e9 * np.eye(2), {"horizon": 40.0}, G=B)
+    run = netkf.simulate(scenario, engine="simpy")
+    stationary = scipy.linalg.solve_continuous_lyapunov(A, -0.3 * B @ B.T)
+    np.testing.assert_allclose(run.P[-1, 0], stationary, rtol=1e-6, atol=1e-7)
+
+
+def kalman():
+    filterpy = pytest.importorskip("filterpy.kalman")
+    kf = filterpy.KalmanFilter(dim_x=2, dim_z=1)
+    kf.F, kf.Q = np.array([[1.0, 0.5], [0.0, 1.0]]), np.diag([0.01, 0.04])
+    kf.H, kf.R = np.array([[1.0, 0.0]]), np.array([[0.3]])
+    kf.x, kf.P = np.array([[2.0], [-1.0]]), np.diag([4.0, 2.0])
+    return kf
+
+
+def test_a_run_of_a_filterpy_filter_is_that_filter():
+    kf = kalman()
+    run = netkf.simulate(netkf.from_filterpy(kf, period=0.5), engine="simpy")
+    pytest.importorskip("stonesoup")
+    detections = sorted(run.to_stonesoup().detections, key=lambda one: one.timestamp)
+    assert len(detections) == len(run.times) - 2  # the last sample is at the horizon
+    for k, one in enumerate(detections, 1):
+        kf.predict()
+        kf.update(np.asarray(one.state_vector, dtype=float))
+        np.testing.assert_allclose(run.xhat[k, 0], kf.x[:, 0], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(run.P[k, 0], kf.P, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: netkf.from_control(3, 1, 1), "system: must be a state space; got 'int'"),
+        (lambda: netkf.from_control(SYSTEM, np.eye(3), R), "Q: must have 2 rows"),
+        (lambda: netkf.from_control(SYSTEM, np.eye(2), 1.0), "R: must have 2 rows"),
+        (lambda: netkf.from_control(SYSTEM, -np.eye(2), R), "Q: must be"),
+        (lambda: netkf.from_control(SYSTEM, np.eye(2), R, {"horizn": 1}), "horizn: is not a key"),
+        (
+            lambda: netkf.from_control(
+                signal.StateSpace(A, B, C, np.ones((2, 1))),
+                np.eye(2),
+                R,
+                {"plant.input": {"kind": "constant", "value": [1.0]}},
+            ),
+            "system.D: feeds the input through",
+        ),
+        (lambda: netkf.from_filterpy(SYSTEM), "kf: must have F, Q, H, R, x, P"),
+        (lambda: netkf.from_filterpy(faded()), "kf.alpha: must be 1"),
+        (lambda: netkf.from_filterpy(kalman(), period=0.0), "period: must be"),
+    ],
+)
+def test_what_is_no_model_is_refused_in_one_line(call, message):
+    with pytest.raises(netkf.ScenarioError, match=message) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+SYSTEM = signal.StateSpace(A, B, C, np.zeros((2, 1)))
+
+
+def faded():
+    kf = kalman()
+    kf.alpha = 1.02
+    return kf

@@ -1,0 +1,125 @@
+"""Runs as objects of Stone Soup, with its own metrics, predictors and updaters."""
+
+import datetime
+
+import numpy as np
+import pytest
+
+import netkf
+from tests.conftest import SCENARIOS
+
+pytest.importorskip("stonesoup")
+from stonesoup.measures import Euclidean
+from stonesoup.metricgenerator.ospametric import OSPAMetric
+from stonesoup.models.transition.linear import LinearGaussianTimeInvariantTransitionModel
+from stonesoup.predictor.kalman import KalmanPredictor
+from stonesoup.types.hypothesis import SingleHypothesis
+from stonesoup.types.state import GaussianState
+from stonesoup.updater.kalman import ExtendedKalmanUpdater, KalmanUpdater
+
+
+def test_ospa_of_a_track_is_the_error_of_its_node(run):
+    found = run.to_stonesoup()
+    (truth,) = found.truths
+    metric = OSPAMetric(p=1, c=1e6, measure=Euclidean())
+    for track in found.tracks:
+        k = list(run.nodes).index(track.metadata["node"])
+        both = (metric.extract_states([path], True) for path in (track, truth))
+        computed = [one.value for one in metric.compute_over_time(*sum(both, ())).value]
+        np.testing.assert_allclose(computed, np.sqrt(run.sq_error[:, k]), rtol=1e-12)
+        np.testing.assert_array_equal(track.states[-1].covar, run.P[-1, k])
+    assert {track.metadata["node"] for track in found.tracks} == set(run.nodes)
+
+
+def test_detections_are_the_readings(run):
+    start = datetime.datetime(2024, 2, 29, 12)
+    found = run.to_stonesoup(start)
+    senses = run.events[run.events.kind == "sense"]
+    when = {
+        (one.timestamp - start).total_seconds(): one
+        for one in found.detections
+        if one.metadata["node"] == run.nodes[0]
+    }
+    own = senses[senses.node == run.nodes[0]]
+    np.testing.assert_allclose(sorted(when), own.t, atol=1e-6)
+    # The readings less H x at their instants have the covariance R, by Stone Soup's own density.
+    (truth,) = found.truths
+    states = {state.timestamp: state for state in truth}
+    hits = [one for one in found.detections if one.timestamp in states]
+    nis = [
+        float((z.T @ np.linalg.inv(one.measurement_model.covar()) @ z).item())
+        for one in hits
+        for z in [one.state_vector - one.measurement_model.function(states[one.timestamp])]
+    ]
+    assert len(nis) > 30
+    assert abs(np.mean(nis) - 1.0) < 4.0 * np.sqrt(2.0 / len(nis))
+
+
+def test_the_tracker_of_a_node_gives_what_local_gives(slot_run):
+    """Stone Soup's Kalman filter, fed with the detections, has the track of the node."""
+    scenario = slot_run.scenario.replace({"filter": {"kind": "local"}})
+    run = netkf.simulate(scenario, engine="simpy")
+    found, plant = run.to_stonesoup(), scenario.plant
+    node = scenario.sensing_nodes[0]
+    (track,) = [one for one in found.tracks if one.metadata["node"] == node]
+    model = LinearGaussianTimeInvariantTransitionModel(
+        transition_matrix=plant.F, covariance_matrix=plant.Q
+    )
+    predictor, updater = KalmanPredictor(model), KalmanUpdater()
+    at = {d.timestamp: d for d in found.detections if d.metadata["node"] == node}
+    state = GaussianState(plant.start_mean, plant.start_cov, timestamp=track[0].timestamp)
+    for theirs in track[1:-1]:  # the last sample uses readings of the horizon, which is over
+        prediction = predictor.predict(state, timestamp=theirs.timestamp)
+        state = prediction
+        if theirs.timestamp in at:
+            state = updater.update(SingleHypothesis(prediction, at[theirs.timestamp]))
+        np.testing.assert_allclose(theirs.mean, state.mean, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(theirs.covar, state.covar, rtol=1e-8, atol=1e-12)
+
+
+def test_nonlinear_detections_have_the_jacobian_of_their_sensor():
+    path = SCENARIOS / "nonlinear" / "range_tracking.toml"
+    scenario = netkf.load(path, {"horizon": 4.0})
+    run = netkf.simulate(scenario, engine="simpy")
+    found = run.to_stonesoup()
+    (truth,) = found.truths
+    states = {state.timestamp: state for state in truth}
+    one = next(d for d in found.detections if d.timestamp in states)
+    state = states[one.timestamp]
+    x, model = state.state_vector[:, 0].astype(float), one.measurement_model
+    numeric = np.column_stack(
+        [
+            (
+                model.function(GaussianState(x + 1e-6 * e, np.eye(len(x))))
+                - model.function(GaussianState(x - 1e-6 * e, np.eye(len(x))))
+            )[:, 0]
+            / 2e-6
+            for e in np.eye(len(x))
+        ]
+    ).astype(float)
+    np.testing.assert_allclose(model.jacobian(state), numeric, atol=1e-6)
+    prior = GaussianState(x, np.eye(len(x)), timestamp=one.timestamp)
+    posterior = ExtendedKalmanUpdater().update(SingleHypothesis(prior, one))
+    J, R = numeric, model.covar()
+    expected = np.linalg.inv(np.eye(len(x)) + J.T @ np.linalg.inv(R) @ J)
+    np.testing.assert_allclose(posterior.covar.astype(float), expected, atol=1e-6)
+
+
+def test_blocks_are_paths_of_their_own():
+    scenario = netkf.load(SCENARIOS / "blocks" / "cooperative_localisation.toml", {"horizon": 2.0})
+    run = netkf.simulate(scenario, engine="simpy")
+    found = run.to_stonesoup()
+    assert {truth.id for truth in found.truths} == {p.label for p in scenario.layout.places}
+    track = next(iter(found.tracks))
+    about = track.metadata
+    block = run.block(about["block"], about["owner"], about["node"])
+    np.testing.assert_array_equal([s.state_vector[:, 0].astype(float) for s in track], block.xhat)
+    (truth,) = [t for t in found.truths if t.id == f"{about['block']}@{about['owner']}"]
+    np.testing.assert_array_equal([s.state_vector[:, 0].astype(float) for s in truth], block.x)
+
+
+def test_sample_times_nearer_than_a_microsecond_are_refused():
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 1e-6, "probe": 1e-7})
+    run = netkf.simulate(scenario, engine="simpy")
+    with pytest.raises(netkf.ScenarioError, match="must be a microsecond apart"):
+        run.to_stonesoup()
