@@ -89,7 +89,7 @@ WINGS = {
         *("engines", "runs", "ensembles"),
     ),
     "theory": ("theory", "checks", "testing", "laws"),
-    "tools": ("studies", "logs", "figures", "report", "cli"),
+    "tools": ("studies", "logs", "neighbours", "figures", "report", "cli"),
 }
 """The rooms of each wing, in netkf/ and in tests/: the core knows neither theory nor tools."""
 CORE_TESTS = (
