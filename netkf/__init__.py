@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from netkf import parts, testing, theory
     from netkf.checks.check import check
     from netkf.ensembles.monte_carlo import Ensemble, monte_carlo
+    from netkf.figures.catalogue import plot
     from netkf.logs.exporting import export_log, export_recorded
     from netkf.logs.fitting import fit_log
     from netkf.logs.importing import import_log
@@ -75,6 +76,7 @@ _MODULE_OF = {
     "open": "netkf.studies.opening",
     "page": "netkf.report.embedded",
     "parts": "netkf.parts",
+    "plot": "netkf.figures.catalogue",
     "save": "netkf.runs.run",
     "simulate": "netkf.runs.simulate",
     "size": "netkf.studies.size",
@@ -121,6 +123,7 @@ __all__ = [
     "monte_carlo",
     "page",
     "parts",
+    "plot",
     "save",
     "simulate",
     "size",

@@ -1,4 +1,4 @@
-"""``netkf plot``: draw figures of finished runs, ensembles and sweeps."""
+"""``netkf plot``: draw figures of finished runs, ensembles and sweeps; errors of several in one."""
 
 from __future__ import annotations
 
@@ -21,21 +21,33 @@ def _run(options: argparse.Namespace) -> int:
         raise ScenarioError("plot", rule, None, remedy)
     # Empty: all figures.
     names = tuple(name for text in options.figure for name in _figure_names(text))
-    if options.out is not None:
-        _check_output(options.out, len(options.directories))
     has_several = len(options.directories) > 1
+    if options.out is not None:
+        _check_output(options.out, 1 if names == ("error",) else len(options.directories))
+    results: list[Any] = []
     for directory in options.directories:
+        fit = read_fit(directory)
+        opened = open_directory(directory, trust=options.trust) if fit is None else fit
+        results.append(opened)
+    # After all that can be refused: importing matplotlib takes a second.
+    from netkf.figures.catalogue import plot_to_files
+
+    file_format = options.format or "png"
+    if has_several and "error" in names:
+        together = dict(zip(map(str, options.directories), results, strict=True))
+        is_file = options.out is not None and options.out.suffix.removeprefix(".") in FORMATS
+        out = options.out or options.directories[0] / "figures"
+        target = out if is_file else out / f"errors.{file_format}"
+        print(*plot_to_files(together, ("error",), target, file_format))
+        names = tuple(name for name in names if name != "error")
+        if not names:
+            return 0
+    for directory, result in zip(options.directories, results, strict=True):
         if options.out is None:
             out = directory / "figures"
         else:
             out = options.out / directory.name if has_several else options.out
-        result: Any = read_fit(directory)
-        if result is None:
-            result = open_directory(directory, trust=options.trust)
-        # After all that can be refused: importing matplotlib takes a second.
-        from netkf.figures.catalogue import plot_to_files
-
-        for path in plot_to_files(result, names, out, options.format or "png"):
+        for path in plot_to_files(result, names, out, file_format):
             print(path)
     return 0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from netkf.figures.network import network_figure
 from netkf.figures.outcomes import fate_figure, losses_figure, matrix_figure
 from netkf.figures.pictures import overview
 from netkf.figures.plane import plane_figure
+from netkf.figures.several import curves_of, errors_figure
 from netkf.figures.stability import (
     law_figure,
     reason_to_omit_stability,
@@ -52,11 +53,13 @@ ACRONYMS = ("nees", "nis")
 
 
 def plot(result: Any, figure: str = "error") -> Picture:
-    """Return a figure of a run, an ensemble, a fit, or a sweep that was read from its directory,
-    as a matplotlib Figure (``savefig`` writes it).
+    """Return a figure of a run, an ensemble, a fit, compared filters, or a sweep that was read from
+    its directory, as a matplotlib Figure (``savefig`` writes it).
 
-    If the result lacks the data of that figure, it shows a sentence that says so. Raises
-    ScenarioError for an unknown name, and if ``result`` is not a result.
+    Of several runs and ensembles, in a list or by their labels in a mapping, it is ``error``: the
+    mean square errors of all of them over time. If the result lacks the data of that figure, it
+    shows a sentence that says so. Raises ScenarioError for an unknown name, and if ``result`` is
+    not a result.
     """
     return FigureSet(result).draw(figure)
 
@@ -69,7 +72,14 @@ class FigureSet:
         is_sweep = hasattr(result, "keys") and hasattr(result, "table")
         self._sweep: Any = result if is_sweep else None
         self._envelope = getattr(result, "envelope", None)
-        is_table = is_sweep or self._envelope is not None
+        # Compared filters have their curves.
+        curves = getattr(result, "curves", None)
+        if curves is not None:
+            self._origin = f"{result.scenario}: {result.runs:,} runs, seed {result.seed}."
+        if isinstance(result, (Mapping, Sequence)):
+            curves, self._origin = curves_of(result)
+        self._curves: Any = curves
+        is_table = is_sweep or self._envelope is not None or curves is not None
         self._data = None if is_table else reduce_result(result)
 
     @property
@@ -77,6 +87,8 @@ class FigureSet:
         """The names of the figures of this kind of result."""
         if self._envelope is not None:
             return FIT_FIGURES
+        if self._curves is not None:
+            return ("error",)
         return ("stability",) if self._sweep is not None else tuple(FIGURES)
 
     def draw(self, name: str, *, omit_slow: bool = False) -> Picture:
@@ -91,12 +103,8 @@ class FigureSet:
             raise ScenarioError("figure", "is not known", name, remedy)
         with style_context():
             try:
-                if self._envelope is not None:
-                    return envelope_figure(self._envelope)
-                if self._sweep is not None:
-                    sweep = self._sweep
-                    return sweep_figure(sweep.scenario.name, sweep.table, sweep.keys, sweep.status)
-                assert self._data is not None
+                if self._data is None:
+                    return self._draw_table()
                 if omit_slow and name == "stability":
                     reason = reason_to_omit_stability(self._data)
                     if reason is not None:
@@ -111,6 +119,15 @@ class FigureSet:
                     caption = [f"{self._sweep.scenario.name}, a sweep."]
                     return message_figure(headline, reason, caption)
                 return message_figure(self._data.title(headline), reason, self._data.caption())
+
+    def _draw_table(self) -> Picture:
+        """Return the figure of curves, a fit or a sweep; raises UnavailableError."""
+        if self._curves is not None:
+            return errors_figure(self._curves, self._origin)
+        if self._envelope is not None:
+            return envelope_figure(self._envelope)
+        sweep = self._sweep
+        return sweep_figure(sweep.scenario.name, sweep.table, sweep.keys, sweep.status)
 
 
 def plot_to_files(result: Any, names: tuple[str, ...], out: Path, file_format: str) -> list[Path]:

@@ -56,6 +56,7 @@ SCRIPTS = (
     "estimates.js",
     "sequence.js",
     "why.js",
+    "tracks.js",
     "curves.js",
     "figures.js",
     "clock.js",

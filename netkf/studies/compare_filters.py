@@ -6,10 +6,12 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from netkf.algorithms.filter import Filter
 from netkf.core.errors import EngineError, ScenarioError, suggest_nearest
@@ -18,6 +20,7 @@ from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
 from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.ensembles.replicas import replicate_blocks
+from netkf.runs.curves import ErrorCurve
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failures
 from netkf.runs.files import check_sources, create_output_directory, write_scenario, write_text
@@ -36,13 +39,17 @@ from netkf.studies.filter_values import (
     block_values,
     count_traffic,
     credibility,
+    curve_rows,
     estimate_quantities,
     join_values,
+    mean_curve,
 )
+from netkf.trace.run import plot_by_name
 
 if TYPE_CHECKING:
     import pandas as pd
 
+CURVES = "errors.parquet"
 CARRIED = ("mean", "cov", "model", "estimates")
 """Keys of ``[filter]`` that every compared filter takes over from the scenario."""
 MAX_FILTERS = 200
@@ -121,7 +128,8 @@ class ComparedFilter:
 @dataclass(frozen=True)
 class FilterComparison(NotebookTable):
     """Filters side by side; all intervals of differences from the first that can run hold together
-    with probability ``confidence``.
+    with probability ``confidence``. ``curves`` are the mean square errors over time of those that
+    ran.
     """
 
     scenario: str
@@ -129,6 +137,13 @@ class FilterComparison(NotebookTable):
     seed: int
     confidence: float
     rows: tuple[ComparedFilter, ...]
+    curves: tuple[ErrorCurve, ...] = field(compare=False)
+
+    def plot(self, figure: str = "error") -> Any:
+        """Return the mean square errors of all filters over time as a matplotlib Figure; there is
+        ``error`` only. Raises ScenarioError for another name.
+        """
+        return plot_by_name(self, figure)
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -190,16 +205,20 @@ def compare_filters(
     candidates = _candidates(scenario, filters, engine)
     values: dict[str, FilterValues] = {}
     traffic: dict[str, dict[str, float]] = {}
+    curves, curve_at = [], curve_rows(scenario, count)
     with make_pool(count, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
         for k, candidate in enumerate(candidates):
             label, case = candidate.label, candidate.scenario
             if case is not None:
                 chosen = choose_engine(engine, case)
-                task = partial(block_values, engine=chosen)
+                task = partial(block_values, engine=chosen, rows=curve_at)
                 with explain_failures(case):
                     values[label] = replicate_blocks(
                         task, join_values, case, count, root, pool=pool
                     )
+                if scenario.plant.truth_known:
+                    curves.append(mean_curve(label, case, values[label].curves))
+                values[label] = values[label]._replace(curves=np.empty((0, 0)))
                 traffic[label] = count_traffic(case, root, chosen)
             if progress is not None:
                 progress(k + 1, len(candidates))
@@ -227,7 +246,12 @@ def compare_filters(
             )
         )
     return FilterComparison(
-        scenario=scenario.name, runs=count, seed=root, confidence=confidence, rows=tuple(rows)
+        scenario=scenario.name,
+        runs=count,
+        seed=root,
+        confidence=confidence,
+        rows=tuple(rows),
+        curves=tuple(curves),
     )
 
 
@@ -359,6 +383,10 @@ def write_comparison(
     table = comparison.table
     write_table(directory / "filters.parquet", {str(k): column for k, column in table.items()})
     write_text(directory / "filters.csv", table.to_csv(index=False))
+    files = ["scenario.toml", "filters.parquet"]
+    if comparison.curves:
+        write_table(directory / CURVES, _curve_columns(comparison.curves))
+        files.append(CURVES)
     manifest = {
         "name": scenario.name,
         "versions": versions(),
@@ -367,7 +395,18 @@ def write_comparison(
         "confidence": comparison.confidence,
         "runs": {"wanted": comparison.runs, "done": comparison.runs},
         "status": "complete",
-        "files": file_digests(directory, ["scenario.toml", "filters.parquet"]),
+        "files": file_digests(directory, files),
     }
     write_sealed(directory / "manifest.json", manifest)
     return CompletedComparison(directory, comparison)
+
+
+def _curve_columns(curves: Sequence[ErrorCurve]) -> dict[str, Any]:
+    """Return a row per filter and time: filter, t, mean square error and its standard error."""
+    errors = [np.full(len(c.times), np.nan) if c.se is None else c.se for c in curves]
+    return {
+        "filter": [curve.label for curve in curves for _ in curve.times],
+        "t": np.concatenate([curve.times for curve in curves]),
+        "mse": np.concatenate([curve.square for curve in curves]),
+        "mse_se": np.concatenate(errors),
+    }

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from netkf.core.printable import shorten
+from netkf.figures.catalogue import plot
 from netkf.figures.style import (
     BLUE,
     LOG_RATIO,
@@ -27,7 +28,9 @@ PANELS = (
 
 
 def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
-    """Write ``filters.png``: errors, consistency and traffic of the filters that ran."""
+    """Write ``filters.png``: errors, consistency and traffic of the filters that ran, and
+    ``errors.png``: their mean square errors over time.
+    """
     rows = [row for row in completed.comparison.rows if row.ran]
     with style_context():
         figure = new_figure(9.6, 1.7 + 0.34 * len(rows))
@@ -49,6 +52,8 @@ def filter_picture(scenario: Scenario, completed: CompletedComparison) -> None:
             title = f"{shorten(best.filter, MAX_LABEL)} has the smallest RMS error, {error}"
         finish_figure(figure, title, [f"{scenario.name}: {runs}"])
     write_figure(figure, completed.directory / "filters.png")
+    if completed.comparison.curves:
+        write_figure(plot(completed.comparison), completed.directory / "errors.png")
 
 
 def _draw_quantity(axes: Any, rows: list[ComparedFilter], name: str, label: str) -> None:

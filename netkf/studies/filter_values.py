@@ -13,6 +13,7 @@ from netkf.engines.base import Engine
 from netkf.ensembles.statistics import run_values
 from netkf.laws.intervals import interval_of_squares
 from netkf.linalg.arrays import FloatArray
+from netkf.runs.curves import ErrorCurve, squares_over_time
 from netkf.runs.quantities import NETWORK, NetworkSink, with_network
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
@@ -20,6 +21,8 @@ from netkf.studies.metrics import mean_over_runs
 
 JUDGED = ("rms_error", "worst_instant", "nees_ratio")
 """Quantities whose differences have intervals."""
+MAX_SAMPLES, MAX_CURVES = 200, 20_000_000
+"""Samples of a curve of errors over time, and numbers of all runs' curves of a filter."""
 ROUNDING = 1e-9
 """Relative difference up to which two filters count as equal."""
 
@@ -31,22 +34,44 @@ class FilterValues(NamedTuple):
     nees     : e' P^-1 e, mean of all nodes
     samples  : (R, K) quantities ``runs.quantities.sample_names``, of all nodes (not averages)
     diverged : True if the run ended early
+    curves   : (R, K) squared error at K samples, mean of all nodes
     """
 
     square: FloatArray
     nees: FloatArray
     samples: FloatArray
     diverged: np.ndarray
+    curves: FloatArray = np.empty((0, 0))
 
 
-def block_values(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> FilterValues:
-    """Simulate ``replicas`` of ``seed`` and return their values; for ``replicate_blocks``."""
+def curve_rows(scenario: Scenario, runs: int) -> np.ndarray:
+    """Return the indices (K,) of the samples of curves of so many runs, evenly spaced."""
+    total = len(scenario.times)
+    count = min(total, MAX_SAMPLES, max(2, MAX_CURVES // runs))
+    return np.unique(np.linspace(0, total - 1, count).astype(int))
+
+
+def mean_curve(label: str, scenario: Scenario, curves: FloatArray) -> ErrorCurve:
+    """Return the mean over runs of ``curves`` (R, K), with its standard error."""
+    runs, times = len(curves), scenario.times[curve_rows(scenario, len(curves))]
+    error = curves.std(axis=0, ddof=1) / math.sqrt(runs) if runs > 1 else None
+    return ErrorCurve(label, times, curves.mean(axis=0), error, runs)
+
+
+def block_values(
+    scenario: Scenario, seed: int, replicas: range, engine: Engine, rows: np.ndarray
+) -> FilterValues:
+    """Simulate ``replicas`` of ``seed`` and return their values, curves at the samples ``rows``;
+    for ``replicate_blocks``.
+    """
     parts = []
     for batch in engine.run_many(scenario, seed, replicas):
         values = run_values(batch, scenario)
         # (R,): squared error and NEES, means over time and nodes.
         square, _, nees = values.averages[:, -1].T
-        parts.append(FilterValues(square, nees, values.quantities[:, -1], values.diverged > 0))
+        curves = squares_over_time(batch, rows)
+        quantities = values.quantities[:, -1]
+        parts.append(FilterValues(square, nees, quantities, values.diverged > 0, curves))
     return join_values(*parts)
 
 

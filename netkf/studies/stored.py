@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line
+from netkf.runs.curves import ErrorCurve
 from netkf.runs.documents import COUNT, NUMBER, TEXT, TEXTS, DamagedError, check_files, require_form
 from netkf.runs.parquet_files import read_flags, read_numbers, read_texts
 from netkf.runs.quantities import NETWORK, sample_names
 from netkf.runs.stored import read_checked_document
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
-from netkf.studies.compare_filters import ComparedFilter, FilterComparison
+from netkf.studies.compare_filters import CURVES, ComparedFilter, FilterComparison
 from netkf.studies.filter_values import Quantity
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
     """
     require_form(manifest, COMPARISON)
     _require_confidence(manifest)
-    check_files(directory, manifest, [FILTERS])
+    has_curves = CURVES in manifest["files"]
+    check_files(directory, manifest, [FILTERS, *([CURVES] if has_curves else [])])
     path = directory / FILTERS
     quantities = ("rms_error", "nees_ratio", *sample_names(base))
     parts = [f"{key}_{part}" for key in quantities for part in PARTS[:-1]]
@@ -81,9 +83,25 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
         seed=manifest["seed"],
         confidence=manifest["confidence"],
         rows=tuple(rows),
+        curves=_read_curves(directory / CURVES, manifest["runs"]["done"]) if has_curves else (),
         directory=directory,
         manifest=manifest,
         base=base,
+    )
+
+
+def _read_curves(path: Path, runs: int) -> tuple[ErrorCurve, ...]:
+    numbers = read_numbers(path, ["t", "mse", "mse_se"], allow_empty=True)
+    tables = numbers.groupby(read_texts(path, "filter").astype(str), sort=False)
+    return tuple(
+        ErrorCurve(
+            str(label),
+            table["t"].to_numpy(),
+            table["mse"].to_numpy(),
+            table["mse_se"].to_numpy(),
+            runs,
+        )
+        for label, table in tables
     )
 
 

@@ -190,6 +190,31 @@ def test_the_command_writes_files(results, tmp_path, capsys):
         assert len(line.splitlines()) == 1
 
 
+def test_errors_of_several_results_are_drawn_in_one_figure(results, tmp_path, capsys):
+    run, ensemble = results("ring"), results("ensemble")
+    figure = netkf.plot({"one $run$": run, "many": ensemble}, "error")
+    assert_well_laid_out(figure)
+    one, many = figure.axes[0].lines[:2]
+    squares = ((run.x[:, None] - run.xhat) ** 2).sum(axis=2).mean(axis=1)
+    np.testing.assert_allclose(one.get_ydata(), squares, rtol=1e-9)
+    means = np.trace(ensemble.mean_error, axis1=2, axis2=3).mean(axis=1)
+    np.testing.assert_allclose(many.get_ydata(), means, rtol=1e-12)
+    averages = {"one $run$": squares[1:].mean(), "many": means[1:].mean()}
+    best = min(averages, key=averages.get).replace("$", r"\$")
+    assert figure.get_suptitle().startswith(f"{best} has the smallest mean square error")
+    assert_well_laid_out(netkf.plot([run, results("no truth"), run] * 10))
+    with pytest.raises(netkf.ScenarioError, match="its figures are error"):
+        netkf.plot([run, ensemble], "nees")
+    with pytest.raises(netkf.ScenarioError, match="name at least one"):
+        netkf.plot([])
+    folders = [str(netkf.save(run, run.scenario, tmp_path / name)) for name in ("a", "b")]
+    assert main(["plot", *folders, "--figure", "error,age", "--out", str(tmp_path / "o")]) == 0
+    written = [str(tmp_path / "o" / name) for name in ("errors.png", "a/age.png", "b/age.png")]
+    assert capsys.readouterr().out.splitlines() == written
+    assert main(["plot", *folders, "--figure", "error", "--out", str(tmp_path / "e.svg")]) == 0
+    assert (tmp_path / "e.svg").exists()
+
+
 def test_a_map_that_takes_minutes_is_drawn_on_request_only(results, monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(netkf.figures.stability, "MAX_UNKNOWNS", 1)
     monkeypatch.setattr(

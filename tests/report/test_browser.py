@@ -253,6 +253,59 @@ def test_the_first_sight_is_the_worst_instant(files, look, ring):
     assert f"{worst.peak:.4g}" in row
 
 
+def test_the_address_is_a_moment_and_the_figures_share_a_stretch_of_time(files, look):
+    page = look(files["two"])
+    page.evaluate("location.hash = '#t=3.5&node=2&run=B'")
+    page.wait_for_timeout(300)
+    told = "[window.netkf.time(), window.netkf.app.nodeId, window.netkf.app.focus]"
+    assert page.evaluate(told) == [3.5, 2, 1]
+    page.keyboard.press("Escape")
+    page.focus(".view")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(300)
+    assert page.evaluate("location.hash") == "#t=4&node=2&run=B"
+    over = page.locator(".curve .u-over")
+    over.first.scroll_into_view_if_needed()
+    box = over.first.bounding_box()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 45, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    assert page.evaluate("window.netkf.app.span") == pytest.approx([1.5, 4.5], abs=0.05)
+    assert page.evaluate("window.netkf.time()") == 4.0  # a drag is no click
+    box = page.locator("#tracks").bounding_box()
+    left, width = box["x"] + 92, box["width"] - 104
+    page.mouse.click(left + 0.5 * width, box["y"] + 6 + 13 * 4.5)  # the fifth row: node 4
+    page.wait_for_timeout(300)
+    assert page.evaluate(told) == [pytest.approx(3.0, abs=0.05), 4, 0]
+    page.click("#whole")
+    assert page.evaluate("window.netkf.app.span") is None
+
+
+def test_tables_are_offered_as_csv(files, look):
+    page = look(files["two"])
+    with page.expect_download() as download:
+        page.locator("button.csv").first.click()
+    lines = Path(download.value.path()).read_text(encoding="utf-8").splitlines()
+    assert "network.activation.rate,1.0,4.0" in lines
+    assert lines[2].startswith("RMS error,")
+
+
+def test_a_broadcast_says_who_lost_it(files, look, slots):
+    page = look(files["slots"])
+    messages = plain_messages(netkf.open(slots).events)
+    text = page.locator("#sequence .hearers title").first.text_content()
+    words = text.split()
+    sender, sent = int(words[4]), float(words[6])
+    lost = {
+        receiver
+        for (who, receiver, _), (at, outcome, *_) in messages.items()
+        if who == sender and abs(at - sent) < 1e-6 and outcome == "lost"
+    }
+    assert {int(name.strip(",")) for name in words[words.index("by") + 1 :]} == lost
+
+
 def test_a_click_on_a_node_explains_it(files, look):
     page = look(files["ring"])
     box = page.locator(".view canvas").first.bounding_box()

@@ -11,6 +11,7 @@ import scipy.stats
 import netkf
 from netkf import parts
 from netkf.cli.main import main
+from netkf.studies.compare_filters import write_comparison
 from tests.conftest import SCENARIOS
 
 RUNS = 6
@@ -114,6 +115,23 @@ def test_values_are_those_of_the_runs_and_intervals_students(scenario, found):
     assert local["nees_ratio"].se == pytest.approx(scipy.stats.sem(nees) / 2.0, rel=1e-8)
 
 
+def test_curves_are_mean_square_errors_over_the_runs(scenario, found, tmp_path):
+    squares = [
+        (run.error**2).sum(axis=2).mean(axis=1) for run in runs_of(scenario, {"kind": "local"})
+    ]
+    curve = next(curve for curve in found.curves if curve.label == "local")
+    np.testing.assert_array_equal(curve.times, scenario.times)
+    np.testing.assert_allclose(curve.square, np.mean(squares, axis=0), rtol=1e-12)
+    np.testing.assert_allclose(curve.se, scipy.stats.sem(squares), rtol=1e-9, atol=1e-15)
+    # The figure has them, also when it is read back.
+    directory = write_comparison(scenario, found, tmp_path / "out").directory
+    for comparison in (found, netkf.open(directory)):
+        axes = comparison.plot("error").axes[0]
+        lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+        np.testing.assert_array_equal(lines["local"], curve.square)
+        assert set(lines) == {row.filter for row in found.rows if row.ran}
+
+
 def test_one_algorithm_under_two_names_does_not_differ(found):
     icf = row_of(found, "icf steps=2")
     for quantity in icf.quantities.values():
@@ -183,7 +201,8 @@ def test_the_command_line_prints_a_table_a_document_and_a_directory(file, tmp_pa
     ):
         assert words in text
     assert {f.name for f in out.iterdir()} == {
-        *("scenario.toml", "manifest.json", "filters.csv", "filters.parquet", "filters.png")
+        *("scenario.toml", "manifest.json", "filters.csv", "filters.parquet", "filters.png"),
+        *("errors.parquet", "errors.png"),
     }
     assert list(pd.read_parquet(out / "filters.parquet")["filter"]) == [
         *("hcmci", "icf steps=2", "gossip", "intermittent")

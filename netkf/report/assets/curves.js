@@ -12,27 +12,34 @@ const Curves = (() => {
       Format.element("figcaption", {}, Format.element("strong", {}, title), " ", note || ""), box,
       legend(series, lines, band));
     const steep = isSteep(series);
-    let plot = null;
+    let plot = null, dragged = false;
     function build() {
       if (plot) plot.destroy();
       box.replaceChildren();
       const width = Math.max(260, box.clientWidth);
       plot = new uPlot(options(width), data(series, steep), box);
       box.querySelectorAll("canvas").forEach((canvas) => canvas.setAttribute("aria-hidden", "true"));
-      if (timed) plot.over.addEventListener("click", () => app.setTime(plot.posToVal(plot.cursor.left, "x")));
+      if (!timed) return;
+      plot.over.addEventListener("click", () => { if (!dragged) app.setTime(plot.posToVal(plot.cursor.left, "x")); dragged = false; });
+      plot.over.addEventListener("dblclick", () => app.setSpan(null));
     }
 
     function options(width) {
       const axis = { stroke: Theme.colours.ink, grid: { stroke: Theme.colours.faint, width: 1 }, ticks: { stroke: Theme.colours.faint }, font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif" };
       return {
         width, height: HEIGHT, padding: [12, 12, 0, 0], legend: { show: false },
-        cursor: { drag: { x: false, y: false }, y: false },
-        scales: { x: { time: false, ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
+        // A stretch of time that is dragged over is what all figures over time then show.
+        cursor: { drag: { x: Boolean(timed), y: false, setScale: false, dist: 6 }, y: false },
+        scales: { x: { time: false, ...(timed ? { range: (u, low, high) => app.span || [low, high > low ? high : low + 1] } : {}), ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
         axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
           ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],
         bands: bandsOf(series),
-        hooks: { drawClear: [(u) => drawBand(u, band, steep)], draw: [(u) => overlay(u, lines, timed ? app.time : null, steep), (u) => drawMarks(u, series, steep)] },
+        hooks: { setSelect: [(u) => {
+          if (!timed || u.select.width < 6) return;
+          dragged = true;
+          app.setSpan([u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]);
+        }], drawClear: [(u) => drawBand(u, band, steep)], draw: [(u) => overlay(u, lines, timed ? app.time : null, steep), (u) => drawMarks(u, series, steep)] },
       };
     }
     return { whole, build, redraw: () => plot && plot.redraw(false) };

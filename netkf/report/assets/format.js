@@ -61,5 +61,30 @@ const Format = (() => {
     return element("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": caption }, made);
   }
 
-  return { number, time, count, element, table };
+  // A table as CSV, offered as a file; cells with commas, quotes or line ends are quoted.
+  function csv(table) {
+    const cell = (text) => (/[",\n]/.test(text) ? '"' + text.replace(/"/g, '""') + '"' : text);
+    return [...table.rows].map((row) => [...row.cells].map((c) => cell(c.textContent)).join(",")).join("\r\n") + "\r\n";
+  }
+
+  function offerCsv(table) {
+    const caption = table.caption ? table.caption.textContent : "table";
+    const name = caption.replace(/[^A-Za-z0-9]+/g, "-").replace(/^-|-$/g, "").slice(0, 60).toLowerCase() + ".csv";
+    const button = element("button", { type: "button", class: "csv", "aria-label": "Download as CSV: " + caption }, "CSV");
+    button.addEventListener("click", () => {
+      const url = URL.createObjectURL(new Blob([csv(table)], { type: "text/csv" }));
+      element("a", { href: url, download: name }).click();
+      setTimeout(() => URL.revokeObjectURL(url), 10000);
+    });
+    return button;
+  }
+
+  // Each table of the page has its button, those that the script makes later too.
+  function offerTables(root) {
+    for (const box of root.querySelectorAll(".scroll > table")) {
+      if (!box.parentNode.querySelector(".csv")) box.before(offerCsv(box));
+    }
+  }
+
+  return { number, time, count, element, table, csv, offerTables };
 })();

@@ -3,7 +3,7 @@ const find = (id) => document.getElementById(id);
 
 const app = {
   time: 0, nodeId: null, axes: [0, 0], filter: "all", range: "now", lifelines: "near", picks: [],
-  window: 1, playing: false, speed: 1, focus: 0, runs: [], views: [], figures: [], said: 0,
+  span: null, window: 1, playing: false, speed: 1, focus: 0, runs: [], views: [], figures: [], said: 0,
 
   get run() { return this.runs[this.focus]; },
   get end() { return Math.max(...this.runs.map((run) => run.horizon)); },
@@ -42,6 +42,16 @@ const app = {
     else this.setTime(this.time + seconds, true);
   },
 
+  // The stretch of time [from, to] that all figures and tracks show; null for the whole run.
+  setSpan(span) {
+    this.span = span && span[1] > span[0] ? span : null;
+    if (find("whole")) find("whole").hidden = !this.span;
+    buildFigures();
+    if (this.runs.length) schedule();
+  },
+
+  focusOn(run) { if (this.run !== run) focusRun(this.runs.indexOf(run)); },
+
   setNode(i) {
     this.nodeId = this.run.nodes[i];
     find("node").value = String(i);
@@ -75,10 +85,29 @@ function schedule(moving) {
 
 function drawSlowly(now) {
   app.figures.forEach((figure) => figure.redraw());
+  Tracks.draw(find("tracks"), find("tracks-note"), app);
   Sequence.draw(find("sequence"), find("sequence-note"), app.run, app);
   Why.show(find("why"), find("why-title"), app.run, app);
   if (!app.playing || now - app.said > 5000) { app.said = now; say(); }
-  if (!app.playing) fillTables();
+  if (!app.playing) { fillTables(); writeMoment(); }
+}
+
+// The address of the page names the moment and the node, #t=16&node=2: a link to it.
+function writeMoment() {
+  const moment = "#t=" + Format.time(app.time) + "&node=" + encodeURIComponent(String(app.run.names[app.nodeOf(app.run)]));
+  const run = app.focus ? "&run=" + "AB"[app.focus] : "";
+  if (location.hash !== moment + run) try { history.replaceState(null, "", moment + run); } catch { /* a browser that forbids it */ }
+}
+
+// Shows the moment in the address; true if there is one. What is not of this run is passed over.
+function readMoment() {
+  const asked = new URLSearchParams(location.hash.slice(1)), t = Number(asked.get("t") || NaN);
+  const r = "AB".indexOf(asked.get("run") || "A");
+  if (r >= 0 && r < app.runs.length && r !== app.focus) focusRun(r);
+  const i = app.run.names.findIndex((name) => String(name) === asked.get("node"));
+  if (i >= 0) app.setNode(i);
+  if (Number.isFinite(t)) app.setTime(t);
+  return i >= 0 || Number.isFinite(t);
 }
 
 // The state in words, for readers of the screen by ear: not more often than it can be read.
@@ -106,6 +135,7 @@ function say() {
 function fillTables() {
   if (find("table-box").open) find("table").replaceChildren(...app.runs.map(nodeTable));
   if (find("messages-box").open) find("message-table").replaceChildren(...app.runs.map(messageTable));
+  Format.offerTables(find("live"));
 }
 
 function nodeTable(run, r) {
@@ -269,6 +299,8 @@ function setUpControls() {
   find("forward").addEventListener("click", () => step(1));
   find("next").addEventListener("click", nextMessage);
   find("worst").addEventListener("click", toWorst);
+  find("whole").addEventListener("click", () => app.setSpan(null));
+  window.addEventListener("hashchange", readMoment);
   for (const id of ["table-box", "messages-box"]) find(id).addEventListener("toggle", fillTables);
 }
 
@@ -280,6 +312,8 @@ function startLive() {
   setUpControls();
   focusRun(0);
   buildViews();
+  Tracks.listen(find("tracks"), app);
+  readMoment();
 }
 
 const page = JSON.parse(find("page-data").textContent);
@@ -301,6 +335,7 @@ async function start() {
     app.setTime = () => {};
   }
   buildFigures();
+  Format.offerTables(document);
   const redraw = () => {
     buildFigures();
     if (app.runs.length) schedule();

@@ -212,12 +212,14 @@ const Network = (() => {
   // Nine of ten samples lie below the end of the scale: one wild node does not make all others light.
   // Runs side by side have one scale.
   function shadeRange(runs) {
+    if (runs.shades) return runs.shades;
     const values = [];
     for (const run of runs) for (let k = 0; k < run.samples.count; k++) {
       for (let i = 0; i < run.N; i++) values.push(shade(run, k, i));
     }
     const sorted = values.filter(Number.isFinite).sort((a, b) => a - b);
-    return sorted[Math.floor(0.9 * (sorted.length - 1))] || 1;
+    runs.shades = sorted[Math.floor(0.9 * (sorted.length - 1))] || 1;
+    return runs.shades;
   }
 
   // Pixels per unit of each of two components: the same for all nodes, times and runs, so that sizes
@@ -254,5 +256,5 @@ const Network = (() => {
     return run.sizes[c];
   }
 
-  return { view, colour, MAX_DRAWN };
+  return { view, colour, shade, shadeRange, MAX_DRAWN };
 })();

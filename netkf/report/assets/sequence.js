@@ -1,7 +1,7 @@
 // The sequence chart: a lifeline for each chosen node, time downwards, an arrow for each message.
 const Sequence = (() => {
   const HEIGHT = 480, TOP = 34, LEFT = 70, RIGHT = 66, BOTTOM = 14;
-  const MAX_ARROWS = 220, MAX_NEAR = 7;
+  const MAX_ARROWS = 220, MAX_NEAR = 7, MAX_LOSERS = 4;
   const make = Format.element;
 
   // The chosen node and those it has heard most recently.
@@ -74,6 +74,7 @@ const Sequence = (() => {
     drawFrame(svg, at, start, end, wide);
     drawLifelines(svg, run, app, chosen, x, at, start, end);
     for (const row of drawn) svg.append(arrow(run, row, x, at));
+    if (run.broadcasts) drawLosers(svg, run, drawn, x, at);
     drawClock(svg, at, app.time, wide, end);
     svg.addEventListener("click", (event) => {
       const y = event.clientY - svg.getBoundingClientRect().top;
@@ -166,6 +167,32 @@ const Sequence = (() => {
     return group;
   }
 
+  // Beside each broadcast the nodes that lost it, also those without a lifeline here.
+  function drawLosers(svg, run, drawn, x, at) {
+    const m = run.messages, said = new Set();
+    for (const row of drawn) {
+      const key = m.sender[row] + " " + m.sent[row] + " " + m.phase[row];
+      if (said.has(key)) continue;
+      said.add(key);
+      const names = losers(run, row);
+      if (!names.length || at.sent(row) < TOP - 6) continue;
+      const more = names.length > MAX_LOSERS ? " and " + (names.length - MAX_LOSERS) + " more" : "";
+      svg.append(make("text", { x: x.get(m.sender[row]) + 5, y: at.sent(row) - 4, class: "hearers" },
+        make("title", {}, "the broadcast of node " + run.names[m.sender[row]] + " at " + Format.time(m.sent[row]) + " s was lost by " + names.join(", ")),
+        "lost by " + names.slice(0, MAX_LOSERS).join(", ") + more));
+    }
+  }
+
+  // The names of the nodes that lost the broadcast which message `row` is a part of.
+  function losers(run, row) {
+    const m = run.messages, found = [];
+    for (let k = State.firstSent(m, m.sent[row]); k < m.bySent.length && m.sent[m.bySent[k]] === m.sent[row]; k++) {
+      const other = m.bySent[k];
+      if (m.sender[other] === m.sender[row] && m.phase[other] === m.phase[row] && m.outcome[other] === State.LOST) found.push(m.receiver[other]);
+    }
+    return found.sort((a, b) => a - b).map((i) => run.names[i]);
+  }
+
   // The part of a line that lies in the chart: messages may begin before and end after it.
   function cut([x1, y1], [x2, y2]) {
     const at = (y) => [x1 + ((x2 - x1) * (y - y1)) / (y2 - y1), y];
@@ -195,5 +222,5 @@ const Sequence = (() => {
     return Math.min(width, run.horizon) || 1;
   }
 
-  return { draw, sentence, usualWindow };
+  return { draw, sentence, usualWindow, losers };
 })();

@@ -1,0 +1,140 @@
+"""The mean square errors of several filters or runs over time, in one figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from netkf.core.errors import ScenarioError
+from netkf.core.printable import shorten
+from netkf.figures.figure_data import FigureData, reduce_result
+from netkf.figures.style import (
+    MAX_DRAWN,
+    MUTED,
+    SECONDS,
+    SERIES,
+    Picture,
+    draw_legend,
+    finish_figure,
+    message_figure,
+    new_figure,
+    set_scale,
+    style_context,
+)
+from netkf.linalg.arrays import FloatArray
+from netkf.runs.curves import ErrorCurve
+from netkf.runs.summary import NORMAL_QUANTILE
+
+MAX_CURVES = 24
+"""Curves that a figure shows; markers tell those apart whose lines look alike."""
+MAX_LABEL, MAX_ORIGINS = 40, 3
+NO_TRUTH = "None of them has a ground truth, so that their errors are unknown."
+
+
+def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
+    """Return the mean square errors ``curves`` over time as one figure; ``origin`` begins its
+    caption.
+    """
+    known = [c for c in curves if np.isfinite(c.square).any()]
+    with style_context():
+        if not known:
+            return message_figure("No error to show", NO_TRUTH, [origin])
+        figure = new_figure(7.4, 4.6)
+        axes = figure.add_subplot()
+        for k, curve in enumerate(known[:MAX_CURVES]):
+            _draw_curve(axes, curve, k)
+        central = {curve.central for curve in curves if math.isfinite(curve.central)}
+        if len(central) == 1:
+            label = "centralised filter, trace of P by theory"
+            axes.axhline(*central, color=MUTED, lw=0.9, ls=(0, (1, 2)), label=label)
+        drawn = np.concatenate([_high(curve) for curve in known[:MAX_CURVES]])
+        set_scale(axes, np.append(drawn, list(central)))
+        axes.set(xlabel=SECONDS, ylabel="mean square error, squared units of the state")
+        draw_legend(axes)
+        sentences = [origin, "Mean over all nodes."]
+        if any(curve.se is not None for curve in known):
+            sentences.append("Bands: 95% intervals of the means over runs, or wider.")
+        if len(known) > MAX_CURVES:
+            sentences.append(f"The first {MAX_CURVES} of {len(known)}.")
+        missing = [shorten(c.label, MAX_LABEL) for c in curves if c not in known]
+        if missing:
+            sentences.append(f"Without errors: {', '.join(missing)}.")
+        finish_figure(figure, _headline(known), [" ".join(filter(None, sentences))])
+    return figure
+
+
+def _draw_curve(axes: Any, curve: ErrorCurve, k: int) -> None:
+    style, again = SERIES[k % len(SERIES)], k // len(SERIES)
+    label = shorten(curve.label, MAX_LABEL).replace("$", r"\$")
+    square = np.minimum(curve.square, MAX_DRAWN)
+    marks: dict[str, Any] = {"marker": SERIES[again].marker, "ms": 3.5} if again else {}
+    marks |= {"markevery": max(1, len(square) // 12)} if again else {}
+    alone = {"marker": style.marker, "ms": 4} if len(square) == 1 else {}
+    axes.plot(
+        curve.times, square, color=style.colour, ls=style.dashes, label=label, **marks | alone
+    )
+    if curve.se is not None:
+        low, high = np.maximum(square - NORMAL_QUANTILE * curve.se, 0.0), _high(curve)
+        axes.fill_between(curve.times, low, high, color=style.colour, alpha=0.15, lw=0)
+
+
+def _high(curve: ErrorCurve) -> FloatArray:
+    """Return the upper ends (T,) of a curve's intervals, or the curve itself."""
+    width = 0.0 if curve.se is None else NORMAL_QUANTILE * curve.se
+    return np.minimum(curve.square + width, MAX_DRAWN)
+
+
+def _headline(curves: Sequence[ErrorCurve]) -> str:
+    """Return which curve has the smallest mean after time 0."""
+    means = []
+    for curve in curves:
+        after = curve.square[curve.times > 0.0]
+        mean = float(after.mean()) if len(after) else math.nan  # nan where a run diverged
+        means.append((mean if math.isfinite(mean) else math.inf, shorten(curve.label, MAX_LABEL)))
+    (best, name), (worst, last) = min(means), max(means)
+    if not math.isfinite(best):
+        return "Mean square errors over time"
+    sentence = f"{name} has the smallest mean square error after time 0, {best:.3g}"
+    if len(means) == 1:
+        return f"{name}: mean square error {best:.3g} after time 0"
+    return f"{sentence}; {last} {worst:.3g}" if math.isfinite(worst) else f"{sentence}"
+
+
+def curves_of(
+    results: Sequence[Any] | Mapping[str, Any],
+) -> tuple[tuple[ErrorCurve, ...], str]:
+    """Return the curves of runs and ensembles, by label or in a list, whose labels are what tells
+    them apart: their filters, else their scenarios, else numbers; and a sentence on the runs.
+    Raises ScenarioError.
+    """
+    if isinstance(results, Mapping):
+        labels, found = [str(label) for label in results], list(results.values())
+    else:
+        found = list(results)
+        labels = []
+    if not found:
+        raise ScenarioError("", "plot needs a run or an ensemble", results, "name at least one")
+    data = [reduce_result(result) for result in found]
+    named = zip(labels or _labels(data), data, strict=True)
+    origins = list(dict.fromkeys(f"{one.scenario.name}: {one.count_text}" for one in data))
+    more = f"; and {len(origins) - MAX_ORIGINS} more" if len(origins) > MAX_ORIGINS else ""
+    return tuple(_curve(*pair) for pair in named), f"{'; '.join(origins[:MAX_ORIGINS])}{more}."
+
+
+def _labels(data: Sequence[FigureData]) -> list[str]:
+    choices = (
+        [type(one.scenario.filter.algorithm).__name__ for one in data],
+        [one.scenario.name for one in data],
+    )
+    numbered = [f"{k + 1}: {one.scenario.name}" for k, one in enumerate(data)]
+    return next((names for names in choices if len(set(names)) == len(names)), numbered)
+
+
+def _curve(label: str, data: FigureData) -> ErrorCurve:
+    # A node's standard errors bound those of the mean of all nodes, which are dependent.
+    se = None if data.se_error is None else data.se_error.mean(axis=1)
+    square, central = data.sq_error.mean(axis=1), data.promised.central
+    return ErrorCurve(label, data.times, square, se, data.runs, central)
