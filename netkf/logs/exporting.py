@@ -17,6 +17,7 @@ from netkf.logs.recorded_network import Files
 from netkf.network.clocks import LinkClock
 from netkf.network.lives import lifetimes
 from netkf.rng.streams import Streams
+from netkf.runs.files import require_run
 from netkf.scenario.positions import tick_times
 from netkf.scenario.sampling import all_sample_times
 from netkf.scenario.scenario import Scenario
@@ -69,9 +70,7 @@ def export_recorded(run: Run, out: str | Path) -> tuple[Path, ...]:
 
 def _new_folder(run: Run, out: str | Path) -> tuple[Path, Scenario]:
     """Return the folder and the scenario of the run; raises ScenarioError."""
-    folder, scenario = as_path("out", out), run.scenario
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError("run", "must have its scenario", None, "take what simulate returns")
+    folder, scenario = as_path("out", out), require_run(run)
     if folder.exists() and any(folder.iterdir() if folder.is_dir() else [folder]):
         rule = "must be a new or empty folder"
         raise ScenarioError(str(folder), rule, None, "choose another folder")

@@ -12,9 +12,8 @@ from netkf.core.errors import ScenarioError
 from netkf.core.extras import require
 from netkf.core.version import __version__
 from netkf.ensembles.monte_carlo import Ensemble
-from netkf.neighbours.files import output_file
 from netkf.network.graphs import NamedNode
-from netkf.runs.files import write_atomically
+from netkf.runs.files import output_file, write_atomically
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import resolve_defaults, to_toml
 from netkf.trace.run import Run

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from netkf.neighbours.files import output_file, require_run
 from netkf.network.graphs import Link
-from netkf.runs.files import write_atomically
+from netkf.runs.files import output_file, require_run, write_atomically
 from netkf.trace.messages import DELIVERED, LATE, LOST, by_link, join_messages
 from netkf.trace.run import Run
 

@@ -16,19 +16,16 @@ import numpy as np
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import number
-from netkf.neighbours.files import output_file, require_run
-from netkf.runs.files import write_atomically
+from netkf.runs.files import output_file, require_run, write_atomically
 from netkf.trace.messages import LOST, join_messages
 from netkf.trace.nees import traces
 from netkf.trace.run import Run
 from netkf.trace.schema import KINDS
 
-EVENTS, DOWN = 1, 2
-"""Tracks of a node: its events, and when it was down."""
+EVENTS = 1
+"""The track of a node with its events."""
 WIDEST = 500
 """Events are drawn this fraction of the window wide, or up to the next one of their node."""
-ENDS = {"crash": True, "leave": True, "restart": False, "join": False}
-"""Kinds of events after which a node is down (True) or up."""
 Event = dict[str, Any]
 
 
@@ -40,9 +37,9 @@ def export_perfetto(
     ui.perfetto.dev, or in chrome://tracing.
 
     Each node is a process. Its track ``events`` has a slice for each instant at which something
-    happens, named after the kinds of its events, and one ``down`` where it was; slices have a width
-    so that they can be seen. Messages that arrive are arrows (flows) between slices; trace P and
-    the norm of the error are counters. Instants are rounded to nanoseconds.
+    happens, named after the kinds of its events; its width means nothing. Messages that arrive are
+    arrows (flows) between slices; trace P and norm of error are counters. Instants are rounded to
+    nanoseconds.
 
     Raises ScenarioError for a window in which there is nothing, and WriteError.
     """
@@ -60,7 +57,6 @@ def export_perfetto(
     events = itertools.chain(
         _names(run, pids),
         _slices(log, pids, end - begin),
-        _outages(run.log, pids, begin, end),
         _arrows(run, pids, begin, end),
         _counters(run, pids, begin, end),
     )
@@ -80,13 +76,11 @@ def _micro(t: float) -> float:
 
 def _names(run: Run, pids: dict[int, int]) -> Iterator[Event]:
     labels = {int(node): f"node {node}" for node in run.nodes}
-    tracks = {EVENTS: "events", DOWN: "down"}
     for node, pid in pids.items():
         process = {"ph": "M", "pid": pid, "tid": EVENTS}
         yield {**process, "name": "process_name", "args": {"name": labels.get(node, "network")}}
         yield {**process, "name": "process_sort_index", "args": {"sort_index": pid}}
-        for tid, name in tracks.items():
-            yield {"ph": "M", "pid": pid, "tid": tid, "name": "thread_name", "args": {"name": name}}
+        yield {**process, "name": "thread_name", "args": {"name": "events"}}
 
 
 def _slices(log: np.ndarray, pids: dict[int, int], span: float) -> Iterator[Event]:
@@ -116,25 +110,6 @@ def _slices(log: np.ndarray, pids: dict[int, int], span: float) -> Iterator[Even
             }
 
 
-def _outages(log: np.ndarray, pids: dict[int, int], begin: float, end: float) -> Iterator[Event]:
-    """Yield a slice for each time at which a node was down inside the window."""
-    codes = {KINDS.index(kind): down for kind, down in ENDS.items()}
-    changes = log[np.isin(log["kind"], list(codes))]
-    for node, pid in pids.items():
-        own = changes[changes["node"] == node]
-        times, down = own["t"].tolist(), [codes[code] for code in own["kind"].tolist()]
-        # A node whose first change is that it comes up was down before.
-        if down and not down[0]:
-            times, down = [0.0, *times], [True, *down]
-        for k, t in enumerate(times):
-            until = min(times[k + 1] if k + 1 < len(times) else math.inf, end)
-            start = max(t, begin)
-            if down[k] and start < until:
-                place = {"pid": pid, "tid": DOWN, "ts": _micro(start)}
-                dur = round(_micro(until) - _micro(start), 3)
-                yield {"ph": "X", "name": "down", "cat": "lives", **place, "dur": dur}
-
-
 def _arrows(run: Run, pids: dict[int, int], begin: float, end: float) -> Iterator[Event]:
     messages = join_messages(run.log)
     ended = (messages["ended"] <= end) & (messages["outcome"] != LOST)
@@ -147,10 +122,11 @@ def _arrows(run: Run, pids: dict[int, int], begin: float, end: float) -> Iterato
 
 
 def _counters(run: Run, pids: dict[int, int], begin: float, end: float) -> Iterator[Event]:
-    values = {"trace P": traces(run.P), "error": np.sqrt(run.sq_error)}
+    # Perfetto calls a counter by both of its names.
+    values = {("trace", "P"): traces(run.P), ("norm of", "error"): np.sqrt(run.sq_error)}
     for k in np.flatnonzero((run.times >= begin) & (run.times <= end)).tolist():
         for place, node in enumerate(run.nodes):
-            for name, samples in values.items():
+            for (name, of), samples in values.items():
                 if math.isfinite(value := float(samples[k, place])):
                     at = {"pid": pids[int(node)], "ts": _micro(float(run.times[k]))}
-                    yield {"ph": "C", "name": name, **at, "args": {"value": value}}
+                    yield {"ph": "C", "name": name, **at, "args": {of: value}}

@@ -11,7 +11,7 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.extras import require
 from netkf.linalg.arrays import FloatArray
-from netkf.neighbours.files import require_run
+from netkf.runs.files import require_run
 from netkf.runs.readings import collect_readings
 from netkf.runs.simulate import ENGINES
 from netkf.trace.run import Run
@@ -31,23 +31,28 @@ class StoneSoupRun(NamedTuple):
 def to_stonesoup(run: Run, start: datetime.datetime | None = None) -> StoneSoupRun:
     """Return a run as objects of Stone Soup, see ``Run.to_stonesoup``."""
     scenario = require_run(run)
-    _import("types.state")
     stamps = [_stamp(t, start) for t in run.times.tolist()]
     if len(set(stamps)) < len(stamps):
         rule = "must be a microsecond apart, which the times of Stone Soup resolve"
         raise ScenarioError("times", rule, None, "choose a longer probe")
-    truths, tracks = set(), set()
+    types, path = _import("types.state"), _import("types.groundtruth").GroundTruthPath
+    track, truths, tracks = _import("types.track").Track, set(), set()
     for place in scenario.layout.places:
-        about = {"block": place.name, "owner": place.node}
         if run.truth_known:
-            truths.add(_truth(run.x[:, place.entries], stamps, place.label, about))
+            states = _states(types.State, stamps, run.x[:, place.entries])
+            truths.add(path(states, id=place.label))
         for k, node in enumerate(run.nodes):
             places = scenario.estimated[k]
-            if place in places:
-                first = sum(one.n for one in places[: places.index(place)])
-                own = slice(first, first + place.n)
-                metadata = {"node": node, **about}
-                tracks.add(_track(run.xhat[:, k, own], run.P[:, k, own, own], stamps, metadata))
+            if place not in places:
+                continue
+            first = sum(one.n for one in places[: places.index(place)])
+            own = slice(first, first + place.n)
+            P = run.P[:, k, own, own]
+            # Some filters have no covariance.
+            made = (types.GaussianState, P) if np.isfinite(P).all() else (types.State,)
+            states = _states(made[0], stamps, run.xhat[:, k, own], *made[1:])
+            about = {"node": node, "block": place.name, "owner": place.node}
+            tracks.add(track(states, init_metadata=about))
     return StoneSoupRun(truths, _detections(run, start), tracks)
 
 
@@ -59,27 +64,10 @@ def _stamp(t: float, start: datetime.datetime | None) -> datetime.datetime:
     return (start or START) + datetime.timedelta(microseconds=round(t * 1e6))
 
 
-def _truth(x: FloatArray, stamps: list[Any], label: str, about: dict[str, Any]) -> Any:
-    types = _import("types.groundtruth")
-    states = [
-        types.GroundTruthState(row, timestamp=t, metadata=about)
-        for row, t in zip(x, stamps, strict=True)
-        if np.isfinite(row).all()
-    ]
-    return types.GroundTruthPath(states, id=label)
-
-
-def _track(xhat: FloatArray, P: FloatArray, stamps: list[Any], about: dict[str, Any]) -> Any:
-    """Return the track of estimates (T, n) with their covariances (T, n, n), nan for none."""
-    types = _import("types.state")
-    states = [
-        types.GaussianState(row, cov, timestamp=t)
-        if np.isfinite(cov).all()
-        else types.State(row, timestamp=t)
-        for row, cov, t in zip(xhat, P, stamps, strict=True)
-        if np.isfinite(row).all()
-    ]
-    return _import("types.track").Track(states, init_metadata=about)
+def _states(make: Any, stamps: list[Any], *columns: FloatArray) -> list[Any]:
+    """Return what ``make`` makes of rows of ``columns`` (T, ...) where the first is finite."""
+    rows = zip(stamps, *columns, strict=True)
+    return [make(*row, timestamp=t) for t, *row in rows if np.isfinite(row[0]).all()]
 
 
 def _detections(run: Run, start: datetime.datetime | None) -> set[Any]:
@@ -88,24 +76,21 @@ def _detections(run: Run, start: datetime.datetime | None) -> set[Any]:
     placed = scenario.placed_sensors if scenario.slotted else scenario.sampled_sensors
     engine = run.engine if run.engine in ENGINES else "auto"
     found = collect_readings(scenario, run.seed, run.replica, placed, all_slots=True, engine=engine)
-    detection, models = _import("types.detection").Detection, {}
+    detection = _import("types.detection").Detection
     detections = set()
     for one in found.readings:
         origin, y = found.origin[one.number], one.y
-        key: tuple[Any, ...] = (one.node, one.placed.ordinal, one.rows.tobytes(), one.R.tobytes())
-        is_linear = isinstance(one.H, np.ndarray)
-        if is_linear:
+        if isinstance(one.H, np.ndarray):
             # Readings are counted without the response to an input that filters know.
-            y, key = y + one.H @ origin, (*key, one.H.tobytes())
-        if key not in models:
-            cls = _linear_model() if is_linear else _nonlinear_model()
-            about = {"ndim_state": scenario.plant.n, "mapping": (), "noise_covar": one.R}
-            models[key] = cls(reading=one.H, **about)
+            y = y + one.H @ origin
+        model = _model_class()(
+            ndim_state=scenario.plant.n, mapping=(), noise_covar=one.R, reading=one.H
+        )
         detections.add(
             detection(
                 y,
                 timestamp=_stamp(float(found.times[one.number]), start),
-                measurement_model=models[key],
+                measurement_model=model,
                 metadata={"node": one.node, "sensor": one.placed.ordinal},
             )
         )
@@ -113,53 +98,40 @@ def _detections(run: Run, start: datetime.datetime | None) -> set[Any]:
 
 
 @cache
-def _linear_model() -> Any:
-    """Return a class of Stone Soup's linear models with any H (p, n) as ``reading``."""
-    base, linear = _import("base"), _import("models.measurement.linear")
+def _model_class() -> Any:
+    """Return a class of Stone Soup's measurement models for any reading: its own pick entries of x,
+    or are of one kind of radar.
+    """
+    base, types = _import("base"), _import("types.array")
+    gaussian = _import("models.measurement.nonlinear").NonLinearGaussianMeasurement
 
-    class LinearReading(linear.LinearGaussian):  # type: ignore[name-defined,misc]
-        """``y = H x + v`` with H (p, n) as ``reading``."""
+    class Reading(gaussian):  # type: ignore[misc,valid-type]
+        """``y = H x + v`` or ``y = h(x) + v``; ``reading`` is H (p, n) or a Linearised."""
 
-        reading: Any = base.Property(doc="H (p, n)")
+        reading: Any = base.Property(doc="H, or h with its Jacobian")
 
         @property
         def ndim_meas(self) -> int:
-            return len(self.reading)
+            return len(self.noise_covar)
+
+        def function(self, state: Any, noise: Any = False, **_: Any) -> Any:
+            xs = np.asarray(state.state_vector, dtype=np.float64)
+            H = self.reading
+            is_linear = isinstance(H, np.ndarray)
+            y = H @ xs if is_linear else np.column_stack([H.value(x) for x in xs.T])
+            drawn = self.rvs(num_samples=xs.shape[1]) if noise is True else noise
+            cls = types.StateVector if y.shape[1] == 1 else types.StateVectors
+            return cls(y) + (0 if drawn is False or drawn is None else drawn)
+
+        def jacobian(self, state: Any, **_: Any) -> FloatArray:
+            if isinstance(self.reading, np.ndarray):
+                return self.reading
+            x = np.asarray(state.state_vector, dtype=np.float64)[:, 0]
+            jacobian: FloatArray = self.reading(self.reading.value(x), x)[1]
+            return jacobian
 
         def matrix(self, **_: Any) -> FloatArray:
             matrix: FloatArray = self.reading
             return matrix
-
-    return LinearReading
-
-
-@cache
-def _nonlinear_model() -> Any:
-    """Return a class of Stone Soup's nonlinear models with any h(x) as ``reading``, a
-    ``plants.nonlinear.Linearised``.
-    """
-    base, types = _import("base"), _import("types.array")
-    nonlinear = _import("models.measurement.nonlinear")
-
-    class Reading(nonlinear.NonLinearGaussianMeasurement):  # type: ignore[name-defined,misc]
-        """``y = h(x) + v``."""
-
-        reading: Any = base.Property(doc="h and its Jacobian")
-
-        @property
-        def ndim_meas(self) -> int:
-            return int(self.reading.size)
-
-        def function(self, state: Any, noise: Any = False, **_: Any) -> Any:
-            vectors = np.asarray(state.state_vector, dtype=np.float64)
-            values = np.column_stack([self.reading.value(x) for x in vectors.T])
-            drawn = self.rvs(num_samples=vectors.shape[1]) if noise is True else noise
-            cls = types.StateVector if values.shape[1] == 1 else types.StateVectors
-            return cls(values) + (0 if drawn is False or drawn is None else drawn)
-
-        def jacobian(self, state: Any, **_: Any) -> FloatArray:
-            x = np.asarray(state.state_vector, dtype=np.float64)[:, 0]
-            jacobian: FloatArray = self.reading(self.reading.value(x), x)[1]
-            return jacobian
 
     return Reading

@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 
 from netkf.core.errors import ScenarioError, WriteError
+from netkf.core.fields import as_path
 from netkf.scenario.plugins import find_module_files, find_unimportable_class
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
 from netkf.scenario.writing import resolve_defaults, to_toml
+from netkf.trace.run import Run
 
 
 @contextlib.contextmanager
@@ -186,6 +188,28 @@ def make_directory(path: Path, must_be_new: bool = False) -> bool:
     else:
         return True
     raise ScenarioError("--out", f"cannot be made ({reason})", str(path), "choose another")
+
+
+def require_run(run: object) -> Scenario:
+    """Return the scenario of a run; raises ScenarioError for what is no run, or has none."""
+    scenario = run.scenario if isinstance(run, Run) else None
+    if not isinstance(scenario, Scenario):
+        remedy = "take what netkf.simulate or netkf.open returns"
+        raise ScenarioError("run", "must be a run with its scenario", None, remedy)
+    return scenario
+
+
+def output_file(out: str | Path, name: str) -> Path:
+    """Return the path of a file to write: ``out``, or ``name`` in it if it is a folder, which must
+    not exist yet. Raises ScenarioError and WriteError.
+    """
+    path = as_path("out", out)
+    path = path / name if path.is_dir() else path
+    require_own(path)
+    if path.exists():
+        raise ScenarioError(str(path), "exists already", None, "choose another name, or remove it")
+    make_directory(path.parent)
+    return path
 
 
 BLOCKS_FOLDER = "blocks"
