@@ -17,7 +17,7 @@ from netkf.core.fields import covariance, definite_covariance, matrix, positive,
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root
 from netkf.plants.transitions import decimal_below
-from netkf.scenario.reading import from_table
+from netkf.scenario.reading import from_table, require_changes
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import change_table
 
@@ -54,7 +54,7 @@ def from_control(
     A, B, C = (matrix(name, np.asarray(getattr(space, name))) for name in "ABC")
     gain = np.eye(len(A)) if G is None else _shaped("G", matrix("G", np.atleast_2d(G)), len(A))
     noise = _shaped("Q", covariance("Q", np.atleast_2d(Q)), gain.shape[1])
-    if np.any(space.D) and any(key.startswith("plant.input") for key in changes or {}):
+    if np.any(space.D) and any(key.startswith("plant.input") for key in require_changes(changes)):
         rule = "feeds the input through to the readings, which netkf does not"
         remedy = "subtract D u from the outputs and set D = 0"
         raise ScenarioError("system.D", rule, np.asarray(space.D), remedy)
@@ -110,7 +110,7 @@ def _shaped(key: str, value: FloatArray, rows: int) -> FloatArray:
 
 
 def _slots(period: Any) -> dict[str, Any]:
-    period = positive("period", float(period))
+    period = positive("period", period)
     horizon = float(SLOTS * Decimal(repr(period)))
     return {"horizon": horizon, "probe": period, "plant": {"kind": "linear", "period": period}}
 
@@ -131,7 +131,7 @@ def _scenario(table: dict[str, Any], H: FloatArray, R: Any, B: Any, changes: Cha
         "network": {"graph": {"kind": "complete", "nodes": len(rows)}},
         "filter": {"kind": "central"},
     }
-    changes = dict(changes or {})
+    changes = dict(require_changes(changes))
     u = changes.get("plant.input")
     if isinstance(u, Mapping) and "G" not in u and B is not None:
         changes["plant.input"] = {**u, "G": np.asarray(B, dtype=np.float64)}

@@ -31,6 +31,10 @@ class StoneSoupRun(NamedTuple):
 def to_stonesoup(run: Run, start: datetime.datetime | None = None) -> StoneSoupRun:
     """Return a run as objects of Stone Soup, see ``Run.to_stonesoup``."""
     scenario = require_run(run)
+    if start is not None and not isinstance(start, datetime.datetime):
+        raise ScenarioError(
+            "start", "must be a datetime", start, "give datetime.datetime(2000, 1, 1)"
+        )
     stamps = [_stamp(t, start) for t in run.times.tolist()]
     if len(set(stamps)) < len(stamps):
         rule = "must be a microsecond apart, which the times of Stone Soup resolve"

@@ -45,15 +45,19 @@ def load(
     Raises ScenarioError with one line for the first mistake.
     """
     path = as_path("path", path, "load takes the path of a scenario file")
-    changes = changes or {}
-    value: object = changes  # scripts that no type checker reads may pass anything
-    if not isinstance(value, Mapping):
-        rule, remedy = "must be a table", 'give values by key: {"horizon": 10.0}'
-        raise ScenarioError("changes", rule, value, remedy)
+    changes = require_changes(changes)
     try:
         return from_table(change_table(_parse_file(path), changes), path.parent, trust)
     except ScenarioError as error:
         raise explain_left_over(error, changes).in_file(str(path)) from None
+
+
+def require_changes(changes: object) -> Mapping[str, Any]:
+    """Return ``changes``, none for None; raises ScenarioError for what is no table."""
+    if changes is not None and not isinstance(changes, Mapping):
+        rule, remedy = "must be a table", 'give values by key: {"horizon": 10.0}'
+        raise ScenarioError("changes", rule, changes, remedy)
+    return changes or {}
 
 
 def from_table(table: Mapping[str, Any], folder: Path, trust: bool = True) -> Scenario:

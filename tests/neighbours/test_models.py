@@ -106,6 +106,8 @@ def test_a_run_of_a_filterpy_filter_is_that_filter():
         (lambda: netkf.from_filterpy(SYSTEM), "kf: must have F, Q, H, R, x, P"),
         (lambda: netkf.from_filterpy(faded()), "kf.alpha: must be 1"),
         (lambda: netkf.from_filterpy(kalman(), period=0.0), "period: must be"),
+        (lambda: netkf.from_filterpy(kalman(), ["horizon"]), "changes: must be a table"),
+        (lambda: netkf.from_filterpy(kalman(), period="x"), "period: must be"),
     ],
 )
 def test_what_is_no_model_is_refused_in_one_line(call, message):

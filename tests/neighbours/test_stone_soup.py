@@ -123,3 +123,5 @@ def test_sample_times_nearer_than_a_microsecond_are_refused():
     run = netkf.simulate(scenario, engine="simpy")
     with pytest.raises(netkf.ScenarioError, match="must be a microsecond apart"):
         run.to_stonesoup()
+    with pytest.raises(netkf.ScenarioError, match="start: must be a datetime"):
+        run.to_stonesoup("noon")
