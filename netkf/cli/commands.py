@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -111,6 +112,27 @@ def parse_node(text: str) -> str:
     return text.strip()
 
 
+def parse_part(text: str) -> tuple[int, int]:
+    """Return the value i/n of ``--part``; raises ArgumentTypeError."""
+    index, _, count = text.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and len(text) < 20) or not (
+        int(index) <= int(count) > 0
+    ):
+        rule = "must be i/n, part i of n, such as 3/64"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    return int(index), int(count)
+
+
+def parse_duration(text: str) -> float:
+    """Return the seconds of a duration such as 50m or 1h30m; raises ArgumentTypeError."""
+    found = re.fullmatch(r"(?:(\d{1,6})h)?(?:(\d{1,6})m)?(?:(\d{1,9})s)?", text.strip())
+    if not found or not any(found.groups()):
+        rule = "must be hours, minutes and seconds, such as 50m or 1h30m"
+        raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+    hours, minutes, seconds = (float(group or 0) for group in found.groups())
+    return 3600.0 * hours + 60.0 * minutes + seconds
+
+
 def parse_columns(text: str) -> dict[str, str]:
     """Return NAME=COLUMN,... as a dictionary; raises argparse.ArgumentTypeError."""
     pairs = [pair.partition("=") for pair in text.split(",")]
@@ -168,6 +190,13 @@ POOL = (
     _option("--workers", "number of processes (default: one per core)", type=parse_workers),
     _option("--scheduler", "Dask scheduler, tcp://HOST:PORT", metavar="ADDRESS"),
 )
+TRACE = _option(
+    "--trace",
+    "runs that keep tables of events and states (default: full for one run, else first)",
+    choices=["full", "first", "none"],
+    default="first",
+)
+PLANNED = _option("directory", "directory that netkf plan wrote", type=Path, metavar="DIR")
 JSON = _flag("--json", "print one JSON document only")
 ALL = _flag("--all", "show all rows with all that they say")
 NO_PLOT = _flag("--no-plot", "do not draw a picture")
@@ -183,15 +212,65 @@ COMMANDS = (
             ENGINE,
             _out("directory of the run (default: runs/NAME-k)"),
             POOL,
-            _option(
-                "--trace",
-                "runs that keep tables of events and states (default: full for one run, else "
-                "first)",
-                choices=["full", "first", "none"],
-            ),
+            TRACE._replace(settings={**TRACE.settings, "default": None}),
             _flag("--resume", "continue the runs of --out that were stopped"),
             NO_PLOT,
         ),
+    ),
+    Command(
+        "plan",
+        "write the directory of an ensemble that many jobs of a cluster simulate; nothing runs",
+        (
+            _option("--runs", "number of independent runs", type=parse_count, required=True),
+            SEED,
+            ENGINE,
+            _out("directory of the plan (default: runs/NAME-k)"),
+            TRACE,
+            _option("--tasks", "number of jobs", type=parse_count, default=64),
+            _flag("--slurm", "print a submission script for an array of SLURM jobs"),
+            _option(
+                "--time",
+                "time limit of each job in that script (default: 1h)",
+                type=parse_duration,
+                default="1h",
+                metavar="DURATION",
+            ),
+        ),
+    ),
+    Command(
+        "work",
+        "simulate runs of a plan that have no result yet",
+        (
+            PLANNED,
+            _option(
+                "--part",
+                "part i of n of the runs (default: that of this job of an array of SLURM, PBS, "
+                "Grid Engine or LSF, else all)",
+                type=parse_part,
+                metavar="I/N",
+            ),
+            _option(
+                "--for",
+                "begin no run after so long, such as 50m; the status is 1 if some are left",
+                type=parse_duration,
+                dest="seconds",
+                metavar="DURATION",
+            ),
+            _option("--workers", "number of processes", type=parse_workers, default=1),
+            _trust("DIR"),
+        ),
+        takes_scenario=False,
+    ),
+    Command(
+        "merge",
+        "turn the results of a plan into those of one ensemble; the status is 1 if some miss",
+        (
+            PLANNED,
+            _flag("--mixed", "merge results of machines of different kinds, too"),
+            NO_PLOT,
+            _trust("DIR"),
+        ),
+        takes_scenario=False,
     ),
     Command(
         "check",

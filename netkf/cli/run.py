@@ -69,7 +69,7 @@ def _run_once(scenario: Scenario, options: argparse.Namespace) -> int:
             draw,
             replica,
         )
-    _print_summary(scenario, completed)
+    print_summary(scenario, completed)
     duration = f"{completed.seconds:.2f} s"
     if completed.events >= MIN_RATED_EVENTS:
         duration += f", {completed.events / max(completed.seconds, 1e-9):,.0f} per second"
@@ -110,8 +110,8 @@ def _run_ensemble(scenario: Scenario, options: argparse.Namespace) -> int:
     if completed is None:
         print(f"nothing left to do in {options.out}")
         return 0
-    _print_summary(scenario, completed)
-    _print_ensemble(completed, options.runs)
+    print_summary(scenario, completed)
+    print_ensemble(completed, options.runs)
     return 0
 
 
@@ -119,7 +119,8 @@ def _print_note(note: str) -> None:
     print_notes([note])
 
 
-def _print_summary(scenario: Scenario, completed: Any) -> None:
+def print_summary(scenario: Scenario, completed: Any) -> None:
+    """Print the notes on a scenario and the table of its completed run or ensemble."""
     from netkf.runs.files import missing_modules
     from netkf.runs.tables import summary_table
 
@@ -130,7 +131,8 @@ def _print_summary(scenario: Scenario, completed: Any) -> None:
     print(summary_table(completed.summary, promised.limit_label, promised.notes))
 
 
-def _print_ensemble(completed: Any, runs: int) -> None:
+def print_ensemble(completed: Any, runs: int) -> None:
+    """Print how many runs an ensemble averages over, how it ended, and where it is."""
     ensemble = completed.ensemble
     # No rate: the time may count compiling, in this process or in workers.
     print(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import pickle
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError
 from netkf.ensembles.merge_tree import Merge, MergeTree
+from netkf.linalg.compiling import seconds_spent
 from netkf.runs.failures import explain_failure
 from netkf.runs.provenance import versions
 from netkf.scenario.imports import unload_namesake
@@ -63,22 +65,35 @@ class Job(NamedTuple):
         return range(self.first + self.start, self.first + last)
 
 
-def work(job: Job) -> Any:
+class BlockResult(NamedTuple):
+    """What the task of a block returned, and the CPU time in seconds that it took without compiling
+    (which is slow but happens once).
+    """
+
+    value: Any
+    seconds: float
+
+
+def work(job: Job) -> BlockResult:
     """Do a block of work, in a worker or in this process; return what its task returns for its
     replicas.
 
     Raises EngineError with the name of the class if a plugged-in class fails.
     """
     scenario = job.scenario
+    # CPU time: on a busy machine the wall-clock time would make blocks small.
+    started, compiled = time.thread_time(), seconds_spent()
     if isinstance(scenario, PackedScenario):
         scenario = unpack_scenario(scenario)
     try:
-        return job.task(scenario, job.seed, job.replicas)
+        value = job.task(scenario, job.seed, job.replicas)
     except Exception as error:
         reason = explain_failure(scenario, error)
         if reason is error:
             raise
         raise reason from error
+    seconds = time.thread_time() - started - (seconds_spent() - compiled)
+    return BlockResult(value, max(0.0, seconds))
 
 
 def each_replica(task: Task, merge: Merge, scenario: Scenario, seed: int, replicas: range) -> Any:

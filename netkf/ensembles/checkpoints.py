@@ -1,7 +1,8 @@
-"""Finished blocks on disk, ``blocks/000003.npz`` of a run directory, from which runs are resumed.
+"""Finished blocks on disk, from which runs are resumed and merged: ``blocks/000000064-16.npz`` of a
+run directory has the runs 64 to 79.
 
-A block is used only if its last line is the digest of all bytes before it, and the identity inside
-(run, number, installation) is that of the run.
+Each is a node of the binary tree over replicas. A block is used only if its last line is the digest
+of all bytes before it, and the identity inside (run, replicas, installation) is that of the run.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import io
 import json
 import math
 import os
+import platform
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,10 +24,13 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from netkf.core.errors import EngineError
+from netkf.ensembles.merge_tree import MergeTree
 from netkf.ensembles.moments import Moments
-from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace
-from netkf.runs.documents import DamagedError, reading_file
+from netkf.ensembles.replicas import Node
+from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace, merge
+from netkf.runs.documents import MAX_COUNT, DamagedError, reading_file
 from netkf.runs.files import BLOCKS_FOLDER, write_atomically, writing_file
+from netkf.runs.provenance import machine, versions
 from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.trace.schema import EVENT
@@ -38,7 +44,12 @@ PARTS = (
 MARK = b"\nsha256 "  # begins the last line of a block's file
 SEAL_BYTES = len(MARK) + 64  # length of that line, with the SHA-256 in hexadecimal
 CHUNK = 1 << 20  # bytes hashed at once
-MAX_BLOCK = 1 << 32  # a number of runs beyond that is damage
+TRACED = {"full": MAX_COUNT, "first": 1, "none": 0}
+"""Number of the first runs that leave a trace, by the option ``trace``."""
+FIRST_WRITE, WRITE_SHARE = 10.0, 0.2
+"""Results are merged in memory and written after so many seconds, and then whenever a further share
+of the time until then has passed: a command that is killed loses no more.
+"""
 
 
 @dataclass(frozen=True)
@@ -48,9 +59,6 @@ class RunIdentity:
     scenario : digest of the resolved scenario with its files
     seed, runs : seed and number of runs
     trace, engine : options of the command
-    installation : digest of the versions of all packages and of netkf's own files, and of the
-                   processor's features
-    block : number of runs in a block
     """
 
     scenario: str
@@ -58,17 +66,16 @@ class RunIdentity:
     runs: int
     trace: str
     engine: str
-    installation: str
-    block: int
-
-    def of(self, number: int) -> dict[str, Any]:
-        """Return the identity of block ``number`` of these runs."""
-        return {**asdict(self), "number": number}
 
     @property
-    def blocks(self) -> int:
-        """Number of blocks."""
-        return -(-self.runs // self.block)
+    def traces(self) -> int:
+        """Number of replicas that leave a trace."""
+        return min(self.runs, TRACED[self.trace])
+
+    def of(self, node: Node) -> dict[str, Any]:
+        """Return the identity of the block of a node, if its runs are simulated here."""
+        names = {"start": node[0], "size": node[1]}
+        return {**asdict(self), **names, "versions": versions(), "machine": machine()}
 
 
 class BlockCheckpoints:
@@ -76,40 +83,53 @@ class BlockCheckpoints:
 
     def __init__(self, directory: Path, scenario: Scenario) -> None:
         self._folder, self._scenario = directory / BLOCKS_FOLDER, scenario
-        self._numbers: set[int] = set()
+        self._nodes: set[Node] = set()
+        self._pending = MergeTree(merge)
+        self._begun = self._written = 0.0  # times of the first result and of the last writing
+        self.installations: list[dict[str, Any]] = []  # of the nodes that were found
 
-    def stored_block_size(self) -> int | None:
-        """Return the number of runs in a block (consecutive replicas whose results are one file),
-        from the first readable file; None without one. A resumed command must go on with blocks of
-        this size, or it could not use the stored ones.
-        """
-        for file in self._block_paths():
-            with contextlib.suppress(DamagedError), _open_block(file) as arrays:
-                size = _read_texts(arrays)["identity"]["block"]
-                if is_block_size(size):
-                    return int(size)
-        return None
+    def find(
+        self,
+        identity: RunIdentity,
+        any_installation: bool = False,
+        within: range | None = None,
+    ) -> tuple[list[Node], list[str]]:
+        """Return the largest nodes (replicas start, ..., ``size`` of them) that are stored of the
+        runs with this ``identity``, in order, and lines for the user about files that are
+        unreadable or belong to other runs, which are removed.
 
-    def find(self, identity: RunIdentity) -> tuple[list[int], list[str]]:
-        """Return the numbers of the stored blocks (consecutive replicas) of the runs with this
-        ``identity``, in order, and lines for the user about removed ones.
-
-        Files that are unreadable or belong to other runs are removed.
+        With ``any_installation`` blocks may come from other versions and machines, and no file is
+        removed: workers may be at work there. Only those with replicas ``within`` a range are read.
         """
         bad: list[tuple[str, str]] = []
+        found: dict[Node, dict[str, Any]] = {}
+        expected: dict[str, Any] = {}
+        if not any_installation:
+            expected |= {"versions": versions(), "machine": machine()}
         for file in self._block_paths():
             try:
-                number = int(file.stem[:12])
-                if file != self._block_path(number) or number >= identity.blocks:
-                    raise DamagedError("has a number that no block has")
-                self._check(file, identity.of(number))
+                node = _node_of(file)
+                if within is not None and not (node[0] < within.stop and sum(node) > within.start):
+                    continue
+                expected |= {**asdict(identity), "start": node[0], "size": node[1]}
+                stored = self._check(file, expected)
+                found[node] = {key: stored.get(key) for key in ("versions", "machine")}
             except DamagedError as error:
+                if any_installation and not file.exists():
+                    continue  # its writer has replaced it
                 bad.append((file.name, str(error)))
-                with contextlib.suppress(OSError):
-                    file.unlink()
-            else:
-                self._numbers.add(number)
-        return sorted(self._numbers), _describe(bad)
+                if not any_installation:
+                    with contextlib.suppress(OSError):
+                        file.unlink()
+        end = 0
+        # Nodes that overlap contain each other: the larger one, which comes first, is taken.
+        for node in sorted(found, key=lambda node: (node[0], -node[1])):
+            if node[0] >= end:
+                self._nodes.add(node)
+                end = sum(node)
+                if found[node] not in self.installations:
+                    self.installations.append(found[node])
+        return sorted(self._nodes), _describe(bad)
 
     def readable(self, scenario_digest: str, seed: int) -> list[RunStatistics]:
         """Return the statistics of all blocks of runs of a scenario (by its digest) and ``seed``
@@ -119,45 +139,79 @@ class BlockCheckpoints:
         """
         statistics = []
         identity = {"scenario": scenario_digest, "seed": seed}
-        for file in self._block_paths():
+        end = 0
+        for file in sorted(self._block_paths(), key=_order):
             with contextlib.suppress(DamagedError):
-                self._check(file, identity)
+                start, size = _node_of(file)
+                if start < end:
+                    continue  # in a larger one
+                self._check(file, {**identity, "start": start, "size": size})
                 with _open_block(file) as arrays:
                     statistics.append(_restore_statistics(arrays))
+                end = start + size
         return statistics
 
-    def save(self, number: int, statistics: RunStatistics, identity: RunIdentity) -> None:
-        """Write the file of block ``number``, with the ``statistics`` of its runs and the traces
+    def add(self, node: Node, statistics: RunStatistics, identity: RunIdentity) -> RunStatistics:
+        """Take the ``statistics`` of a block, to be merged with those of its neighbours and written
+        now or later; return them without traces, which fill the memory.
+        """
+        start, size = node
+        self._pending.add(start // size, statistics, size.bit_length() - 1)
+        now = time.monotonic()
+        if not self._begun:
+            self._begun = self._written = now
+        # Traces fill the memory; other results wait to be merged, as a file takes as much for many
+        # runs as for one.
+        patience = max(FIRST_WRITE, WRITE_SHARE * (self._written - self._begun))
+        if identity.trace == "full" or now - self._written >= patience:
+            self.write(identity)
+        return statistics._replace(traces=())
+
+    def write(self, identity: RunIdentity) -> None:
+        """Write the results that ``add`` took and that are not written yet; raises WriteError."""
+        for level, k, statistics in self._pending.nodes():
+            self.save((k << level, 1 << level), statistics, identity)
+        self._pending = MergeTree(merge)
+        self._written = time.monotonic()
+
+    def save(self, node: Node, statistics: RunStatistics, identity: RunIdentity) -> None:
+        """Write the file of the block of a node, with the ``statistics`` of its runs and the traces
         (events and samples of single runs) in them; raises WriteError.
 
-        ``identity`` is that of the scenario, seed and installation, by which a resumed run knows
-        its blocks.
+        ``identity`` is that of the scenario and its runs, by which a resumed run knows its blocks.
         """
         with writing_file(self._folder):
             self._folder.mkdir(exist_ok=True)
         # In memory first: on a full disk some versions of numpy leave their file open.
         block = io.BytesIO()
-        arrays = _as_arrays(statistics, identity.of(number))
+        arrays = _as_arrays(statistics, identity.of(node))
         np.savez(block, **arrays)
         block.write(MARK + _digest(block, block.tell()))
-        with write_atomically(self._block_path(number)) as part:
+        # Another worker may write the same block: the one who renames last wins, with the same.
+        writer = f"{platform.node()}-{os.getpid()}."
+        with write_atomically(self._block_path(node), writer) as part:
             part.write_bytes(block.getvalue())
-        self._numbers.add(number)
+        self._nodes.add(node)
 
-    def load(self, number: int) -> RunStatistics:
-        """Return block ``number`` without its traces; raises EngineError if it was damaged
+    def load(self, node: Node) -> RunStatistics:
+        """Return the block of a node without its traces; raises EngineError if it was damaged
         meanwhile.
         """
-        with self._expect_block(number), _open_block(self._block_path(number)) as arrays:
+        with self._expect_block(node), _open_block(self._block_path(node)) as arrays:
             return _restore_statistics(arrays)
 
     def traces(self) -> Iterator[Trace]:
         """Yield the traces (events and samples of a run) that the blocks of this run have, in the
-        order of replicas; raises EngineError if a block was damaged since it was found or saved.
+        order of replicas, those not written yet included; raises EngineError if a block was damaged
+        since it was found or saved.
         """
-        for number in sorted(self._numbers):
-            file = self._block_path(number)
-            with self._expect_block(number), _open_block(file, verified=False) as arrays:
+        pending = {(k << level, 1 << level): found for level, k, found in self._pending.nodes()}
+        for node in sorted({*self._nodes, *pending}):
+            if node in pending:
+                yield from pending[node].traces
+                continue
+            file = self._block_path(node)
+            with self._expect_block(node), _open_block(file, verified=False) as arrays:
                 for k in range(_read_texts(arrays)["traces"]):
                     yield self._restore_trace(arrays, k)
 
@@ -167,24 +221,34 @@ class BlockCheckpoints:
 
     def _block_paths(self) -> list[Path]:
         files = self._folder.glob("*.npz") if self._folder.is_dir() else ()
-        return sorted(file for file in files if file.stem.isdecimal())
+        return sorted(files)
 
-    def _block_path(self, number: int) -> Path:
-        """Return the path of block ``number``."""
-        return self._folder / f"{number:06d}.npz"
+    def _block_path(self, node: Node) -> Path:
+        """Return the path of the block of a node."""
+        return self._folder / f"{node[0]:09d}-{node[1]}.npz"
 
-    def _check(self, file: Path, identity: dict[str, Any]) -> None:
-        """Raise DamagedError unless a block's file is intact."""
+    def _check(self, file: Path, identity: dict[str, Any]) -> dict[str, Any]:
+        """Return the stored identity of a block; raises DamagedError unless its file is intact."""
         with _open_block(file, verified=False) as arrays:
             stored = _read_texts(arrays).get("identity")
+            if not isinstance(stored, dict):
+                raise DamagedError("does not say of which runs it is")
             for key, value in identity.items():
-                if not isinstance(stored, dict) or stored.get(key) != value:
-                    raise DamagedError(f"is of another {key}")
+                if stored.get(key) != value:
+                    name = "installation" if key in ("versions", "machine") else key
+                    raise DamagedError(f"is of another {name}")
             statistics = _restore_statistics(arrays)
             if not self._has_form(statistics):
                 raise DamagedError("does not fit the scenario")
             if not self._has_numbers(statistics):
                 raise DamagedError("lacks numbers that every run has")
+            start, size, runs = (int(stored[key]) for key in ("start", "size", "runs"))
+            if statistics.runs != min(size, runs - start):
+                raise DamagedError("has another number of runs than it says")
+            kept = len(range(start, min(start + size, runs, TRACED[stored["trace"]])))
+            if _read_texts(arrays)["traces"] != kept:
+                raise DamagedError("lacks events of its runs")
+            return stored
 
     def _has_form(self, statistics: RunStatistics) -> bool:
         """Return True if the arrays of ``statistics`` have the shapes and types they should."""
@@ -243,21 +307,34 @@ class BlockCheckpoints:
         return Trace(int(trace.replica), *trace[1:])
 
     @contextlib.contextmanager
-    def _expect_block(self, number: int) -> Iterator[None]:
-        """Turn a DamagedError about block ``number`` into an EngineError, and remove it."""
+    def _expect_block(self, node: Node) -> Iterator[None]:
+        """Turn a DamagedError about the block of a node into an EngineError, and remove it."""
         try:
             yield
         except DamagedError as error:
             with contextlib.suppress(OSError):
-                self._block_path(number).unlink()
-            message, remedy = f"{self._block_path(number)} {error}", "go on with --resume"
+                self._block_path(node).unlink()
+            message, remedy = f"{self._block_path(node)} {error}", "go on with --resume"
             raise EngineError(f"{message}; {remedy}, which does it again") from None
 
 
-def is_block_size(value: object) -> bool:
-    """Return True for a power of two, as numbers of runs in a block are."""
-    is_integer = isinstance(value, int) and not isinstance(value, bool)
-    return is_integer and 0 < value <= MAX_BLOCK and value & (value - 1) == 0  # type: ignore[operator]
+def _node_of(file: Path) -> Node:
+    """Return the node whose name a block's file has; raises DamagedError if there is none."""
+    start, _, size = file.stem.partition("-")
+    if not (start.isdecimal() and size.isdecimal() and len(start) < 16 and len(size) < 16):
+        raise DamagedError("has a name that no block has")
+    node = int(start), int(size)
+    if node[1] & (node[1] - 1) or node[1] == 0 or node[0] % node[1]:
+        raise DamagedError("has a name that no block has")
+    return node
+
+
+def _order(file: Path) -> tuple[int, int]:
+    """Sort files by their first run, the largest block first."""
+    with contextlib.suppress(DamagedError):
+        start, size = _node_of(file)
+        return start, -size
+    return -1, 0
 
 
 def _describe(bad: list[tuple[str, str]]) -> list[str]:

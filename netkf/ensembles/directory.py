@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from netkf.core.errors import WriteError
 from netkf.core.fields import integer, one_of
+from netkf.engines.base import Engine
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
-from netkf.ensembles.pool import Pool, block_size
+from netkf.ensembles.pool import MAX_BLOCK, Pool
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
-from netkf.ensembles.replicas import NumberedBlocks, Progress, replicate_blocks
-from netkf.ensembles.resume import find_stored_blocks
+from netkf.ensembles.replicas import BlockStore, Node, Progress, replicate_blocks
+from netkf.ensembles.resume import is_finished
 from netkf.ensembles.statistics import RunStatistics, block_statistics, merge
 from netkf.ensembles.summary import summarise_ensemble
 from netkf.runs.failures import InterruptedRunError, explain_failure
@@ -28,7 +31,6 @@ from netkf.runs.files import (
     write_scenario,
 )
 from netkf.runs.parquet_files import ParquetSink, write_table
-from netkf.runs.provenance import installation_digest
 from netkf.runs.run import Manifest
 from netkf.runs.simulate import choose_engine
 from netkf.runs.summary import PromisedTraces, promise_traces
@@ -106,16 +108,15 @@ def runs_to_directory(
     engine_used = choose_engine(options.engine, scenario, announce=False)
     check_sources(scenario)
     with make_pool(runs, options.pool) as pool:
-        writer = _open_directory(scenario, runs, out, options, engine_used.name, pool.width)
+        writer = _open_directory(scenario, runs, out, options, engine_used.name)
         if writer is None:
             return None
         try:
             writer.begin(note)
             engine_used.announce(scenario)
-            task = partial(block_statistics, engine=engine_used, traces=writer.traces)
-            statistics = writer.simulate(task, pool, progress)
+            statistics = writer.simulate(engine_used, pool, progress)
             pool.close(at_once=False)  # its memory is not needed any more
-            finished = _write_files(writer, statistics, started)
+            finished = write_files(writer, statistics, started)
             if finish is not None:
                 finish(finished)
             writer.end(finished.status, statistics)
@@ -128,39 +129,34 @@ def runs_to_directory(
     return finished
 
 
-def _open_directory(
-    scenario: Scenario,
-    runs: int,
-    out: Path | None,
-    options: EnsembleOptions,
-    engine: str,
-    width: int,
-) -> _DirectoryWriter | None:
-    """Return the writer of a new directory for the results of ``runs`` runs."""
-    size = block_size(runs, width)
-    if options.trace == "full":
-        size = min(size, MAX_TRACED_BLOCK)  # events of all runs of a block are in memory
-    plan = RunIdentity(
+def identify_runs(scenario: Scenario, runs: int, trace: str, engine: str) -> RunIdentity:
+    """Return the identity of the blocks of ``runs`` runs of a scenario."""
+    return RunIdentity(
         scenario=scenario_digest(scenario),
         seed=scenario.seed,
         runs=runs,
-        trace=options.trace,
+        trace=trace,
         engine=engine,
-        installation=installation_digest(),
-        block=size,
     )
-    unfinished = find_stored_blocks(out, scenario, plan) if options.resume else None
-    if unfinished is None:
-        return _DirectoryWriter(scenario, create_output_directory(out, scenario.name), plan)
-    if unfinished.finished:
-        BlockCheckpoints(unfinished.directory, scenario).remove()
+
+
+def _open_directory(
+    scenario: Scenario, runs: int, out: Path | None, options: EnsembleOptions, engine: str
+) -> DirectoryWriter | None:
+    """Return the writer of a directory for the results of ``runs`` runs, None if it has them."""
+    plan = identify_runs(scenario, runs, options.trace, engine)
+    finished = is_finished(out, scenario, plan) if options.resume else None
+    if finished is None:
+        return DirectoryWriter(scenario, create_output_directory(out, scenario.name), plan)
+    assert out is not None
+    if finished:
+        BlockCheckpoints(out, scenario).remove()
         return None
-    # Blocks on disk are only of use to a plan with blocks of the same size.
-    return _DirectoryWriter(scenario, unfinished.directory, replace(plan, block=unfinished.block))
+    return DirectoryWriter(scenario, out, plan)
 
 
-def _write_files(
-    writer: _DirectoryWriter, statistics: RunStatistics, started: float
+def write_files(
+    writer: DirectoryWriter, statistics: RunStatistics, started: float
 ) -> FinishedEnsemble:
     """Write all files but the manifest; ``started`` is a value of the performance counter."""
     directory, scenario, plan = writer.directory, writer.scenario, writer.plan
@@ -184,10 +180,18 @@ def _write_files(
     )
 
 
-class _DirectoryWriter:
-    """Writes the blocks of an ensemble to its directory, and updates the manifest."""
+class DirectoryWriter:
+    """Writes the blocks of an ensemble to its directory, and updates the manifest.
 
-    def __init__(self, scenario: Scenario, directory: Path, plan: RunIdentity) -> None:
+    ``known`` are the nodes that are stored; ``tasks`` the number of jobs for which it was planned,
+    0 if it was not.
+    """
+
+    def __init__(
+        self, scenario: Scenario, directory: Path, plan: RunIdentity, tasks: int = 0
+    ) -> None:
+        self.known: list[Node] = []
+        self._tasks = tasks
         self.scenario, self.directory, self.plan = scenario, directory, plan
         self.blocks = BlockCheckpoints(directory, scenario)
         self._manifest = Manifest(
@@ -200,61 +204,71 @@ class _DirectoryWriter:
             node_names=scenario.topology.names,
             time_grid=scenario.time_grid,
         )
-        self._known: list[int] = []
         self._done = self.simulated = 0
         self._last_note = 0.0
         self._ended = False
-
-    @property
-    def traces(self) -> int:
-        """Number of replicas that leave a trace."""
-        return {"full": self.plan.runs, "first": 1, "none": 0}[self.plan.trace]
 
     def begin(self, note: Callable[[str], None] | None) -> None:
         """Write the manifest and the scenario, and find the stored blocks of a resumed run."""
         # The manifest comes first: if the process is killed, it states that the run is unfinished.
         self.note()
         write_scenario(self.directory, self.scenario)
-        self._known, lines = self.blocks.find(self.plan)
+        lines = self.find_blocks()
         if note is not None:
             for line in lines:
                 note(line)
-        self._done = sum(map(self._runs_in_block, self._known))
-        self.note()
+        if self.known:
+            self.note()
 
-    def simulate(
-        self, task: Callable[..., RunStatistics], pool: Pool, progress: Progress | None
-    ) -> RunStatistics:
+    def find_blocks(self, any_installation: bool = False) -> list[str]:
+        """Find the stored blocks; return lines for the user about others."""
+        self.known, lines = self.blocks.find(self.plan, any_installation)
+        self._done = sum(map(self._runs_of, self.known))
+        return lines
+
+    def simulate(self, engine: Engine, pool: Pool, progress: Progress | None) -> RunStatistics:
         """Return the statistics of all runs: stored blocks are read, others simulated."""
-        finished_blocks = {number: partial(self.blocks.load, number) for number in self._known}
-        blocks = NumberedBlocks(self.plan.block, finished_blocks, self.save_block)
+        plan = self.plan
+        store = BlockStore(
+            {node: partial(self.blocks.load, node) for node in self.known},
+            self._add,
+            MAX_TRACED_BLOCK if plan.trace == "full" else MAX_BLOCK,
+        )
         statistics: RunStatistics = replicate_blocks(
-            task, merge, self.scenario, self.plan.runs, pool=pool, progress=progress, blocks=blocks
+            partial(block_statistics, engine=engine, traces=plan.traces),
+            merge,
+            self.scenario,
+            plan.runs,
+            pool=pool,
+            progress=progress,
+            store=store,
         )
         return statistics
 
-    def _runs_in_block(self, number: int) -> int:
-        return min(self.plan.block, self.plan.runs - number * self.plan.block)
+    def _runs_of(self, node: Node) -> int:
+        return min(sum(node), self.plan.runs) - node[0]
 
-    def save_block(self, number: int, statistics: RunStatistics) -> RunStatistics:
-        """Store block ``number``; return its statistics without traces, which fill the memory."""
-        self.blocks.save(number, statistics, self.plan)
-        self._done += self._runs_in_block(number)
-        self.simulated += self._runs_in_block(number)
+    def _add(self, node: Node, statistics: RunStatistics) -> RunStatistics:
+        """Keep the statistics of a block; return them without traces, which fill the memory."""
+        without_traces = self.blocks.add(node, statistics, self.plan)
+        self._done += self._runs_of(node)
+        self.simulated += self._runs_of(node)
         if time.monotonic() - self._last_note >= NOTE_SECONDS:
             self.note()  # writes the number of runs done to the manifest
-        return statistics._replace(traces=())
+        return without_traces
 
     def note(self, status: str = "interrupted", error: BaseException | None = None) -> None:
         """Write status and progress to the manifest, unless the final manifest is written."""
         if not self._ended:
-            self._manifest.write(
-                status, self._identity_entries(block=self.plan.block), self._done, error
-            )
+            tasks = {"tasks": self._tasks} if self._tasks else {}
+            entries = self._identity_entries(**tasks)
+            self._manifest.write(status, entries, self._done, error)
             self._last_note = time.monotonic()
 
     def stop(self, error: BaseException) -> BaseException:
         """Write the status after ``error`` to the manifest; return the exception to raise."""
+        with contextlib.suppress(WriteError):  # as that of a full disk, which is told already
+            self.blocks.write(self.plan)
         self.note("failed" if isinstance(error, Exception) else "interrupted", error)
         if isinstance(error, KeyboardInterrupt):
             return InterruptedRunError(
@@ -262,14 +276,22 @@ class _DirectoryWriter:
             )
         return explain_failure(self.scenario, error, self.directory)
 
-    def end(self, status: str, statistics: RunStatistics) -> None:
-        """Write the final manifest, after which ``note`` writes nothing any more."""
+    def end(
+        self, status: str, statistics: RunStatistics, machines: Sequence[dict[str, Any]] = ()
+    ) -> None:
+        """Write the final manifest, after which ``note`` writes nothing any more; ``machines`` are
+        those that simulated the runs if it was not this one.
+        """
         entries = self._identity_entries(
             # totals: numbers of events and of diverged runs
             diverged=int(statistics.totals[1]),
             events=int(statistics.totals[0]),
         )
         entries["fingerprint"] = statistics.fingerprint
+        if machines:
+            entries["machine"] = machines[0]
+        if len(machines) > 1:
+            entries["machines"] = list(machines)
         self._manifest.write(status, entries, self.plan.runs, names=run_file_names(self.scenario))
         self._ended = True
 

@@ -35,13 +35,16 @@ class MergeTree:
             level, k = level + 1, k >> 1
         self._waiting[level, k] = value
 
+    def nodes(self) -> list[tuple[int, int, Any]]:
+        """Return the nodes (level, k, value) that wait for a neighbour, in order."""
+        nodes = sorted(self._waiting, key=lambda node: node[1] << node[0])
+        return [(level, k, self._waiting[level, k]) for level, k in nodes]
+
     def result(self) -> Any:
         """Return the merged result of all nodes that were added; nodes at the end that wait for a
         neighbour, which does not come, are merged from right to left.
         """
-        # Of a node (level, k) the first block is k 2^level.
-        nodes = sorted(self._waiting, key=lambda node: node[1] << node[0])
-        values = [self._waiting[node] for node in nodes]
+        values = [value for _, _, value in self.nodes()]
         total = values.pop()
         while values:
             total = self._merge(values.pop(), total)

@@ -5,43 +5,73 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any, Self
+from typing import Self
 
-from netkf.ensembles.blocks import Job, PackedScenario, pack_scenario
+from netkf.ensembles.blocks import BlockResult, Job, PackedScenario, pack_scenario
 from netkf.scenario.scenario import Scenario
 
-AHEAD = 1024
-"""Largest number of blocks that are submitted and not yet completed."""
-
-MAX_BLOCK = 64  # runs in a block: a killed command repeats at most so many for each worker
-MAX_BLOCKS = 4096  # blocks in all: each is a file and a message to a worker
-ROUNDS = 16  # blocks for each worker, so that all workers end at nearly the same time
+AHEAD = 2
+"""Blocks for each worker that are submitted and not yet completed, if it is not in this process."""
+GROWTH = 16
+"""Blocks become at most so many times larger at a time."""
+MAX_BLOCK = 1 << 16
+"""Largest number of runs in a block."""
+MIN_SECONDS = 0.05
+"""CPU time of the last blocks, which become smaller so that all workers end at the same time."""
 
 
 class Pool(ABC):
     """Runs blocks of replicas.
 
     width : number of blocks that run at a time, as far as known
+    quick : seconds of CPU time up to which blocks are made larger
     ahead : number of blocks that may be submitted before the first is complete
     """
 
     width: int = 1
-    ahead: int = AHEAD
+    quick: float = 5.0
+    _size: int = 1
+    _rate: float = 0.0  # CPU seconds of a run of the last block
+
+    @property
+    def ahead(self) -> int:
+        """Number of blocks that may be submitted before the first is complete."""
+        return AHEAD * self.width
 
     @abstractmethod
-    def submit(self, job: Job) -> Future[Any]:
+    def submit(self, job: Job) -> Future[BlockResult]:
         """Submit a job, a block of replicas; return the future of its result.
 
         Pools that work in this process may run the block before they return.
         """
 
-    def next_size(self, left: int, runs: int) -> int:
-        """Return the number of runs of the next block, a power of two, when ``left`` of ``runs``
-        are not yet submitted; asked before each block is made.
-        """
-        return block_size(runs, self.width)
+    def begin(self, scenario: object) -> None:
+        """Prepare for blocks of a scenario: begin with small ones, whatever others took."""
+        self._size, self._rate = 1, 0.0
 
-    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+    def next_size(self, left: int) -> int:
+        """Return the number of runs of the next block, a power of two, when ``left`` runs are not
+        yet submitted; asked before each block is made.
+
+        The last blocks are small, so that all workers end at nearly the same time, but none so
+        small that sending its result takes longer than its work.
+        """
+        fair = max(1, left // (2 * self.width))
+        if self._rate > 0.0:
+            fair = max(fair, int(MIN_SECONDS / self._rate))
+        return min(self._size, 1 << (fair.bit_length() - 1))
+
+    def note_duration(self, job: Job, seconds: float) -> None:
+        """Choose larger blocks if ``job``, of full size, took few ``seconds`` of CPU time."""
+        # The caller may have made the block larger than asked, as a full set of SIMD lanes.
+        runs = len(job.replicas)
+        self._rate = seconds / runs
+        if seconds < self.quick and runs >= self._size:
+            growth = self.quick / max(seconds, self.quick / GROWTH)
+            self._size = min(job.size << (int(growth).bit_length() - 1), MAX_BLOCK)
+            self._size = max(self._size, 2 * job.size)
+
+    def wait(self, futures: Collection[Future[BlockResult]]) -> Collection[Future[BlockResult]]:
         """Wait until one of the futures of ``submit`` is done; return all that are."""
         return wait(futures, return_when=FIRST_COMPLETED).done
 
@@ -62,7 +92,7 @@ class RemotePool(Pool):
         # The last scenario and its packed form, to be reused for its other blocks.
         self._packed: tuple[object, PackedScenario] | None = None
 
-    def submit(self, job: Job) -> Future[Any]:
+    def submit(self, job: Job) -> Future[BlockResult]:
         """Submit a block with the scenario pickled; blocks of one scenario share one pickle."""
         if isinstance(job.scenario, Scenario):
             if self._packed is None or self._packed[0] is not job.scenario:
@@ -75,20 +105,5 @@ class RemotePool(Pool):
         return pack_scenario(scenario)
 
     @abstractmethod
-    def _send(self, job: Job) -> Future[Any]:
+    def _send(self, job: Job) -> Future[BlockResult]:
         """Submit a block whose scenario is packed (pickled) to the pool's workers."""
-
-
-def block_size(runs: int, width: int) -> int:
-    """Return the number of runs in a block, the unit of work that one worker does at a time, for
-    ``runs`` runs on ``width`` workers: a power of two.
-
-    Every worker gets about ROUNDS blocks, so that all end at nearly the same time, within the
-    limits MAX_BLOCK and MAX_BLOCKS.
-    """
-    size = 1
-    while size < MAX_BLOCK and 2 * size * width * ROUNDS <= runs:
-        size *= 2
-    while size * MAX_BLOCKS < runs:
-        size *= 2
-    return size

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,15 +15,16 @@ from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.core.printable import shorten
 from netkf.ensembles.ask_scheduler import scheduler_answers
-from netkf.ensembles.blocks import Job, PackedScenario, pack_scenario, work
-from netkf.ensembles.pool import AHEAD, Pool, RemotePool, block_size
+from netkf.ensembles.blocks import BlockResult, Job, PackedScenario, pack_scenario, work
+from netkf.ensembles.pool import Pool, RemotePool
 from netkf.ensembles.workers import ProcessPool
-from netkf.linalg.compiling import seconds_spent
 from netkf.runs.provenance import versions
 from netkf.scenario.scenario import Scenario
 
 QUICK_SECONDS, MAX_BLOCK_HERE = 0.2, 1024
-"""Blocks in this process double in size while they take fewer seconds, up to so many runs."""
+"""Blocks in this process double in size while they take less CPU time, up to so many runs: when
+the command is stopped, the present one is lost.
+"""
 
 WARM, SAVING = 0.2, 2.0
 """Seconds of work in this process after which the total time is estimated; and the estimated saving
@@ -39,32 +42,25 @@ class LocalPool(Pool):
     """A pool that runs one block at a time in this process, with its scenario and caches."""
 
     ahead = 1
+    quick = QUICK_SECONDS
 
-    def __init__(self) -> None:
-        self._size = 1
-
-    def submit(self, job: Job) -> Future[Any]:
+    def submit(self, job: Job) -> Future[BlockResult]:
         """Run the block at once, in this process; return its completed future."""
-        future: Future[Any] = Future()
-        started, compile_seconds = time.perf_counter(), seconds_spent()
+        future: Future[BlockResult] = Future()
         try:
             future.set_result(work(job))
         except Exception as error:
             future.set_exception(error)
-        # Compilation, which is slow but happens once, says nothing about later blocks.
-        self._note_duration(
-            job, time.perf_counter() - started - (seconds_spent() - compile_seconds)
-        )
         return future
 
-    def next_size(self, left: int, runs: int) -> int:
+    def next_size(self, left: int) -> int:
         """Return the present size of blocks, which doubles while blocks are quick."""
         return self._size
 
-    def _note_duration(self, job: Job, seconds: float) -> None:
+    def note_duration(self, job: Job, seconds: float) -> None:
         """Double the size of the next blocks if ``job``, of full size, was quick."""
         # The caller may have made the block larger than asked, as a full set of SIMD lanes.
-        if seconds < QUICK_SECONDS and len(job.replicas) >= self._size:
+        if seconds < self.quick and len(job.replicas) >= self._size:
             self._size = min(2 * job.size, MAX_BLOCK_HERE)
 
 
@@ -76,34 +72,42 @@ class AdaptivePool(LocalPool):
     """
 
     def __init__(self, workers: int, open_ended: bool = False) -> None:
-        super().__init__()
         self.width, self._open_ended = workers, open_ended
         self._processes: ProcessPool | None = None
-        self._scenario: object = None
         self._begun, self._seconds, self._runs, self._spent = False, 0.0, 0, 0.0
 
-    def submit(self, job: Job) -> Future[Any]:
+    @property
+    def ahead(self) -> int:  # type: ignore[override]
+        """One block in this process, several for worker processes."""
+        return 1 if self._processes is None else self._processes.ahead
+
+    def begin(self, scenario: object) -> None:
+        """Forget the times of another scenario, which say nothing about this one."""
+        super().begin(scenario)
+        self._begun, self._seconds, self._runs = False, 0.0, 0
+        if self._processes is not None:
+            self._processes.begin(scenario)
+
+    def submit(self, job: Job) -> Future[BlockResult]:
         """Run the block in this process, or submit it to workers once that would save time."""
-        if job.scenario is not self._scenario:
-            # The times of another scenario say nothing about this one.
-            self._scenario, self._size = job.scenario, 1
-            self._begun, self._seconds, self._runs = False, 0.0, 0
         if self._processes is None and self._worth_processes(job):
             self._processes = ProcessPool(self.width)
-            self.ahead = AHEAD
         if self._processes is not None:
             return self._processes.submit(job)
         return super().submit(job)
 
-    def next_size(self, left: int, runs: int) -> int:
+    def next_size(self, left: int) -> int:
         """Return the size of the next block: small here, larger for worker processes."""
         if self._processes is None:
-            return super().next_size(left, runs)
-        return block_size(left, self.width)
+            return super().next_size(left)
+        return self._processes.next_size(left)
 
-    def _note_duration(self, job: Job, seconds: float) -> None:
+    def note_duration(self, job: Job, seconds: float) -> None:
         """Add the ``seconds`` of a block to the estimate for a run; not those that fill caches."""
-        super()._note_duration(job, seconds)
+        if self._processes is not None:
+            self._processes.note_duration(job, seconds)
+            return
+        super().note_duration(job, seconds)
         self._spent += seconds
         if self._begun or seconds > 1.0:
             self._seconds += seconds
@@ -118,7 +122,7 @@ class AdaptivePool(LocalPool):
             expected = max(expected, self._spent)
         return expected * (1.0 - 1.0 / self.width) > SAVING
 
-    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+    def wait(self, futures: Collection[Future[BlockResult]]) -> Collection[Future[BlockResult]]:
         """Wait until one of the futures is done; return all that are."""
         if self._processes is None:
             return super().wait(futures)
@@ -131,15 +135,15 @@ class AdaptivePool(LocalPool):
 
 
 class ExecutorPool(RemotePool):
-    """A user's concurrent.futures executor, which is not shut down."""
+    """A user's concurrent.futures executor with so many ``workers``, which is not shut down."""
 
-    def __init__(self, executor: Executor) -> None:
+    def __init__(self, executor: Executor, workers: int | None = None) -> None:
         super().__init__()
         self._executor = executor
         # Executors do not tell their number of workers; those of the standard library have it here.
-        self.width = getattr(executor, "_max_workers", None) or cores()
+        self.width = workers or getattr(executor, "_max_workers", None) or cores()
 
-    def _send(self, job: Job) -> Future[Any]:
+    def _send(self, job: Job) -> Future[BlockResult]:
         """Submit a block; return its future."""
         return self._executor.submit(work, job)
 
@@ -167,19 +171,28 @@ class DaskPool(RemotePool):
         except (OSError, ValueError, TypeError) as error:
             raise _unreachable(address, type(error).__name__) from None
         self._executor = self._client.get_executor(retries=3)
-        self._address = address
-        self.width = max(1, sum(self._client.nthreads().values()))
+        self._address, self._threads, self._counted = address, 1, -math.inf
+
+    @property
+    def width(self) -> int:  # type: ignore[override]
+        """Number of threads of the workers that are there now, or were a moment ago."""
+        now = time.monotonic()
+        if now > self._counted + LOOK_SECONDS:
+            with suppress(OSError):
+                self._threads = max(1, sum(self._client.nthreads().values()))
+            self._counted = now
+        return self._threads
 
     def _pack(self, scenario: Scenario) -> PackedScenario:
         # Workers may join at any time, so that each checks its own versions.
         return pack_scenario(scenario)._replace(versions=tuple(versions().items()))
 
-    def _send(self, job: Job) -> Future[Any]:
+    def _send(self, job: Job) -> Future[BlockResult]:
         """Submit a block; return its future."""
-        future: Future[Any] = self._executor.submit(work, job)
+        future: Future[BlockResult] = self._executor.submit(work, job)
         return future
 
-    def wait(self, futures: Collection[Future[Any]]) -> Collection[Future[Any]]:
+    def wait(self, futures: Collection[Future[BlockResult]]) -> Collection[Future[BlockResult]]:
         """Wait until one of the ``futures`` of submitted blocks is done; return all that are."""
         answered = time.monotonic()
         while True:
@@ -222,7 +235,8 @@ def cores() -> int:
 
 @dataclass(frozen=True)
 class PoolOptions:
-    """Where replicas are simulated; at most one of the three may be given.
+    """Where replicas are simulated; at most one of the three may be given, but an executor may come
+    with the number of its workers.
 
     workers   : number of processes; 1 is this process
     executor  : an executor of concurrent.futures
@@ -251,7 +265,7 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
     workers, executor, scheduler = options.workers, options.executor, options.scheduler
     values = {"workers": workers, "executor": executor, "scheduler": scheduler}
     names = [name for name, value in values.items() if value is not None]
-    if len(names) > 1:
+    if len(names) > 1 and names != ["workers", "executor"]:
         rule = f"cannot go together with {names[1]}"
         raise ScenarioError(names[0], rule, values[names[0]], "give one of them")
     if executor is not None:
@@ -265,7 +279,7 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
             raise ScenarioError(
                 "executor", "must be a concurrent.futures.Executor", executor, remedy
             )
-        return ExecutorPool(executor)
+        return ExecutorPool(executor, workers and integer(low=1)("workers", workers))
     if scheduler is not None:
         return DaskPool(scheduler)
     count = cores() if workers is None else integer(low=1)("workers", workers)

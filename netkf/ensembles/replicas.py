@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Future
 from functools import partial
 from types import MappingProxyType
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
-from netkf.ensembles.blocks import BlockTask, Job, Task, each_replica
+from netkf.ensembles.blocks import BlockResult, BlockTask, Job, Task, each_replica
 from netkf.ensembles.merge_tree import Merge, MergeTree
 from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
@@ -23,18 +23,29 @@ Progress = Callable[[int, int], None]
 """Called with the number of runs done and the number of all runs."""
 
 
-class NumberedBlocks(NamedTuple):
-    """Blocks of a fixed size, numbered from 0.
+Node = tuple[int, int]
+"""The replicas start, ... of a node of the binary tree: ``size`` of them, a power of two, of which
+``start`` is a multiple; those from the number of runs on do not exist.
+"""
 
-    size     : replicas in a block, a power of two; 0 if the pool chooses
-    known    : functions that return the results of blocks that need not be simulated, by number
-    received : function of (number, result) that is called with each other block as it completes,
+
+class BlockStore(NamedTuple):
+    """Results of blocks of replicas that are kept, and which others are wanted.
+
+    known    : functions that return the results of nodes that need not be simulated, by node
+    received : function of (node, result) that is called with each other block as it completes,
                and returns the result to merge
+    largest  : largest number of replicas in a block
+    wanted   : replicas that are to be simulated (default: all); if some are missing at the end,
+               there is no result
+    time_is_up : function that is asked before each block if no further one should begin
     """
 
-    size: int = 0
-    known: Mapping[int, Callable[[], Any]] = MappingProxyType({})
-    received: Callable[[int, Any], Any] = lambda _, result: result
+    known: Mapping[Node, Callable[[], Any]] = MappingProxyType({})
+    received: Callable[[Node, Any], Any] = lambda _, result: result
+    largest: int = 1 << 62
+    wanted: range | None = None
+    time_is_up: Callable[[], bool] = lambda: False
 
 
 def replicate(
@@ -62,7 +73,7 @@ def replicate_blocks(
     progress: Progress | None = None,
     first: int = 0,
     together: int | None = None,
-    blocks: NumberedBlocks = NumberedBlocks(),  # noqa: B008 - it is immutable
+    store: BlockStore = BlockStore(),  # noqa: B008 - it is immutable
 ) -> Any:
     """Return ``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first +
     runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
@@ -79,8 +90,7 @@ def replicate_blocks(
     together : smallest number of replicas in a block run in this process, a power of two; by
                default as many as SIMD lanes for a scenario in slots, whose runs are simulated in
                lanes, else 1
-    blocks   : numbered blocks of fixed size, some of which may be known; by default the pool
-               chooses the sizes
+    store    : results of some blocks that are known, and what is done with those of others
 
     Raises ScenarioError for wrong arguments, EngineError if workers die again and again or a
     plugged-in class fails, and whatever ``task`` raises.
@@ -89,8 +99,8 @@ def replicate_blocks(
         raise ScenarioError("", "must be a netkf.Scenario", scenario, "netkf.load(path) gives one")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     runs, first = integer(low=1)("runs", runs), integer(low=0)("first", first)
-    tree, runs_done, known = MergeTree(merge), 0, blocks.known
-    job = Job(scenario, task, seed, first, start=0, stop=runs, size=blocks.size)
+    tree, runs_done = MergeTree(merge), 0
+    job = Job(scenario, task, seed, first, start=0, stop=runs, size=1)
 
     def take(block: Job, result: Any) -> None:
         nonlocal runs_done
@@ -102,45 +112,61 @@ def replicate_blocks(
 
     with contextlib.ExitStack() as stack:
         if isinstance(pool, PoolOptions):
-            pool = stack.enter_context(make_pool(-(-runs // (blocks.size or 1)), pool))
-        for number in sorted(known):
-            take(job._replace(start=number * job.size), known[number]())
-        for block, result in _complete_blocks(pool, _make_blocks(pool, job, together, known)):
-            take(block, blocks.received(block.start // block.size, result))
-    return tree.result()
+            pool = stack.enter_context(make_pool(runs, pool))
+        pool.begin(scenario)
+        for start, size in sorted(store.known):
+            take(job._replace(start=start, size=size), store.known[start, size]())
+        for block, result in _complete_blocks(pool, _make_blocks(pool, job, together, store)):
+            take(block, store.received((block.start, block.size), result))
+    return tree.result() if runs_done == runs else None
+
+
+def missing_ranges(known: Iterable[Node], wanted: range) -> Iterator[range]:
+    """Yield the ranges of replicas of ``wanted`` that are in no ``known`` node, in order."""
+    first = wanted.start
+    for start, size in sorted(known):
+        if start > first and first < wanted.stop:
+            yield range(first, min(start, wanted.stop))
+        first = max(first, start + size)
+    if first < wanted.stop:
+        yield range(first, wanted.stop)
 
 
 def _as_list(task: Task, scenario: Scenario, seed: int, replica: int) -> list[Any]:
     return [task(scenario, seed, replica)]
 
 
-def _make_blocks(
-    pool: Pool, job: Job, together: int | None, known: Mapping[int, Callable[[], Any]]
-) -> Iterator[Job]:
+def _make_blocks(pool: Pool, job: Job, together: int | None, store: BlockStore) -> Iterator[Job]:
     """Yield the blocks of replicas of ``job`` that are to be simulated, in order, each as a Job."""
-    if job.size:
-        for number in range(-(-job.stop // job.size)):
-            if number not in known:
-                yield job._replace(start=number * job.size)
-        return
     # Runs in slots are simulated in SIMD lanes: fewer runs than lanes take as long.
     slotted = isinstance(job.scenario, Scenario) and job.scenario.slotted
-    start, min_size = 0, together or (LANES if slotted else 1)
-    while start < job.stop:
-        size = pool.next_size(job.stop - start, job.stop)
-        if pool.ahead == 1:  # blocks run one at a time, in this process
-            size = max(size, min_size)
-        if start:
-            # A block must be a node of the tree: ``start`` must be a multiple of its size. The
-            # largest power of two that divides ``start`` is ``start & -start``.
-            size = min(size, start & -start)
-        yield job._replace(start=start, size=size)
-        start += size
+    min_size = together or (LANES if slotted else 1)
+    gaps = list(missing_ranges(store.known, store.wanted or range(job.stop)))
+    left = sum(map(len, gaps))
+    for gap in gaps:
+        start = gap.start
+        while start < gap.stop:
+            if store.time_is_up():
+                return
+            size = pool.next_size(left)
+            if pool.ahead == 1:  # blocks run one at a time, in this process
+                size = max(size, min_size)
+            if start:
+                # A block must be a node of the tree: ``start`` must be a multiple of its size. The
+                # largest power of two that divides ``start`` is ``start & -start``.
+                size = min(size, start & -start)
+            if gap.stop < job.stop:  # it may reach beyond the last run only
+                size = min(size, 1 << ((gap.stop - start).bit_length() - 1))
+            size = min(size, store.largest, 1 << (job.stop - start - 1).bit_length())
+            block = job._replace(start=start, size=size)
+            yield block
+            start += block.size
+            left -= len(block.replicas)
 
 
 def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
     """Submit ``blocks`` of replicas to the pool, as many at a time as it allows."""
-    waiting: dict[Future[Any], Job] = {}
+    waiting: dict[Future[BlockResult], Job] = {}
     try:
         while True:
             while len(waiting) < pool.ahead and (block := next(blocks, None)) is not None:
@@ -148,7 +174,9 @@ def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, A
             if not waiting:
                 return
             for future in pool.wait(waiting):
-                yield waiting.pop(future), future.result()
+                block, done = waiting.pop(future), future.result()
+                pool.note_duration(block, done.seconds)
+                yield block, done.value
     except BrokenExecutor as error:
         message = "workers ended again and again before their runs were done; perhaps the memory is"
         raise EngineError(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from netkf.core.errors import ScenarioError
-from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity, is_block_size
+from netkf.ensembles.checkpoints import RunIdentity
 from netkf.runs.documents import (
     COUNT,
     FINAL_STATUSES,
@@ -37,24 +37,14 @@ MANIFEST = {
     "machine?": {},
     "scenario?": TEXT,
     "trace?": TEXT,
-    "block?": COUNT,
+    "tasks?": COUNT,
 }
 """The form of a manifest that runs are resumed from."""
 
 
-class StoredBlocks(NamedTuple):
-    """A directory to resume in, the number of runs in its blocks, and whether it is complete."""
-
-    directory: Path
-    block: int
-    finished: bool
-
-
-def find_stored_blocks(
-    out: Path | None, scenario: Scenario, plan: RunIdentity
-) -> StoredBlocks | None:
-    """Return the directory ``out`` with the size of the blocks (files with the results of some
-    consecutive replicas) that a stopped command left there; None if it is new or empty.
+def is_finished(out: Path | None, scenario: Scenario, plan: RunIdentity) -> bool | None:
+    """Return True if the directory ``out`` has all results, False if it has those that a stopped
+    command left there, and None if it is new or empty.
 
     ``plan`` is what the command would run now. Raises ScenarioError unless the directory holds a
     run of this plan and of this installation only, whose files were not changed since they were
@@ -63,14 +53,13 @@ def find_stored_blocks(
     if out is None:
         remedy = "add --out DIR with the directory of the run that was stopped"
         raise ScenarioError("--resume", "needs the directory of the runs", None, remedy)
-    size = BlockCheckpoints(out, scenario).stored_block_size() or plan.block
     if not (out / "manifest.json").exists():
         if not _has_own_files(out, scenario):
             return None
         # Stopped before the manifest was written. Each block names its run: blocks of other runs
         # are removed when they are read.
         _check_scenario(out, scenario)
-        return StoredBlocks(directory=out, block=size, finished=False)
+        return False
     manifest = read_manifest(out)
     if manifest["runs"]["wanted"] != plan.runs:
         rule, value = "the run was begun with another number of runs", manifest["runs"]["wanted"]
@@ -100,9 +89,7 @@ def find_stored_blocks(
     finished = manifest["status"] in FINAL_STATUSES
     if finished:
         _require(out, lambda: check_files(out, manifest), "start in a new directory")
-    if is_block_size(manifest.get("block")):
-        size = manifest["block"]
-    return StoredBlocks(directory=out, block=size, finished=finished)
+    return finished
 
 
 def clear_unfinished_runs(
@@ -189,14 +176,14 @@ def _require(path: Path, check: Callable[[], None], remedy: str) -> None:
         raise ScenarioError("--resume", f"{path}: {error}", None, remedy) from None
 
 
-def read_manifest(directory: Path) -> dict[str, Any]:
-    """Return manifest.json of a directory that runs are to be resumed in; raises ScenarioError if
-    it is missing or damaged.
+def read_manifest(directory: Path, option: str = "--resume") -> dict[str, Any]:
+    """Return manifest.json of a directory that runs are to be resumed in; raises ScenarioError
+    about an ``option`` if it is missing or damaged.
     """
     try:
         manifest = read_document(directory / "manifest.json")
         require_form(manifest, MANIFEST)
     except DamagedError as error:
-        rule = f"must be a directory that netkf run left: manifest.json {error}"
-        raise ScenarioError("--resume", rule, str(directory), "give another --out") from None
+        rule = f"must be a directory that netkf run or plan left: manifest.json {error}"
+        raise ScenarioError(option, rule, str(directory), "give another directory") from None
     return manifest

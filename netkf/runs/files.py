@@ -83,13 +83,14 @@ def publish(temporary: Path, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def write_atomically(path: Path) -> Iterator[Path]:
+def write_atomically(path: Path, writer: str = "") -> Iterator[Path]:
     """Yield the path of a temporary file that replaces ``path`` at the end of the body.
 
-    Readers never see an incomplete file; if the body raises, the temporary file is removed. Raises
-    WriteError if the body raises OSError or the file cannot be renamed.
+    Processes that may write the file at the same time each give a name as ``writer``. Readers never
+    see an incomplete file; if the body raises, the temporary file is removed. Raises WriteError if
+    the body raises OSError or the file cannot be renamed.
     """
-    temporary = path.parent / f"{path.name}.part"
+    temporary = path.parent / f"{path.name}.{writer}part"
     # Before the block that removes it: what is not a file here is nobody's temporary file.
     require_own(temporary)
     try:

@@ -16,12 +16,11 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import EngineError, ScenarioError, WriteError
-from netkf.ensembles import checkpoints
+from netkf.ensembles import checkpoints, pools
 from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.pools import PoolOptions
 from netkf.runs import provenance
-from netkf.runs.documents import write_sealed
 from netkf.runs.files import write_scenario
 from netkf.runs.parquet_files import ParquetSink
 from tests.conftest import SCENARIOS
@@ -47,10 +46,14 @@ def made(tmp_path_factory):
         if done >= 6:
             raise KeyboardInterrupt
 
-    runs_to_directory(short(), RUNS, folder / "whole", OPTIONS)
-    for name, seed in (("cut", 1), ("other", 2)):
-        with pytest.raises(KeyboardInterrupt):
-            runs_to_directory(short(seed), RUNS, folder / name, OPTIONS, progress=stop)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoints, "FIRST_WRITE", 0.0)  # every block in a file
+        patch.setattr(checkpoints, "WRITE_SHARE", 0.0)
+        patch.setattr(pools, "MAX_BLOCK_HERE", 1)
+        runs_to_directory(short(), RUNS, folder / "whole", OPTIONS)
+        for name, seed in (("cut", 1), ("other", 2)):
+            with pytest.raises(KeyboardInterrupt):
+                runs_to_directory(short(seed), RUNS, folder / name, OPTIONS, progress=stop)
     return folder
 
 
@@ -112,7 +115,7 @@ def as_fifo(block, draw):
 
 
 def as_other_number(block, draw):
-    shutil.copyfile(block.with_name("000000.npz"), block)
+    shutil.copyfile(block.with_name("000000000-1.npz"), block)
 
 
 DAMAGE = {
@@ -135,12 +138,12 @@ DAMAGE = {
 
 @pytest.mark.parametrize("how", DAMAGE)
 def test_a_damaged_block_is_done_again(cut, made, how):
-    DAMAGE[how](cut / "blocks" / "000003.npz", random.Random(1))
+    DAMAGE[how](cut / "blocks" / "000000003-1.npz", random.Random(1))
     assert_done_again(cut, made)
 
 
 def test_every_byte_of_a_block_is_proved(cut):
-    block = cut / "blocks" / "000003.npz"
+    block = cut / "blocks" / "000000003-1.npz"
     whole, draw = block.read_bytes(), random.Random(1)
     for _ in range(200):
         block.write_bytes(whole)
@@ -151,7 +154,7 @@ def test_every_byte_of_a_block_is_proved(cut):
 
 def test_a_block_of_another_seed_is_done_again(cut, made):
     for number in (1, 2):
-        name = f"{number:06d}.npz"
+        name = f"{number:09d}-1.npz"
         shutil.copyfile(made / "other" / "blocks" / name, cut / "blocks" / name)
     assert_done_again(cut, made, blocks=2)
 
@@ -166,9 +169,9 @@ def test_everything_that_decides_bits_decides_what_is_used(cut, monkeypatch, key
     for found in before:
         if key in found:
             found[key] = "other"
-    for room in ("netkf.runs.provenance", "netkf.ensembles.resume"):
-        monkeypatch.setattr(f"{room}.versions", lambda: before[0])
-        monkeypatch.setattr(f"{room}.machine", lambda: before[1])
+    for room in ("runs.provenance", "ensembles.resume", "ensembles.checkpoints"):
+        monkeypatch.setattr(f"netkf.{room}.versions", lambda: before[0])
+        monkeypatch.setattr(f"netkf.{room}.machine", lambda: before[1])
     with pytest.raises(ScenarioError, match=f"holds a run of another (version|machine).*{key}"):
         resume(cut)
     (cut / "manifest.json").unlink()
@@ -191,7 +194,7 @@ def change(manifest, key, value):
 
 
 CHANGES = {
-    "block": 2,
+    "tasks": 2,
     "runs.done": 12,
     "runs.wanted": 13,
     "seed": 2,
@@ -234,15 +237,6 @@ def test_what_is_no_manifest_is_refused_in_one_line(cut, text, capsys):
         assert len(printed.splitlines()) == 1
 
 
-def test_a_block_size_that_is_none_is_not_used(cut, made):
-    """Sealed, so that only the value itself tells."""
-    found = json.loads((cut / "manifest.json").read_text())
-    del found["sha256"]
-    write_sealed(cut / "manifest.json", {**found, "block": 3})
-    resume(cut)
-    assert files(cut) == files(made / "whole")
-
-
 def test_results_do_not_stay_beside_another_scenario(made, cut, tmp_path):
     whole = shutil.copytree(made / "whole", tmp_path / "whole")
     for folder in (cut, whole):
@@ -272,9 +266,9 @@ def test_a_block_that_is_damaged_meanwhile_is_one_line(cut, made, monkeypatch):
     """After it was proved, before its traces are written."""
     load = BlockCheckpoints.load
 
-    def damage(self, number):
-        (cut / "blocks" / "000002.npz").write_bytes(b"")
-        return load(self, number)
+    def damage(self, node):
+        (cut / "blocks" / "000000002-1.npz").write_bytes(b"")
+        return load(self, node)
 
     monkeypatch.setattr(BlockCheckpoints, "load", damage)
     with pytest.raises(EngineError, match="go on with --resume"):
@@ -285,8 +279,8 @@ def test_a_block_that_is_damaged_meanwhile_is_one_line(cut, made, monkeypatch):
 
 
 def test_a_trace_that_does_not_fit_is_one_line_and_done_again(cut, made):
-    forged(cut / "blocks" / "000000.npz", trace_0_replica=np.array(1e300))
-    with pytest.raises(EngineError, match=r"000000\.npz does not fit the scenario"):
+    forged(cut / "blocks" / "000000000-1.npz", trace_0_replica=np.array(1e300))
+    with pytest.raises(EngineError, match=r"000000000-1\.npz does not fit the scenario"):
         resume(cut)
     assert resume(cut) == ([], 1)
     assert files(cut) == files(made / "whole")

@@ -1,0 +1,72 @@
+"""``netkf plan``: write the directory of an ensemble for workers, and the script of an array."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from netkf.cli.options import load_scenario, print_notes
+
+ARRAY = """\
+#!/bin/bash
+#SBATCH --job-name={name}
+#SBATCH --array=0-{last}
+#SBATCH --cpus-per-task=1
+#SBATCH --time={hours:02d}:{minutes:02d}:00
+#SBATCH --signal=TERM@60
+#SBATCH --requeue
+#SBATCH --open-mode=append
+#SBATCH --output={log}
+
+# Each job takes the runs of its part that have no result yet. A job that is killed or requeued
+# goes on where it was, and a part that is finished is left alone.
+srun {work}
+status=$?
+# 1: the time was up before the part was finished.
+if [ $status -eq 1 ]; then scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}}"; fi
+exit $status
+
+# When all are done: {merge}
+"""
+MARGIN = 2
+"""Minutes of a job that are left for its start, and for the end of its last block."""
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Write the plan; return the exit status."""
+    from netkf.ensembles.directory import EnsembleOptions
+    from netkf.ensembles.plans import plan_ensemble
+    from netkf.runs.directory_lock import lock_directory
+
+    scenario = load_scenario(options)
+    tasks = min(options.tasks, options.runs)
+    with lock_directory(options.out):
+        settings = EnsembleOptions(options.engine, options.trace)
+        directory = plan_ensemble(scenario, options.runs, options.out, settings, tasks)
+    print_notes(scenario.notes)
+    # With a script on standard output, what a person reads goes beside it.
+    out = sys.stderr if options.slurm else sys.stdout
+    print(f"{options.runs:,} runs for {tasks:,} jobs, none of them simulated", file=out)
+    print(f"each: netkf work {directory}; in the end: netkf merge {directory}", file=out)
+    print(f"written to {directory}", file=out)
+    if options.slurm:
+        print(_array(directory.resolve(), scenario.name, tasks, options), end="")
+    return 0
+
+
+def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) -> str:
+    """Return the submission script of an array of ``tasks`` SLURM jobs on a plan."""
+    trust = ["--trust"] if options.trust else []
+    minutes = max(1, round(options.time / 60))
+    limit = f"{max(1, minutes - MARGIN)}m"
+    return ARRAY.format(
+        name="".join(c if c.isalnum() or c in "-_." else "-" for c in f"netkf-{name}")[:100],
+        last=tasks - 1,
+        hours=minutes // 60,
+        minutes=minutes % 60,
+        log=str(directory.parent / f"{directory.name}-%A_%a.log"),
+        work=shlex.join(["netkf", "work", str(directory), "--for", limit, *trust]),
+        merge=shlex.join(["netkf", "merge", str(directory), *trust]),
+    )
