@@ -1,0 +1,354 @@
+"""Plans: what workers leave in a directory, in any order and however they end, is one ensemble."""
+
+import itertools
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+import netkf
+from netkf.cli.main import main
+from netkf.ensembles import checkpoints, plans
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.plans import Part, open_plan, part_of_array, work_on_plan
+from netkf.ensembles.pools import PoolOptions
+from netkf.runs import provenance
+from tests.conftest import SCENARIOS
+
+RING = str(SCENARIOS / "poisson_ring.toml")
+RUNS = 21
+LINE = [RING, "--set", "horizon=1.0", "--runs", str(RUNS)]
+
+
+def files(folder):
+    return {f.relative_to(folder): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What one command writes."""
+    folder = tmp_path_factory.mktemp("plans") / "whole"
+    scenario = netkf.load(RING, {"horizon": 1.0})
+    runs_to_directory(scenario, RUNS, folder, EnsembleOptions(pool=PoolOptions(1)))
+    return files(folder)
+
+
+@pytest.fixture
+def plan(tmp_path, capsys):
+    assert main(["plan", *LINE, "--out", str(tmp_path / "plan"), "--tasks", "5"]) == 0
+    assert "21 runs for 5 jobs, none of them simulated" in capsys.readouterr().out
+    return tmp_path / "plan"
+
+
+def work(folder, *arguments):
+    return main(["work", str(folder), *arguments])
+
+
+def merge(folder, *arguments):
+    return main(["merge", str(folder), "--no-plot", *arguments])
+
+
+def test_shuffled_workers_are_one_run(plan, whole, capsys):
+    order = list(range(1, 6))
+    random.Random(3).shuffle(order)
+    for k in order[:-1]:
+        assert work(plan, "--part", f"{k}/5") == 0
+    assert merge(plan) == 1
+    gap = Part(order[-1], 5).of(RUNS)
+    assert f"runs have no result: {gap[0]}-{gap[-1]}\n" in capsys.readouterr().out
+    assert work(plan, "--part", f"{order[0]}/5") == 0  # requeued, though it was finished
+    assert "nothing left to do" in capsys.readouterr().out
+    assert work(plan) == 0
+    assert merge(plan) == 0
+    assert files(plan) == whole
+    for again in (work, merge):
+        assert again(plan) == 0
+        assert "nothing left to do" in capsys.readouterr().out
+    assert files(plan) == whole
+
+
+def test_parts_cover_all_runs_once_from_0_or_from_1():
+    for runs, count in itertools.product((1, 2, 21, 64, 1000), (1, 2, 3, 7, 64)):
+        for first in (0, 1):
+            parts = [Part(k, count).of(runs) for k in range(first, count + first)]
+            covered = sorted(replica for part in parts for replica in part)
+            assert covered == list(range(runs))
+        longest = max(map(len, parts))
+        assert longest <= -(-runs // count) * 1.25 + 1  # parts are about equal
+
+
+@pytest.mark.parametrize(
+    ("variables", "part"),
+    [
+        ({}, Part(0, 1)),
+        ({"SLURM_ARRAY_TASK_ID": "12", "MIN": "10", "MAX": "13", "COUNT": "4"}, Part(2, 4)),
+        ({"SLURM_ARRAY_TASK_ID": "6", "MIN": "2", "MAX": "8", "STEP": "2"}, Part(2, 4)),
+        # Three jobs of the plan's five that are submitted again.
+        ({"SLURM_ARRAY_TASK_ID": "4", "MIN": "1", "MAX": "4", "COUNT": "3"}, Part(4, 5)),
+        ({"PBS_ARRAY_INDEX": "3"}, Part(3, 5)),
+        ({"SGE_TASK_ID": "undefined"}, Part(0, 1)),
+        ({"SGE_TASK_ID": "3", "SGE_TASK_FIRST": "1", "SGE_TASK_LAST": "9"}, Part(2, 9)),
+        ({"LSB_JOBINDEX": "0", "LSB_JOBINDEX_END": "9"}, Part(0, 1)),
+        ({"LSB_JOBINDEX": "9", "LSB_JOBINDEX_END": "9", "LSB_JOBINDEX_STEP": "1"}, Part(8, 9)),
+    ],
+)
+def test_arrays_of_batch_systems_tell_the_part(variables, part):
+    short = ("MIN", "MAX", "STEP", "COUNT")
+    names = {name: f"SLURM_ARRAY_TASK_{name}" if name in short else name for name in variables}
+    environment = {names[name]: value for name, value in variables.items()}
+    assert part_of_array(5, environment) == part
+
+
+def test_time_and_interrupts_keep_what_was_finished(plan, whole, monkeypatch, capsys):
+    ticks = itertools.count()
+    with monkeypatch.context() as patch:  # a second for each look at the clock
+        patch.setattr(plans.time, "monotonic", lambda: float(next(ticks)))
+        assert work(plan, "--for", "12s") == 1
+    assert "are left: run it again" in capsys.readouterr().out
+
+    def stop(done, wanted):
+        raise KeyboardInterrupt
+
+    opened = open_plan(plan)
+    before = len(list((plan / "blocks").iterdir()))
+    with pytest.raises(KeyboardInterrupt, match="go on with netkf work"):
+        work_on_plan(opened, Part(0, 1), progress=stop)
+    assert len(list((plan / "blocks").iterdir())) > before
+    assert work(plan) == 0
+    assert merge(plan) == 0
+    assert files(plan) == whole
+
+
+def test_two_workers_on_one_block_do_no_harm(plan, whole, monkeypatch):
+    """The second begins before the first has written, with blocks of another size."""
+    opened, inside = open_plan(plan), []
+
+    def other(done, wanted):
+        if not inside:
+            inside.append(work_on_plan(opened, Part(0, 2), pool=PoolOptions(1)).simulated)
+
+    assert work_on_plan(opened, Part(0, 1), progress=other).simulated == RUNS
+    assert inside == [len(Part(0, 2).of(RUNS))]
+    assert merge(plan) == 0
+    assert files(plan) == whole
+
+
+def test_damaged_blocks_are_missing_until_they_are_done_again(plan, whole, capsys):
+    assert work(plan, "--part", "1/2") == 0
+    assert work(plan, "--part", "2/2") == 0
+    largest = max((plan / "blocks").iterdir(), key=lambda file: int(file.stem.split("-")[1]))
+    damaged = bytearray(largest.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    largest.write_bytes(damaged)
+    (plan / "blocks" / "notes.npz").write_bytes(b"")
+    (plan / "blocks" / "000000008-8.npz.node-1.part").write_bytes(b"half")
+    assert merge(plan) == 1
+    printed = capsys.readouterr()
+    assert f"{largest.name} was changed since it was written" in printed.err
+    assert "have no result" in printed.out
+    assert work(plan) == 0
+    assert merge(plan) == 0
+    assert files(plan) == whole
+
+
+def test_other_versions_are_refused_and_other_machines_only_mixed_if_asked(
+    plan, whole, monkeypatch, capsys
+):
+    assert work(plan, "--part", "1/2") == 0
+    other = {**provenance.machine(), "processor": "another"}
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "machine", lambda: other)
+        assert work(plan) == 0
+    capsys.readouterr()
+    assert merge(plan) == 2
+    error = capsys.readouterr().err
+    assert "machines of different kinds" in error
+    assert "another" in error
+    assert len(error.splitlines()) == 1
+    mixed = shutil.copytree(plan, plan.with_name("mixed"))
+    assert merge(mixed, "--mixed") == 0
+    manifest = json.loads((mixed / "manifest.json").read_text())
+    assert other in manifest["machines"]
+    assert files(mixed).keys() == whole.keys()
+    capsys.readouterr()
+
+    newer = {**provenance.versions(), "numpy": "99.0"}
+    monkeypatch.setattr(plans, "versions", lambda: newer)
+    for again in (work, merge):
+        assert again(plan) == 2
+        error = capsys.readouterr().err
+        assert "numpy 99.0 instead of" in error
+        assert len(error.splitlines()) == 1
+
+
+def test_what_is_no_plan_is_refused_in_one_line(plan, tmp_path, capsys):
+    changed = shutil.copytree(plan, tmp_path / "changed")
+    text = (changed / "scenario.toml").read_text()
+    (changed / "scenario.toml").write_text(text.replace("horizon = 1.0", "horizon = 2.0"))
+    lost = shutil.copytree(plan, tmp_path / "lost")
+    (lost / "scenario.toml").unlink()
+    sealed = shutil.copytree(plan, tmp_path / "sealed")
+    manifest = (sealed / "manifest.json").read_text()
+    (sealed / "manifest.json").write_text(manifest.replace('"wanted": 21', '"wanted": 22'))
+    for folder in (tmp_path / "none", changed, lost, sealed):
+        for command in (work, merge):
+            before = files(folder)
+            assert command(folder) == 2
+            error = capsys.readouterr().err
+            assert str(folder) in error
+            assert len(error.splitlines()) == 1
+            assert files(folder) == before
+    assert main(["plan", *LINE, "--out", str(plan)]) == 2
+    assert "must be a new or empty directory" in capsys.readouterr().err
+    for bad in (["--part", "5/4"], ["--part", "x"], ["--for", "5x"], ["--for", ""]):
+        with pytest.raises(SystemExit):
+            main(["work", str(plan), *bad])
+        assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_full_disk_keeps_what_was_written(plan, whole, monkeypatch, capsys):
+    assert work(plan, "--part", "1/2") == 0
+    before = files(plan)
+
+    def full(self, data):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(plan), "write_bytes", full)
+        assert work(plan) == 2
+    error = capsys.readouterr().err
+    assert "No space left on device" in error
+    assert len(error.splitlines()) == 1
+    assert files(plan) == before
+    assert work(plan) == 0
+    assert merge(plan) == 0
+    assert files(plan) == whole
+
+
+def test_a_stopped_run_and_a_plan_are_the_same(plan, whole, tmp_path, capsys):
+    """Workers go on with ``netkf run``, and ``--resume`` with a plan."""
+    assert work(plan, "--part", "2/3") == 0
+    assert main(["run", *LINE, "--out", str(plan), "--resume", "--no-plot", "--workers", "1"]) == 0
+    assert files(plan) == whole
+
+    def stop(done, wanted):
+        if done >= 3:
+            raise KeyboardInterrupt
+
+    options = EnsembleOptions(pool=PoolOptions(1))
+    with pytest.raises(KeyboardInterrupt):
+        runs_to_directory(
+            netkf.load(RING, {"horizon": 1.0}), RUNS, tmp_path / "cut", options, progress=stop
+        )
+    assert work(tmp_path / "cut") == 0
+    assert merge(tmp_path / "cut") == 0
+    assert files(tmp_path / "cut") == whole
+
+
+def test_traces_of_all_runs_come_through(tmp_path):
+    line = [*LINE, "--trace", "full"]
+    assert main(["plan", *line, "--out", str(tmp_path / "plan")]) == 0
+    for part in ("2/2", "1/2"):
+        assert work(tmp_path / "plan", "--part", part) == 0
+    assert merge(tmp_path / "plan") == 0
+    one = ["--workers", "1", "--no-plot", "--out", str(tmp_path / "one")]
+    assert main(["run", *line, *one]) == 0
+    assert files(tmp_path / "plan") == files(tmp_path / "one")
+
+
+def test_a_worker_writes_bytes_for_runs_not_for_blocks(tmp_path, monkeypatch):
+    """A part that is a node of the tree over runs is one file, however many blocks it had."""
+    assert (
+        main(["plan", RING, "--set", "horizon=1.0", "--runs", "64", "--out", str(tmp_path / "p")])
+        == 0
+    )
+    blocks = []
+    add = checkpoints.BlockCheckpoints.add
+    monkeypatch.setattr(
+        checkpoints.BlockCheckpoints, "add", lambda *given: (blocks.append(given[1]), add(*given))
+    )
+    for part in ("1/2", "2/2"):
+        assert work(tmp_path / "p", "--part", part) == 0
+    assert len(blocks) > 4
+    assert len(list((tmp_path / "p" / "blocks").iterdir())) == 2
+
+
+def test_slurm_script(tmp_path, capsys):
+    line = ["--out", str(tmp_path / "my plan"), "--tasks", "8", "--slurm", "--time", "1h30m"]
+    assert main(["plan", *LINE, *line]) == 0
+    script = capsys.readouterr().out
+    for words in ("--array=0-7", "--signal=TERM@", "--requeue", "--time=01:30:00", "--for 88m"):
+        assert words in script
+    shell = shutil.which("bash")
+    assert subprocess.run([shell, "-n"], input=script, text=True, check=False).returncode == 0
+
+
+def test_no_plan_is_made_of_what_could_not_run(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert (
+        main(
+            [
+                "plan",
+                RING,
+                "--runs",
+                "4",
+                "--engine",
+                "compiled",
+                "--set",
+                "filter.kind=none",
+                "--out",
+                str(out),
+            ]
+        )
+        == 2
+    )
+    assert not out.exists()
+
+
+COMMAND = [sys.executable, "-c", "import sys, netkf.cli.main; sys.exit(netkf.cli.main.main())"]
+QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+
+@pytest.mark.slow
+def test_64_workers_killed_at_random_and_repeated(tmp_path):
+    """As SLURM does it: in any order, several at a time, killed, terminated and requeued."""
+    draw, out = random.Random(1), tmp_path / "plan"
+    line = [RING, "--set", "horizon=20.0", "--runs", "1000"]
+    assert main(["plan", *line, "--out", str(out), "--tasks", "64"]) == 0
+    queue = list(range(64))
+    draw.shuffle(queue)
+    running = {}
+    while queue or running:
+        while queue and len(running) < 4:
+            part = queue.pop()
+            environment = {
+                **os.environ,
+                "SLURM_ARRAY_TASK_ID": str(part),
+                "SLURM_ARRAY_TASK_MIN": "0",
+                "SLURM_ARRAY_TASK_MAX": "63",
+                "SLURM_ARRAY_TASK_COUNT": "64",
+            }
+            running[part] = subprocess.Popen([*COMMAND, "work", str(out)], env=environment, **QUIET)
+        time.sleep(0.05)
+        for part, process in list(running.items()):
+            status = process.poll()
+            if status is not None:
+                del running[part]
+                if status != 0 or draw.random() < 0.1:  # requeued, now and then without need
+                    queue.insert(0, part)
+            elif draw.random() < 0.01:
+                how = draw.choice([signal.SIGKILL, signal.SIGTERM])
+                process.send_signal(how)
+                began = time.monotonic()
+                process.wait(30)
+                assert time.monotonic() - began < 10.0
+    assert merge(out) == 0
+    one = ["--workers", "1", "--no-plot", "--out", str(tmp_path / "one")]
+    assert main(["run", *line, *one]) == 0
+    assert files(out) == files(tmp_path / "one")
