@@ -20,7 +20,7 @@ def _run(options: argparse.Namespace) -> int:
         update = line.make_count_update("runs")
         done = work_on_plan(plan, part, options.seconds, pool, update)
     print_notes(plan.scenario.notes)
-    which = f"part {part.index % part.count + 1} of {part.count}" if part.count > 1 else "all"
+    which = f"part {part.index}/{part.count}" if part.count > 1 else "all"
     if not done.simulated and not done.left:
         print(f"nothing left to do in {plan.directory} ({which})")
         return 0
