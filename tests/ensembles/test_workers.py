@@ -39,7 +39,7 @@ def test_a_worker_killed_while_it_writes_is_replaced(ring, tmp_path):
         time.sleep(0.01)
     time.sleep(0.6)  # nobody reads meanwhile: the worker dies with most of its result unwritten
     assert pool.wait([future]) == [future]
-    assert len(future.result()) == LARGE
+    assert len(future.result().value) == LARGE
     pool.close(at_once=False)
 
 
