@@ -30,6 +30,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
 html_theme = "furo"
 html_title = f"netkf {release}"
 html_copy_source = False
+html_static_path, html_css_files = ["_static"], ["code.css"]
 html_math_renderer = "mathml"  # browsers draw it, without a script from the network
 
 myst_enable_extensions = ["dollarmath", "amsmath"]

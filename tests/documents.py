@@ -11,7 +11,8 @@ What a block is follows from its language and its first line:
 - `console`: commands after `$ `, each followed by what it prints;
 - `python` without a name: code that runs in one namespace a page; a `text` block directly below
   is what it prints; it is left out if it imports a package of OPTIONAL that is not installed;
-- `toml` without a name: part of a scenario file, which has to be TOML.
+- `toml` without a name: part of a scenario file, which has to be TOML;
+- `matlab`, `ini`: files of other programs, to read.
 
 In what is printed `...` stands for any text in a line and, alone, for any number of lines.
 """
@@ -40,7 +41,7 @@ FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"# (\S+\.(?:py|toml|csv|sh))\n")
 STATUS = "echo $?"
 OPTIONAL = ("duckdb", "polars")  # blocks that import them are left out where they are not there
-LANGUAGES = {"python", "toml", "console", "sh", "text", "json"}
+LANGUAGES = {"python", "toml", "console", "sh", "text", "json", "matlab", "ini"}
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,14 @@ def test_a_tutorial_is_a_script(page):
     subprocess.run(["bash", "-n"], input=text, text=True, check=True)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_code_fits_its_column(page):
+    """Of 100 characters, by docs/_static/code.css; commands and what they print wrap there."""
+    code = [block for block in blocks(page) if block.language not in ("console", "text")]
+    wide = [line for block in code for line in block.text.splitlines() if len(line) > 100]
+    assert wide == []
+
+
 def test_pictures_are_small_and_used():
     texts = "".join(page.read_text(encoding="utf-8") for page in [*PAGES, ROOT / "README.md"])
     for picture in [*DOCS.rglob("*.svg"), *DOCS.rglob("*.png"), *DOCS.rglob("*.gif")]:
