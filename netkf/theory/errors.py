@@ -167,7 +167,7 @@ def require_known_filter(scenario: Scenario) -> None:
     name = type(algorithm).__name__
     require_linear(scenario)
     if built_in_class(algorithm) is None:
-        rule = "an affine filter says so by shift and analysis = Analysis(affine=True), or by kernels"
+        rule = "one that is affine says so by shift and Analysis(affine=True), or by kernels"
         raise TheoryError(f"no exact error covariance for {name}: {rule}")
     overridden_names = overridden(algorithm)
     if overridden_names:
