@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.algorithms.belief_propagation import MAX_STEPS, is_forest
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading

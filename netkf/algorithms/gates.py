@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
-import scipy.stats
+import scipy
 
 from netkf.core.fields import Component, field, number, one_of
 from netkf.linalg.arrays import FloatArray

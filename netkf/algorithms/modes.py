@@ -18,7 +18,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.linalg.arrays import FloatArray
 

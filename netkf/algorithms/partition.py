@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from netkf.algorithms.filter import Exchange, Filter, Message, NodeInfo, PairReading, Reading
 from netkf.algorithms.registry import built_in
@@ -318,4 +318,4 @@ def _best_weight(P: FloatArray, H: FloatArray, C: FloatArray, R: FloatArray) -> 
     least, largest = MARGIN, 1.0 - MARGIN
     if slope(least) >= 0.0:
         return least
-    return largest if slope(largest) <= 0.0 else float(brentq(slope, least, largest))
+    return largest if slope(largest) <= 0.0 else float(scipy.optimize.brentq(slope, least, largest))

@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.algorithms.registry import LINK_WEIGHTS, base_filter, built_in_class, own_attributes
 from netkf.checks.evidence import (

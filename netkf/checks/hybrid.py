@@ -9,8 +9,7 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
+import scipy
 
 from netkf.checks.equations import error_promises
 from netkf.checks.evidence import (

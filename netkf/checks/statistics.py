@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.laws.intervals import POWER, Interval, noncentrality, scale_interval
 from netkf.linalg.arrays import FloatArray

@@ -6,8 +6,7 @@ from typing import Any
 
 import networkx
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
+import scipy
 
 from netkf.network.graphs import Topology
 

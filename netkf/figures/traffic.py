@@ -9,7 +9,7 @@ import contextlib
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest
+import scipy
 
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import select_evenly, shade_downtimes
@@ -264,7 +264,7 @@ def _require_messages(data: FigureData) -> list[DirectedMessages]:
 
 def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
     """Return Wilson's interval of a delivery probability, at the level CONFIDENCE."""
-    interval = binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
+    interval = scipy.stats.binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
     return float(interval.low), float(interval.high)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.core.laws import WaitingLaw
 from netkf.laws.intervals import Comparison, Interval, detectable_shift, deviation_interval

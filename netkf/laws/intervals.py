@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.linalg.arrays import FloatArray
 

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.core.clock import Entity
 from netkf.core.laws import EXPONENTIAL, Lattice, WaitingLaw

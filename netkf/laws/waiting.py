@@ -15,7 +15,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.core.laws import WaitingLaw
 from netkf.laws.intervals import (

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.core.errors import ScenarioError, errors_under, quote, suggest_nearest
 from netkf.core.fields import (

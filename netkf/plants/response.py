@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.core.instants import TimeGrid
 from netkf.linalg.arrays import FloatArray

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.checks.innovations import Innovations
 from netkf.engines.soundness import describe_divergence

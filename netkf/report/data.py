@@ -6,7 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.checks.innovations import Innovations
 from netkf.figures.layout import get_positions

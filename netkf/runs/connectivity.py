@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from netkf.linalg.arrays import FloatArray
 from netkf.network.clocks import RecordedClock
@@ -117,8 +116,10 @@ class ConnectivitySink(Sink):
     def _parts(self, up: np.ndarray) -> tuple[int, np.ndarray]:
         """Return in how many parts the links ``up`` (D,) join the nodes, and that of each (N,)."""
         size, ends = len(self._scenario.nodes), self._ends[up].T
-        graph = coo_array((np.ones(len(ends[0])), (ends[0], ends[1])), shape=(size, size))
-        count, labels = connected_components(graph, connection=self._strength)
+        graph = scipy.sparse.coo_array(
+            (np.ones(len(ends[0])), (ends[0], ends[1])), shape=(size, size)
+        )
+        count, labels = scipy.sparse.csgraph.connected_components(graph, connection=self._strength)
         return int(count), np.asarray(labels)
 
     def _look(self, t: FloatArray, links: np.ndarray) -> None:

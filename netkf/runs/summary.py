@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from scipy.special import gammaincinv
+import scipy
 
 from netkf.core.wings import WINGS
 from netkf.linalg.arrays import FloatArray
@@ -130,7 +130,9 @@ def chi_square_interval(freedom: Any, probability: float) -> tuple[FloatArray, F
     Each interval holds its variable with the given ``probability``; the tails are equally probable.
     """
     tail = 0.5 * (1.0 - probability)
-    low, high = (2.0 * gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail))
+    low, high = (
+        2.0 * scipy.special.gammaincinv(0.5 * freedom, q) / freedom for q in (tail, 1.0 - tail)
+    )
     return np.asarray(low), np.asarray(high)
 
 

@@ -15,7 +15,7 @@ from numbers import Real
 from typing import Any, Self, TypeVar
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval

@@ -11,8 +11,7 @@ import itertools
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.csgraph import breadth_first_order
+import scipy
 
 from netkf.algorithms.filter import Exchange, may_be_silent
 from netkf.algorithms.translation import read_vector
@@ -266,7 +265,9 @@ def _check_ways(scenario: DerivedScenario) -> None:
         (links, "no way from node {0} to {1}"),
         (links.T, "no way from node {1} to {0}"),
     ):
-        reached = breadth_first_order(one_way.tocsr(), 0, return_predecessors=False)
+        reached = scipy.sparse.csgraph.breadth_first_order(
+            one_way.tocsr(), 0, return_predecessors=False
+        )
         missed = np.setdiff1d(np.arange(N), reached)
         if missed.size:
             raise ScenarioError(

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy.special
+import scipy
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import as_path, number

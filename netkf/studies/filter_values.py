@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.engines.base import Engine
 from netkf.ensembles.statistics import run_values

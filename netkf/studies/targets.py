@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.runs.quantities import NETWORK

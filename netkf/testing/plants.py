@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.core.errors import NetkfError
 from netkf.laws.noise import moment_law, transition_law, whiten

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 
 import numpy as np
-import scipy.special
+import scipy
 
 from netkf.checks.evidence import GAUSSIAN, PLANT, SENSORS, START, Assumption, Finding, Promise
 from netkf.checks.laws import find

@@ -10,7 +10,7 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.algorithms.registry import own_attributes
 from netkf.checks.rounding import EPS

@@ -11,8 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.stats
+import scipy
 
 from netkf.algorithms.gates import Gate
 from netkf.linalg.arrays import FloatArray

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.linalg.arrays import FloatArray, IntArray, block_diagonal, symmetric
 from netkf.linalg.spectra import growth_rate

@@ -14,9 +14,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
-import scipy.sparse.linalg
+import scipy
 
 from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError

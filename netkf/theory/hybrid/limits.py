@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from netkf.algorithms.registry import overridden
 from netkf.core.errors import TheoryError

@@ -13,8 +13,7 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse.linalg
+import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
+import scipy
 
 from netkf.linalg.arrays import FloatArray
 from netkf.theory.hybrid.coupled import CoupledRiccati

@@ -10,7 +10,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from netkf.core.clock import Clock
 from netkf.linalg.arrays import FloatArray

@@ -15,9 +15,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
-import scipy.sparse.linalg
+import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray

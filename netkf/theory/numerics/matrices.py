@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.algorithms.kernels.riccati import move_covariances
 from netkf.algorithms.kernels.riccati import riccati_flow as flow_over

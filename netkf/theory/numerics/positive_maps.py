@@ -15,8 +15,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse.linalg
+import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray, symmetric

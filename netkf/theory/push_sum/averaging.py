@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray, IntArray

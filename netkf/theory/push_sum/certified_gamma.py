@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.linalg.arrays import FloatArray

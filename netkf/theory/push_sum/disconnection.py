@@ -16,9 +16,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
-import scipy.special
+import scipy
 
 from netkf.core.errors import TheoryError
 from netkf.network.graphs import Topology
