@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import networkx
 import numpy as np
 import scipy
 
@@ -39,6 +38,8 @@ def compute_layout(topology: Topology) -> Positions:
     """Return positions: rings as a circle, small networks by Kamada and Kawai, large by pivots."""
     if len(topology.nodes) > MAX_KAMADA_KAWAI:
         return _pivot_layout(topology)
+    import networkx
+
     graph: networkx.Graph[int] = networkx.Graph()
     # The order of the nodes is that around the circle.
     graph.add_nodes_from(topology.nodes)

@@ -160,6 +160,11 @@ def write_figure(figure: Figure, path: Path) -> None:
     undated: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     metadata = undated[file_format]
     with style_context(), write_atomically(path) as temporary:
+        if (engine := figure.get_layout_engine()) is not None:
+            # Once, instead of in a first drawing of all artists that is thrown away.
+            figure.set_dpi(RESOLUTION)
+            engine.execute(figure)
+            figure.set_layout_engine("none")
         figure.savefig(temporary, dpi=RESOLUTION, format=file_format, metadata=metadata)
 
 

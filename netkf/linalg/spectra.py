@@ -190,6 +190,10 @@ def _joined(A: FloatArray, value: complex, other: complex) -> bool:
 
 def _balance(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``D^-1 A D`` of like rows and columns, and D (n,) of powers of 2."""
+    sizes = np.abs(A)
+    alike = ~sizes.any(axis=0) | ~sizes.any(axis=1) | (sizes == sizes.T).all(axis=0)
+    if alike.all():  # D is 1, known without scipy's linear algebra, whose import takes 0.2 s
+        return A, np.ones(len(A))
     with np.errstate(invalid="ignore"):  # scipy takes large powers for indices that it then drops
         balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     return np.asarray(balanced, dtype=np.float64), np.asarray(scale, dtype=np.float64)

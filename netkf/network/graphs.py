@@ -186,16 +186,18 @@ class Topology:
     @cached_property
     def components(self) -> list[set[int]]:
         """The (weakly) connected components as sets of node ids, largest first."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
-        ends = np.array([(self.index[i], self.index[j]) for i, j in self.links]).reshape(-1, 2)
-        ones, size = np.ones(len(ends)), len(self.nodes)
-        _, labels = connected_components(coo_array((ones, tuple(ends.T)), shape=(size, size)))
-        # Node indices sorted by label, cut where the label changes.
-        order = np.argsort(labels, kind="stable")
-        groups = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-        components = [{self.nodes[k] for k in group.tolist()} for group in groups]
+        components, seen = [], set[int]()
+        for first in self.nodes:
+            if first in seen:
+                continue
+            component, waiting = {first}, [first]
+            while waiting:
+                node = waiting.pop()
+                found = {*self._receivers[node], *self._senders[node]} - component
+                component |= found
+                waiting.extend(found)
+            seen |= component
+            components.append(component)
         return sorted(components, key=len, reverse=True)
 
 

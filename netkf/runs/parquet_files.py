@@ -6,10 +6,9 @@ import contextlib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -19,7 +18,10 @@ from netkf.runs.files import publish, writing_file
 from netkf.scenario.scenario import Scenario
 from netkf.trace.recorder import Sink
 from netkf.trace.run import StateSamples, event_columns, state_table
-from netkf.trace.schema import EVENT
+from netkf.trace.schema import EVENT, KINDS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ROW_GROUP_ROWS = 1 << 17
 """Rows that are collected before they are written as one row group."""
@@ -45,6 +47,8 @@ def read_numbers(
     Raises DamagedError if the file cannot be read, lacks one of the columns, has more than
     MAX_READ_ROWS rows, or has empty cells that are not allowed.
     """
+    import pandas as pd
+
     with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         names, types = file.schema_arrow.names, file.schema_arrow.types
         types_by_name = dict(zip(names, types, strict=True))
@@ -66,6 +70,8 @@ def read_texts(path: Path, column: str, run: int | None = None) -> pd.Series[str
 
     Raises DamagedError if the file cannot be read, lacks the column or has empty cells in it.
     """
+    import pandas as pd
+
     with _open_for_reading(path) as source, pq.ParquetFile(source) as file:
         names = file.schema_arrow.names
         if names.count(column) != 1:
@@ -166,7 +172,8 @@ class ParquetSink(Sink):
         # A row group at a time: in large networks a slot has millions of rows.
         for first in range(0, max(1, len(rows)), ROW_GROUP_ROWS):
             part = rows[first : first + ROW_GROUP_ROWS]
-            self._events.collect(event_columns(part, self._replica, self._event_count))
+            columns = event_columns(part, self._replica, self._event_count, _kinds)
+            self._events.collect(columns)
             self._event_count += len(part)
 
     def states(
@@ -219,6 +226,29 @@ class ParquetSink(Sink):
             self._states.discard()
 
 
+def _arrow(values: Any) -> Any:
+    """Return a column (rows,) as an Arrow array; nan is null.
+
+    ``pyarrow.array`` imports pandas, which takes as long as a short run does.
+    """
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
+        return pa.array(values, from_pandas=True)
+    valid = None
+    if values.dtype.kind == "f" and (missing := np.isnan(values)).any():
+        valid = pa.py_buffer(np.packbits(~missing, bitorder="little"))
+    buffers = [valid, pa.py_buffer(np.ascontiguousarray(values))]
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), buffers)
+
+
+def _kinds(codes: np.ndarray) -> Any:
+    """Return the kinds of events with ``codes`` (K,) int8 as an Arrow array of categories."""
+    texts = [name.encode() for name in KINDS]
+    ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(texts))]
+    names = pa.Array.from_buffers(pa.string(), len(texts), buffers)
+    return pa.DictionaryArray.from_arrays(_arrow(codes), names)
+
+
 def write_table(path: Path, columns: dict[str, Any]) -> None:
     """Write columns {name: values (rows,)} as a Parquet file; raises WriteError."""
     table = _Table(path)
@@ -239,8 +269,7 @@ class _Table:
 
     def collect(self, columns: dict[str, Any]) -> None:
         """Append rows, which are written once they fill a row group; the first give the schema."""
-        table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
-        self._pending.append(table)
+        self._pending.append(pa.table({name: _arrow(column) for name, column in columns.items()}))
         if sum(map(len, self._pending)) >= ROW_GROUP_ROWS:
             self.flush()
 

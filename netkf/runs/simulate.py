@@ -10,7 +10,6 @@ from netkf.core.errors import EngineError, ScenarioError
 from netkf.core.fields import integer
 from netkf.engines.base import Engine, Progress, silent
 from netkf.engines.compiled.engine import CompiledEngine
-from netkf.engines.simpy.engine import SimpyEngine
 from netkf.linalg.plain import is_plain
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
@@ -37,9 +36,9 @@ def choose_engine(
     elif name_or_engine in ("auto", "compiled"):
         engine = CompiledEngine()
         if name_or_engine == "auto" and (is_plain() or engine.refusal(scenario) is not None):
-            engine = SimpyEngine()
+            engine = _simpy_engine()
     elif name_or_engine in ("simpy", "processes"):
-        engine = SimpyEngine()
+        engine = _simpy_engine()
     else:
         raise EngineError(f"engine must be one of {', '.join(ENGINES)}; got {name_or_engine!r}")
     refusal = engine.refusal(scenario)
@@ -48,6 +47,12 @@ def choose_engine(
     if announce and engine is not name_or_engine:
         engine.announce(scenario)
     return engine
+
+
+def _simpy_engine() -> Engine:
+    from netkf.engines.simpy.engine import SimpyEngine
+
+    return SimpyEngine()
 
 
 def require_scenario(value: object, function: str, rest: str = "") -> None:

@@ -17,6 +17,8 @@ from netkf.trace.nees import BLUR, ROUNDING, blurred_from, errors, traces
 from netkf.trace.schema import CODES, EVENT_COLUMNS, KINDS, state_columns
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import pandas as pd
 
 CERTAIN = 1e-14
@@ -210,15 +212,23 @@ def plot_by_name(result: Any, figure: str) -> Any:
     return WINGS.draw(result, figure)
 
 
-def event_columns(rows: np.ndarray, replica: int, first: int) -> dict[str, Any]:
-    """Return K EVENT ``rows`` as named columns (K,), those of EVENT_COLUMNS; ``replica`` is the
-    number of the run and ``first`` the sequence number of the first row.
-    """
+def _categorical(codes: np.ndarray) -> Any:
+    """Return the kinds of events with ``codes`` (K,) int8."""
     import pandas as pd
 
-    kinds = pd.Categorical.from_codes(rows["kind"].astype(np.int8), categories=pd.Index(KINDS))
+    return pd.Categorical.from_codes(codes, categories=pd.Index(KINDS))
+
+
+def event_columns(
+    rows: np.ndarray, replica: int, first: int, kinds: Callable[[np.ndarray], Any] = _categorical
+) -> dict[str, Any]:
+    """Return K EVENT ``rows`` as named columns (K,), those of EVENT_COLUMNS; ``replica`` is the
+    number of the run and ``first`` the sequence number of the first row. ``kinds`` makes the column
+    of kinds of their codes (K,) int8, places in KINDS.
+    """
+    kind = kinds(rows["kind"].astype(np.int8))
     run = np.full(len(rows), replica, dtype=np.int64)
-    columns = {"run": run, "seq": np.arange(first, first + len(rows)), "kind": kinds}
+    columns = {"run": run, "seq": np.arange(first, first + len(rows)), "kind": kind}
     return {name: columns[name] if name in columns else rows[name] for name in EVENT_COLUMNS}
 
 
