@@ -1,6 +1,7 @@
 """How the process of a command ends: closed streams, signals, text from files."""
 
 import os
+import resource
 import shlex
 import signal
 import subprocess
@@ -229,3 +230,43 @@ def test_names_that_are_not_ascii_may_stand_on_a_machine_that_knows_no_others(tm
         assert done.returncode == 0, done.stderr
     files = set(os.listdir(folder + b"/out"))
     assert {b"events.parquet", b"states.parquet", b"manifest.json"} <= files
+
+
+UNNEEDED = """
+import sys, netkf.cli.main
+netkf.cli.main.main(sys.argv[2:])
+print(*sys.modules, file=open(sys.argv[1], "w"))
+"""
+SHORT = ["run", RING, "--engine", "simpy", "--set", "horizon=1.0", "--no-plot"]
+PICTURES, NUMBERS = ("matplotlib", "networkx"), ("pandas", "simpy", "scipy.stats", "scipy.sparse")
+
+
+@pytest.mark.parametrize(
+    ("words", "unneeded"),
+    [
+        ([*SHORT, "--out", "{out}"], (*PICTURES, "pandas", "scipy.stats")),
+        (["run", "nowhere.toml"], (*PICTURES, *NUMBERS, "pyarrow", "netkf.theory.common")),
+        (["schema"], (*PICTURES, *NUMBERS, "pyarrow")),
+    ],
+)
+def test_commands_import_what_they_need(words, unneeded, tmp_path):
+    seen = tmp_path / "modules"
+    words = [word.format(out=tmp_path / "out") for word in words]
+    subprocess.run([sys.executable, "-c", UNNEEDED, seen, *words], capture_output=True, check=False)
+    assert not {*unneeded} & {*seen.read_text().split()}
+
+
+def cpu_seconds(*words):
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, *words], capture_output=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return sum(getattr(after, k) - getattr(before, k) for k in ("ru_utime", "ru_stime"))
+
+
+def test_a_short_run_costs_little_more_than_what_it_imports(tmp_path):
+    """Ratios of CPU, not of time: the machine may be busy. The first run compiles or loads."""
+    run = ["-m", "netkf", "run", RING, "--no-plot", "--out"]
+    cpu_seconds(*run, tmp_path / "first")
+    unit = min(cpu_seconds("-c", "import numpy, pandas") for _ in range(2))
+    assert min(cpu_seconds(*run, tmp_path / f"{k}") for k in range(2)) < 3.2 * unit
+    assert cpu_seconds("-m", "netkf", "run", "nowhere.toml") < 1.0 * unit
