@@ -15,6 +15,7 @@ from netkf.ensembles.pool import Pool
 from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
+from netkf.studies.help import BEYOND, describe_help
 from netkf.studies.metrics import central_trace, join_metrics
 from netkf.studies.targets import (
     MISSED,
@@ -81,6 +82,8 @@ class Sizing(NotebookTable):
     quantity : description of the computed quantity
     sure     : certainty of the result, and assumptions
     advice   : what to try next, or empty
+    central  : what the centralised filter has at ``value`` (or ``misses``), and which key would
+               help, or empty
     """
 
     key: str
@@ -94,6 +97,7 @@ class Sizing(NotebookTable):
     quantity: str
     sure: str
     advice: str = ""
+    central: str = ""
 
     def __bool__(self) -> bool:
         return self.value is not None
@@ -172,6 +176,8 @@ class Search:
             # One more value shows whether the quantity is monotone at all.
             middle = self._value_between(low, high)
             self._probe(low if middle is None else middle)
+        central = self._describe_central(misses if value is None else value)
+        hopeless = value is None and central.endswith(BEYOND) and not self.key.startswith("sensors")
         return Sizing(
             self.key,
             self.target,
@@ -183,8 +189,13 @@ class Search:
             tuple(self.probes),
             quantity,
             sure=self._describe_certainty(confidence, grows, value is None),
-            advice=self._advise(value, misses, grows),
+            advice="" if hopeless else self._advise(value, misses, grows),
+            central=central,
         )
+
+    def _describe_central(self, value: float | None) -> str:
+        described = "" if value is None else describe_help(self.at(value), self.target, self.key)
+        return described and f"at {self.key} = {value:g} {described}"
 
     def _bisect(self, value: float, misses: float) -> tuple[float, float]:
         """Return neighbouring values between ``value``, which meets the target, and ``misses``."""

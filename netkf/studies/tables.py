@@ -73,7 +73,7 @@ def format_sizing(sizing: Sizing) -> str:
         f"{sizing.target.quantity}: {sizing.quantity}",
         f"sure: {sizing.sure}",
     ]
-    lines += [sizing.advice] if sizing.advice else []
+    lines += [line for line in (sizing.central, sizing.advice) if line]
     return "\n".join(lines)
 
 

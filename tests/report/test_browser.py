@@ -218,9 +218,9 @@ def test_it_plays_scrubs_and_filters_by_keyboard_alone(files, look):
     page.keyboard.press(" ")
     for _ in range(50):  # wait_for_function evaluates texts, which the page forbids
         page.wait_for_timeout(50)
-        if page.evaluate(time) > 16.2:
+        if page.evaluate(time) > 8.2:
             break
-    assert page.evaluate(time) > 16.2
+    assert page.evaluate(time) > 8.2
     page.keyboard.press(" ")
     stopped = page.evaluate(time)
     page.wait_for_timeout(150)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.integrate
 import scipy.optimize
 import scipy.stats
 
@@ -583,6 +584,40 @@ def test_decisions_are_right_as_often_as_they_say(build):
             wrong += (probe.target == "missed") and exact[probe.value] <= limit
     assert wrong <= 5  # of 20 searches, each right as a whole with probability 0.9
     assert answers >= 5
+
+
+def test_a_search_says_what_the_centralised_filter_has_and_which_key_helps():
+    scenario = netkf.load(RING)
+    found = netkf.size(scenario, RATE, 0.5, 50.0, "worst_rms<=1.8", by="theory")
+    plant, sensor = scenario.plant, scenario.sensors[0]
+    G = len(sensor.nodes) * sensor.H.T @ np.linalg.inv(sensor.R) @ sensor.H
+
+    def flow(_, flat):
+        P = flat.reshape(2, 2)
+        return (plant.A @ P + P @ plant.A.T + plant.B @ plant.B.T - P @ G @ P).ravel()
+
+    times = scenario.times
+    P = scipy.integrate.solve_ivp(
+        flow, (0.0, times[-1]), plant.start_cov.ravel(), t_eval=times, rtol=1e-10, atol=1e-12
+    ).y
+    error = np.sqrt((P[0] + P[3])[1:].mean())
+    assert found.central.startswith(f"at {RATE} = {found.value:g} a centralised filter has RMS")
+    assert f"RMS error {error:.4g} there" in found.central
+    # The key that is named first helps most of those that the scenario has.
+    at = scenario.replace({RATE: found.value})
+    worst = {
+        key: bound_traces(at.replace({key: value})).max()
+        for key, value in (
+            ("network.channel.loss.delivery", 0.77),
+            ("filter.epsilon", 0.33),
+            ("sensors.0.R", [[0.25 / 1.1]]),
+        )
+    }
+    assert f"fall most with {min(worst, key=worst.get)} = " in found.central
+    hopeless = netkf.size(scenario, RATE, 10.0, 20.0, f"worst_rms<={0.9 * error}", by="theory")
+    assert not hopeless
+    assert "no exchange of messages reaches the limit" in hopeless.central
+    assert hopeless.advice == ""
 
 
 # Comparisons
