@@ -104,6 +104,16 @@ def parse_replica(text: str) -> int:
     return int(text)
 
 
+def parse_replica_or_rank(text: str) -> int | str:
+    """Return the value of ``--replica`` of a page; raises ArgumentTypeError."""
+    if text in ("worst", "median"):
+        return text
+    if text.isdecimal():
+        return parse_replica(text)
+    rule = "must be an integer of at least 0, worst or median"
+    raise argparse.ArgumentTypeError(f"{rule}, got {quote(text)}")
+
+
 def parse_node(text: str) -> str:
     """Return the id or the name of a node; raises ArgumentTypeError for a text that is neither."""
     if not text.strip() or len(text) > MAX_NAME:
@@ -408,7 +418,12 @@ COMMANDS = (
                 "one to compare with, or the verdict of the first"
             ),
             _out("file of the page (default: DIR/report.html)"),
-            _replica("recorded run to show (default: the first)"),
+            _option(
+                "--replica",
+                "recorded run to show: its number, worst or median (default: the first)",
+                type=parse_replica_or_rank,
+                metavar="K",
+            ),
             _trust("the directory"),
         ),
         takes_scenario=False,

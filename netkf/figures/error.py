@@ -135,7 +135,7 @@ def quantiles_figure(data: FigureData) -> Picture:
     headline = _mark_worst(axes, data, times, values, name)
     set_scale(axes, values)
     axes.margins(y=0.15)
-    axes.set(xlabel=SECONDS, ylabel=f"{label}, units of the state")
+    axes.set(xlabel=SECONDS, ylabel=f"{label}, {data.unit}")
     draw_legend(axes)
     values_of = "means over the runs" if data.runs > 1 else "this run"
     caption = data.caption(f"Quantiles over the nodes of {values_of}, at each sample.")

@@ -82,6 +82,11 @@ class FigureData:
         return (int(sizes[0]), 1.0) if np.ptp(sizes) == 0 else (1, sizes)
 
     @property
+    def unit(self) -> str:
+        """The unit of the states, for labels, in which a dollar sign is no formula."""
+        return self.scenario.unit.replace("$", r"\$")
+
+    @property
     def nodes(self) -> tuple[int, ...]:
         """The ids of the N nodes."""
         return self.scenario.nodes

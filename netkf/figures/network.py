@@ -50,8 +50,8 @@ def network_figure(data: FigureData) -> Picture:
 def error_label(data: FigureData) -> tuple[str, str]:
     """Return the key and the label of the nodes' errors, or of trace P without ground truth."""
     if data.shows_errors:
-        return "rms_error", "RMS error, units of the state"
-    return "mean_trace", "mean trace P, squared units of the state"
+        return "rms_error", f"RMS error, {data.unit}"
+    return "mean_trace", f"mean trace P, squared {data.unit}"
 
 
 def node_values(data: FigureData, key: str) -> dict[int, float]:

@@ -32,8 +32,7 @@ from netkf.runs.summary import (
 
 MAX_LINES = 60
 """Curves of single nodes in one panel; of larger networks evenly spaced nodes are drawn."""
-RMS_ERROR = "RMS error, units of the state"
-ROOT_TRACE = "root of trace P, units of the state"
+RMS_ERROR, ROOT_TRACE = "RMS error", "root of trace P"
 
 
 def select_evenly(indices: np.ndarray, max_count: int = MAX_LINES) -> np.ndarray:
@@ -104,7 +103,8 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
             draw_message(axes, NO_TRUTH)
             return
         draw_nodes(axes, data, data.first_component, se=None)
-        axes.set(ylabel="estimate, first component", xlabel=SECONDS)
+        label = f"estimate of {data.scenario.state_labels[0]}".replace("$", r"\$")
+        axes.set(ylabel=label, xlabel=SECONDS)
         shade_downtimes(axes, data)
         draw_legend(axes)
         return
@@ -120,7 +120,8 @@ def draw_errors(axes: Any, data: FigureData, bound: bool = False) -> None:
         curves.append(roots)
         _draw_bound(axes, data.times, roots)
     set_scale(axes, np.concatenate(curves))
-    axes.set(ylabel="error |x - xhat|" if data.runs == 1 else RMS_ERROR, xlabel=SECONDS)
+    name = "error |x - xhat|" if data.runs == 1 else RMS_ERROR
+    axes.set(ylabel=f"{name}, {data.unit}", xlabel=SECONDS)
     shade_downtimes(axes, data)
     draw_legend(axes)
 
@@ -135,7 +136,7 @@ def draw_covariances(axes: Any, data: FigureData) -> None:
     draw_promises(axes, data.times, data.promised)
     bound = data.promised.bound
     set_scale(axes, root if bound is None else np.concatenate([root, np.sqrt(bound)]))
-    axes.set(ylabel=ROOT_TRACE, xlabel=SECONDS)
+    axes.set(ylabel=f"{ROOT_TRACE}, {data.unit}", xlabel=SECONDS)
     shade_downtimes(axes, data)
     draw_legend(axes)
 

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from netkf.core.errors import errors_under
-from netkf.core.fields import Component, covariance, field, instance_of, vector
+from netkf.core.errors import ScenarioError, errors_under
+from netkf.core.fields import Component, covariance, field, instance_of, list_of, text, vector
 from netkf.core.instants import OnGrid, TimeGrid
 from netkf.linalg.arrays import FloatArray
 from netkf.linalg.portable import noise_root, product
@@ -26,7 +26,8 @@ class Plant(Component, OnGrid):
     """The contract of a plant, whose x(0) is Gaussian of ``mean`` (n,) and ``cov`` (n, n).
 
     Both are zero by default. ``input`` drives the state beside the noise (``response``); what the
-    methods of plants return is the state without it.
+    methods of plants return is the state without it. ``states`` are the names and ``units`` the
+    units of its n components, for figures and pages.
     """
 
     is_random: ClassVar[bool] = True
@@ -45,6 +46,25 @@ class Plant(Component, OnGrid):
     mean: FloatArray | None = field(vector, default=None)
     cov: FloatArray | None = field(covariance, default=None)
     input: Input | None = field(instance_of(Input), default=None)
+    states: tuple[str, ...] | None = field(list_of(text, "names"), default=None)
+    units: tuple[str, ...] | None = field(list_of(text, "units"), default=None)
+
+    def check_names(self) -> None:
+        """Raise ScenarioError unless there is a name and a unit for each component, or none."""
+        for key, given in (("states", self.states), ("units", self.units)):
+            if given is not None and len(given) != self.n:
+                rule = f"must be {self.n}, one for each component of the state"
+                raise ScenarioError(key, rule, list(given), "add or remove some")
+        names = list(self.states or ())
+        if len(set(names)) < len(names):
+            raise ScenarioError("states", "must differ from each other", names, "rename one")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the n components, such as ``x (m)``; empty where one has no name or unit."""
+        names, units = self.states or ("",) * self.n, self.units or ("",) * self.n
+        pairs = zip(names, (f"({unit})" if unit else "" for unit in units), strict=True)
+        return tuple(" ".join(filter(None, pair)) for pair in pairs)
 
     def on_grid(self, grid: TimeGrid) -> Self:
         """Return the plant with its instants, and those of its input, on the ``grid``."""

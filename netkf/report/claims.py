@@ -15,6 +15,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import describe_innovations
 from netkf.report.messages import information_age
+from netkf.report.replicas import describe_replica
 from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_samples
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
@@ -66,6 +67,9 @@ def describe_source(
     sentences = _describe_status(source)
     if source.kind == "ensemble":
         sentences += [*_describe_ensemble(source), *_describe_bound(source)]
+        if source.run is not None:
+            replica = source.run.replica
+            sentences.append(describe_replica(replica, source.runs, source.replicas))
     elif source.run is not None and len(source.run.times):
         sentences += _describe_worst_node(source, source.run, messages)
         sentences += [describe_innovations(readings)] if isinstance(readings, Innovations) else []

@@ -15,6 +15,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
+from netkf.report.replicas import Replicas, choose_replica, read_replicas
 from netkf.report.worst import WorstSamples, find_worst_samples
 from netkf.runs.documents import NUMBER, TEXT, TEXTS, require_form
 from netkf.runs.stored import StoredRun, read_checked_document
@@ -63,6 +64,11 @@ class ReportSource:
     sweep: StoredSweep | None = None
     filters: StoredComparison | None = None
     verdict: dict[str, Any] | None = None
+
+    @cached_property
+    def replicas(self) -> Replicas | None:
+        """The recorded runs of an ensemble by their errors, None unless several were kept."""
+        return None if self.ensemble is None else read_replicas(self.ensemble)
 
     @property
     def kind(self) -> str:
@@ -132,11 +138,14 @@ class ReportSource:
         return np.asarray(np.nextafter(ends, -np.inf))
 
 
-def read_source(directory: Path, replica: int | None = None, trust: bool = False) -> ReportSource:
+def read_source(
+    directory: Path, replica: int | str | None = None, trust: bool = False
+) -> ReportSource:
     """Return the contents of a directory that ``netkf run``, ``sweep``, ``check`` or
     ``compare-filters`` wrote.
 
-    ``replica`` chooses one of the recorded runs of an ensemble, by default the first. Of runs that
+    ``replica`` chooses one of the recorded runs of an ensemble, by default the first; it may be
+    ``"worst"`` or ``"median"``, by the RMS error of all nodes. Of runs that
     were interrupted or failed the part that was written is read. ``trust`` imports classes that
     the scenario names. Raises ScenarioError if netkf did not write the directory, or if its files
     were changed since.
@@ -179,13 +188,14 @@ def read_source(directory: Path, replica: int | None = None, trust: bool = False
 
 
 def _choose_run(
-    stored: StoredRun | StoredEnsemble, replica: int | None
+    stored: StoredRun | StoredEnsemble, replica: int | str | None
 ) -> tuple[StoredRun | None, StoredEnsemble | None]:
     if isinstance(stored, StoredRun):
         if replica is not None and replica != stored.replica:
             where = shorten(stored.directory)
             raise ScenarioError(where, "holds no replica", replica, "leave out --replica")
         return stored, None
+    replica = choose_replica(stored, replica)
     # Without a trace (events and samples) of any run there is nothing to animate.
     if replica is None and not (stored.directory / "states.parquet").exists():
         return None, stored

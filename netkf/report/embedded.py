@@ -35,10 +35,11 @@ class Page:
         return path
 
 
-def page(result: Any, other: Any = None, *, replica: int | None = None) -> Page:
+def page(result: Any, other: Any = None, *, replica: int | str | None = None) -> Page:
     """Return the page that ``netkf report`` writes of a result, or of two side by side: each is a
     run in memory, what ``netkf.open`` returns, or a directory. ``replica`` is the run of an
-    ensemble to show. Scenarios are read without trust, see ``netkf.open``.
+    ensemble to show, its number, "worst" or "median". Scenarios are read without trust, see
+    ``netkf.open``.
 
     Raises ScenarioError for what is no result, and WriteError.
     """

@@ -93,7 +93,7 @@ class _AnalysedSource(NamedTuple):
 def write_report(
     directories: Sequence[str | Path],
     out: Path | None = None,
-    replica: int | None = None,
+    replica: int | str | None = None,
     trust: bool = False,
 ) -> Path:
     """Write the page of one directory, or of two side by side, and return its path.
@@ -133,7 +133,7 @@ def _require_page(path: Path) -> None:
 
 def make_page(
     directories: Sequence[str | Path],
-    replica: int | None = None,
+    replica: int | str | None = None,
     trust: bool = False,
     out: Path | None = None,
 ) -> str:
@@ -168,7 +168,7 @@ def make_page(
         data_limits = data_limits.scaled(min(0.5, 0.9 * MAX_BYTES / size))
 
 
-def _analyse_directory(directory: Path, replica: int | None, trust: bool) -> _AnalysedSource:
+def _analyse_directory(directory: Path, replica: int | str | None, trust: bool) -> _AnalysedSource:
     """Read a directory and compute what takes long once; raises ScenarioError."""
     source = read_source(directory, replica, trust)
     if source.run is None:
@@ -320,7 +320,8 @@ def _main_sections(
     losses = [outcome_figures(source.run, source.label) for source in sources]
     if any(losses):
         columns = "".join(f"<div>{one}</div>" for one in losses)
-        parts.append(section("losses", "Losses", f'<div class="views">{columns}</div>'))
+        beside = ' class="views"' if len(losses) > 1 else ""
+        parts.append(section("losses", "Losses", f"<div{beside}>{columns}</div>"))
     results = "".join(_result_tables(source) for source in sources)
     parts.append(section("verdicts", "Verdicts and averages", results))
     scenarios = ""

@@ -14,6 +14,7 @@ from netkf.core.printable import shorten
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.markup import bullets, paragraph, table_box
+from netkf.report.replicas import spread_curves
 from netkf.runs.files import to_json_value
 from netkf.runs.summary import CONFIDENCE, nees_bounds
 from netkf.runs.tables import (
@@ -261,7 +262,8 @@ def ensemble_curves(source: ReportSource) -> dict[str, Any] | None:
         }
         if ensemble.bound is not None:
             nodes[str(node)]["bound"] = to_json_value(ensemble.bound[:, k].tolist())
-    return {"times": ensemble.times.tolist(), "nodes": nodes}
+    spread = spread_curves(source.replicas, ensemble.nodes)
+    return {"times": ensemble.times.tolist(), "nodes": nodes, "spread": spread}
 
 
 def difference_curves(source_a: ReportSource, source_b: ReportSource) -> dict[str, Any] | None:

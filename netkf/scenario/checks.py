@@ -133,6 +133,9 @@ def _check_entries(scenario: DerivedScenario, samples: float) -> None:
 
 def _check_plant(scenario: DerivedScenario) -> None:
     plant, n = scenario.plant, scenario.plant.n
+    for key, one in scenario.all_plants:
+        with errors_under(key):
+            one.check_names()
     if isinstance(plant, Diffusion):
         why = f"plant.A has {n} rows"
         require_shape("plant.B", plant.B, (n, None), why)

@@ -337,6 +337,34 @@ class ScenarioModel(Component):
         """The numbers (N,) of states that nodes estimate."""
         return np.asarray(self.is_estimated.sum(axis=1))
 
+    @cached_property
+    def state_labels(self) -> tuple[str, ...]:
+        """The labels (width,) of the columns x0, x1, ...: names and units that plants give, as
+        ``x (m)``; that of the column where they give none, or nodes estimate different states.
+        """
+        plants = [
+            (place, plant)
+            for place, (_, plant) in zip(self.layout.places, self.all_plants, strict=True)
+        ]
+        labels = {place.key: plant.labels for place, plant in plants}
+        columns: list[set[str]] = [set() for _ in range(self.width)]
+        for places in self.estimated:
+            named = [label for place in places for label in labels[place.key]]
+            for column, label in zip(columns, named, strict=False):
+                column.add(label)
+        return tuple(self._column_label(k, found) for k, found in enumerate(columns))
+
+    @staticmethod
+    def _column_label(k: int, found: set[str]) -> str:
+        label = found.pop() if len(found) == 1 else ""
+        return f"x{k} {label}".strip() if label[:1] in ("", "(") else label
+
+    @cached_property
+    def unit(self) -> str:
+        """The unit of all states, "units of the state" where they have none or different ones."""
+        units = {unit for _, plant in self.all_plants for unit in plant.units or ("",)}
+        return (units.pop() if len(units) == 1 else "") or "units of the state"
+
     @property
     def width(self) -> int:
         """The largest number of states that a node estimates."""

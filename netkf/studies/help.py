@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from netkf.core.errors import NetkfError
 from netkf.runs.tables import format_number
 from netkf.scenario.scenario import Scenario
@@ -78,8 +80,9 @@ def _candidates(scenario: Scenario) -> list[tuple[str, dict[str, Any], str]]:
         steps = [value * STEP, value / STEP] if name == "epsilon" else [value * STEP]
         steps = [min(step, 1.0) if name == "delivery" else step for step in steps]
         found += [(key, {key: s}, f"{s:.3g}") for s in steps if s != value]
-    noises = {f"sensors.{k}.R": getattr(one, "R", None) for k, one in enumerate(scenario.sensors)}
-    if noises and all(R is not None for R in noises.values()):
-        changes = {key: (R / STEP).tolist() for key, R in noises.items()}  # type: ignore[operator]
+    noises = [getattr(sensor, "R", None) for sensor in scenario.sensors]
+    known = [np.asarray(R) for R in noises if R is not None]
+    if known and len(known) == len(noises):
+        changes = {f"sensors.{k}.R": (R / STEP).tolist() for k, R in enumerate(known)}
         found.append(("sensors.*.R", changes, "less by a tenth"))
     return found

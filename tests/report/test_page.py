@@ -412,6 +412,45 @@ def test_two_runs_show_their_differences(ensembles):
     assert found == sorted(found)
 
 
+def test_a_page_of_an_ensemble_says_which_run_moves_and_how_runs_spread(ensembles):
+    states = pd.read_parquet(ensembles[0] / "states.parquet")
+    errors = np.sqrt(states[states["t"] > 0.0].groupby("run")["sq_error"].mean()).sort_values()
+    for replica, rank in ((None, None), ("worst", -1), ("median", (len(errors) - 1) // 2)):
+        page = Page(make_page(ensembles[:1], replica))
+        shown = 0 if rank is None else int(errors.index[rank])
+        assert page.data["runs"][0]["replica"] == shown
+        place = errors.index.get_loc(shown) + 1
+        words = f"The run that moves below is replica {shown} of 12, RMS error {errors[shown]:.4g}"
+        assert f"{words}, number {place} from the best" in page.shown
+    found = page.data["ensembles"][0]["spread"]["4"]
+    at = states[(states["node"] == 4) & (states["t"] == 3.0)]["sq_error"]
+    expected = np.sqrt(np.quantile(at, [0.5, 0.05, 0.95]))
+    np.testing.assert_allclose([curve[6] for curve in found], expected, rtol=1e-12)
+    with pytest.raises(ScenarioError, match="worst or median"):
+        make_page(ensembles[:1], "best")
+
+
+def test_states_have_their_names_and_units_on_pages_and_figures(ring, tmp_path):
+    names = {"plant.states": ["height", "speed"], "plant.units": ["m", "m/s"]}
+    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 2.0, **names})
+    assert scenario.unit == "units of the state"
+    run = netkf.simulate(scenario, engine="simpy")
+    page = Page(make_page([netkf.save(run, scenario, tmp_path / "named")]))
+    assert page.data["runs"][0]["states"] == ["height (m)", "speed (m/s)"]
+    assert netkf.open(tmp_path / "named").scenario.plant.states == ("height", "speed")
+    assert "xhat0" in run.states.columns  # columns of tables stay
+    metres = scenario.replace({"plant.units": ["m", "m"], "plant.states": ["x", "y"]})
+    assert netkf.simulate(metres, engine="simpy").plot().axes[0].get_ylabel().endswith(", m")
+    assert netkf.open(ring).scenario.state_labels == ("x0", "x1")
+    for key, value in (("states", ["x"]), ("states", ["x", "x"]), ("units", ["m"] * 3)):
+        with pytest.raises(ScenarioError, match=f"plant.{key}"):
+            scenario.replace({f"plant.{key}": value})
+    file = SCENARIOS / "blocks" / "cooperative_localisation.toml"
+    count = len(netkf.load(file).plants)
+    blocks = netkf.load(file, {f"plants.{k}.states": ["x", "y", "heading"] for k in range(count)})
+    assert blocks.state_labels == ("x", "y", "heading")
+
+
 def test_intervals_of_differences_over_time(ensembles):
     one, other = (read_source(directory) for directory in ensembles)
     found = difference_curves(one, other)

@@ -56,7 +56,7 @@ const Estimates = (() => {
     }
 
     function drawEllipses(context, width, height, nodes, x, [a, b], spans) {
-      const axes = frame(context, width, height, spans, ["x" + a, "x" + b]);
+      const axes = frame(context, width, height, spans, [run.states[a], run.states[b]]);
       nodes.forEach((s, i) => { if (i !== app.nodeOf(run)) ellipse(context, axes, s, a, b, false); });
       if (app.nodeOf(run) >= 0) ellipse(context, axes, nodes[app.nodeOf(run)], a, b, true);
       if (x) truth(context, axes.x(x[a]), axes.y(x[b]));
@@ -77,7 +77,7 @@ const Estimates = (() => {
     }
 
     function drawIntervals(context, width, height, nodes, x, a, span) {
-      const axes = frame(context, width, height, [[-0.7, run.N - 0.3], span], ["", "x" + a], run.names);
+      const axes = frame(context, width, height, [[-0.7, run.N - 0.3], span], ["", run.states[a]], run.names);
       if (x) {
         context.strokeStyle = Theme.colours.green;
         context.lineWidth = 2;

@@ -49,10 +49,19 @@ const Figures = (() => {
     });
   }
 
+  // How the runs of an ensemble spread about the one that moves.
+  function spread(app, r, name) {
+    const found = page.ensembles[r], entry = found && found.spread && found.spread[String(app.nodeId)];
+    if (!entry) return [];
+    const [y, low, high] = entry;
+    return [{ label: name + "error of node " + app.nodeId + ", median of all runs; shaded: 90 % of them", x: found.times, y, low, high, colour: coloured(page.runs, r, "purple"), width: 1, dash: "dashed" }];
+  }
+
   function errors(app, runs) {
     const series = [], lines = [];
     runs.forEach((run, r) => {
       const i = app.nodeOf(run), name = letter(runs, r), x = run.samples.t, colour = COLOURS[r];
+      series.push(...spread(app, r, name));
       if (run.truth) {
         const all = overNodes(run, run.samples.sq_error);
         series.push({ label: name + "all nodes, root mean square; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
@@ -68,7 +77,7 @@ const Figures = (() => {
     for (const [label, value] of Object.entries(runs[0].limits)) lines.push({ label: label + ", square root:", y: Math.sqrt(value), colour: "purple", dash: lines.length ? "dotted" : "dashed" });
     const truth = runs.some((run) => run.truth);
     const bound = runs.some((run) => run.samples.bound);
-    return { title: truth ? (bound ? "Error and bound" : "Error and uncertainty") : "Uncertainty and disagreement", unit: truth ? "|x - xhat|" : "units of the state", timed: true, series, lines,
+    return { title: truth ? (bound ? "Error and bound" : "Error and uncertainty") : "Uncertainty and disagreement", unit: (truth ? "|x - xhat|, " : "") + runs[0].unit, timed: true, series, lines,
       note: bound ? "One run: the bound is about the mean over runs." : truth ? "P is the covariance that the filter claims." : "Without truth there is no error." };
   }
 

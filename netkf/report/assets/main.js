@@ -141,11 +141,11 @@ function fillTables() {
 function nodeTable(run, r) {
   const state = State.at(run, app.time, 0), [a, b] = app.axes, n = run.n;
   const parts = a === b ? [a] : [a, b];
-  const header = ["node", ...parts.flatMap((c) => ["xhat" + c, "95 % +-"]), "trace P", "error", "NEES", "age of information"];
+  const header = ["node", ...parts.flatMap((c) => [run.states[c].replace(/^x(?=\d)/, "xhat"), "95 % +-"]), "trace P", "error", "NEES", "age of information"];
   const rows = state.nodes.map((s) => [s.node,
     ...parts.flatMap((c) => [Format.number(s.xhat[c]), Format.number(run.scale.interval * Math.sqrt(State.variance(s.P, n, c, c)))]),
     Format.number(s.trace), Format.number(s.error), Format.number(s.nees), Format.number(s.age)]);
-  const truth = state.x ? "; truth " + parts.map((c) => "x" + c + " = " + Format.number(state.x[c])).join(", ") : "; no truth that all share is known";
+  const truth = state.x ? "; truth " + parts.map((c) => run.states[c] + " = " + Format.number(state.x[c])).join(", ") : "; no truth that all share is known";
   const name = app.runs.length > 1 ? "AB"[r] + ": nodes" : "Nodes";
   return Format.table(name + " at the sample of " + Format.time(state.sample ?? NaN) + " s" + truth, header, rows);
 }
@@ -278,7 +278,7 @@ function setUpControls() {
   app.filter = usualFilter();
   app.axes = run.axes.map((c) => Math.min(c, least - 1));
   app.window = Sequence.usualWindow(run, app.nodeOf(run), app.time);
-  const parts = Array.from({ length: least }, (_, c) => [String(c), "x" + c]);
+  const parts = Array.from({ length: least }, (_, c) => [String(c), run.states[c]]);
   choose("speed", speeds.map((s) => [String(s), Format.number(s) + " s per s"]), app.speed, (v) => { app.speed = Number(v); });
   choose("filter", null, app.filter, (v) => { app.filter = v; });
   choose("axis-x", parts, app.axes[0], (v) => { app.axes[0] = Number(v); });

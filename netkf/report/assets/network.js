@@ -183,7 +183,7 @@ const Network = (() => {
       const smaller = [...new Set(app.axes)].map((c, d) => [c, shrunk[d]]).filter(([, part]) => part < 1);
       if (!smaller.length) return;
       context.textAlign = "right";
-      context.fillText("ellipses drawn smaller: " + smaller.map(([c, part]) => "x" + c + " " + Math.round(1 / part) + " times").join(", "), width - 8, height - 6);
+      context.fillText("ellipses drawn smaller: " + smaller.map(([c, part]) => run.states[c] + " " + Math.round(1 / part) + " times").join(", "), width - 8, height - 6);
       context.textAlign = "left";
     }
 
