@@ -269,26 +269,33 @@ def _judge_node(
         statistic, p = whiteness_p(columns, lags, level)
         correlation = _detectable_correlation(sum(map(len, columns)), lags * len(columns), level)
     stretch = find_stretch(nis, rows, np.array([one.sum() for one in whitened]))
-    contradictions = (
+    since, until = math.nan, math.nan
+    reasons = [reason for reason, holds in (
         (f"NIS above {high:.3g}", bool(law.kind) and mean > high),
         (f"NIS below {low:.3g}", law.kind in ("white", "exact") and mean < low),
         ("biased", bool(law.kind) and abs(bias) > reach),
         ("correlated", is_white and p < level),
-    )
-    reasons = [reason for reason, holds in contradictions if holds]
+    ) if holds]  # fmt: skip
     if is_white and not reasons and stretch.p < level:
         reasons.append("some readings are not like the others")
-    times = recorded.times[chosen]
-    since = times[stretch.first] if reasons and stretch.first else math.nan
-    until = times[stretch.end - 1] if reasons and stretch.end < len(times) else math.nan
-    ends = (("since", since), ("until", until))
-    reasons += [f"{word} {time:g} s" for word, time in ends if math.isfinite(time)]
+    if reasons:
+        since, until = _ends_of(stretch, recorded.times[chosen])
+        ends = (("since", since), ("until", until))
+        reasons += [f"{word} {time:g} s" for word, time in ends if math.isfinite(time)]
     verdict = f"BROKEN: {', '.join(reasons)}" if reasons else _unbroken(law, counted, mean < low)
     return NodeInnovations(
         node, len(chosen), mean, low, high, detectable, bias, reach, found, component, statistic,
         lags * len(columns), p, correlation, float(recorded.log_density[chosen].sum()),
-        float(since), float(until), verdict,
+        since, until, verdict,
     )  # fmt: skip
+
+
+def _ends_of(stretch: Stretch, times: FloatArray) -> tuple[float, float]:
+    """Return when a stretch of the readings of ``times`` (M,) begins and ends, seconds; nan where
+    it begins with the first or ends with the last.
+    """
+    since = float(times[stretch.first]) if stretch.first else math.nan
+    return since, float(times[stretch.end - 1]) if stretch.end < len(times) else math.nan
 
 
 def _unbroken(law: Law, counted: float, is_small: bool) -> str:
