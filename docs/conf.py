@@ -46,7 +46,10 @@ nitpick_ignore_regex = [
         r"|Progress|Coupling|StackedStates|Key|DiffusionChange|LinearChange|Course|Fault|Drawn|dict\[.*",
     ),
     # parts of the inside: states of filters, paths of sensors, base classes without public members
-    (r"py:class", r"netkf\.(algorithms|core|linalg|rng|network|plants|engines|trace|scenario)\..*"),
+    (
+        r"py:class",
+        r"netkf\.(algorithms|core|linalg|rng|network|plants|engines|trace|scenario|figures)\..*",
+    ),
     (
         r"py:class",
         r"netkf\.theory\..*|.*\.(ReplicaResult|PromisedTraces|Probe|Target|MessageKey|Quantity)"
