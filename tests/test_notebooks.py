@@ -16,6 +16,7 @@ def test_a_notebook_is_that_of_its_script(script):
     assert kept == notebook(script), "write it again: python -m tests.notebooks"
 
 
+@pytest.mark.slow
 def test_the_ten_minutes_are_the_same_on_the_page_and_in_the_notebook(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     _, _, error, run, _, alone, _, theory, size, verdict = run_cells(TUTORIAL.with_suffix(".ipynb"))

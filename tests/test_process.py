@@ -263,6 +263,7 @@ def cpu_seconds(*words):
     return sum(getattr(after, k) - getattr(before, k) for k in ("ru_utime", "ru_stime"))
 
 
+@pytest.mark.slow
 def test_a_short_run_costs_little_more_than_what_it_imports(tmp_path):
     """Ratios of CPU, not of time: the machine may be busy. The first run compiles or loads."""
     run = ["-m", "netkf", "run", RING, "--no-plot", "--out"]

@@ -138,6 +138,7 @@ def test_the_figures_of_the_intermittent_paper_are_drawn(tmp_path):
     assert out.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_figures_of_the_push_sum_paper_are_drawn(tmp_path, monkeypatch):
     figures = script("analysis", "push_sum_figures")
     monkeypatch.setattr(figures, "DELIVERIES", (0.8, 1.0))

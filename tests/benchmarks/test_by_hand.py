@@ -126,6 +126,7 @@ def test_means_over_runs_agree(make):
     agree(case, runs, results)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("slower")
 def test_nodes_that_hear_nothing_have_the_covariances_of_a_local_filter():
     case = cases.load("poisson_ring").replace({"network.channel.loss.delivery": 0.0})

@@ -70,6 +70,7 @@ def test_samples(cov, R, engine):
         assert np.linalg.norm(P - wanted) < limit * np.linalg.norm(wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cov", [1e8, 1e10])
 def test_nees_of_a_wide_start_is_what_it_should_be(cov):
     """It was -7393 where P had become indefinite."""

@@ -350,6 +350,7 @@ class Half(SharedLoss):
         return 0.5 * self.share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("law", "expected"), [(SharedLoss, "holds"), (Half, "broken")])
 def test_check_knows_the_share(scenario_of, law, expected):
     scenario = scenario_of(CLOCKS, *KINDS["shared"], horizon=60.0)

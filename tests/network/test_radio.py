@@ -56,6 +56,7 @@ def waits(run):
 AIR = 0.6
 
 
+@pytest.mark.slow
 def test_waiting_is_that_of_the_queue(scenario_of):
     # Poisson arrivals, constant service: the mean waiting time is D rho / (2 (1 - rho)).
     run = netkf.simulate(scenario_of(f"bits_per_second = {128 / AIR}", 8000.0), seed=1)

@@ -175,6 +175,7 @@ def held(scenario):
     return {row.assumption.split(":")[0]: (row.holds, row.evidence) for row in table.itertuples()}
 
 
+@pytest.mark.slow
 def test_assumptions_of_section_vi_hold_and_their_breaking_is_seen(regression):
     whole = held(regression)
     assert [name for name, (holds, _) in whole.items() if not holds] == [

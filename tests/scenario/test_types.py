@@ -228,6 +228,7 @@ def mypy(folder, **files):
     return result.stdout + result.stderr
 
 
+@pytest.mark.slow
 def test_mypy_accepts_classes_of_ones_own_and_finds_mistakes(tmp_path):
     pytest.importorskip("mypy")
     found = mypy(tmp_path, own=OWN, wrong=OWN + WRONG)

@@ -90,6 +90,7 @@ def searched(trials):
     return {f"size {name}": count(found[name], truth) for name, truth in truths.items()}
 
 
+@pytest.mark.slow
 def test_intervals_of_comparisons_and_searches_miss_as_often_as_they_say():
     assert wrong_sides() == []
 

@@ -37,6 +37,7 @@ def test_the_rate_that_keeps_the_age(pair):
     assert not found.grows
 
 
+@pytest.mark.slow
 def test_the_duty_cycle_that_stays_connected(pair):
     """Connected while node 1 is up too, and while 0 is the only one that is: always. With three
     nodes in a row and the middle asleep, not.

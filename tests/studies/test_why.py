@@ -346,6 +346,7 @@ def test_a_message_that_came_too_late_is_replayed_without_delay(runs, name, outc
     assert abs(outcome.trace - found.trace) > 1e-9
 
 
+@pytest.mark.slow
 def test_the_smallest_set_is_that_of_all_sets(tmp_path):
     scenario = make("diffusion", tmp_path, horizon=2.5)
     run, node, at = netkf.simulate(scenario), 2, 2.0

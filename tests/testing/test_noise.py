@@ -142,6 +142,7 @@ def test_slower_clocks_are_found(cls, monkeypatch):
     assert found_by(_check_clock, cls(rate=2.0)) >= 7
 
 
+@pytest.mark.slow
 def test_sound_channels_and_clocks_pass_at_other_seeds(monkeypatch):
     monkeypatch.setattr(noise, "LEVEL", 1e-4)
     monkeypatch.setattr("netkf.testing.clocks._check_entity", lambda *_: None)

@@ -176,6 +176,7 @@ def test_equal_numbers_pass_silently(name):
         assert compare(cls, settings, same_as_parent=True) is None
 
 
+@pytest.mark.slow
 def test_check_filter_compares_with_the_parent():
     with pytest.raises(AssertionError, match=r"LateStart.timing: must have the numbers of Gos"):
         check_filter(LateStart)

@@ -86,6 +86,7 @@ def test_probabilities_are_integrals_over_biases_that_the_filter_follows(scenari
         e = F * (e + K * z)
 
 
+@pytest.mark.slow
 def test_first_bad_readings_are_refused_so_often(scenario_of):
     scenario = scenario_of('{ kind = "biased", size = 1.5, since = 5.0 }', count=150, horizon=6.0)
     refused = 0

@@ -151,6 +151,7 @@ def test_invariant_samples_have_the_exact_law_of_the_scalar_example(delivery):
     np.testing.assert_array_equal(P, again[:, 0, 0])
 
 
+@pytest.mark.slow
 def test_a_single_draw_has_the_invariant_law_too():
     """Stopping at the first meeting would prefer draws with recent arrivals; 2000 seeds."""
     scipy_stats = pytest.importorskip("scipy.stats")

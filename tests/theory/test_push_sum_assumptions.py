@@ -105,6 +105,7 @@ def test_the_central_covariance_of_slots_is_that_after_the_reading():
     assert min(errors) > np.trace(after)
 
 
+@pytest.mark.slow
 def test_netkf_theory_shows_both_kinds_of_gamma(tmp_path, capsys):
     path = tmp_path / "planar.toml"
     path.write_text(to_toml(resolve_defaults(planar(2, 0.7, delta=1.01 * RHO_T1))))
@@ -125,6 +126,7 @@ def test_netkf_theory_shows_both_kinds_of_gamma(tmp_path, capsys):
     assert "1412" in text
 
 
+@pytest.mark.slow
 def test_what_does_not_exist_has_a_reason():
     found = compute_promises(planar(1, 0.5))["push_sum"]
     assert found["error_traces"]["value"] is None

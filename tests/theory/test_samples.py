@@ -170,6 +170,7 @@ def test_many_vague_samples_are_increments(build):
         assert found[-1] < 1e-3
 
 
+@pytest.mark.slow
 def test_the_steady_state_is_where_the_bound_settles(build):
     for activation in (
         {"kind": "poisson", "rate": 2.0, "at": "nodes"},
