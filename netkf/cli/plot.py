@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.errors import ScenarioError, suggest_nearest
+from netkf.core.extras import missing
 from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
 
@@ -17,8 +18,7 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.studies.opening import open as open_directory
 
     if find_spec("matplotlib") is None:
-        rule, remedy = "needs matplotlib", "install it: pip install 'netkf[plot]'"
-        raise ScenarioError("plot", rule, None, remedy)
+        raise missing("matplotlib", "plot", "plot")
     # Empty: all figures.
     names = tuple(name for text in options.figure for name in _figure_names(text))
     has_several = len(options.directories) > 1

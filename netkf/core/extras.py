@@ -18,5 +18,10 @@ def require(module: str, extra: str, user: str) -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != package:
             raise
-        rule, remedy = f"needs {package}", f"install it: pip install 'netkf[{extra}]'"
-        raise ScenarioError(user, rule, None, remedy) from None
+        raise missing(package, extra, user) from None
+
+
+def missing(package: str, extra: str, user: str) -> ScenarioError:
+    """Return the error that says what to install for ``user``, which needs a ``package``."""
+    remedy = f"install it: pip install 'netkf[{extra}]'"
+    return ScenarioError(user, f"needs {package}", None, remedy)

@@ -16,7 +16,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,6 +26,7 @@ import numpy as np
 from netkf.core.errors import EngineError
 from netkf.ensembles.merge_tree import MergeTree
 from netkf.ensembles.moments import Moments
+from netkf.ensembles.pool import MAX_BLOCK
 from netkf.ensembles.replicas import Node
 from netkf.ensembles.statistics import MESSAGES, RunStatistics, Trace, merge
 from netkf.runs.documents import MAX_COUNT, DamagedError, reading_file
@@ -44,6 +45,8 @@ PARTS = (
 MARK = b"\nsha256 "  # begins the last line of a block's file
 SEAL_BYTES = len(MARK) + 64  # length of that line, with the SHA-256 in hexadecimal
 CHUNK = 1 << 20  # bytes hashed at once
+MAX_TRACED_BLOCK = 8
+"""Largest number of runs in a block where all runs leave a trace: their events are in memory."""
 TRACED = {"full": MAX_COUNT, "first": 1, "none": 0}
 """Number of the first runs that leave a trace, by the option ``trace``."""
 FIRST_WRITE, WRITE_SHARE = 10.0, 0.2
@@ -71,6 +74,15 @@ class RunIdentity:
     def traces(self) -> int:
         """Number of replicas that leave a trace."""
         return min(self.runs, TRACED[self.trace])
+
+    @property
+    def max_block(self) -> int:
+        """Largest number of replicas in a block."""
+        return MAX_TRACED_BLOCK if self.trace == "full" else MAX_BLOCK
+
+    def runs_of(self, node: Node) -> int:
+        """Return the number of runs of a node, which may reach beyond the last one."""
+        return min(sum(node), self.runs) - node[0]
 
     def of(self, node: Node) -> dict[str, Any]:
         """Return the identity of the block of a node, if its runs are simulated here."""
@@ -121,14 +133,10 @@ class BlockCheckpoints:
                 if not any_installation:
                     with contextlib.suppress(OSError):
                         file.unlink()
-        end = 0
-        # Nodes that overlap contain each other: the larger one, which comes first, is taken.
-        for node in sorted(found, key=lambda node: (node[0], -node[1])):
-            if node[0] >= end:
-                self._nodes.add(node)
-                end = sum(node)
-                if found[node] not in self.installations:
-                    self.installations.append(found[node])
+        for node in _outermost(found):
+            self._nodes.add(node)
+            if found[node] not in self.installations:
+                self.installations.append(found[node])
         return sorted(self._nodes), _describe(bad)
 
     def readable(self, scenario_digest: str, seed: int) -> list[RunStatistics]:
@@ -137,18 +145,16 @@ class BlockCheckpoints:
 
         They serve to show the results of an interrupted ensemble, not to resume it.
         """
-        statistics = []
+        found, statistics = [], []
         identity = {"scenario": scenario_digest, "seed": seed}
-        end = 0
-        for file in sorted(self._block_paths(), key=_order):
+        for file in self._block_paths():
             with contextlib.suppress(DamagedError):
-                start, size = _node_of(file)
-                if start < end:
-                    continue  # in a larger one
+                start, size = node = _node_of(file)
                 self._check(file, {**identity, "start": start, "size": size})
-                with _open_block(file) as arrays:
-                    statistics.append(_restore_statistics(arrays))
-                end = start + size
+                found.append(node)
+        for node in _outermost(found):
+            with contextlib.suppress(DamagedError), _open_block(self._block_path(node)) as arrays:
+                statistics.append(_restore_statistics(arrays))
         return statistics
 
     def add(self, node: Node, statistics: RunStatistics, identity: RunIdentity) -> RunStatistics:
@@ -225,7 +231,7 @@ class BlockCheckpoints:
 
     def _block_path(self, node: Node) -> Path:
         """Return the path of the block of a node."""
-        return self._folder / f"{node[0]:09d}-{node[1]}.npz"
+        return self._folder / _name_of(node)
 
     def _check(self, file: Path, identity: dict[str, Any]) -> dict[str, Any]:
         """Return the stored identity of a block; raises DamagedError unless its file is intact."""
@@ -318,23 +324,28 @@ class BlockCheckpoints:
             raise EngineError(f"{message}; {remedy}, which does it again") from None
 
 
+def _name_of(node: Node) -> str:
+    return f"{node[0]:09d}-{node[1]}.npz"
+
+
 def _node_of(file: Path) -> Node:
     """Return the node whose name a block's file has; raises DamagedError if there is none."""
     start, _, size = file.stem.partition("-")
-    if not (start.isdecimal() and size.isdecimal() and len(start) < 16 and len(size) < 16):
-        raise DamagedError("has a name that no block has")
-    node = int(start), int(size)
-    if node[1] & (node[1] - 1) or node[1] == 0 or node[0] % node[1]:
-        raise DamagedError("has a name that no block has")
-    return node
+    if start.isdecimal() and size.isdecimal() and len(start) < 16 and len(size) < 16:
+        node = int(start), int(size)
+        is_node = node[1] > 0 and node[1] & (node[1] - 1) == 0 and node[0] % node[1] == 0
+        if is_node and file.name == _name_of(node):
+            return node
+    raise DamagedError("has a name that no block has")
 
 
-def _order(file: Path) -> tuple[int, int]:
-    """Sort files by their first run, the largest block first."""
-    with contextlib.suppress(DamagedError):
-        start, size = _node_of(file)
-        return start, -size
-    return -1, 0
+def _outermost(nodes: Iterable[Node]) -> Iterator[Node]:
+    """Yield the nodes that are in no other one, in order: nodes that overlap contain each other."""
+    end = 0
+    for node in sorted(nodes, key=lambda node: (node[0], -node[1])):
+        if node[0] >= end:
+            yield node
+            end = sum(node)
 
 
 def _describe(bad: list[tuple[str, str]]) -> list[str]:

@@ -15,7 +15,7 @@ from netkf.core.fields import integer, one_of
 from netkf.engines.base import Engine
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
-from netkf.ensembles.pool import MAX_BLOCK, Pool
+from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
 from netkf.ensembles.replicas import BlockStore, Node, Progress, replicate_blocks
 from netkf.ensembles.resume import is_finished
@@ -38,7 +38,6 @@ from netkf.scenario.scenario import Scenario
 from netkf.trace.run import StateSamples
 
 TRACES = ("full", "first", "none")
-MAX_TRACED_BLOCK = 8
 NOTE_SECONDS = 1.0
 """Least number of seconds between two updates of the number of finished runs in the manifest."""
 
@@ -213,18 +212,19 @@ class DirectoryWriter:
         # The manifest comes first: if the process is killed, it states that the run is unfinished.
         self.note()
         write_scenario(self.directory, self.scenario)
-        lines = self.find_blocks()
-        if note is not None:
-            for line in lines:
-                note(line)
+        self.find_blocks(note)
         if self.known:
             self.note()
 
-    def find_blocks(self, any_installation: bool = False) -> list[str]:
-        """Find the stored blocks; return lines for the user about others."""
+    def find_blocks(
+        self, note: Callable[[str], None] | None, any_installation: bool = False
+    ) -> None:
+        """Find the stored blocks; ``note`` is called with lines for the user about others."""
         self.known, lines = self.blocks.find(self.plan, any_installation)
-        self._done = sum(map(self._runs_of, self.known))
-        return lines
+        self._done = sum(map(self.plan.runs_of, self.known))
+        if note is not None:
+            for line in lines:
+                note(line)
 
     def simulate(self, engine: Engine, pool: Pool, progress: Progress | None) -> RunStatistics:
         """Return the statistics of all runs: stored blocks are read, others simulated."""
@@ -232,7 +232,7 @@ class DirectoryWriter:
         store = BlockStore(
             {node: partial(self.blocks.load, node) for node in self.known},
             self._add,
-            MAX_TRACED_BLOCK if plan.trace == "full" else MAX_BLOCK,
+            plan.max_block,
         )
         statistics: RunStatistics = replicate_blocks(
             partial(block_statistics, engine=engine, traces=plan.traces),
@@ -245,14 +245,11 @@ class DirectoryWriter:
         )
         return statistics
 
-    def _runs_of(self, node: Node) -> int:
-        return min(sum(node), self.plan.runs) - node[0]
-
     def _add(self, node: Node, statistics: RunStatistics) -> RunStatistics:
         """Keep the statistics of a block; return them without traces, which fill the memory."""
         without_traces = self.blocks.add(node, statistics, self.plan)
-        self._done += self._runs_of(node)
-        self.simulated += self._runs_of(node)
+        self._done += self.plan.runs_of(node)
+        self.simulated += self.plan.runs_of(node)
         if time.monotonic() - self._last_note >= NOTE_SECONDS:
             self.note()  # writes the number of runs done to the manifest
         return without_traces

@@ -19,7 +19,6 @@ from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer, one_of
 from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
 from netkf.ensembles.directory import (
-    MAX_TRACED_BLOCK,
     TRACES,
     DirectoryWriter,
     EnsembleOptions,
@@ -27,7 +26,6 @@ from netkf.ensembles.directory import (
     identify_runs,
     write_files,
 )
-from netkf.ensembles.pool import MAX_BLOCK
 from netkf.ensembles.pools import LocalPool, PoolOptions, make_pool
 from netkf.ensembles.replicas import BlockStore, Progress, missing_ranges, replicate_blocks
 from netkf.ensembles.resume import read_manifest
@@ -213,7 +211,7 @@ def work_on_plan(
     def add(node: tuple[int, int], statistics: Any) -> None:
         nonlocal simulated, slowest, begun
         blocks.add(node, statistics, identity)
-        simulated += min(sum(node), identity.runs) - node[0]
+        simulated += identity.runs_of(node)
         slowest, begun = max(slowest, time.monotonic() - begun), time.monotonic()
         if progress is not None:
             progress(simulated, wanted)
@@ -221,7 +219,7 @@ def work_on_plan(
     store = BlockStore(
         dict.fromkeys(known, _nothing),
         add,
-        MAX_TRACED_BLOCK if identity.trace == "full" else MAX_BLOCK,
+        identity.max_block,
         replicas,
         # The next block may take as long as the slowest, and none helps that was merged already.
         lambda: time.monotonic() + slowest > deadline or _was_merged(plan.directory),
@@ -276,9 +274,7 @@ def merge_plan(
     """
     started = time.perf_counter()
     writer = DirectoryWriter(plan.scenario, plan.directory, plan.identity, plan.tasks)
-    lines = writer.find_blocks(any_installation=True)
-    for line in lines if note is not None else ():
-        note(line)  # type: ignore[misc]
+    writer.find_blocks(note, any_installation=True)
     missing = list(missing_ranges(writer.known, range(plan.identity.runs)))
     if missing:
         return missing

@@ -100,7 +100,7 @@ def _headline(curves: Sequence[ErrorCurve]) -> str:
     sentence = f"{name} has the smallest mean square error after time 0, {best:.3g}"
     if len(means) == 1:
         return f"{name}: mean square error {best:.3g} after time 0"
-    return f"{sentence}; {last} {worst:.3g}" if math.isfinite(worst) else f"{sentence}"
+    return f"{sentence}; {last} {worst:.3g}" if math.isfinite(worst) else sentence
 
 
 def curves_of(

@@ -51,6 +51,7 @@ class ReportSource:
     manifest      : the contents of manifest.json
     scenario_text : the scenario file
     run           : the recorded run, or one recorded run of an ensemble, with its trace
+    replicas      : the recorded runs of an ensemble by their errors, if several were kept
     filters       : a comparison of filters
     verdict       : the contents of verdict.json
     """
@@ -61,14 +62,10 @@ class ReportSource:
     scenario_text: str
     run: StoredRun | None = None
     ensemble: StoredEnsemble | None = None
+    replicas: Replicas | None = None
     sweep: StoredSweep | None = None
     filters: StoredComparison | None = None
     verdict: dict[str, Any] | None = None
-
-    @cached_property
-    def replicas(self) -> Replicas | None:
-        """The recorded runs of an ensemble by their errors, None unless several were kept."""
-        return None if self.ensemble is None else read_replicas(self.ensemble)
 
     @property
     def kind(self) -> str:
@@ -173,7 +170,8 @@ def read_source(
     if stored.summary:
         with damage_named(directory):
             require_form(stored.summary, SUMMARY, "summary.json")
-    run, ensemble = _choose_run(stored, replica)
+    ensemble = stored if isinstance(stored, StoredEnsemble) else None
+    replicas = None if ensemble is None else read_replicas(ensemble)
     scenario = stored.scenario
     assert isinstance(scenario, Scenario)
     return ReportSource(
@@ -181,22 +179,23 @@ def read_source(
         manifest=stored.manifest,
         scenario=scenario,
         scenario_text=text,
-        run=run,
+        run=_choose_run(stored, replicas, replica),
         ensemble=ensemble,
+        replicas=replicas,
         verdict=verdict,
     )
 
 
 def _choose_run(
-    stored: StoredRun | StoredEnsemble, replica: int | str | None
-) -> tuple[StoredRun | None, StoredEnsemble | None]:
+    stored: StoredRun | StoredEnsemble, replicas: Replicas | None, replica: int | str | None
+) -> StoredRun | None:
     if isinstance(stored, StoredRun):
         if replica is not None and replica != stored.replica:
             where = shorten(stored.directory)
             raise ScenarioError(where, "holds no replica", replica, "leave out --replica")
-        return stored, None
-    replica = choose_replica(stored, replica)
+        return stored
+    replica = choose_replica(stored, replicas, replica)
     # Without a trace (events and samples) of any run there is nothing to animate.
     if replica is None and not (stored.directory / "states.parquet").exists():
-        return None, stored
-    return stored.replica(replica or 0), stored
+        return None
+    return stored.replica(replica or 0)

@@ -34,9 +34,9 @@ class Replicas(NamedTuple):
     errors: FloatArray
     spread: FloatArray
 
-    def number(self, rank: str) -> int:
-        """Return the replica of a rank, ``worst`` or ``median``."""
-        return int(self.numbers[-1 if rank == "worst" else (len(self.numbers) - 1) // 2])
+    def place(self, rank: str) -> int:
+        """Return the place in ``numbers`` of a rank, ``worst`` or ``median``."""
+        return len(self.numbers) - 1 if rank == "worst" else (len(self.numbers) - 1) // 2
 
 
 def read_replicas(stored: StoredEnsemble) -> Replicas | None:
@@ -57,18 +57,21 @@ def read_replicas(stored: StoredEnsemble) -> Replicas | None:
     return Replicas(numbers, np.sqrt(after.to_numpy()), roots.reshape(shape))
 
 
-def choose_replica(stored: StoredEnsemble, replica: int | str | None) -> int | None:
-    """Return the number of the ``replica`` asked for, by number or rank; raises ScenarioError."""
+def choose_replica(
+    stored: StoredEnsemble, found: Replicas | None, replica: int | str | None
+) -> int | None:
+    """Return the number of the ``replica`` asked for, by number or by rank among those ``found``;
+    raises ScenarioError.
+    """
     if not isinstance(replica, str):
         return replica
     if replica not in RANKS:
         rule = f"must be a number, {' or '.join(RANKS)}"
         raise ScenarioError("replica", rule, replica, "correct it")
-    found = read_replicas(stored)
     if found is None:
         where, rule = shorten(Path(stored.directory)), "has not kept the errors of several runs"
         raise ScenarioError(where, rule, None, "run it with --trace full")
-    return found.number(replica)
+    return int(found.numbers[found.place(replica)])
 
 
 def describe_replica(shown: int, runs: int, replicas: Replicas | None) -> str:
@@ -81,12 +84,8 @@ def describe_replica(shown: int, runs: int, replicas: Replicas | None) -> str:
         sentence += f", RMS error {format_number(float(replicas.errors[place]))}, number "
         sentence += f"{place + 1} from the best"
     ends = [
-        f"{rank} is {replicas.number(rank)} ({format_number(float(error))})"
-        for rank, error in zip(
-            RANKS,
-            (replicas.errors[-1], replicas.errors[(len(replicas.errors) - 1) // 2]),
-            strict=True,
-        )
+        f"{rank} is {replicas.numbers[k]} ({format_number(float(replicas.errors[k]))})"
+        for rank, k in ((rank, replicas.place(rank)) for rank in RANKS)
     ]
     return (
         f"{sentence}. Of {len(replicas.numbers):,} recorded runs the {', the '.join(ends)}: "

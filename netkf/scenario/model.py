@@ -342,11 +342,10 @@ class ScenarioModel(Component):
         """The labels (width,) of the columns x0, x1, ...: names and units that plants give, as
         ``x (m)``; that of the column where they give none, or nodes estimate different states.
         """
-        plants = [
-            (place, plant)
+        labels = {
+            place.key: plant.labels
             for place, (_, plant) in zip(self.layout.places, self.all_plants, strict=True)
-        ]
-        labels = {place.key: plant.labels for place, plant in plants}
+        }
         columns: list[set[str]] = [set() for _ in range(self.width)]
         for places in self.estimated:
             named = [label for place in places for label in labels[place.key]]
