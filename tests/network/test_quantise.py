@@ -198,3 +198,17 @@ def test_what_has_no_meaning_is_refused(scenario_of, changes, key):
         scenario_of().replace(changes)
     assert key in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_is_drawn_does_not_depend_on_who_hears(scenario_of, tmp_path):
+    """Nobody hears a node whose receivers are down: its channel loses that message in the twin."""
+    text = (scenario_of() and (tmp_path / "bits.toml").read_text()).replace(
+        "[filter]",
+        '[[network.lives]]\nkind = "duty"\nnodes = [1, 2]\nperiod = 7.0\nup = 4.0\n[filter]',
+    )
+    (tmp_path / "down.toml").write_text(text)
+    run = netkf.simulate(netkf.load(tmp_path / "down.toml"), engine="simpy")
+    assert run.count("lost") > 0
+    netkf.export_recorded(run, tmp_path / "twin")
+    twin = netkf.simulate(netkf.load(tmp_path / "twin" / "scenario.toml"), engine="simpy")
+    np.testing.assert_array_equal(twin.xhat, run.xhat)

@@ -148,6 +148,8 @@ class Transmitter:
         append = self._recorder.append
         # Lost messages are numbered too: a recorded loss names a message by its number.
         append((now, SEND, sender, receiver, number, phase, NAN))
+        # Lost ones take their dither too: what is drawn must not depend on what is heard.
+        payload = self._encode(sender, payload, phase)
         if self.broadcasts is not None and outcome is not LINK_DOWN:
             outcome = self.broadcasts.over(sender, outcome)
         sent = direction.first
@@ -166,7 +168,6 @@ class Transmitter:
         if math.isnan(delay):
             append((now, LOST, sender, receiver, number, phase, NAN))
             return
-        payload = self._encode(sender, payload, phase)
         envelope = Envelope(sender, number, direction.weight, payload, now, exchange)
         # No event for a message without delay: it arrives inside the tick.
         if delay == 0.0:
