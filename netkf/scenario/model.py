@@ -696,11 +696,13 @@ class ScenarioModel(Component):
         if radio.queue == "wait":
             return math.inf
         phases = range((self.node_filter.timing.schedule or ()).count("exchange"))
-        largest = max(
+        sizes = (
             self.message_size(node, phase)
             for node in self.nodes
             for phase in (phases if self.slotted else (-1,))
         )
+        # The central filter sends nothing.
+        largest = max(sizes, default=0)
         return longest + radio.seconds(largest)
 
     def mean_delivery(self, link: Link) -> float:

@@ -5,6 +5,7 @@ import pytest
 
 import netkf
 from netkf.trace.schema import CODES
+from tests.conftest import SCENARIOS
 
 SCENARIO = """
 format = 1
@@ -116,3 +117,11 @@ def test_check_of_a_busy_radio_promises_nothing_of_arrivals(scenario_of):
         radio = f'bits_per_second = {128 / AIR}, queue = "{queue}"'
         table = netkf.check(scenario_of(radio, 60.0), runs=20, seed=1).table
         assert "broken" not in set(table["verdict"]), table[table["verdict"] == "broken"]
+
+
+def test_a_filter_that_exchanges_nothing_in_a_slot_has_no_longest_message():
+    radio = {"bits_per_second": 20000.0, "queue": "drop"}
+    scenario = netkf.load(SCENARIOS / "push_sum_planar.toml").replace({"network.radio": radio})
+    assert scenario.longest_delay > 0.0
+    for kind in ("central", "local"):
+        assert scenario.replace({"filter": {"kind": kind}}).longest_delay == 0.0
