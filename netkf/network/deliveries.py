@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.core.fields import field, instance_of
+from netkf.linalg.arrays import FloatArray
 from netkf.network.delays import Delay
 from netkf.network.graphs import Link, Topology
-from netkf.network.losses import Loss, Transmission
+from netkf.network.losses import Loss, Transmission, delivery_probabilities
 
 
 class MessageKey(NamedTuple):
@@ -33,8 +34,32 @@ class Deliveries:
     """
 
     def __init__(self) -> None:
-        self.chosen: Chosen | None = frozenset()
-        self.without_delay: Chosen = frozenset()
+        self.choose(frozenset())
+        self._given: dict[tuple[Link, int, int], FloatArray] = {}
+
+    def choose(self, chosen: Chosen | None, without_delay: Chosen = frozenset()) -> None:
+        """Deliver these messages in the next replay."""
+        self.chosen, self.without_delay = chosen, without_delay
+        self._numbers: dict[Link, list[int]] = {}
+        for sender, receiver, message in chosen or ():
+            self._numbers.setdefault((sender, receiver), []).append(message)
+
+    def given(self, loss: Loss, sent: Transmission) -> FloatArray:
+        """Return the delivery probabilities (K,) in the run, by its ``loss``, of the messages
+        ``sent``: those that a link carries, and when, are the same in each replay.
+        """
+        key = sent.link, int(sent.number[0]) if len(sent.number) else 0, len(sent.number)
+        if key not in self._given:
+            self._given[key] = delivery_probabilities(loss, sent)
+        return self._given[key]
+
+    def are_chosen(self, link: Link, numbers: np.ndarray) -> np.ndarray:
+        """Return (K,) bool: which messages of a directed link, of these ``numbers``, are chosen."""
+        if self.chosen is None:
+            return np.ones(len(numbers), dtype=bool)
+        # Sorted, and beyond all numbers in the end: quicker than np.isin of so few.
+        chosen = np.array([*sorted(self._numbers.get(link, ())), np.iinfo(np.int64).max])
+        return np.asarray(chosen[np.searchsorted(chosen, numbers)] == numbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +70,7 @@ class DeliveringLoss(Loss):
     """
 
     independent = False
+    vectorised = True
 
     given: Loss = field(instance_of(Loss))
     # A mutable object, set before each replay: one scenario with its cached tables serves all.
@@ -83,12 +109,15 @@ class DeliveringLoss(Loss):
         """Return the next state of the channel, True if it is bad, by the model ``given``."""
         return self.given.next_state(link, bad, random)
 
-    def delivery_probability(self, sent: Transmission) -> float:
+    def delivery_probability(self, sent: Transmission) -> Any:
         """Return 1 for messages that the replay delivers, else the given probability."""
         chosen = self.deliveries.chosen
-        if chosen is None or (*sent.link, sent.number) in chosen:
-            return 1.0
-        return float(self.given.delivery_probability(sent))
+        if np.ndim(sent.number) == 0:
+            is_chosen = chosen is None or (*sent.link, sent.number) in chosen
+            return 1.0 if is_chosen else self.given.delivery_probability(sent)
+        values = self.deliveries.given(self.given, sent).copy()
+        values[self.deliveries.are_chosen(sent.link, sent.number)] = 1.0
+        return values
 
     def mean_delivery(self, sent: Transmission) -> float:
         """Return nan: this is one outcome, not a law."""

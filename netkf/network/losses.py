@@ -515,9 +515,10 @@ def checked_delivery_probability(loss: Loss, sent: Transmission) -> float:
 
 
 def _demand_probabilities(loss: Loss, sent: Transmission, values: FloatArray) -> None:
-    wrong = np.flatnonzero(~((values >= 0.0) & (values <= 1.0)))
-    if not wrong.size:
+    is_right = (values >= 0.0) & (values <= 1.0)
+    if is_right.all():
         return
+    wrong = np.flatnonzero(~is_right)
     number = np.ravel(sent.number)[wrong[0]]
     rule = (
         f"{type(loss).__name__}: the delivery probability of message {number} on link "

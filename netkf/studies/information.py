@@ -63,6 +63,13 @@ class Messages:
         """Return the identity of message ``m``."""
         return MessageKey(int(self.sender[m]), int(self.receiver[m]), int(self.number[m]))
 
+    def keys(self, messages: IntArray) -> list[MessageKey]:
+        """Return the identities of the K ``messages`` (K,)."""
+        columns = (
+            column[messages].tolist() for column in (self.sender, self.receiver, self.number)
+        )
+        return list(map(MessageKey, *columns))
+
 
 def match_messages(log: IntArray, swaps: bool, slotted: bool) -> Messages:
     """Return the M messages of an EVENT ``log`` (E,): when each was sent, arrived and used, or why

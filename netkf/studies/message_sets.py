@@ -21,6 +21,8 @@ NEGLIGIBLE = 1e-2
 """The oldest messages are left out if all of them together change the trace by less than this share
 of its distance from the limit.
 """
+COARSENESS = 16
+"""At most one of so many candidates stays though it and all older ones are negligible together."""
 MAX_SETS = 300_000
 """Largest number of sets of one size that are sorted at once."""
 
@@ -144,7 +146,8 @@ class _Search:
             return abs(self.trace(keys) - base) <= tolerance
 
         low, high = 0, len(candidates)
-        while low < high:
+        # To the message if they are few: with a long run's, the replays serve better in the search.
+        while high - low > len(candidates) // COARSENESS:
             middle = (low + high + 1) // 2
             if are_negligible(middle):
                 low = middle
@@ -158,6 +161,8 @@ class _Search:
         """Return a set of ``size`` that reaches the limit, or None, and whether all were tried."""
         best_set: tuple[MessageKey, ...] | None = None
         best_trace = math.inf
+        if self._replayer.count >= max_count and len(candidates) >= size:
+            return None, False
         sets, all_listed = self._list_sets(candidates, size)
         for keys in sets:
             if self._replayer.count >= max_count:
@@ -175,7 +180,9 @@ class _Search:
     ) -> tuple[Iterator[tuple[MessageKey, ...]], bool]:
         """Return sets by decreasing expected gain (at most MAX_SETS), and whether these are all."""
         single_gains = {c.key: self._gains.get((c.key,), 0.0) for c in candidates}
-        ranked = sorted(candidates, key=lambda c: (-single_gains[c.key], -c.sent))
+        times = np.array([c.sent for c in candidates])
+        gains = np.array(list(single_gains.values()))
+        ranked = [candidates[k] for k in np.lexsort((-times, -gains)).tolist()]
         count = len(ranked)
         while math.comb(count, size) > MAX_SETS:
             count = max(size, int(0.9 * count))

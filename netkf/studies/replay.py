@@ -88,7 +88,7 @@ class Replayer:
         scenario = self.scenario
         messages = match_messages(self.log, scenario.node_filter.analysis.swaps, scenario.slotted)
         unused = np.flatnonzero(np.isin(messages.outcome, (LATE, REFUSED, UNDER_WAY)))
-        return frozenset(messages.key(m) for m in unused.tolist())
+        return frozenset(messages.keys(unused))
 
     @cached_property
     def full_log(self) -> IntArray:
@@ -121,7 +121,7 @@ class Replayer:
         if chosen is None or chosen:
             without_delay = self.delayed if chosen is None else chosen & self.delayed
         # The channel models of both scenarios read these when messages are sent.
-        self._deliveries.chosen, self._deliveries.without_delay = chosen, without_delay
+        self._deliveries.choose(chosen, without_delay)
         scenario = self._full if to_horizon else self._short
         run = simulate(scenario, self._seed, self._replica)
         k, n = self._node, int(self.scenario.sizes[self._node])

@@ -201,21 +201,23 @@ class _Evidence:
         # best.
         full_flow = find_flow(self.scenario, replayer.full_log, full)
         self._full_search = replayer.full_log, search_back(full_flow, node)
+        unused = np.flatnonzero(~was_used)
+        named = {n: self.scenario.topology.named(n) for n in self.scenario.nodes}
+        times = self.messages.sent[unused].tolist(), self.messages.arrived[unused].tolist()
+        outcomes = map(OUTCOMES.__getitem__, self.messages.outcome[unused].tolist())
+        keys = self.messages.keys(unused)
         self.missing: dict[MessageKey, Missing] = {
-            self.messages.key(m): _describe_missing(self.messages, m, self.scenario.topology)
-            for m in np.flatnonzero(~was_used).tolist()
+            key: Missing(named[key[0]], named[key[1]], key[2], *rest)
+            for key, *rest in zip(keys, outcomes, *times, strict=True)
         }
 
     def candidates(self) -> list[Candidate]:
         """Return the unused messages whose information could have reached the node."""
-        candidates = []
         # The cost of a message is 1 if it was not used in the run, else 0.
-        for m in np.flatnonzero(self._flow.cost).tolist():
-            needed = self._reach.needed(m)
-            if needed is not None:
-                sent = float(self.messages.sent[m])
-                candidates.append(Candidate(self.messages.key(m), sent, needed))
-        return candidates
+        unused = np.flatnonzero(self._flow.cost)
+        times, keys = self.messages.sent[unused].tolist(), self.messages.keys(unused)
+        rows = zip(keys, times, map(self._reach.needed, unused.tolist()), strict=True)
+        return [Candidate(key, sent, needed) for key, sent, needed in rows if needed is not None]
 
     def sources(self) -> tuple[InformationSource, ...]:
         """Return what had reached the node from every other node and its own sensor."""

@@ -323,7 +323,7 @@ def test_both_engines_deliver_the_chosen_messages(runs, name, channel):
     deliveries = Deliveries()
     replayed = delivering(scenario, deliveries)
     for chosen in (frozenset(lost[:1]), frozenset(lost[3::4]), frozenset(lost[-2:]), None):
-        deliveries.chosen = chosen
+        deliveries.choose(chosen)
         compiled, simpy = (netkf.simulate(replayed, engine=e) for e in ("compiled", "simpy"))
         pd.testing.assert_frame_equal(compiled.events, simpy.events)
         np.testing.assert_allclose(compiled.xhat, simpy.xhat, rtol=1e-9, atol=1e-12)
