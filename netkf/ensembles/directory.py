@@ -13,7 +13,8 @@ from typing import Any
 from netkf.core.errors import WriteError
 from netkf.core.fields import integer, one_of
 from netkf.engines.base import Engine
-from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
+from netkf.ensembles.block_files import RunIdentity
+from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.monte_carlo import Ensemble, ensemble_of, ensemble_table
 from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
@@ -245,9 +246,9 @@ class DirectoryWriter:
         )
         return statistics
 
-    def _add(self, node: Node, statistics: RunStatistics) -> RunStatistics:
+    def _add(self, node: Node, statistics: RunStatistics, seconds: float) -> RunStatistics:
         """Keep the statistics of a block; return them without traces, which fill the memory."""
-        without_traces = self.blocks.add(node, statistics, self.plan)
+        without_traces = self.blocks.add(node, statistics, self.plan, seconds)
         self._done += self.plan.runs_of(node)
         self.simulated += self.plan.runs_of(node)
         if time.monotonic() - self._last_note >= NOTE_SECONDS:

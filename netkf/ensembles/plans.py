@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 from netkf.core.errors import ScenarioError
 from netkf.core.fields import integer, one_of
-from netkf.ensembles.checkpoints import BlockCheckpoints, RunIdentity
+from netkf.ensembles.block_files import RunIdentity
+from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import (
     TRACES,
     DirectoryWriter,
@@ -208,9 +209,9 @@ def work_on_plan(
     wanted = sum(map(len, missing_ranges(known, replicas)))
     simulated, slowest, begun = 0, 0.0, time.monotonic()
 
-    def add(node: tuple[int, int], statistics: Any) -> None:
+    def add(node: tuple[int, int], statistics: Any, cpu_seconds: float) -> None:
         nonlocal simulated, slowest, begun
-        blocks.add(node, statistics, identity)
+        blocks.add(node, statistics, identity, cpu_seconds)
         simulated += identity.runs_of(node)
         slowest, begun = max(slowest, time.monotonic() - begun), time.monotonic()
         if progress is not None:

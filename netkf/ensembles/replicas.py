@@ -33,8 +33,8 @@ class BlockStore(NamedTuple):
     """Results of blocks of replicas that are kept, and which others are wanted.
 
     known    : functions that return the results of nodes that need not be simulated, by node
-    received : function of (node, result) that is called with each other block as it completes,
-               and returns the result to merge
+    received : function of (node, result, CPU seconds) that is called with each other block as it
+               completes, and returns the result to merge
     largest  : largest number of replicas in a block
     wanted   : replicas that are to be simulated (default: all); if some are missing at the end,
                there is no result
@@ -42,7 +42,7 @@ class BlockStore(NamedTuple):
     """
 
     known: Mapping[Node, Callable[[], Any]] = MappingProxyType({})
-    received: Callable[[Node, Any], Any] = lambda _, result: result
+    received: Callable[[Node, Any, float], Any] = lambda _, result, _seconds: result
     largest: int = 1 << 62
     wanted: range | None = None
     time_is_up: Callable[[], bool] = lambda: False
@@ -116,8 +116,8 @@ def replicate_blocks(
         pool.begin(scenario)
         for start, size in sorted(store.known):
             take(job._replace(start=start, size=size), store.known[start, size]())
-        for block, result in _complete_blocks(pool, _make_blocks(pool, job, together, store)):
-            take(block, store.received((block.start, block.size), result))
+        for block, done in _complete_blocks(pool, _make_blocks(pool, job, together, store)):
+            take(block, store.received((block.start, block.size), done.value, done.seconds))
     return tree.result() if runs_done == runs else None
 
 
@@ -164,7 +164,7 @@ def _make_blocks(pool: Pool, job: Job, together: int | None, store: BlockStore) 
             left -= len(block.replicas)
 
 
-def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, Any]]:
+def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, BlockResult]]:
     """Submit ``blocks`` of replicas to the pool, as many at a time as it allows."""
     waiting: dict[Future[BlockResult], Job] = {}
     try:
@@ -176,7 +176,7 @@ def _complete_blocks(pool: Pool, blocks: Iterator[Job]) -> Iterator[tuple[Job, A
             for future in pool.wait(waiting):
                 block, done = waiting.pop(future), future.result()
                 pool.note_duration(block, done.seconds)
-                yield block, done.value
+                yield block, done
     except BrokenExecutor as error:
         message = "workers ended again and again before their runs were done; perhaps the memory is"
         raise EngineError(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.errors import ScenarioError
-from netkf.ensembles.checkpoints import RunIdentity
+from netkf.ensembles.block_files import RunIdentity
 from netkf.runs.documents import (
     COUNT,
     FINAL_STATUSES,

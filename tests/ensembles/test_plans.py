@@ -14,7 +14,7 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.ensembles import checkpoints, plans
+from netkf.ensembles import block_files, checkpoints, plans
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.plans import Part, open_plan, part_of_array, work_on_plan
 from netkf.ensembles.pools import PoolOptions
@@ -163,7 +163,7 @@ def test_other_versions_are_refused_and_other_machines_only_mixed_if_asked(
     assert work(plan, "--part", "1/2") == 0
     other = {**provenance.machine(), "processor": "another"}
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoints, "machine", lambda: other)
+        patch.setattr(block_files, "machine", lambda: other)
         assert work(plan) == 0
     capsys.readouterr()
     assert merge(plan) == 2

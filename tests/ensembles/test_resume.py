@@ -16,7 +16,7 @@ import pytest
 import netkf
 from netkf.cli.main import main
 from netkf.core.errors import EngineError, ScenarioError, WriteError
-from netkf.ensembles import checkpoints, pools
+from netkf.ensembles import block_files, pools
 from netkf.ensembles.checkpoints import BlockCheckpoints
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
 from netkf.ensembles.pools import PoolOptions
@@ -47,8 +47,9 @@ def made(tmp_path_factory):
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checkpoints, "FIRST_WRITE", 0.0)  # every block in a file
-        patch.setattr(checkpoints, "WRITE_SHARE", 0.0)
+        patch.setattr(block_files, "FIRST_WRITE", 0.0)  # every block in a file
+        patch.setattr(block_files, "WRITE_SHARE", 0.0)
+        patch.setattr(block_files, "_neighbour", lambda node: None)  # and none is merged
         patch.setattr(pools, "MAX_BLOCK_HERE", 1)
         runs_to_directory(short(), RUNS, folder / "whole", OPTIONS)
         for name, seed in (("cut", 1), ("other", 2)):
@@ -86,7 +87,7 @@ def assert_done_again(folder, made, blocks=1):
 def seal(contents):
     """A block that says of itself that it is whole."""
     buffer = io.BytesIO(contents)
-    return contents + checkpoints.MARK + checkpoints._digest(buffer, len(contents))
+    return contents + block_files.MARK + block_files.digest_of(buffer, len(contents))
 
 
 def forged(block, **changes):
@@ -148,8 +149,8 @@ def test_every_byte_of_a_block_is_proved(cut):
     for _ in range(200):
         block.write_bytes(whole)
         flip(block, draw)
-        with pytest.raises(checkpoints.DamagedError):
-            checkpoints._verify(block)
+        with pytest.raises(block_files.DamagedError):
+            block_files.verify(block)
 
 
 def test_a_block_of_another_seed_is_done_again(cut, made):
@@ -169,7 +170,7 @@ def test_everything_that_decides_bits_decides_what_is_used(cut, monkeypatch, key
     for found in before:
         if key in found:
             found[key] = "other"
-    for room in ("runs.provenance", "ensembles.resume", "ensembles.checkpoints"):
+    for room in ("runs.provenance", "ensembles.resume", "ensembles.block_files"):
         monkeypatch.setattr(f"netkf.{room}.versions", lambda: before[0])
         monkeypatch.setattr(f"netkf.{room}.machine", lambda: before[1])
     with pytest.raises(ScenarioError, match=f"holds a run of another (version|machine).*{key}"):

@@ -33,7 +33,7 @@ import pandas as pd
 from netkf.cli.main import main as netkf
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import printable
-from netkf.ensembles import checkpoints
+from netkf.ensembles import block_files
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.studies.opening import open as open_result
@@ -247,7 +247,7 @@ def change_arrays(path: Path, draw: random.Random) -> str:
     contents = made.getvalue()
     if path.parent.name == "blocks":
         buffer = io.BytesIO(contents)
-        contents += checkpoints.MARK + checkpoints._digest(buffer, len(contents))
+        contents += block_files.MARK + block_files.digest_of(buffer, len(contents))
     path.write_bytes(contents)
     reseal(path)
     return name
