@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -42,17 +42,18 @@ from netkf.checks.exact import promised_filter, with_base_filter, with_promised_
 from netkf.checks.looks import MAX_LOOKED_RUNS, is_decided, keep_decisions, level_of_look, next_runs
 from netkf.checks.paper import PaperChecks
 from netkf.checks.parts.rows import gaussian_noises, part_assumptions, part_promises
-from netkf.checks.parts.samples import PartSummary, stack_parts, summarise_parts
+from netkf.checks.parts.samples import stack_parts, summarise_parts
 from netkf.checks.points import check_slots, probe_times
-from netkf.checks.records.rows import Audit, audit_record, audit_run, record_promises
+from netkf.checks.records.rows import audit_record, audit_run, record_promises
+from netkf.checks.results import RESULTS_FORM, ReplicaResult
 from netkf.checks.rounding import EPS, OPERATIONS
-from netkf.checks.samples import ReplicaSummary, stack_summaries
+from netkf.checks.samples import stack_summaries
 from netkf.core.errors import ScenarioError, TheoryError
 from netkf.core.fields import integer, number
 from netkf.core.notebook import NotebookTable
 from netkf.engines.base import Engine
 from netkf.engines.simpy.engine import SimpyEngine
-from netkf.ensembles.pools import PoolOptions
+from netkf.ensembles.pools import PoolOptions, make_pool
 from netkf.ensembles.replicas import replicate
 from netkf.runs.simulate import choose_engine, require_scenario, simulate
 from netkf.scenario.model import ALL_READ, HEALTHY, RIGHT_CLOCKS
@@ -170,30 +171,6 @@ def with_check_times(scenario: Scenario) -> Scenario:
         nearest = np.abs(scenario.times[None] - times[:, None]).argmin(axis=1)
         times = scenario.times[np.unique(nearest)]
     return dataclasses.replace(scenario, probe=times)
-
-
-class ReplicaResult(NamedTuple):
-    """The result of one replica.
-
-    summary    : values that the promises of the paper are about; None if the run diverged
-    difference : largest difference of the errors from those of the built-in base of a user's
-                 filter class, on the same readings and messages, in standard deviations; nan if the
-                 base was not run or rounding hides the difference
-    expected   : a divergence is no surprise, because the built-in filter diverges too
-    parts      : statistics of the parts of the scenario
-    audit      : what is wrong with the record of the run
-    """
-
-    summary: ReplicaSummary | None
-    difference: float
-    expected: bool = False
-    parts: PartSummary | None = None
-    audit: Audit = Audit()
-
-    @property
-    def diverged(self) -> bool:
-        """True if the run ended early."""
-        return self.summary is None
 
 
 def run_replica(
@@ -421,21 +398,23 @@ def check(
     _require_laws(scenario)
     chosen = with_check_times(scenario)
     verdict, last = earlier, max(count, most if until else count)
-    while True:
-        results = list(verdict.results) if verdict is not None else []
-        results += replicate(
-            partial(run_replica, engine=choose_engine("auto", chosen)),
-            chosen,
-            count - len(results),
-            root,
-            first=len(results),
-            pool=PoolOptions(workers, executor, scheduler),
-            progress=progress,
-        )
-        verdict = _look_again(chosen, verdict, results, root, confident, bool(until))
-        if not until or not verdict or verdict.is_decided or count >= last:
-            return verdict
-        count = next_runs(verdict.rows, count, last)
+    with make_pool(last, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
+        while True:
+            results = list(verdict.results) if verdict is not None else []
+            results += replicate(
+                partial(run_replica, engine=choose_engine("auto", chosen)),
+                chosen,
+                count - len(results),
+                root,
+                first=len(results),
+                pool=pool,
+                progress=progress,
+                form=RESULTS_FORM,
+            )
+            verdict = _look_again(chosen, verdict, results, root, confident, bool(until))
+            if not until or not verdict or verdict.is_decided or count >= last:
+                return verdict
+            count = next_runs(verdict.rows, count, last)
 
 
 def _look_again(

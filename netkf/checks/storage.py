@@ -13,12 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.check import ReplicaResult, Verdict
+from netkf.checks.check import Verdict
 from netkf.checks.evidence import Evidence
-from netkf.checks.parts.samples import PART_TYPES, PartSummary
-from netkf.checks.records.rows import audit_columns, read_audit
 from netkf.checks.report import verdict_json, verdict_text
-from netkf.checks.samples import ReplicaSummary
+from netkf.checks.results import ReplicaResult, result_columns, results_of_columns
 from netkf.core.errors import ScenarioError
 from netkf.core.interrupts import defer_signals
 from netkf.ensembles.resume import remove_unfinished
@@ -60,7 +58,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
     if not (directory / "scenario.toml").exists():
         write_scenario(directory, scenario)
     results = io.BytesIO()
-    columns: dict[str, Any] = _result_columns(verdict.results)
+    columns: dict[str, Any] = result_columns(verdict.results)
     np.savez_compressed(results, **columns)
     with write_atomically(directory / RESULTS) as part:
         part.write_bytes(results.getvalue())
@@ -85,7 +83,7 @@ def _save_verdict(directory: Path, scenario: Scenario, verdict: Verdict, text: s
 
 
 def _require_same(path: Path, columns: dict[str, Any]) -> None:
-    again = _result_columns(tuple(_read_results(path)))
+    again = result_columns(_read_results(path))
     for name in sorted(columns.keys() | again.keys()):
         one, other = (np.asarray(part.get(name, ())) for part in (columns, again))
         is_real = one.dtype.kind == other.dtype.kind == "f"
@@ -157,56 +155,7 @@ def _read_rows(document: dict[str, Any]) -> tuple[Evidence, ...]:
     return tuple(Evidence(**row) for row in rows)
 
 
-def _result_columns(results: tuple[ReplicaResult, ...]) -> dict[str, np.ndarray]:
-    columns = {
-        "difference": np.array([result.difference for result in results]),
-        "expected": np.array([result.expected for result in results]),
-        "diverged": np.array([result.diverged for result in results]),
-        **audit_columns([result.audit for result in results]),
-    }
-    completed = [result for result in results if result.summary is not None]
-    if not completed:
-        return columns
-    for name in vars(completed[0].summary):
-        columns[f"summary.{name}"] = np.array(
-            [getattr(result.summary, name) for result in completed]
-        )
-    for part, first in zip(PartSummary._fields, completed[0].parts or (), strict=False):
-        for name in first._fields if first is not None else ():
-            values = [getattr(getattr(result.parts, part), name) for result in completed]
-            columns[f"{part}.{name}"] = np.array(values)
-    return columns
-
-
 def _read_results(path: Path) -> list[ReplicaResult]:
     """Return the results of the replicas in the file ``path``, in order."""
     with np.load(path, allow_pickle=False) as file:
-        columns = {name: file[name] for name in file.files}
-    audits = {name: columns.pop(name) for name in list(columns) if name.startswith("audit.")}
-    results, index = [], 0
-    for k, diverged in enumerate(columns["diverged"].tolist()):
-        difference, expected = float(columns["difference"][k]), bool(columns["expected"][k])
-        audit = read_audit(_select_fields({name: v[k] for name, v in audits.items()}, "audit"))
-        if diverged:
-            results.append(ReplicaResult(None, difference, expected, audit=audit))
-            continue
-        values_of_replica = {name: v[index] for name, v in columns.items() if "." in name}
-        summary = ReplicaSummary(**_select_fields(values_of_replica, "summary"))
-        parts = {
-            part: cls(**_select_fields(values_of_replica, part))
-            if _select_fields(values_of_replica, part)
-            else None
-            for part, cls in PART_TYPES.items()
-        }
-        results.append(ReplicaResult(summary, difference, expected, PartSummary(**parts), audit))
-        index += 1
-    return results
-
-
-def _select_fields(values: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """Return the values named ``prefix.name``, by ``name``."""
-    return {
-        name.split(".", 1)[1]: value
-        for name, value in values.items()
-        if name.split(".", 1)[0] == prefix
-    }
+        return results_of_columns({name: file[name] for name in file.files})

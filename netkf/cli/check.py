@@ -79,6 +79,7 @@ def _run_check(scenario: Scenario, options: argparse.Namespace, earlier: Verdict
             options.runs,
             confidence=options.confidence,
             workers=options.workers,
+            executor=options.executor,
             scheduler=options.scheduler,
             progress=line.make_count_update("runs"),
             until=options.until,

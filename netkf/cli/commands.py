@@ -15,6 +15,10 @@ from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
 
 ENGINES = ("auto", "simpy", "processes", "compiled")
 MAX_RUNS = 100_000_000  # larger numbers are typing errors
+ONE_THREAD = ("check", "work", "merge")
+"""Commands whose last digits must not depend on whether a run is simulated here or in a worker
+process, whose LAPACK has one thread.
+"""
 WORKERS_PER_CORE = 8  # more processes only fill the memory
 
 
@@ -49,12 +53,25 @@ class Command(NamedTuple):
             group = parser.add_mutually_exclusive_group()
             for name, settings in entry:
                 group.add_argument(name, **settings)
-        parser.set_defaults(run=self.run)
+        # ``executor`` is the pool of a plan, on which commands run studies.
+        parser.set_defaults(run=self.run, executor=None)
 
     def run(self, options: argparse.Namespace) -> int:
         """Run the command with the parsed options; return the exit status."""
+        if self.name in ONE_THREAD:
+            from netkf.ensembles.process_start import limit_blas_threads
+
+            with limit_blas_threads():
+                return self._run(options)
+        return self._run(options)
+
+    def _run(self, options: argparse.Namespace) -> int:
         # Only now, so that ``netkf --help`` and usage errors do not wait for numpy and numba.
         module: Any = import_module(f"netkf.cli.{self.module or self.name.replace('-', '_')}")
+        if getattr(options, "plan", None) is not None:
+            from netkf.cli.planned import plan_study
+
+            return plan_study(module._run, options)
         status: int = module._run(options)
         return status
 
@@ -206,7 +223,27 @@ TRACE = _option(
     choices=["full", "first", "none"],
     default="first",
 )
-PLANNED = _option("directory", "directory that netkf plan wrote", type=Path, metavar="DIR")
+ARRAY = (
+    _option("--tasks", "number of jobs of the plan", type=parse_count, default=64),
+    _flag("--slurm", "print a submission script for an array of SLURM jobs on the plan"),
+    _option(
+        "--time",
+        "time limit of each job in that script (default: 1h)",
+        type=parse_duration,
+        default="1h",
+        metavar="DURATION",
+    ),
+)
+PLAN = (
+    _option(
+        "--plan",
+        "write a plan that netkf work and netkf merge carry out; nothing runs",
+        type=Path,
+        metavar="DIR",
+    ),
+    *ARRAY,
+)
+PLANNED = _option("directory", "directory of a plan", type=Path, metavar="DIR")
 JSON = _flag("--json", "print one JSON document only")
 ALL = _flag("--all", "show all rows with all that they say")
 NO_PLOT = _flag("--no-plot", "do not draw a picture")
@@ -236,15 +273,7 @@ COMMANDS = (
             ENGINE,
             _out("directory of the plan (default: runs/NAME-k)"),
             TRACE,
-            _option("--tasks", "number of jobs", type=parse_count, default=64),
-            _flag("--slurm", "print a submission script for an array of SLURM jobs"),
-            _option(
-                "--time",
-                "time limit of each job in that script (default: 1h)",
-                type=parse_duration,
-                default="1h",
-                metavar="DURATION",
-            ),
+            *ARRAY,
         ),
     ),
     Command(
@@ -273,7 +302,7 @@ COMMANDS = (
     ),
     Command(
         "merge",
-        "turn the results of a plan into those of one ensemble; the status is 1 if some miss",
+        "turn the results of a plan into those of one command; the status is 1 if some miss",
         (
             PLANNED,
             _flag("--mixed", "merge results of machines of different kinds, too"),
@@ -296,6 +325,7 @@ COMMANDS = (
             POOL,
             ALL,
             JSON,
+            *PLAN,
             NO_PLOT,
         ),
     ),
@@ -316,6 +346,7 @@ COMMANDS = (
             ENGINE,
             POOL,
             JSON,
+            *PLAN,
         ),
     ),
     Command(
@@ -343,6 +374,7 @@ COMMANDS = (
             ENGINE,
             POOL,
             JSON,
+            *PLAN,
         ),
     ),
     Command(
@@ -395,6 +427,7 @@ COMMANDS = (
             ENGINE,
             POOL,
             JSON,
+            *PLAN,
         ),
     ),
     Command(

@@ -36,6 +36,7 @@ def _compare(options: argparse.Namespace) -> int:
             confidence=options.confidence,
             engine=options.engine,
             workers=options.workers,
+            executor=options.executor,
             scheduler=options.scheduler,
             progress=line.make_count_update("filters"),
         )

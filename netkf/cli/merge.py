@@ -1,4 +1,4 @@
-"""``netkf merge``: turn the results of all workers of a plan into one ensemble."""
+"""``netkf merge``: turn the results of all workers of a plan into one ensemble or study."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from functools import partial
 
 from netkf.cli import pictures
 from netkf.cli.options import FAILED, print_notes
+from netkf.cli.planned import describe_ranges, merge_study
 from netkf.cli.run import print_ensemble, print_summary
-
-SHOWN = 20  # ranges of missing runs that are listed
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -18,6 +17,8 @@ def _run(options: argparse.Namespace) -> int:
     from netkf.runs.directory_lock import lock_directory
 
     plan = open_plan(options.directory, options.trust)
+    if plan.arguments:
+        return merge_study(plan, options)
     if plan.is_merged:
         print(f"nothing left to do in {plan.directory}")
         return 0
@@ -38,7 +39,5 @@ def _run(options: argparse.Namespace) -> int:
 def _print_missing(directory: object, missing: list[range], runs: int) -> None:
     """Print which of the runs have no result, and what to do."""
     count = sum(map(len, missing))
-    listed = [f"{gap[0]}" if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" for gap in missing[:SHOWN]]
-    more = f" and {len(missing) - SHOWN} further ranges" if len(missing) > SHOWN else ""
-    print(f"{count:,} of {runs:,} runs have no result: {', '.join(listed)}{more}")
+    print(f"{count:,} of {runs:,} runs have no result: {describe_ranges(missing)}")
     print(f"go on with netkf work {directory}")

@@ -10,6 +10,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -57,10 +58,15 @@ def load_scenario(
     """
     from netkf.scenario.reading import load
 
+    copy: Path | None = getattr(options, "copy", None)
+    if copy is not None:  # that of a plan, with all changes
+        return load(copy, trust=options.trust)
     changes = {**parse_changes(options.set), **ignored}
     if getattr(options, "seed", None) is not None:
         changes["seed"] = options.seed
-    return load(options.scenario, changes, trust=options.trust)
+    loaded = load(options.scenario, changes, trust=options.trust)
+    options.loaded = loaded
+    return loaded
 
 
 def print_notes(notes: Sequence[str]) -> None:

@@ -6,8 +6,12 @@ import argparse
 import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from netkf.cli.options import load_scenario, print_notes
+
+if TYPE_CHECKING:
+    from netkf.scenario.scenario import Scenario
 
 ARRAY = """\
 #!/bin/bash
@@ -45,15 +49,22 @@ def _run(options: argparse.Namespace) -> int:
     with lock_directory(options.out):
         settings = EnsembleOptions(options.engine, options.trace)
         directory = plan_ensemble(scenario, options.runs, options.out, settings, tasks)
+    print_plan(directory, scenario, f"{options.runs:,} runs", tasks, options)
+    return 0
+
+
+def print_plan(
+    directory: Path, scenario: Scenario, what: str, tasks: int, options: argparse.Namespace
+) -> None:
+    """Print what a plan holds and how to go on, and with ``--slurm`` the script of an array."""
     print_notes(scenario.notes)
     # With a script on standard output, what a person reads goes beside it.
     out = sys.stderr if options.slurm else sys.stdout
-    print(f"{options.runs:,} runs for {tasks:,} jobs, none of them simulated", file=out)
+    print(f"{what} for {tasks:,} jobs, none of them simulated", file=out)
     print(f"each: netkf work {directory}; in the end: netkf merge {directory}", file=out)
     print(f"written to {directory}", file=out)
     if options.slurm:
         print(_array(directory.resolve(), scenario.name, tasks, options), end="")
-    return 0
 
 
 def _array(directory: Path, name: str, tasks: int, options: argparse.Namespace) -> str:

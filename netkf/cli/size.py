@@ -37,6 +37,7 @@ def _run(options: argparse.Namespace) -> int:
             options.runs,
             options.confidence,
             workers=options.workers,
+            executor=options.executor,
             scheduler=options.scheduler,
             engine=options.engine,
             progress=line.report,

@@ -35,7 +35,7 @@ def _run(options: argparse.Namespace) -> int:
             sweep_to_directory(
                 plan_sweep(scenario, grid, options.runs, engine=options.engine),
                 options.out,
-                PoolOptions(workers=options.workers, scheduler=options.scheduler),
+                PoolOptions(options.workers, options.executor, options.scheduler),
                 progress=line.make_count_update("points"),
                 finish=None if options.no_plot else draw,
                 take=completed.append,  # called before files are written, which may fail

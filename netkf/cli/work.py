@@ -5,16 +5,20 @@ from __future__ import annotations
 import argparse
 
 from netkf.cli.options import FAILED, print_notes
+from netkf.cli.planned import work_on_study
 from netkf.cli.progress import ProgressLine
 
 
 def _run(options: argparse.Namespace) -> int:
     """Simulate the runs of a part without a result; return the exit status, 1 if some are left."""
-    from netkf.ensembles.plans import Part, open_plan, part_of_array, work_on_plan
+    from netkf.ensembles.parts import Part, part_of_array
+    from netkf.ensembles.plans import open_plan, work_on_plan
     from netkf.ensembles.pools import PoolOptions
 
     plan = open_plan(options.directory, options.trust)
     part = Part(*options.part) if options.part else part_of_array(plan.tasks)
+    if plan.arguments:
+        return work_on_study(plan, part, options)
     pool = PoolOptions(workers=options.workers)
     with ProgressLine() as line:
         update = line.make_count_update("runs")

@@ -94,6 +94,11 @@ class BlockFiles(ABC):
         self._spent = self._written = 0.0  # CPU seconds of all results, and of those written
         self.installations: list[dict[str, Any]] = []  # of the nodes that were found
 
+    @property
+    def nodes(self) -> list[Node]:
+        """The largest nodes that are stored, in order."""
+        return list(outermost(self._nodes))
+
     @abstractmethod
     def pack(self, value: Any) -> dict[str, Any]:
         """Return the result of a block as arrays by name."""
@@ -144,7 +149,7 @@ class BlockFiles(ABC):
                 self._own.add(node)
             if found[node] not in self.installations:
                 self.installations.append(found[node])
-        return sorted(self._nodes), _describe(bad)
+        return self.nodes, _describe(bad)
 
     def add(self, node: Node, value: Any, identity: RunIdentity, seconds: float) -> Any:
         """Take the result of a block that took so many ``seconds`` of CPU time, to be merged with
@@ -165,24 +170,32 @@ class BlockFiles(ABC):
         neighbours that are stored already; raises WriteError.
         """
         for level, k, value in self._pending.nodes():
-            node, inner = (k << level, 1 << level), []
-            while identity.trace != "full" and (other := _neighbour(node)) in self._own:
-                try:
-                    with open_block(self._path(other), verified=False) as arrays:
-                        stored = self.unpack(arrays)
-                except DamagedError:
-                    break  # another worker has merged it, or it is done again
-                pair = (stored, value) if other < node else (value, stored)
-                inner.append(other)
-                node, value = (min(node[0], other[0]), 2 * node[1]), self._merge(*pair)
-            self.save(node, value, identity)
-            for other in inner:  # which the file of the larger block contains
-                self._nodes.discard(other)
-                self._own.discard(other)
-                with contextlib.suppress(OSError):
-                    self._path(other).unlink()
+            node = k << level, 1 << level
+            if identity.trace == "full":
+                self.save(node, value, identity)
+            else:
+                self._save_merged(node, value, identity)
         self._pending = MergeTree(self._merge)
         self._written = self._spent
+
+    def _save_merged(self, node: Node, value: Any, identity: RunIdentity) -> None:
+        """Write a result merged with those of neighbours that were written here, in one file."""
+        inner = []
+        while (other := _neighbour(node)) in self._own:
+            try:
+                with open_block(self._path(other), verified=False) as arrays:
+                    stored = self.unpack(arrays)
+            except DamagedError:
+                break  # another worker has merged it, or it is done again
+            value = self._merge(stored, value) if other < node else self._merge(value, stored)
+            node = min(node[0], other[0]), 2 * node[1]
+            inner.append(other)
+        self.save(node, value, identity)
+        for other in inner:  # which the file of the larger block contains
+            self._nodes.discard(other)
+            self._own.discard(other)
+            with contextlib.suppress(OSError):
+                self._path(other).unlink()
 
     def save(self, node: Node, value: Any, identity: RunIdentity) -> None:
         """Write the file of the block of a node, with the result of its runs; raises WriteError.

@@ -7,10 +7,8 @@ it, ``netkf work`` adds blocks of runs without a result, and ``netkf merge`` tur
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,94 +25,29 @@ from netkf.ensembles.directory import (
     identify_runs,
     write_files,
 )
+from netkf.ensembles.parts import Part, Worker
 from netkf.ensembles.pools import LocalPool, PoolOptions, make_pool
-from netkf.ensembles.replicas import BlockStore, Progress, missing_ranges, replicate_blocks
+from netkf.ensembles.replicas import Progress, missing_ranges, replicate_blocks
 from netkf.ensembles.resume import read_manifest
-from netkf.ensembles.statistics import block_statistics
-from netkf.runs.documents import FINAL_STATUSES, DamagedError, check_seal, read_document
+from netkf.ensembles.statistics import block_statistics, merge
+from netkf.runs.documents import (
+    FINAL_STATUSES,
+    DamagedError,
+    check_seal,
+    read_document,
+    write_sealed,
+)
 from netkf.runs.failures import InterruptedRunError, explain_failures
-from netkf.runs.files import check_sources, create_output_directory, scenario_digest
+from netkf.runs.files import check_sources, create_output_directory, scenario_digest, write_scenario
 from netkf.runs.provenance import machine, versions
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
 
-PIECES = 8
-"""Parts begin at multiples of a power of two of about so many to a part: fewer files in the end."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """Part ``index`` of ``count``, counted modulo ``count``: parts may begin at 0 or at 1."""
-
-    index: int
-    count: int
-
-    def of(self, runs: int) -> range:
-        """Return the replicas of this part of ``runs`` runs; it may be empty."""
-        unit = 1 << (max(1, runs // (PIECES * self.count)).bit_length() - 1)
-
-        def bound(index: int) -> int:
-            return runs if index == self.count else index * runs // self.count // unit * unit
-
-        index = self.index % self.count
-        return range(bound(index), bound(index + 1))
-
-
-@dataclass(frozen=True)
-class ArrayVariables:
-    """Environment variables of a batch system's arrays of jobs; empty where it has none."""
-
-    index: str
-    first: str = ""
-    last: str = ""
-    step: str = ""
-    count: str = ""
-
-
-ARRAYS = (
-    ArrayVariables(
-        "SLURM_ARRAY_TASK_ID",
-        "SLURM_ARRAY_TASK_MIN",
-        "SLURM_ARRAY_TASK_MAX",
-        "SLURM_ARRAY_TASK_STEP",
-        "SLURM_ARRAY_TASK_COUNT",
-    ),
-    ArrayVariables("PBS_ARRAY_INDEX"),
-    ArrayVariables("SGE_TASK_ID", "SGE_TASK_FIRST", "SGE_TASK_LAST", "SGE_TASK_STEPSIZE"),
-    ArrayVariables("LSB_JOBINDEX", last="LSB_JOBINDEX_END", step="LSB_JOBINDEX_STEP"),
-)
-
-
-def part_of_array(tasks: int, environment: Mapping[str, str] = os.environ) -> Part:
-    """Return the part of this job of an array by the variables of SLURM, PBS, Grid Engine or LSF;
-    without such variables the whole.
-
-    Where the system does not tell the number of jobs, or its indices have gaps, as when some jobs
-    of an array are submitted again, the array is that of ``tasks`` jobs for which the plan is.
-    """
-
-    def read(name: str, default: int) -> int:
-        text = environment.get(name, "")
-        return int(text) if text.isdecimal() else default
-
-    for names in ARRAYS:
-        index = read(names.index, -1)
-        # Grid Engine writes "undefined" and LSF 0 for a job that is in no array.
-        if index < 0 or (index == 0 and names.index == "LSB_JOBINDEX"):
-            continue
-        first, step = read(names.first, 1), max(1, read(names.step, 1))
-        regular = (read(names.last, -1) - first) // step + 1
-        count = read(names.count, regular)
-        if count < 1 or count != regular:
-            return Part(index, tasks)
-        return Part((index - first) // step, count)
-    return Part(0, 1)
-
 
 class Plan(NamedTuple):
-    """A planned ensemble: its directory, its scenario, the identity of its blocks, the number of
-    jobs it was made for, and whether it has been merged.
+    """A planned ensemble or study: its directory, its scenario, the identity of its blocks, the
+    number of jobs it was made for, whether it has been merged, and the command line of a study.
     """
 
     directory: Path
@@ -122,6 +55,7 @@ class Plan(NamedTuple):
     identity: RunIdentity
     tasks: int
     is_merged: bool
+    arguments: Sequence[str] = ()
 
 
 def plan_ensemble(
@@ -144,6 +78,37 @@ def plan_ensemble(
     directory = create_output_directory(out, scenario.name)
     DirectoryWriter(scenario, directory, identity, tasks).begin(None)
     return directory
+
+
+def write_study(
+    directory: Path, scenario: Scenario, arguments: Sequence[str], runs: int, tasks: int
+) -> None:
+    """Write the plan of a study: the command line ``arguments`` that does it, and a copy of its
+    scenario, of whose ensembles so many ``runs`` are known.
+
+    Raises ScenarioError if the scenario cannot be copied, and WriteError.
+    """
+    check_sources(scenario)
+    # Keys of a study change others than those that the file has, such as defaults that follow them.
+    write_scenario(directory, scenario, resolve=False)
+    digest, trust = scenario_digest(scenario), getattr(scenario, "_trust", False)
+    if scenario_digest(load(directory / "scenario.toml", trust=trust)) != digest:
+        remedy = "put its files and classes beside it"
+        raise ScenarioError("scenario", "is another one when it is copied", scenario.name, remedy)
+    manifest = {
+        "name": scenario.name,
+        "versions": versions(),
+        "machine": machine(),
+        "seed": scenario.seed,
+        "replica": 0,
+        "runs": {"wanted": runs, "done": 0},
+        "engine": "auto",
+        "status": "planned",
+        "scenario": digest,
+        "tasks": tasks,
+        "arguments": list(arguments),
+    }
+    write_sealed(directory / "manifest.json", manifest)
 
 
 def open_plan(directory: Path, trust: bool = False) -> Plan:
@@ -173,7 +138,8 @@ def open_plan(directory: Path, trust: bool = False) -> Plan:
         trace=manifest.get("trace", "first"),
         engine=manifest["engine"],
     )
-    return Plan(directory, scenario, identity, manifest.get("tasks", 1), is_merged)
+    tasks, arguments = manifest.get("tasks", 1), manifest.get("arguments", ())
+    return Plan(directory, scenario, identity, tasks, is_merged, arguments)
 
 
 class WorkDone(NamedTuple):
@@ -201,52 +167,23 @@ def work_on_plan(
     written then. Raises EngineError if a plugged-in class fails, and WriteError.
     """
     replicas, identity, scenario = part.of(plan.identity.runs), plan.identity, plan.scenario
-    deadline = float("inf") if seconds is None else time.monotonic() + seconds
     if plan.is_merged or not replicas:
         return WorkDone(replicas, 0, 0)
+    worker = Worker(part, seconds, progress)
     blocks = BlockCheckpoints(plan.directory, scenario)
-    known, _ = blocks.find(identity, any_installation=True, within=replicas)
-    wanted = sum(map(len, missing_ranges(known, replicas)))
-    simulated, slowest, begun = 0, 0.0, time.monotonic()
-
-    def add(node: tuple[int, int], statistics: Any, cpu_seconds: float) -> None:
-        nonlocal simulated, slowest, begun
-        blocks.add(node, statistics, identity, cpu_seconds)
-        simulated += identity.runs_of(node)
-        slowest, begun = max(slowest, time.monotonic() - begun), time.monotonic()
-        if progress is not None:
-            progress(simulated, wanted)
-
-    store = BlockStore(
-        dict.fromkeys(known, _nothing),
-        add,
-        identity.max_block,
-        replicas,
-        # The next block may take as long as the slowest, and none helps that was merged already.
-        lambda: time.monotonic() + slowest > deadline or _was_merged(plan.directory),
-    )
-    engine = choose_engine(identity.engine, scenario, announce=bool(wanted))
+    engine = choose_engine(identity.engine, scenario)
     task = partial(block_statistics, engine=engine, traces=identity.traces)
     try:
-        with explain_failures(scenario), make_pool(max(1, wanted), pool) as workers:
-            replicate_blocks(
-                task, _merge_nothing, scenario, identity.runs, pool=workers, store=store
-            )
+        with (
+            explain_failures(scenario),
+            make_pool(len(replicas), pool) as workers,
+            worker.store(blocks, identity, is_over=partial(_was_merged, plan.directory)) as store,
+        ):
+            replicate_blocks(task, merge, scenario, identity.runs, pool=workers, store=store)
     except KeyboardInterrupt:
         remedy = f"; go on with netkf work {plan.directory}"
         raise InterruptedRunError(plan.directory, remedy) from None
-    finally:
-        if not _was_merged(plan.directory):
-            blocks.write(identity)
-    return WorkDone(replicas, simulated, wanted - simulated)
-
-
-def _nothing() -> None:
-    """Stand for the result of a stored block, which a worker does not need."""
-
-
-def _merge_nothing(a: None, b: None) -> None:
-    """Merge two of them."""
+    return WorkDone(replicas, worker.simulated, worker.left)
 
 
 def _was_merged(directory: Path) -> bool:
@@ -279,15 +216,7 @@ def merge_plan(
     missing = list(missing_ranges(writer.known, range(plan.identity.runs)))
     if missing:
         return missing
-    made_by = writer.blocks.installations
-    if any(installation["versions"] != versions() for installation in made_by):
-        rule = "holds results of other versions, whose last digits may differ"
-        raise ScenarioError("DIR", rule, str(plan.directory), "remove its blocks, and work again")
-    machines = [installation["machine"] for installation in made_by]
-    if len(machines) > 1 and not mixed:
-        kinds = ", ".join(sorted(str(one.get("processor")) for one in machines))
-        rule = "holds results of machines of different kinds, whose last digits may differ"
-        raise ScenarioError("DIR", rule, kinds, "give --mixed to merge them, and the manifest says")
+    machines = require_alike(writer.blocks.installations, plan.directory, mixed)
     if note is not None and machines != [machine()]:
         note("runs were simulated on another kind of machine than this: bounds of theory are of it")
     with LocalPool() as pool:
@@ -299,3 +228,20 @@ def merge_plan(
     writer.end(finished.status, statistics, machines)
     writer.blocks.remove()
     return finished
+
+
+def require_alike(
+    installations: Sequence[dict[str, Any]], directory: Path, mixed: bool
+) -> list[dict[str, Any]]:
+    """Return the machines of the ``installations`` that made the results in a directory; raises
+    ScenarioError for other versions than here, or different machines unless they may be mixed.
+    """
+    if any(installation["versions"] != versions() for installation in installations):
+        rule = "holds results of other versions, whose last digits may differ"
+        raise ScenarioError("DIR", rule, str(directory), "remove its blocks, and work again")
+    machines = [installation["machine"] for installation in installations]
+    if len(machines) > 1 and not mixed:
+        kinds = ", ".join(sorted(str(one.get("processor")) for one in machines))
+        rule = "holds results of machines of different kinds, whose last digits may differ"
+        raise ScenarioError("DIR", rule, kinds, "give --mixed to merge them")
+    return machines

@@ -5,10 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from netkf.ensembles.blocks import BlockResult, Job, PackedScenario, pack_scenario
 from netkf.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from netkf.ensembles.planned_study import PlannedStudy
 
 AHEAD = 2
 """Blocks for each worker that are submitted and not yet completed, if it is not in this process."""
@@ -26,12 +29,15 @@ class Pool(ABC):
     width : number of blocks that run at a time, as far as known
     quick : seconds of CPU time up to which blocks are made larger
     ahead : number of blocks that may be submitted before the first is complete
+    plan  : the study in a plan whose ensembles are simulated, if any
     """
 
+    plan: PlannedStudy | None = None
     width: int = 1
     quick: float = 5.0
     _size: int = 1
     _rate: float = 0.0  # CPU seconds of a run of the last block
+    _scenario: object = None  # the last one
 
     @property
     def ahead(self) -> int:
@@ -46,8 +52,9 @@ class Pool(ABC):
         """
 
     def begin(self, scenario: object) -> None:
-        """Prepare for blocks of a scenario: begin with small ones, whatever others took."""
-        self._size, self._rate = 1, 0.0
+        """Prepare for blocks of a scenario: begin with small ones, unless it is the last one."""
+        if scenario is not self._scenario:
+            self._scenario, self._size, self._rate = scenario, 1, 0.0
 
     def next_size(self, left: int) -> int:
         """Return the number of runs of the next block, a power of two, when ``left`` runs are not

@@ -83,8 +83,9 @@ class AdaptivePool(LocalPool):
 
     def begin(self, scenario: object) -> None:
         """Forget the times of another scenario, which say nothing about this one."""
+        if scenario is not self._scenario:
+            self._begun, self._seconds, self._runs = False, 0.0, 0
         super().begin(scenario)
-        self._begun, self._seconds, self._runs = False, 0.0, 0
         if self._processes is not None:
             self._processes.begin(scenario)
 
@@ -239,7 +240,7 @@ class PoolOptions:
     with the number of its workers.
 
     workers   : number of processes; 1 is this process
-    executor  : an executor of concurrent.futures
+    executor  : an executor of concurrent.futures, or a pool that is used as it is
     scheduler : address of a Dask scheduler
 
     By default runs are simulated in this process, and on as many processes as there are cores once
@@ -247,7 +248,7 @@ class PoolOptions:
     """
 
     workers: int | None = None
-    executor: Executor | None = None
+    executor: Executor | Pool | None = None
     scheduler: str | None = None
 
 
@@ -263,6 +264,8 @@ def make_pool(blocks: int, options: PoolOptions = ANYWHERE, open_ended: bool = F
     Raises ScenarioError if the options ask for two pools, or for one of the wrong kind.
     """
     workers, executor, scheduler = options.workers, options.executor, options.scheduler
+    if isinstance(executor, Pool):
+        return executor
     values = {"workers": workers, "executor": executor, "scheduler": scheduler}
     names = [name for name, value in values.items() if value is not None]
     if len(names) > 1 and names != ["workers", "executor"]:

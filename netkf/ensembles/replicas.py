@@ -10,7 +10,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from netkf.core.errors import EngineError, ScenarioError
+from netkf.core.errors import EngineError, NetkfError, ScenarioError
 from netkf.core.fields import integer
 from netkf.ensembles.blocks import BlockResult, BlockTask, Job, Task, each_replica
 from netkf.ensembles.merge_tree import Merge, MergeTree
@@ -39,6 +39,7 @@ class BlockStore(NamedTuple):
     wanted   : replicas that are to be simulated (default: all); if some are missing at the end,
                there is no result
     time_is_up : function that is asked before each block if no further one should begin
+    merge    : merges the results, by default as those of the task are merged
     """
 
     known: Mapping[Node, Callable[[], Any]] = MappingProxyType({})
@@ -46,6 +47,56 @@ class BlockStore(NamedTuple):
     largest: int = 1 << 62
     wanted: range | None = None
     time_is_up: Callable[[], bool] = lambda: False
+    merge: Merge | None = None
+
+
+class Form(NamedTuple):
+    """How the results of blocks are stored: functions that turn one into arrays by name, with one
+    row for each run, and back.
+    """
+
+    pack: Callable[[Any], dict[str, Any]]
+    unpack: Callable[[Mapping[str, Any]], Any]
+
+
+def form_of(kind: Any) -> Form:
+    """Return the form of results that are named tuples of arrays of this ``kind``."""
+    return Form(
+        lambda value: value._asdict(), lambda arrays: kind(*(arrays[k] for k in kind._fields))
+    )
+
+
+class Gap(NamedTuple):
+    """The ``missing`` replicas of an ensemble of ``runs`` runs, the ``number``-th of a plan."""
+
+    number: int
+    runs: int
+    missing: list[range]
+
+
+class MissingRunsError(NetkfError):
+    """Ensembles of a plan lack results, which other workers may have under way."""
+
+    def __init__(self, gaps: list[Gap]) -> None:
+        self.gaps = gaps
+        super().__init__("runs of a plan have no result yet")
+
+
+def results_of(calls: Iterable[Callable[[], Any]]) -> Iterator[Any]:
+    """Yield the results of ``calls`` of ``replicate_blocks``, one after another. On a plan each
+    does its share of the work before a MissingRunsError of all is raised.
+    """
+    gaps: list[Gap] = []
+    for call in calls:
+        try:
+            result = call()
+        except MissingRunsError as error:
+            gaps += error.gaps
+        else:
+            if not gaps:
+                yield result
+    if gaps:
+        raise MissingRunsError(gaps)
 
 
 def replicate(
@@ -74,6 +125,7 @@ def replicate_blocks(
     first: int = 0,
     together: int | None = None,
     store: BlockStore = BlockStore(),  # noqa: B008 - it is immutable
+    form: Form | None = None,
 ) -> Any:
     """Return ``task(scenario, seed, replicas)`` for blocks of the replicas ``first`` .. ``first +
     runs - 1``, merged by ``merge(a, b)``, which joins the results of neighbours (a before b) into
@@ -91,15 +143,16 @@ def replicate_blocks(
                default as many as SIMD lanes for a scenario in slots, whose runs are simulated in
                lanes, else 1
     store    : results of some blocks that are known, and what is done with those of others
+    form     : how a plan stores results, if the pool is that of a plan
 
     Raises ScenarioError for wrong arguments, EngineError if workers die again and again or a
-    plugged-in class fails, and whatever ``task`` raises.
+    plugged-in class fails, MissingRunsError on a plan, and whatever ``task`` raises.
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError("", "must be a netkf.Scenario", scenario, "netkf.load(path) gives one")
     seed = scenario.seed if seed is None else integer(low=0)("seed", seed)
     runs, first = integer(low=1)("runs", runs), integer(low=0)("first", first)
-    tree, runs_done = MergeTree(merge), 0
+    runs_done = 0
     job = Job(scenario, task, seed, first, start=0, stop=runs, size=1)
 
     def take(block: Job, result: Any) -> None:
@@ -113,6 +166,9 @@ def replicate_blocks(
     with contextlib.ExitStack() as stack:
         if isinstance(pool, PoolOptions):
             pool = stack.enter_context(make_pool(runs, pool))
+        if pool.plan is not None and form is not None:
+            store = stack.enter_context(pool.plan.store(job, merge, form))
+        tree = MergeTree(store.merge or merge)
         pool.begin(scenario)
         for start, size in sorted(store.known):
             take(job._replace(start=start, size=size), store.known[start, size]())
@@ -141,7 +197,8 @@ def _make_blocks(pool: Pool, job: Job, together: int | None, store: BlockStore) 
     # Runs in slots are simulated in SIMD lanes: fewer runs than lanes take as long.
     slotted = isinstance(job.scenario, Scenario) and job.scenario.slotted
     min_size = together or (LANES if slotted else 1)
-    gaps = list(missing_ranges(store.known, store.wanted or range(job.stop)))
+    wanted = range(job.stop) if store.wanted is None else store.wanted
+    gaps = list(missing_ranges(store.known, wanted))
     left = sum(map(len, gaps))
     for gap in gaps:
         start = gap.start

@@ -13,6 +13,7 @@ from netkf.runs.documents import (
     COUNT,
     FINAL_STATUSES,
     TEXT,
+    TEXTS,
     DamagedError,
     check_files,
     check_seal,
@@ -38,6 +39,7 @@ MANIFEST = {
     "scenario?": TEXT,
     "trace?": TEXT,
     "tasks?": COUNT,
+    "arguments?": TEXTS,
 }
 """The form of a manifest that runs are resumed from."""
 

@@ -21,7 +21,7 @@ from netkf.core.fields import as_path
 from netkf.scenario.plugins import find_module_files, find_unimportable_class
 from netkf.scenario.scenario import Scenario
 from netkf.scenario.tables import source_files
-from netkf.scenario.writing import resolve_defaults, to_toml
+from netkf.scenario.writing import as_table, resolve_defaults, to_toml
 from netkf.trace.run import Run
 
 
@@ -285,9 +285,11 @@ def check_sources(scenario: Scenario) -> None:
             raise ScenarioError("path", rule, source.name, "rename the file")
 
 
-def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None) -> None:
-    """Write scenario.toml with all defaults filled in, and copy the files and modules that it
-    names.
+def write_scenario(
+    directory: Path, scenario: Scenario, seed: int | None = None, resolve: bool = True
+) -> None:
+    """Write scenario.toml with all defaults filled in, unless they should not be ``resolve``-d
+    because keys may still change, and copy the files and modules that it names.
 
     ``seed`` replaces the root seed of the scenario, so that the copy reproduces the run. Raises
     WriteError.
@@ -297,7 +299,7 @@ def write_scenario(directory: Path, scenario: Scenario, seed: int | None = None)
     for module in find_module_files(scenario).values():
         if module is not None:
             _copy(module, directory / module.name)
-    table = resolve_defaults(scenario)
+    table = resolve_defaults(scenario) if resolve else as_table(scenario)
     table["seed"] = scenario.seed if seed is None else seed
     write_text(directory / "scenario.toml", to_toml(table))
 

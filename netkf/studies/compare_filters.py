@@ -18,8 +18,9 @@ from netkf.core.errors import EngineError, ScenarioError, suggest_nearest
 from netkf.core.fields import integer, number
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line, shorten
+from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import PoolOptions, make_pool
-from netkf.ensembles.replicas import replicate_blocks
+from netkf.ensembles.replicas import replicate_blocks, results_of
 from netkf.runs.curves import ErrorCurve
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.failures import explain_failures
@@ -34,6 +35,7 @@ from netkf.scenario.scenario import Scenario
 from netkf.scenario.writing import as_table, part_as_table
 from netkf.studies.filter_values import (
     JUDGED,
+    VALUES,
     FilterValues,
     Quantity,
     block_values,
@@ -206,22 +208,27 @@ def compare_filters(
     values: dict[str, FilterValues] = {}
     traffic: dict[str, dict[str, float]] = {}
     curves, curve_at = [], curve_rows(scenario, count)
+
+    def simulate(case: Scenario, pool: Pool) -> FilterValues:
+        task = partial(block_values, engine=choose_engine(engine, case), rows=curve_at)
+        with explain_failures(case):
+            found: FilterValues = replicate_blocks(
+                task, join_values, case, count, root, pool=pool, form=VALUES
+            )
+            return found
+
+    able = [(one.label, one.scenario) for one in candidates if one.scenario is not None]
     with make_pool(count, PoolOptions(workers, executor, scheduler), open_ended=True) as pool:
-        for k, candidate in enumerate(candidates):
-            label, case = candidate.label, candidate.scenario
-            if case is not None:
-                chosen = choose_engine(engine, case)
-                task = partial(block_values, engine=chosen, rows=curve_at)
-                with explain_failures(case):
-                    values[label] = replicate_blocks(
-                        task, join_values, case, count, root, pool=pool
-                    )
-                if scenario.plant.truth_known:
-                    curves.append(mean_curve(label, case, values[label].curves))
-                values[label] = values[label]._replace(curves=np.empty((0, 0)))
-                traffic[label] = count_traffic(case, root, chosen)
+        found = results_of(partial(simulate, case, pool) for _, case in able)
+        for (label, able_case), value in zip(able, found, strict=True):
+            if scenario.plant.truth_known:
+                curves.append(mean_curve(label, able_case, value.curves))
+            values[label] = value._replace(curves=np.empty((0, 0)))
+            traffic[label] = count_traffic(
+                able_case, root, choose_engine(engine, able_case, announce=False)
+            )
             if progress is not None:
-                progress(k + 1, len(candidates))
+                progress(len(values), len(able))
     first = next(iter(values))
     # Bonferroni: all differences from the first filter hold together.
     names = sample_names(scenario)

@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from netkf.engines.base import Engine
+from netkf.ensembles.replicas import form_of
 from netkf.ensembles.statistics import run_values
 from netkf.laws.intervals import interval_of_squares
 from netkf.linalg.arrays import FloatArray
@@ -42,6 +43,10 @@ class FilterValues(NamedTuple):
     samples: FloatArray
     diverged: np.ndarray
     curves: FloatArray = np.empty((0, 0))
+
+
+VALUES = form_of(FilterValues)
+"""How plans store them."""
 
 
 def curve_rows(scenario: Scenario, runs: int) -> np.ndarray:

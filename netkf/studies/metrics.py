@@ -15,6 +15,7 @@ from netkf.algorithms.kernels.root_flow import whiten_observation
 from netkf.algorithms.models import SlotModel
 from netkf.core.errors import TheoryError
 from netkf.engines.base import Engine
+from netkf.ensembles.replicas import form_of
 from netkf.ensembles.statistics import count_messages, run_values, simulate_batches
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.simulate import simulate
@@ -50,6 +51,10 @@ class RunMetrics(NamedTuple):
     diverged: np.ndarray
     rounding_from: FloatArray
     quantities: FloatArray = NO_QUANTITIES
+
+
+METRICS = form_of(RunMetrics)
+"""How plans store them."""
 
 
 def block_metrics(scenario: Scenario, seed: int, replicas: range, engine: Engine) -> RunMetrics:

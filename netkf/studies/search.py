@@ -16,7 +16,7 @@ from netkf.ensembles.replicas import replicate_blocks
 from netkf.runs.quantities import ensemble_names
 from netkf.scenario.scenario import Scenario
 from netkf.studies.help import BEYOND, describe_help
-from netkf.studies.metrics import central_trace, join_metrics
+from netkf.studies.metrics import METRICS, central_trace, join_metrics
 from netkf.studies.targets import (
     MISSED,
     NOT_SHOWN,
@@ -252,7 +252,13 @@ class Search:
             batch = min(max(plan.first, simulated), plan.runs - simulated)
             metrics.append(
                 replicate_blocks(
-                    plan.task, join_metrics, scenario, batch, first=simulated, pool=plan.pool
+                    plan.task,
+                    join_metrics,
+                    scenario,
+                    batch,
+                    first=simulated,
+                    pool=plan.pool,
+                    form=METRICS,
                 )
             )
             simulated += batch

@@ -15,8 +15,9 @@ import numpy as np
 
 from netkf.core.errors import TheoryError
 from netkf.core.fields import integer
+from netkf.ensembles.pool import Pool
 from netkf.ensembles.pools import ANYWHERE, PoolOptions, make_pool
-from netkf.ensembles.replicas import replicate_blocks
+from netkf.ensembles.replicas import replicate_blocks, results_of
 from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.runs.documents import write_sealed
@@ -33,6 +34,7 @@ from netkf.runs.quantities import ensemble_names
 from netkf.runs.simulate import choose_engine, require_scenario
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import (
+    METRICS,
     MeanEstimate,
     RunMetrics,
     all_nodes,
@@ -127,11 +129,17 @@ def plan_sweep(
 def _simulate_points(
     plan: SweepPlan, options: PoolOptions, progress: Progress | None
 ) -> Iterator[Row]:
+    def simulate(point: GridPoint, pool: Pool) -> RunMetrics:
+        with explain_failures(point.scenario):
+            task = partial(block_metrics, engine=choose_engine(plan.engine, point.scenario))
+            metrics: RunMetrics = replicate_blocks(
+                task, join_metrics, point.scenario, plan.runs, pool=pool, form=METRICS
+            )
+            return metrics
+
     with make_pool(plan.runs, options, open_ended=True) as pool:
-        for k, point in enumerate(plan.points):
-            with explain_failures(point.scenario):
-                task = partial(block_metrics, engine=choose_engine(plan.engine, point.scenario))
-                metrics = replicate_blocks(task, join_metrics, point.scenario, plan.runs, pool=pool)
+        found = results_of(partial(simulate, point, pool) for point in plan.points)
+        for k, (point, metrics) in enumerate(zip(plan.points, found, strict=True)):
             row = _make_row(point, metrics)
             if not _same_truth(plan.points[0].scenario, point.scenario):
                 row["status"] += "; another truth"

@@ -14,9 +14,10 @@ import pytest
 
 import netkf
 from netkf.cli.main import main
-from netkf.ensembles import block_files, checkpoints, plans
+from netkf.ensembles import block_files, checkpoints, parts, plans
 from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
-from netkf.ensembles.plans import Part, open_plan, part_of_array, work_on_plan
+from netkf.ensembles.parts import Part, part_of_array
+from netkf.ensembles.plans import open_plan, work_on_plan
 from netkf.ensembles.pools import PoolOptions
 from netkf.runs import provenance
 from tests.conftest import SCENARIOS
@@ -108,7 +109,7 @@ def test_arrays_of_batch_systems_tell_the_part(variables, part):
 def test_time_and_interrupts_keep_what_was_finished(plan, whole, monkeypatch, capsys):
     ticks = itertools.count()
     with monkeypatch.context() as patch:  # a second for each look at the clock
-        patch.setattr(plans.time, "monotonic", lambda: float(next(ticks)))
+        patch.setattr(parts.time, "monotonic", lambda: float(next(ticks)))
         assert work(plan, "--for", "12s") == 1
     assert "are left: run it again" in capsys.readouterr().out
 

@@ -1,0 +1,194 @@
+"""Studies in a plan: ``--plan`` of their commands, and what ``netkf work`` and ``merge`` do then.
+
+All three run the study itself, on a pool whose results are files: see ``ensembles.planned_study``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from netkf.cli.options import FAILED, print_notes
+from netkf.cli.progress import ProgressLine
+from netkf.core.errors import ScenarioError
+
+if TYPE_CHECKING:
+    from netkf.ensembles.parts import Part
+    from netkf.ensembles.planned_study import PlannedStudy
+    from netkf.ensembles.plans import Plan
+    from netkf.ensembles.replicas import Gap
+
+Run = Callable[[argparse.Namespace], int]
+SHOWN = 20  # ranges of missing runs that are listed
+WAIT_SECONDS = 2.0
+"""Pause between two looks for the results of other jobs in a round."""
+
+
+def plan_study(run: Run, options: argparse.Namespace) -> int:
+    """Write the plan of the study that ``run`` does with these options; return the exit status."""
+    from netkf.cli.plan import print_plan
+    from netkf.ensembles.parts import Worker
+    from netkf.ensembles.planned_study import PlannedStudy
+    from netkf.ensembles.plans import write_study
+    from netkf.runs.directory_lock import lock_directory
+
+    for name in ("workers", "scheduler", "resume"):
+        if getattr(options, name, None):
+            remedy = "leave it out; netkf work has --workers"
+            rule = "does not go with --plan, which runs nothing"
+            raise ScenarioError(f"--{name}", rule, getattr(options, name), remedy)
+    with lock_directory(getattr(options, "out", None), must_be_empty=True):
+        pass  # that of the results
+    with lock_directory(options.plan, must_be_empty=True):
+        gaps = _missing_runs(run, options, PlannedStudy(options.plan, Worker(None), returns=False))
+        runs = [gap.runs for gap in gaps]
+        tasks = min(options.tasks, max(runs, default=1))
+        write_study(options.plan, options.loaded, options.arguments, sum(runs), tasks)
+    what = f"{sum(runs):,} runs"
+    if len(runs) > 1:
+        what += f" of {len(runs):,} ensembles"
+    if has_rounds(options):
+        what += " in the first round"
+    print_plan(options.plan, options.loaded, what, tasks, options)
+    return 0
+
+
+def has_rounds(options: argparse.Namespace) -> bool:
+    """Return True if results of the study's runs decide which runs are next."""
+    return hasattr(options, "target") or bool(getattr(options, "until", None))
+
+
+def work_on_study(plan: Plan, part: Part, options: argparse.Namespace) -> int:
+    """Simulate a part of the runs of each ensemble; return the exit status, 1 if some are left.
+
+    In a study with rounds other jobs are waited for as long as ``--for`` allows.
+    """
+    from netkf.ensembles.parts import Worker
+    from netkf.ensembles.planned_study import PlannedStudy
+    from netkf.runs.failures import InterruptedRunError
+
+    study_options = _parse(plan, options.trust)
+    rounds = has_rounds(study_options)
+    with ProgressLine() as line:
+        worker = Worker(part, options.seconds, line.make_count_update("runs"))
+        while True:
+            study = PlannedStudy(plan.directory, worker, returns=rounds)
+            try:
+                gaps = _missing_runs(study_options.run, study_options, study, options.workers)
+            except KeyboardInterrupt:
+                remedy = f"; go on with netkf work {plan.directory}"
+                raise InterruptedRunError(plan.directory, remedy) from None
+            waits = bool(rounds and gaps and not worker.left and options.seconds is not None)
+            if not waits or time.monotonic() + WAIT_SECONDS > worker.deadline:
+                break
+            time.sleep(WAIT_SECONDS)
+    which = f"part {part.index}/{part.count}" if part.count > 1 else "all"
+    if worker.left:
+        rest = f"; {worker.left:,} are left: run it again"
+    elif rounds and gaps:
+        rest = "; the next round needs the runs of other parts: run it again then"
+    else:
+        rest = "; nothing is left to do"
+    print(f"{which} of {plan.directory}: {worker.simulated:,} runs simulated{rest}")
+    return FAILED if worker.left or (rounds and gaps) else 0
+
+
+def merge_study(plan: Plan, options: argparse.Namespace) -> int:
+    """Finish the study as its command would have done; return its exit status, 1 if runs are
+    missing.
+    """
+    from netkf.ensembles.parts import Worker
+    from netkf.ensembles.planned_study import PlannedStudy
+    from netkf.ensembles.plans import require_alike
+
+    study_options = _parse(plan, options.trust)
+    rounds = has_rounds(study_options)
+    study = PlannedStudy(plan.directory, Worker(None), returns=rounds)
+    gaps = _missing_runs(study_options.run, study_options, study)
+    print_notes(study.worker.notes)
+    if any(gap.missing for gap in gaps):
+        _print_missing(plan.directory, gaps, rounds)
+        return FAILED
+    if len(require_alike(study.installations, plan.directory, options.mixed)) > 1:
+        print_notes(["results are of machines of different kinds: last digits may be others"])
+    study_options = _parse(plan, options.trust)
+    if options.no_plot and hasattr(study_options, "no_plot"):
+        study_options.no_plot = True
+    return _run_on(study_options.run, study_options, PlannedStudy(plan.directory, Worker(None)))
+
+
+def _parse(plan: Plan, trust: bool) -> argparse.Namespace:
+    """Return the options of the command that wrote a plan, for its copy of the scenario."""
+    from netkf.cli.main import make_parser
+
+    options = make_parser().parse_args(plan.arguments)
+    if getattr(options, "plan", None) is None:
+        rule = "holds a plan of no study"
+        raise ScenarioError("DIR", rule, str(plan.directory), "write the plan again")
+    options.copy, options.trust, options.plan = plan.directory / "scenario.toml", trust, None
+    return options
+
+
+def _missing_runs(
+    run: Run, options: argparse.Namespace, study: PlannedStudy, workers: int = 1
+) -> list[Gap]:
+    """Run a study without what it prints and writes; return the ensembles that it needs, with
+    their missing runs; none if it came to its end.
+    """
+    from netkf.ensembles.replicas import MissingRunsError
+
+    out = getattr(options, "out", None)
+    with TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        if hasattr(options, "out"):
+            options.out = Path(folder) / "out"
+        # The notes of the study are printed once, by merge; a worker shows its progress.
+        quiet = contextlib.redirect_stderr(
+            io.StringIO() if study.worker.part is None else sys.stderr
+        )
+        try:
+            with quiet:
+                _run_on(run, options, study, workers)
+        except MissingRunsError as error:
+            return error.gaps
+        finally:
+            options.out = out
+    return []
+
+
+def _run_on(run: Run, options: argparse.Namespace, study: PlannedStudy, workers: int = 1) -> int:
+    """Run a study whose results are those of a plan; return its exit status."""
+    from netkf.ensembles.pools import PoolOptions, make_pool
+
+    with make_pool(workers, PoolOptions(workers)) as pool:
+        pool.plan = study
+        options.executor, options.workers, options.scheduler = pool, None, None
+        return run(options)
+
+
+def _print_missing(directory: Path, gaps: list[Gap], rounds: bool) -> None:
+    """Print which runs have no result, and what to do."""
+    short = [gap for gap in gaps if gap.missing]
+    missing = sum(len(runs) for gap in short for runs in gap.missing)
+    total = sum(gap.runs for gap in gaps)
+    where = [
+        (f"ensemble {gap.number}: " if len(gaps) > 1 else "") + describe_ranges(gap.missing)
+        for gap in short[:SHOWN]
+    ]
+    more = f"; and {len(short) - SHOWN} further ensembles" if len(short) > SHOWN else ""
+    of = f"{total:,} runs" + (f" of round {short[0].number}" if rounds else "")
+    print(f"{missing:,} of {of} have no result: {'; '.join(where)}{more}")
+    print(f"go on with netkf work {directory}")
+
+
+def describe_ranges(missing: list[range]) -> str:
+    """Return ranges of runs as text."""
+    listed = [f"{gap[0]}" if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" for gap in missing[:SHOWN]]
+    more = f" and {len(missing) - SHOWN} further ranges" if len(missing) > SHOWN else ""
+    return ", ".join(listed) + more

@@ -1,0 +1,75 @@
+"""Ensembles of a study that any number of commands simulate through files.
+
+The study is run again and again by ``netkf work`` and ``netkf merge``, on a pool with a plan: each
+ensemble that it asks for has a folder of blocks, in the order in which it asks. As a study is
+deterministic, all commands meet the same ensembles, up to the first whose results it needs and that
+lacks some.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from netkf.ensembles.block_files import BlockFiles, RunIdentity
+from netkf.ensembles.blocks import Job
+from netkf.ensembles.merge_tree import Merge
+from netkf.ensembles.parts import Worker
+from netkf.ensembles.replicas import BlockStore, Form, Gap, MissingRunsError, missing_ranges
+from netkf.runs.documents import DamagedError
+from netkf.runs.files import BLOCKS_FOLDER, scenario_digest
+from netkf.scenario.scenario import Scenario
+
+
+class StudyBlocks(BlockFiles):
+    """Results of the blocks of one ensemble of a study, run by run."""
+
+    def __init__(self, folder: Path, merge: Merge, form: Form) -> None:
+        super().__init__(folder, merge)
+        self._form = form
+
+    def pack(self, value: Any) -> dict[str, Any]:
+        """Return the results of runs as arrays by name, with one row for each run."""
+        return self._form.pack(value)
+
+    def unpack(self, arrays: Any) -> Any:
+        """Return the results of runs from their arrays."""
+        return self._form.unpack({name: arrays[name] for name in arrays if name != "identity"})
+
+    def require_fit(self, arrays: Any, stored: dict[str, Any]) -> None:
+        """Raise DamagedError unless there are as many results as runs."""
+        start, size, runs = (int(stored[key]) for key in ("start", "size", "runs"))
+        first = next(iter(self._form.pack(self.unpack(arrays)).values()))
+        if len(first) != min(size, runs - start):
+            raise DamagedError("has another number of runs than it says")
+
+
+class PlannedStudy:
+    """The ensembles of a study in the ``directory`` of its plan, of which a ``worker`` simulates a
+    part, and whose results it gets if it ``returns`` them; ``installations`` made them.
+    """
+
+    def __init__(self, directory: Path, worker: Worker, returns: bool = True) -> None:
+        self._directory, self._returns = directory, returns
+        self.worker, self._count = worker, 0
+        self.installations: list[dict[str, Any]] = []
+
+    @contextlib.contextmanager
+    def store(self, job: Job, merge: Merge, form: Form) -> Iterator[BlockStore]:
+        """Yield the store of the next ensemble; raises MissingRunsError if results are missing in
+        the end, or are not returned.
+        """
+        assert isinstance(job.scenario, Scenario)
+        self._count += 1
+        digest = scenario_digest(job.scenario)
+        identity = RunIdentity(digest, job.seed, job.stop, "none", "", job.first)
+        folder = self._directory / BLOCKS_FOLDER / f"{self._count:04d}"
+        blocks = StudyBlocks(folder, merge, form)
+        with self.worker.store(blocks, identity, self._returns) as store:
+            yield store
+        self.installations += [i for i in blocks.installations if i not in self.installations]
+        missing = list(missing_ranges(blocks.nodes, range(job.stop)))
+        if missing or not self._returns:
+            raise MissingRunsError([Gap(self._count, job.stop, missing)])

@@ -1,0 +1,186 @@
+"""Plans of studies: what jobs leave in a directory ends as the command itself would have."""
+
+import json
+import re
+import shutil
+
+import pytest
+
+from netkf.cli.main import main
+from netkf.ensembles import block_files
+from netkf.ensembles.merge_tree import MergeTree
+from netkf.runs import provenance
+from netkf.runs.documents import write_sealed
+from tests.conftest import SCENARIOS
+
+RING = [str(SCENARIOS / "poisson_ring.toml"), "--set", "horizon=1.0"]
+SLOW = ["--engine", "simpy"]
+RATES = "network.activation.rate="
+STUDIES = {
+    "sweep": ["sweep", *RING, "--vary", f"{RATES}1.0,3.0", "--runs", "5", *SLOW, "--no-plot"],
+    "filters": [
+        *["compare-filters", *RING, "--filters", "hybrid,local", "--runs", "4"],
+        *[*SLOW, "--json", "--no-plot"],
+    ],
+    "until": ["check", *RING, "--runs", "10", "--until", "decided", "--most", "20", "--no-plot"],
+}
+SIZE = [
+    "size",
+    *RING,
+    "--set",
+    "horizon=0.6",
+    "--vary",
+    f"{RATES}0.5:2.0",
+    "--target",
+    "worst_trace<=9",
+    *SLOW,
+]
+SIZE += ["--by", "simulation", "--runs", "32"]
+
+
+def files(folder):
+    return {f.relative_to(folder): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+def said(capsys):
+    """What a command printed, without where it writes and how long it took."""
+    text = re.sub(r"in \d+\.\d+ s|written to .*", "", capsys.readouterr().out)
+    return re.sub(r'"directory": .*', "", text)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_parts_of_a_study_are_the_study(name, tmp_path, capsys):
+    line, plan, out = STUDIES[name], tmp_path / "plan", tmp_path / "out"
+    status = main([*line, "--out", str(tmp_path / "whole"), "--workers", "1"])
+    expected = said(capsys)
+    assert main([*line, "--out", str(out), "--plan", str(plan), "--tasks", "3"]) == 0
+    assert "none of them simulated" in capsys.readouterr().out
+    assert not out.exists()
+    for part in ("3/3", "1/3"):
+        assert main(["work", str(plan), "--part", part]) == (1 if name == "until" else 0)
+    assert main(["merge", str(plan)]) == 1
+    assert "have no result: " in capsys.readouterr().out
+    assert not out.exists()
+    assert main(["work", str(plan)]) == 0
+    capsys.readouterr()
+    assert main(["merge", str(plan)]) == status
+    assert said(capsys) == expected
+    assert files(out) == files(tmp_path / "whole")
+    assert main(["work", str(plan)]) == 0
+    assert "0 runs simulated; nothing is left to do" in capsys.readouterr().out
+
+
+def test_a_search_goes_round_by_round(tmp_path, capsys):
+    plan = tmp_path / "plan"
+    status = main([*SIZE, "--workers", "1"])
+    expected = capsys.readouterr().out
+    assert main([*SIZE, "--plan", str(plan), "--tasks", "2"]) == 0
+    assert "in the first round for 2 jobs" in capsys.readouterr().out
+    # The second part ends the first round and begins the next, the last: both ends are enough.
+    for part in ("1/2", "2/2", "1/2"):
+        assert main(["merge", str(plan)]) == 1
+        assert re.search(r"of \d+ runs of round \d have no result", capsys.readouterr().out)
+        ended = main(["work", str(plan), "--part", part])
+    assert ended == 0
+    assert "the next round needs the runs of other parts" not in capsys.readouterr().out
+    assert main(["merge", str(plan)]) == status
+    assert capsys.readouterr().out == expected
+
+
+@pytest.fixture
+def plan(tmp_path, capsys):
+    folder = tmp_path / "plan"
+    assert main([*STUDIES["sweep"], "--out", str(tmp_path / "out"), "--plan", str(folder)]) == 0
+    capsys.readouterr()
+    return folder
+
+
+def one_line(capsys):
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1
+    return error
+
+
+def test_damaged_and_mixed_results_of_studies(plan, monkeypatch, capsys):
+    assert main(["work", str(plan), "--part", "1/2"]) == 0
+    block = max((plan / "blocks" / "0002").iterdir(), key=lambda file: file.stat().st_size)
+    block.write_bytes(block.read_bytes()[:-9] + b"123456789")
+    capsys.readouterr()
+    assert main(["merge", str(plan)]) == 1
+    printed = capsys.readouterr()
+    assert f"{block.name} was changed since it was written" in printed.err
+    assert "ensemble 2: 0-" in printed.out
+    with monkeypatch.context() as patch:
+        other = {**provenance.machine(), "processor": "another"}
+        patch.setattr(block_files, "machine", lambda: other)
+        assert main(["work", str(plan)]) == 0
+    capsys.readouterr()
+    assert main(["merge", str(plan)]) == 2
+    assert "machines of different kinds" in capsys.readouterr().err.splitlines()[-1]
+    assert main(["merge", str(plan), "--mixed"]) == 0
+    assert "last digits may be others" in capsys.readouterr().err
+
+
+def test_what_is_no_plan_of_a_study_is_refused_in_one_line(plan, tmp_path, capsys):
+    changed = shutil.copytree(plan, tmp_path / "changed")
+    text = (changed / "scenario.toml").read_text()
+    (changed / "scenario.toml").write_text(text.replace("seed = 1", "seed = 2"))
+    lines = shutil.copytree(plan, tmp_path / "lines")
+    manifest = (lines / "manifest.json").read_text()
+    (lines / "manifest.json").write_text(manifest.replace('"5"', '"6"'))
+    other = shutil.copytree(plan, tmp_path / "other")
+    document = json.loads((other / "manifest.json").read_text())
+    document["arguments"] = ["theory", *RING]
+    del document["sha256"]
+    write_sealed(other / "manifest.json", document)
+    for folder in (changed, lines, other):
+        for command in ("work", "merge"):
+            before = files(folder)
+            assert main([command, str(folder)]) == 2
+            assert "DIR" in one_line(capsys)
+            assert files(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--workers", "2"], "does not go with --plan"),
+        (["--vary", "network.activation.rat=1"], "did you mean"),
+        (["--out", str(SCENARIOS)], "must be a new or empty directory"),
+        (["--plan", str(SCENARIOS)], "must be a new or empty directory"),
+    ],
+)
+def test_a_bad_command_line_writes_no_plan(options, words, tmp_path, capsys):
+    line = [*STUDIES["sweep"], "--plan", str(tmp_path / "plan")]
+    assert main([*line, *options]) == 2
+    assert words in one_line(capsys)
+    assert not (tmp_path / "plan").exists()
+
+
+def test_files_of_neighbours_are_merged_into_one(tmp_path):
+    """However often they are written, at most a file for each bit of the number of runs is left."""
+
+    class Texts(block_files.BlockFiles):
+        """Results that say in which order they were merged."""
+
+        def pack(self, value):
+            return {"text": value}
+
+        def unpack(self, arrays):
+            return str(arrays["text"])
+
+        def require_fit(self, arrays, stored):
+            pass
+
+    def merge(a, b):
+        return f"({a}{b})"
+
+    identity = block_files.RunIdentity("x", 1, 13, "none", "")
+    blocks, tree = Texts(tmp_path, merge), MergeTree(merge)
+    for k in (4, 5, 0, 2, 1, 3, 12, 8, 9, 7, 6, 11, 10):
+        tree.add(k, str(k))
+        blocks.add((k, 1), str(k), identity, 0.0)
+        blocks.write(identity)
+    assert blocks.nodes == [(0, 8), (8, 4), (12, 1)]
+    assert len(list(tmp_path.iterdir())) == 3
+    assert [blocks.load(node) for node in blocks.nodes] == [v for _, _, v in tree.nodes()]
