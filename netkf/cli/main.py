@@ -74,8 +74,9 @@ def _run_command(arguments: Sequence[str], interruption: Interruption) -> int:
 
 def _execute(arguments: Sequence[str], interruption: Interruption) -> _Outcome:
     try:
-        options = make_parser().parse_args(arguments)
-        options.arguments = list(arguments)
+        parser = make_parser()
+        options = parser.parse_args(arguments)
+        options.arguments, options.parse = list(arguments), parser.parse_args
         status: int = options.run(options)
         # A full disk or a closed pipe raises its error here at the latest, where it can be reported
         # in one line.

@@ -74,7 +74,7 @@ def work_on_study(plan: Plan, part: Part, options: argparse.Namespace) -> int:
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.runs.failures import InterruptedRunError
 
-    study_options = _parse(plan, options.trust)
+    study_options = _study_options(plan, options)
     rounds = has_rounds(study_options)
     with ProgressLine() as line:
         worker = Worker(part, options.seconds, line.make_count_update("runs"))
@@ -108,7 +108,7 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.ensembles.plans import require_alike
 
-    study_options = _parse(plan, options.trust)
+    study_options = _study_options(plan, options)
     rounds = has_rounds(study_options)
     study = PlannedStudy(plan.directory, Worker(None), returns=rounds)
     gaps = _missing_runs(study_options.run, study_options, study)
@@ -118,21 +118,22 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
         return FAILED
     if len(require_alike(study.installations, plan.directory, options.mixed)) > 1:
         print_notes(["results are of machines of different kinds: last digits may be others"])
-    study_options = _parse(plan, options.trust)
+    study_options = _study_options(plan, options)
     if options.no_plot and hasattr(study_options, "no_plot"):
         study_options.no_plot = True
     return _run_on(study_options.run, study_options, PlannedStudy(plan.directory, Worker(None)))
 
 
-def _parse(plan: Plan, trust: bool) -> argparse.Namespace:
-    """Return the options of the command that wrote a plan, for its copy of the scenario."""
-    from netkf.cli.main import make_parser
-
-    options = make_parser().parse_args(plan.arguments)
+def _study_options(plan: Plan, given: argparse.Namespace) -> argparse.Namespace:
+    """Return the options of the command that wrote a plan, for its copy of the scenario, by those
+    ``given`` to work or merge.
+    """
+    options: argparse.Namespace = given.parse(plan.arguments)
     if getattr(options, "plan", None) is None:
         rule = "holds a plan of no study"
         raise ScenarioError("DIR", rule, str(plan.directory), "write the plan again")
-    options.copy, options.trust, options.plan = plan.directory / "scenario.toml", trust, None
+    options.copy, options.trust = plan.directory / "scenario.toml", given.trust
+    options.plan = None
     return options
 
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import TYPE_CHECKING, Self
+from typing import Any, Self
 
 from netkf.ensembles.blocks import BlockResult, Job, PackedScenario, pack_scenario
 from netkf.scenario.scenario import Scenario
-
-if TYPE_CHECKING:
-    from netkf.ensembles.planned_study import PlannedStudy
 
 AHEAD = 2
 """Blocks for each worker that are submitted and not yet completed, if it is not in this process."""
@@ -29,10 +26,10 @@ class Pool(ABC):
     width : number of blocks that run at a time, as far as known
     quick : seconds of CPU time up to which blocks are made larger
     ahead : number of blocks that may be submitted before the first is complete
-    plan  : the study in a plan whose ensembles are simulated, if any
+    plan  : the PlannedStudy in a plan whose ensembles are simulated, if any
     """
 
-    plan: PlannedStudy | None = None
+    plan: Any = None
     width: int = 1
     quick: float = 5.0
     _size: int = 1
