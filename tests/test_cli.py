@@ -40,7 +40,7 @@ def test_a_missing_matplotlib_is_told_and_costs_the_picture_only(tmp_path, capsy
     monkeypatch.setitem(sys.modules, "netkf.figures.pictures", None)
     out = tmp_path / "out"
     assert main(["run", RING, "--out", str(out), "--set", "horizon=2.0"]) == 0
-    assert "pip install matplotlib" in capsys.readouterr().err
+    assert "pip install 'netkf[plot]'" in capsys.readouterr().err
     assert json.loads((out / "manifest.json").read_text())["status"] == "complete"
     assert not (out / "run.png").exists()
 

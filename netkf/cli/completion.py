@@ -26,7 +26,7 @@ class PrintCompletion(argparse.Action):
         try:
             import shtab
         except ImportError:
-            parser.error("--print-completion needs shtab: pip install shtab")
+            parser.error("--print-completion needs shtab: pip install 'netkf[completion]'")
         for action in _iterate_actions(parser):
             if action.type is Path:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]

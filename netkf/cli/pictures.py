@@ -37,7 +37,7 @@ def draw_picture(name: tuple[str, str], *results: Any) -> None:
     """Draw the picture of a finished command by ``name``; print a note if there is none."""
     draw = load_drawing(name)
     if draw is None:
-        print_notes(["no picture: matplotlib is missing (pip install matplotlib)"])
+        print_notes(["no picture: matplotlib is missing (pip install 'netkf[plot]')"])
         return
     try:
         is_drawn = draw(*results)

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from netkf.core.fields import as_path
+from netkf.ensembles.directory import EnsembleOptions, runs_to_directory
+from netkf.ensembles.monte_carlo import Ensemble
 from netkf.report.page import make_page
 from netkf.runs.files import write_text
 from netkf.runs.run import save
@@ -37,18 +39,31 @@ class Page:
 
 def page(result: Any, other: Any = None, *, replica: int | str | None = None) -> Page:
     """Return the page that ``netkf report`` writes of a result, or of two side by side: each is a
-    run in memory, what ``netkf.open`` returns, or a directory. ``replica`` is the run of an
-    ensemble to show, its number, "worst" or "median". Scenarios are read without trust, see
+    run or an ensemble in memory, what ``netkf.open`` returns, or a directory. The runs of an
+    ensemble in memory are simulated again, with the events of replica 0. ``replica`` is the run of
+    an ensemble to show, its number, "worst" or "median". Scenarios are read without trust, see
     ``netkf.open``.
 
-    Raises ScenarioError for what is no result, and WriteError.
+    Raises ScenarioError for what is no result, EngineError, and WriteError.
     """
     with tempfile.TemporaryDirectory() as folder:
         directories = []
         for k, one in enumerate([result] if other is None else [result, other]):
             directory = getattr(one, "directory", one)
-            if isinstance(one, Run) and directory is one:
-                directory = save(one, one.scenario, Path(folder) / f"RUN{k + 1}")
-            directories.append(as_path("result", directory, "give a run or its directory"))
+            if directory is one and isinstance(one, Run | Ensemble):
+                directory = _write(one, Path(folder) / f"RUN{k + 1}")
+            remedy = "give a run, an ensemble or its directory"
+            directories.append(as_path("result", directory, remedy))
         # The command on the page names no folder that is gone.
         return Page(make_page(directories, replica).replace(f"{folder}/", ""))
+
+
+def _write(result: Run | Ensemble, directory: Path) -> Path:
+    """Write a run or an ensemble in memory to a new ``directory`` and return that."""
+    if isinstance(result, Run):
+        return save(result, result.scenario, directory)
+    assert result.scenario is not None
+    scenario = result.scenario.replace({"seed": result.seed})
+    options = EnsembleOptions(result.engine)
+    runs_to_directory(scenario, int(result.runs.max()), directory, options)
+    return directory

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -195,6 +196,9 @@ class Why:
         notes = [f"note: {note}" for note in self.notes]
         tables = ["", self._source_table(), "", self._replay_table()]
         return "\n".join([*self.sentences(), *tables, *notes])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"
 
     def sentences(self) -> list[str]:
         """Return the explanation in sentences, one line each."""

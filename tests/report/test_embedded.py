@@ -10,6 +10,8 @@ import netkf
 from netkf.cli.main import main
 from tests.conftest import SCENARIOS
 
+RING = SCENARIOS / "poisson_ring.toml"
+
 
 class Frames(HTMLParser):
     """Collects the documents of iframes, with references resolved as a browser does."""
@@ -24,7 +26,7 @@ class Frames(HTMLParser):
 
 
 def test_a_notebook_shows_the_page_of_the_command(tmp_path, monkeypatch):
-    scenario = netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 2.0})
+    scenario = netkf.load(RING, {"horizon": 2.0})
     run = netkf.simulate(scenario, engine="simpy")
     page = netkf.page(run)
     frames = Frames()
@@ -40,5 +42,23 @@ def test_a_notebook_shows_the_page_of_the_command(tmp_path, monkeypatch):
     assert written.replace(" --out page.html", "") == page.html
     assert netkf.page(netkf.open("RUN1")).html == page.html
     assert page.save("saved.html").read_text(encoding="utf-8") == page.html
-    with pytest.raises(netkf.ScenarioError, match="give a run or its directory"):
+    with pytest.raises(netkf.ScenarioError, match="give a run, an ensemble or its directory"):
         netkf.page(None)
+
+
+def test_the_page_of_an_ensemble_in_memory_is_that_of_the_command(tmp_path, monkeypatch):
+    scenario = netkf.load(RING, {"horizon": 1.0})
+    ensemble = netkf.monte_carlo(scenario, 3, seed=7, engine="simpy", workers=1)
+    page = netkf.page(ensemble)
+    monkeypatch.chdir(tmp_path)
+    options = ["--set", "horizon=1.0", "--seed", "7", "--engine", "simpy", "--runs", "3"]
+    assert main(["run", str(RING), *options, "--no-plot", "--out", "RUN1"]) == 0
+    assert netkf.page("RUN1").html == page.html
+
+
+def test_a_notebook_shows_the_sentences_of_an_explanation():
+    run = netkf.simulate(netkf.load(RING, {"horizon": 2.0}), engine="simpy")
+    found = netkf.why(run, 1, 1.0)
+    frame = found._repr_html_()
+    assert frame.startswith("<pre>")
+    assert html.unescape(frame)[5:-6] == str(found)

@@ -87,5 +87,5 @@ def test_without_shtab_one_line_says_so(monkeypatch, capsys):
         main(["--print-completion", "bash"])
     assert stop.value.code == 2
     assert capsys.readouterr().err == (
-        "netkf: --print-completion needs shtab: pip install shtab; see netkf --help\n"
+        "netkf: --print-completion needs shtab: pip install 'netkf[completion]'; see netkf --help\n"
     )
