@@ -250,6 +250,7 @@ def test_with_a_walking_offset_for_each_mote_filters_are_nearer_than_the_plain_m
 
 
 DRAWINGS = {
+    "benchmarks": [],
     "diffusion": ["--runs", "2"],
     "gallery": ["--runs", "2", "--points", "3"],
     "gossip": ["--samples", "100"],

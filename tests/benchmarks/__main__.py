@@ -1,4 +1,4 @@
-"""Every target of speed in one table: ``python -m tests.benchmarks [--only NAME] [--runs 5]``.
+"""Every target of speed in one table: ``python -m tests.benchmarks [--only NAME] [--history]``.
 
 netkf, one process and no trace, through ``netkf.monte_carlo``, against hand-written numba kernels
 of the same job (``by_hand``), batched numpy, filterpy, Stone Soup and simdkalman (``peers``), and
@@ -11,6 +11,7 @@ it is a lower one (>=). Ratios hold from machine to machine, times do not.
 import argparse
 import importlib.util
 
+from tests.benchmarks import history
 from tests.benchmarks.rows import ROWS
 from tests.benchmarks.table import heading, measured, shown
 
@@ -29,11 +30,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", metavar="NAME", help="rows whose name contains this")
     parser.add_argument("--runs", type=int, default=5, help="measurements of each (default 5)")
+    parser.add_argument("--history", action="store_true", help="keep the ratios, see history.py")
     options = parser.parse_args()
     rows = [row for row in ROWS if options.only is None or options.only in row.name]
     if not rows:
         parser.error(f"no row is named so; there are {', '.join(row.name for row in ROWS)}")
-    missed = []
+    missed, pairs = [], []
     heading()
     for row in rows:
         package = missing(row)
@@ -42,7 +44,10 @@ def main():
             continue
         found = measured(row, options.runs)
         shown(row, found)
+        pairs.append((row, found))
         missed += [row.name] if not found.holds(row) else []
+    if options.history:
+        history.add(pairs)
     print(f"{len(missed)} of {len(rows)} missed" if missed else "no limit missed")
 
 
