@@ -80,6 +80,7 @@ def run_data(
         "name": source.scenario.name,
         "status": source.status,
         "replica": run.replica,
+        "words": source.replicas.words(run.replica) if source.replicas else "",
         "horizon": horizon,
         "truth": run.truth_known,
         # In slots, messages that a node sends at the same time are one transmission.

@@ -4,7 +4,7 @@ of filters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 from netkf.ensembles.stored import StoredEnsemble
 from netkf.linalg.arrays import FloatArray
-from netkf.report.replicas import Replicas, choose_replica, read_replicas
+from netkf.report.replicas import RANKS, Replicas, choose_replica, read_replicas
 from netkf.report.worst import WorstSamples, find_worst_samples
 from netkf.runs.documents import NUMBER, TEXT, TEXTS, require_form
 from netkf.runs.stored import StoredRun, read_checked_document
@@ -77,6 +77,23 @@ class ReportSource:
         if self.ensemble is not None:
             return "ensemble"
         return "run" if self.run is not None else "verdict"
+
+    @property
+    def shown(self) -> str:
+        """The label, for an ensemble with the number of the run that is shown."""
+        if self.ensemble is None or self.run is None:
+            return self.label
+        return f"{self.label}, replica {self.run.replica}"
+
+    def other_runs(self) -> list[ReportSource]:
+        """Return the source with the worst and with the median recorded run of an ensemble, without
+        that which is shown.
+        """
+        if self.ensemble is None or self.run is None or self.replicas is None:
+            return []
+        numbers = {int(self.replicas.numbers[self.replicas.place(rank)]) for rank in RANKS}
+        others = sorted(numbers - {self.run.replica})
+        return [replace(self, run=self.ensemble.replica(number)) for number in others]
 
     @property
     def summary(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,7 @@ SCRIPTS = (
     "decode.js",
     "state.js",
     "theme.js",
+    "brush.js",
     "network.js",
     "estimates.js",
     "sequence.js",
@@ -75,13 +76,16 @@ HEAD = 4096
 
 
 class _AnalysedSource(NamedTuple):
-    """The contents of a directory with its MESSAGE rows, worst sample, innovations and layout."""
+    """The contents of a directory with its MESSAGE rows, worst sample, innovations and layout, and
+    ``others``, the same with other runs of an ensemble, which a reader may choose.
+    """
 
     source: ReportSource
     messages: np.ndarray
     worst: Why | str | None = None
     readings: Innovations | str | None = None
     layout: list[list[float]] | None = None
+    others: tuple[_AnalysedSource, ...] = ()
 
     @property
     def is_live(self) -> bool:
@@ -158,7 +162,8 @@ def make_page(
         reason = "A run did not finish, so nothing is compared"
         comparison = compare(directories) if have_ended else reason
     # Data of the runs are thinned until the page is small enough.
-    data_limits = Budget(BUDGET.messages // len(entries), BUDGET.values // len(entries))
+    count = sum(1 + len(entry.others) for entry in entries)
+    data_limits = Budget(BUDGET.messages // count, BUDGET.values // count)
     while True:
         page = _assemble_page(entries, comparison, shlex.join(command), data_limits)
         size = len(page.encode("utf-8"))
@@ -171,14 +176,21 @@ def make_page(
 def _analyse_directory(directory: Path, replica: int | str | None, trust: bool) -> _AnalysedSource:
     """Read a directory and compute what takes long once; raises ScenarioError."""
     source = read_source(directory, replica, trust)
+    with damage_named(directory):
+        entry = _analyse_run(source)._replace(worst=explain_worst(source))
+        others = map(_analyse_run, source.other_runs()) if entry.is_live else ()
+        return entry._replace(others=tuple(others))
+
+
+def _analyse_run(source: ReportSource) -> _AnalysedSource:
+    """Return a source with what its run needs for the live views; raises DamagedError."""
     if source.run is None:
         return _AnalysedSource(source, np.empty(0, dtype=MESSAGE))
-    with damage_named(directory):
-        try:
-            messages = join_messages(source.run.log)
-        except ValueError as error:
-            raise DamagedError(f"events.parquet: {error}") from None
-    entry = _AnalysedSource(source, messages, explain_worst(source), read_innovations(source))
+    try:
+        messages = join_messages(source.run.log)
+    except ValueError as error:
+        raise DamagedError(f"events.parquet: {error}") from None
+    entry = _AnalysedSource(source, messages, readings=read_innovations(source))
     return entry._replace(layout=positions(source, source.run)) if entry.is_live else entry
 
 
@@ -203,24 +215,18 @@ def _assemble_page(
 ) -> str:
     """Return the page of one or two ``entries`` as HTML, within the ``data_limits``."""
     packer = Packer()  # collects columns of numbers as one compressed text
-    runs = [
-        run_data(
-            entry.source,
-            entry.source.run,
-            entry.messages,
-            entry.readings,
-            entry.layout,
-            data_limits,
-            packer,
-        )
+    choices = [
+        [_live_data(one, data_limits, packer) for one in (entry, *entry.others)]
         for entry in entries
-        if entry.source.run is not None and entry.layout is not None
+        if entry.layout is not None
     ]
-    rules = [rule for data in runs for rule in thinning_rules(data)]
+    runs = [first for first, *_ in choices]
+    rules = list(dict.fromkeys(rule for data in choices for run in data for rule in _rules(run)))
     packed, sizes = packer.text()
     sources = [entry.source for entry in entries]
     data = {
         "runs": runs,
+        "replicas": [others for _, *others in choices],
         "sizes": sizes,
         "ensembles": [tables.ensemble_curves(source) for source in sources],
         "summaries": [tables.averages(source) for source in sources],
@@ -244,6 +250,16 @@ def _assemble_page(
         packed=packed,
         script=script,
     )
+
+
+def _live_data(entry: _AnalysedSource, limits: Budget, packer: Packer) -> dict[str, Any]:
+    assert entry.source.run is not None and entry.layout is not None
+    run, layout = entry.source.run, entry.layout
+    return run_data(entry.source, run, entry.messages, entry.readings, layout, limits, packer)
+
+
+def _rules(data: dict[str, Any]) -> list[str]:
+    return [f"{data['words']}{': ' * bool(data['words'])}{rule}" for rule in thinning_rules(data)]
 
 
 def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | None) -> str:
@@ -317,7 +333,7 @@ def _main_sections(
     figures = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
     if figures:
         parts.append(section("figures", "Errors of the filters", figures))
-    losses = [outcome_figures(source.run, source.label) for source in sources]
+    losses = [outcome_figures(source.run, source.shown) for source in sources]
     if any(losses):
         columns = "".join(f"<div>{one}</div>" for one in losses)
         beside = ' class="views"' if len(losses) > 1 else ""
@@ -438,7 +454,8 @@ def _script() -> str:
     # The licence of uPlot requires its text in every copy.
     licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
     scripts = "\n".join(_asset(name) for name in SCRIPTS)
+    plots = _asset("language.js") + _asset("uPlot.iife.min.js")
     return (
-        f'{licence}{_asset("uPlot.iife.min.js")}\n(function () {{\n"use strict";\n{scripts}\n'
+        f'{licence}{plots}\n(function () {{\n"use strict";\n{scripts}\n'
         "})();\n"
     )

@@ -34,6 +34,15 @@ class Replicas(NamedTuple):
     errors: FloatArray
     spread: FloatArray
 
+    def words(self, number: int) -> str:
+        """Return a replica with its rank, if it has one, and its error."""
+        place = int(np.flatnonzero(self.numbers == number)[0]) if number in self.numbers else -1
+        if place < 0:
+            return f"replica {number}"
+        ranks = "".join(f"{rank}, " for rank in RANKS if self.place(rank) == place)
+        error = format_number(float(self.errors[place]))
+        return f"replica {number} ({ranks}RMS error {error})"
+
     def place(self, rank: str) -> int:
         """Return the place in ``numbers`` of a rank, ``worst`` or ``median``."""
         return len(self.numbers) - 1 if rank == "worst" else (len(self.numbers) - 1) // 2
@@ -88,8 +97,8 @@ def describe_replica(shown: int, runs: int, replicas: Replicas | None) -> str:
         for rank, k in ((rank, replicas.place(rank)) for rank in RANKS)
     ]
     return (
-        f"{sentence}. Of {len(replicas.numbers):,} recorded runs the {', the '.join(ends)}: "
-        "netkf report --replica worst, or median, shows it"
+        f"{sentence}. Of {len(replicas.numbers):,} recorded runs the {', the '.join(ends)}: choose "
+        "them at Run, below; netkf report --replica begins with any other"
     )
 
 

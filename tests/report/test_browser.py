@@ -274,6 +274,7 @@ def test_the_address_is_a_moment_and_the_figures_share_a_stretch_of_time(files, 
     page.wait_for_timeout(300)
     assert page.evaluate("window.netkf.app.span") == pytest.approx([1.5, 4.5], abs=0.05)
     assert page.evaluate("window.netkf.time()") == 4.0  # a drag is no click
+    page.locator("#tracks").scroll_into_view_if_needed()
     box = page.locator("#tracks").bounding_box()
     left, width = box["x"] + 92, box["width"] - 104
     page.mouse.click(left + 0.5 * width, box["y"] + 6 + 13 * 4.5)  # the fifth row: node 4
@@ -281,6 +282,47 @@ def test_the_address_is_a_moment_and_the_figures_share_a_stretch_of_time(files, 
     assert page.evaluate(told) == [pytest.approx(3.0, abs=0.05), 4, 0]
     page.click("#whole")
     assert page.evaluate("window.netkf.app.span") is None
+
+
+def test_the_sequence_chart_shows_the_stretch_and_chooses_one(files, look):
+    page = look(files["ring"])
+    page.evaluate("location.hash = '#t=9&node=1&from=8&to=10'")
+    page.wait_for_timeout(300)
+    assert " messages from 8 to 10 s" in page.inner_text("#sequence-note")
+    scrub = "[document.getElementById('scrub').min, document.getElementById('scrub').max]"
+    assert page.evaluate(scrub) == ["8", "10"]
+    page.evaluate("window.netkf.app.setTime(2)")  # a time outside moves no chart
+    page.wait_for_timeout(300)
+    assert " messages from 8 to 10 s" in page.inner_text("#sequence-note")
+    assert page.locator("#sequence .now").count() == 0
+    chart = page.locator("#sequence svg")
+    chart.scroll_into_view_if_needed()
+    box = chart.bounding_box()
+    top, high = box["y"] + 34, 480 - 34 - 14
+    page.mouse.move(box["x"] + 200, top + 0.25 * high)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 210, top + 0.5 * high, steps=3)
+    assert page.locator(".brush").count() == 1
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    assert page.evaluate("window.netkf.app.span") == pytest.approx([8.5, 9.0], abs=0.02)
+    assert page.locator(".brush").count() == 0
+    page.locator("#sequence svg").click(position={"x": 200, "y": 34 + 0.5 * high})
+    page.wait_for_timeout(300)
+    assert page.evaluate("window.netkf.time()") == pytest.approx(8.75, abs=0.01)
+
+
+def test_a_run_of_an_ensemble_is_chosen_on_the_page(files, look, ensembles):
+    page, stored = look(files["ensemble"]), netkf.open(ensembles[0])
+    number = read_source(ensembles[0]).replicas.numbers[-1]
+    page.select_option("#replica", str(number))
+    page.wait_for_timeout(300)
+    assert page.evaluate("window.netkf.app.run.replica") == number
+    run = stored.replica(int(number))
+    shown = page.evaluate("window.netkf.state(3.0, 0.1).nodes.map((node) => node.xhat)")
+    np.testing.assert_array_equal(shown, run.xhat[np.flatnonzero(run.times <= 3.0)[-1]])
+    assert f"&replica={number}" in page.evaluate("location.hash")
+    assert f"--replica {number}" in page.inner_text("#why")
 
 
 def test_tables_are_offered_as_csv(files, look):
@@ -391,7 +433,7 @@ def test_markup_in_texts_runs_nothing(look, tmp_path):
     page.click("text=Messages at this time as a table")
     assert page.evaluate("window.pwned") is None
     assert page.locator("img").count() == 0
-    assert EVIL in page.inner_text("h2 >> nth=0")
+    assert EVIL in page.inner_text(".claim")
 
 
 def test_motion_is_reduced_where_that_is_asked_for(files, look):

@@ -7,6 +7,7 @@ const app = {
 
   get run() { return this.runs[this.focus]; },
   get end() { return Math.max(...this.runs.map((run) => run.horizon)); },
+  get stretch() { return this.span || [0, this.end]; },
 
   // Seconds for which a message without travel is on show; in slots no longer than a slot.
   persist() {
@@ -38,16 +39,21 @@ const app = {
   },
 
   advance(seconds) {
-    if (this.time + seconds >= this.end) { this.setTime(this.end); play(false); }
+    const end = this.stretch[1];
+    if (this.time + seconds >= end) { this.setTime(end); play(false); }
     else this.setTime(this.time + seconds, true);
   },
 
   // The stretch of time [from, to] that all figures and tracks show; null for the whole run.
   setSpan(span) {
     this.span = span && span[1] > span[0] ? span : null;
-    if (find("whole")) find("whole").hidden = !this.span;
     buildFigures();
-    if (this.runs.length) schedule();
+    if (!this.runs.length) return;
+    find("whole").hidden = !this.span;
+    find("window").disabled = Boolean(this.span); // the sequence chart shows the same stretch
+    const [from, to] = this.stretch;
+    for (const [name, value] of Object.entries({ min: from, max: to, step: (to - from) / 1000 })) find("scrub")[name] = String(value);
+    schedule();
   },
 
   focusOn(run) { if (this.run !== run) focusRun(this.runs.indexOf(run)); },
@@ -62,7 +68,8 @@ const app = {
 
 function play(on) {
   app.playing = on;
-  if (on && app.time >= app.end) app.time = 0;
+  const [from, to] = app.stretch;
+  if (on && (app.time >= to || app.time < from)) app.time = from;
   find("play").textContent = on ? "Pause" : "Play";
   if (on) Clock.start(app);
   schedule();
@@ -92,18 +99,23 @@ function drawSlowly(now) {
   if (!app.playing) { fillTables(); writeMoment(); }
 }
 
-// The address of the page names the moment and the node, #t=16&node=2: a link to it.
+// The address of the page names the moment, the node and what else was chosen: a link to it, such
+// as #t=16&node=2.
 function writeMoment() {
-  const moment = "#t=" + Format.time(app.time) + "&node=" + encodeURIComponent(String(app.run.names[app.nodeOf(app.run)]));
-  const run = app.focus ? "&run=" + "AB"[app.focus] : "";
-  if (location.hash !== moment + run) try { history.replaceState(null, "", moment + run); } catch { /* a browser that forbids it */ }
+  let moment = "#t=" + Format.time(app.time) + "&node=" + encodeURIComponent(String(app.run.names[app.nodeOf(app.run)]));
+  if (app.focus) moment += "&run=" + "AB"[app.focus];
+  if (app.run !== page.choices[app.focus][0]) moment += "&replica=" + app.run.replica;
+  if (app.span) moment += "&from=" + Format.time(app.span[0]) + "&to=" + Format.time(app.span[1]);
+  if (location.hash !== moment) try { history.replaceState(null, "", moment); } catch { /* a browser that forbids it */ }
 }
 
 // Shows the moment in the address; true if there is one. What is not of this run is passed over.
 function readMoment() {
-  const asked = new URLSearchParams(location.hash.slice(1)), t = Number(asked.get("t") || NaN);
+  const asked = new URLSearchParams(location.hash.slice(1)), number = (name) => Number(asked.get(name) || NaN), t = number("t");
   const r = "AB".indexOf(asked.get("run") || "A");
   if (r >= 0 && r < app.runs.length && r !== app.focus) focusRun(r);
+  if (asked.has("replica")) showReplica(number("replica"));
+  if (number("to") > number("from")) app.setSpan([Math.max(0, number("from")), Math.min(app.end, number("to"))]);
   const i = app.run.names.findIndex((name) => String(name) === asked.get("node"));
   if (i >= 0) app.setNode(i);
   if (Number.isFinite(t)) app.setTime(t);
@@ -217,7 +229,7 @@ function keys(event) {
     " ": () => play(!app.playing), m: nextMessage, w: toWorst,
     ArrowLeft: () => (far ? app.setTime(app.time - tenth) : step(-1)),
     ArrowRight: () => (far ? app.setTime(app.time + tenth) : step(1)),
-    Home: () => app.setTime(0), End: () => app.setTime(app.end),
+    Home: () => app.setTime(app.stretch[0]), End: () => app.setTime(app.stretch[1]),
     ArrowUp: () => app.setNode((i + 1) % last), ArrowDown: () => app.setNode((i - 1 + last) % last),
   };
   const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
@@ -229,11 +241,24 @@ function focusRun(r) {
   find("run").value = String(r);
   const run = app.run;
   options(find("node"), run.names.map((node, i) => [String(i), String(node) + (run.sensing[i] ? " (sensor)" : "")]));
+  options(find("replica"), page.choices[r].map((one) => [String(one.replica), one.words]));
+  find("replica").value = String(run.replica);
+  find("replica-choice").hidden = page.choices[r].length < 2;
   if (app.nodeOf(run) < 0) app.nodeId = run.nodes[0];
   find("node").value = String(app.nodeOf(run));
   app.picks = run.nodes.slice(0, 6).map((_, i) => i);
   buildPicks(run);
   schedule();
+}
+
+// Another recorded run of the ensemble moves in the place of the one in focus.
+function showReplica(number) {
+  const found = page.choices[app.focus].find((run) => run.replica === number);
+  if (!found || found === app.run) return;
+  app.runs[app.focus] = found;
+  focusRun(app.focus);
+  buildViews();
+  buildFigures();
 }
 
 function buildPicks(run) {
@@ -291,8 +316,7 @@ function setUpControls() {
   choose("run", app.runs.map((one, r) => [String(r), "AB"[r] + ", " + one.label]), 0, (v) => focusRun(Number(v)));
   find("run-choice").hidden = app.runs.length < 2;
   find("node").addEventListener("change", () => app.setNode(Number(find("node").value)));
-  find("scrub").max = String(app.end);
-  find("scrub").step = String(app.end / 1000);
+  find("replica").addEventListener("change", () => showReplica(Number(find("replica").value)));
   find("scrub").addEventListener("input", () => app.setTime(Number(find("scrub").value)));
   find("play").addEventListener("click", () => play(!app.playing));
   find("back").addEventListener("click", () => step(-1));
@@ -313,6 +337,8 @@ function startLive() {
   focusRun(0);
   buildViews();
   Tracks.listen(find("tracks"), app);
+  Sequence.listen(find("sequence"), app);
+  app.setSpan(null);
   readMoment();
 }
 
@@ -327,7 +353,8 @@ async function start() {
   }
   if (page.runs.length) {
     const bytesOf = await Decode.columns(find("page-columns").textContent, page.sizes);
-    app.runs = page.runs = page.runs.map((data) => Decode.run(data, bytesOf));
+    page.choices = page.runs.map((data, r) => [data, ...page.replicas[r]].map((one) => Decode.run(one, bytesOf)));
+    app.runs = page.runs = page.choices.map((runs) => runs[0]);
     startLive();
   } else {
     const known = page.ensembles.find(Boolean);

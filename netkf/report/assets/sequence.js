@@ -24,15 +24,18 @@ const Sequence = (() => {
     return found;
   }
 
-  // The messages to draw, with half of the width until no more than MAX_ARROWS are left around t.
-  function narrow(run, chosen, t, width, app) {
-    for (;;) {
-      const start = Math.max(0, t - 0.75 * width), end = start + width;
+  // The messages to draw of the stretch of time that all charts show, else of the window, with half
+  // of the width until no more than MAX_ARROWS are left around t.
+  function narrow(run, chosen, t, app) {
+    const [low, high] = app.span || [0, Infinity];
+    for (let width = widest(app); ; width /= 2) {
+      const start = Math.max(low, Math.min(t - 0.75 * width, high - width)), end = start + width;
       const found = app.filtered(run, rows(run, chosen, start, end));
       if (found.length <= MAX_ARROWS || width < 1e-9 * run.horizon) return { found, start, end, width };
-      width /= 2;
     }
   }
+
+  const widest = (app) => (app.span ? app.span[1] - app.span[0] : app.window);
 
   // Instants of several transmissions, such as slots, are spread a little: y then orders what time
   // alone does not tell apart.
@@ -59,9 +62,15 @@ const Sequence = (() => {
     return { y, sent, ended };
   }
 
+  let timeAt = null; // seconds at a height of what was drawn last
+
+  function listen(box, app) {
+    Brush.listen(box, app, "y", (y) => timeAt(y), ({ y }) => { if (y > TOP) app.setTime(timeAt(y)); });
+  }
+
   function draw(box, note, run, app) {
     const chosen = app.lifelines === "near" ? near(run, app.nodeOf(run), app.time) : app.picks.slice();
-    const { found, start, end, width } = narrow(run, chosen, app.time, app.window, app);
+    const { found, start, end, width } = narrow(run, chosen, app.time, app);
     const wide = Math.max(box.clientWidth - 2, LEFT + RIGHT + 44 * chosen.length);
     const step = (wide - LEFT - RIGHT) / Math.max(1, chosen.length - 1 || 1);
     const x = new Map(chosen.map((i, k) => [i, chosen.length > 1 ? LEFT + 14 + (k * (step * (chosen.length - 1) - 28)) / (chosen.length - 1) : wide / 2]));
@@ -75,11 +84,8 @@ const Sequence = (() => {
     drawLifelines(svg, run, app, chosen, x, at, start, end);
     for (const row of drawn) svg.append(arrow(run, row, x, at));
     if (run.broadcasts) drawLosers(svg, run, drawn, x, at);
-    drawClock(svg, at, app.time, wide, end);
-    svg.addEventListener("click", (event) => {
-      const y = event.clientY - svg.getBoundingClientRect().top;
-      if (y > TOP) app.setTime(start + ((y - TOP) / (HEIGHT - TOP - BOTTOM)) * (end - start));
-    });
+    if (app.time >= start && app.time <= end) drawClock(svg, at, app.time, wide);
+    timeAt = (y) => start + ((Math.max(y, TOP) - TOP) / (HEIGHT - TOP - BOTTOM)) * (end - start);
     box.replaceChildren(svg);
     showChosen(box, x, app.nodeOf(run), wide);
     note.textContent = words(run, drawn, start, end, width, app);
@@ -101,7 +107,7 @@ const Sequence = (() => {
 
   function words(run, found, start, end, width, app) {
     let said = Format.count(found.length) + " messages" + app.filterWords() + " from " + Format.time(start) + " to " + Format.time(end) + " s";
-    if (width < app.window) said += "; the window is narrowed so that they can be told apart";
+    if (width < widest(app)) said += "; the window is narrowed so that they can be told apart";
     const m = run.messages;
     if (m.step > 1 && (start < m.start || end > m.end)) {
       said += "; outside of " + Format.time(m.start) + " to " + Format.time(m.end) +
@@ -209,8 +215,7 @@ const Sequence = (() => {
       run.names[m.receiver[row]] + ", sent at " + Format.time(m.sent[row]) + " s, " + outcome + age;
   }
 
-  function drawClock(svg, at, t, wide, end) {
-    if (t > end) return;
+  function drawClock(svg, at, t, wide) {
     svg.append(make("line", { x1: LEFT - 6, x2: wide, y1: at.y(t), y2: at.y(t), class: "now" }));
   }
 
@@ -222,5 +227,5 @@ const Sequence = (() => {
     return Math.min(width, run.horizon) || 1;
   }
 
-  return { draw, sentence, usualWindow, losers };
+  return { draw, listen, sentence, usualWindow };
 })();

@@ -37,7 +37,7 @@ const Tracks = (() => {
     const rows = rowsOf(app), bottom = TOP + rows.length * ROW + GAP, height = bottom + BOTTOM;
     target.style.height = height + "px";
     const { context, width } = Theme.canvas(target, height), scale = scaleOf(app, width);
-    const key = [width, devicePixelRatio, app.span, app.focus, app.nodeId, Theme.colours.ink].join();
+    const key = [width, devicePixelRatio, app.span, app.focus, app.nodeId, Theme.colours.ink, app.runs.map((run) => run.replica)].join();
     if (key !== stillOf) {
       rows.forEach((row, k) => drawRow(context, app, row, TOP + k * ROW, scale, width));
       drawAxis(context, scale, bottom);
@@ -109,24 +109,11 @@ const Tracks = (() => {
 
   // A click sets time and node, a drag the stretch of time.
   function listen(target, app) {
-    let start = null;
-    const at = (event) => {
-      const edge = target.getBoundingClientRect();
-      return [event.clientX - edge.left, event.clientY - edge.top];
-    };
-    target.addEventListener("pointerdown", (event) => { start = at(event); });
-    target.addEventListener("dblclick", () => app.setSpan(null));
-    target.addEventListener("pointerup", (event) => {
-      if (!start) return;
-      const [x, y] = at(event), { t } = scaleOf(app, target.clientWidth), [from] = start;
-      start = null;
-      if (Math.abs(x - from) > 6) {
-        app.setSpan([Math.max(0, t(Math.min(x, from))), Math.min(app.end, t(Math.max(x, from)))]);
-        return;
-      }
+    const timeAt = (x) => scaleOf(app, target.clientWidth).t(x);
+    Brush.listen(target, app, "x", timeAt, ({ x, y }) => {
       const row = rowsOf(app)[Math.floor((y - TOP) / ROW)];
       if (row) { app.focusOn(row.run); app.setNode(row.i); }
-      app.setTime(t(x));
+      app.setTime(timeAt(x));
     });
   }
 

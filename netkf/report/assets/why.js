@@ -149,7 +149,7 @@ const Why = (() => {
     if (found.readings.length) parts.push(readingTable(run, node, found.readings, t));
     parts.push(lostList(run, found.links));
     parts.push(Format.element("p", {}, "What it would have been had these messages come, replayed: ",
-      Format.element("code", {}, "netkf why " + quoted(run.label) + " --node " + run.names[node] + " --at " + Format.time(t))));
+      Format.element("code", {}, "netkf why " + quoted(run.label) + " --node " + run.names[node] + " --at " + Format.time(t) + (run.replica ? " --replica " + run.replica : ""))));
     box.replaceChildren(...parts);
   }
 
