@@ -31,6 +31,8 @@ from netkf.runs.summary import NORMAL_QUANTILE
 MAX_CURVES = 24
 """Curves that a figure shows; markers tell those apart whose lines look alike."""
 MAX_LABEL, MAX_ORIGINS = 40, 3
+BOUND = (0, (1, 1.5))
+"""Dashes of bounds."""
 NO_TRUTH = "None of them has a ground truth, so that their errors are unknown."
 
 
@@ -50,9 +52,13 @@ def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
         if len(central) == 1:
             label = "centralised filter, trace of P by theory"
             axes.axhline(*central, color=MUTED, lw=0.9, ls=(0, (1, 2)), label=label)
-        drawn = np.concatenate([_high(curve) for curve in known[:MAX_CURVES]])
-        set_scale(axes, np.append(drawn, list(central)))
-        axes.set(xlabel=SECONDS, ylabel="mean square error, squared units of the state")
+        if bounds := [c.bound for c in known[:MAX_CURVES] if c.bound is not None]:
+            name = "in its colour: bound on the mean trace of P"
+            axes.plot([], [], color=MUTED, ls=BOUND, lw=0.9, label=name)
+        drawn = np.concatenate([*map(_high, known), *(c.square for c in known), *bounds])
+        levels = [float(np.nanmedian(curve.square)) for curve in known[:MAX_CURVES]]
+        set_scale(axes, np.append(drawn, list(central)), levels)
+        axes.set(xlabel=SECONDS, ylabel=f"mean square error, squared {_unit(known)}")
         draw_legend(axes)
         sentences = [origin, "Mean over all nodes."]
         if any(curve.se is not None for curve in known):
@@ -76,9 +82,17 @@ def _draw_curve(axes: Any, curve: ErrorCurve, k: int) -> None:
     axes.plot(
         curve.times, square, color=style.colour, ls=style.dashes, label=label, **marks | alone
     )
+    if curve.bound is not None:
+        bound = np.minimum(curve.bound, MAX_DRAWN)
+        axes.plot(curve.times, bound, color=style.colour, ls=BOUND, lw=0.9)
     if curve.se is not None:
         low, high = np.maximum(square - NORMAL_QUANTILE * curve.se, 0.0), _high(curve)
         axes.fill_between(curve.times, low, high, color=style.colour, alpha=0.15, lw=0)
+
+
+def _unit(curves: Sequence[ErrorCurve]) -> str:
+    units = {curve.unit for curve in curves}
+    return (units.pop() if len(units) == 1 else "units of the state").replace("$", r"\$")
 
 
 def _high(curve: ErrorCurve) -> FloatArray:
@@ -136,5 +150,6 @@ def _labels(data: Sequence[FigureData]) -> list[str]:
 def _curve(label: str, data: FigureData) -> ErrorCurve:
     # A node's standard errors bound those of the mean of all nodes, which are dependent.
     se = None if data.se_error is None else data.se_error.mean(axis=1)
-    square, central = data.sq_error.mean(axis=1), data.promised.central
-    return ErrorCurve(label, data.times, square, se, data.runs, central)
+    square, promised, unit = data.sq_error.mean(axis=1), data.promised, data.scenario.unit
+    bound = None if promised.bound is None else promised.bound.mean(axis=1)
+    return ErrorCurve(label, data.times, square, se, data.runs, promised.central, bound, unit)

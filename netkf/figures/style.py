@@ -75,6 +75,8 @@ LOG_RATIO = 20.0
 """Ratio of the largest to the smallest value above which an axis is logarithmic."""
 LOG_MEDIANS = 100.0
 """Ratio of the largest value to the median above which a y axis is logarithmic."""
+LOG_LEVELS = 10.0
+"""Ratio of the medians of the highest and the lowest curve above which it is logarithmic too."""
 POINTS_PER_INCH = 72.0
 SECONDS = "simulated seconds"
 TITLE_SIZE, CAPTION_SIZE, LEGEND_SIZE = 10.5, 7.5, 7.5
@@ -219,10 +221,14 @@ def message_figure(headline: str, message: str, caption: Sequence[str]) -> Pictu
     return figure
 
 
-def set_scale(axes: Any, values: FloatArray) -> None:
-    """Set the y axis for ``values``: logarithmic above LOG_MEDIANS times their median."""
+def set_scale(axes: Any, values: FloatArray, levels: Sequence[float] = ()) -> None:
+    """Set the y axis for ``values``: logarithmic above LOG_MEDIANS times their median, or if the
+    ``levels`` of curves differ by a factor of LOG_LEVELS, so that the lowest can be read.
+    """
     positive = np.minimum(values[np.isfinite(values) & (values > 0.0)], MAX_DRAWN)
-    if positive.size and positive.max() > LOG_MEDIANS * np.median(positive):
+    known = [level for level in levels if 0.0 < level < np.inf]
+    apart = max(known, default=0.0) > LOG_LEVELS * min(known, default=0.0)
+    if positive.size and (apart or positive.max() > LOG_MEDIANS * np.median(positive)):
         # Limits first: a new scale would compute its own, which can overflow.
         axes.set_ylim(positive.min() * 0.7, positive.max() * 1.5)
         axes.set_yscale("log")

@@ -17,17 +17,22 @@ MAX_LABEL = 26
 MAX_RATIO = 10.0
 """Ratio of the largest to the smallest bar end on the axis: larger errors are drawn at its end."""
 
+COLOURS = ("ink", "red", "blue", "green", "orange", "purple")
+"""Classes of the colours of filters, here and in the curves over time."""
+
 
 def filters_figure(comparison: StoredComparison) -> str:
     """Return the RMS errors of filters with two standard errors as SVG; empty if none is finite."""
-    rows = [row for row in comparison.rows if row.ran and math.isfinite(row.rms_error.value)]
+    ran = [row for row in comparison.rows if row.ran]
+    colours = {row.filter: COLOURS[k % len(COLOURS)] for k, row in enumerate(ran)}
+    rows = [row for row in ran if math.isfinite(row.rms_error.value)]
     if not rows:
         return ""
     ends = [_bar_end(row) for row in rows]
     # One diverging filter would compress the bars of all others to nothing.
     axis_end = min(max(ends), MAX_RATIO * min(ends))
     scale = (WIDTH - LABEL_WIDTH - NUMBER_WIDTH) / axis_end if min(ends) > 0 else 0.0
-    lines = "".join(_draw_row(row, k, scale) for k, row in enumerate(rows))
+    lines = "".join(_draw_row(row, k, scale, colours[row.filter]) for k, row in enumerate(rows))
     height = ROW_HEIGHT * len(rows) + 8
     label = (
         f"RMS error of {len(rows)} filters over {comparison.runs:,} runs of each on the same "
@@ -51,7 +56,7 @@ def _bar_end(row: ComparedFilter) -> float:
     return error.value + (2.0 * error.se if math.isfinite(error.se) else 0.0)
 
 
-def _draw_row(row: ComparedFilter, k: int, scale: float) -> str:
+def _draw_row(row: ComparedFilter, k: int, scale: float, colour: str) -> str:
     """Return label, bar, dot and number of row ``k`` as SVG; ``scale`` is pixels per unit."""
     error, y = row.rms_error.value, ROW_HEIGHT * k + ROW_HEIGHT // 2 + 4
     axis_end, high = WIDTH - NUMBER_WIDTH, _bar_end(row)
@@ -63,6 +68,7 @@ def _draw_row(row: ComparedFilter, k: int, scale: float) -> str:
         f'<text x="{LABEL_WIDTH - 8}" y="{y + 4}" text-anchor="end">'
         f"{text(shorten(row.filter, MAX_LABEL))}</text>"
         f'<line x1="{left:.2f}" x2="{right:.2f}" y1="{y}" y2="{y}" stroke="currentColor" '
-        f'stroke-width="2"/><circle cx="{x:.2f}" cy="{y}" r="4"/>'
+        f'stroke-width="2"/><circle cx="{x:.2f}" cy="{y}" r="3" stroke-width="5" fill="none" '
+        f'class="swatch {colour}"/>'
         f'<text x="{axis_end + 8}" y="{y + 4}">{text(number)}</text>'
     )

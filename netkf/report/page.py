@@ -233,6 +233,8 @@ def _assemble_page(
         "difference": tables.difference_curves(*sources) if len(sources) == 2 else None,
         "labels": [source.label for source in sources],
         "sweep": tables.sweep_curves(sources[0]),
+        "filters": tables.filter_curves(sources[0]),
+        "unit": " or ".join(dict.fromkeys(source.scenario.unit for source in sources)),
     }
     body = _page_header(entries, comparison) + _main_sections(
         entries, comparison, command, rules, bool(runs)
@@ -253,7 +255,8 @@ def _assemble_page(
 
 
 def _live_data(entry: _AnalysedSource, limits: Budget, packer: Packer) -> dict[str, Any]:
-    assert entry.source.run is not None and entry.layout is not None
+    assert entry.source.run is not None
+    assert entry.layout is not None
     run, layout = entry.source.run, entry.layout
     return run_data(entry.source, run, entry.messages, entry.readings, layout, limits, packer)
 
@@ -331,6 +334,7 @@ def _main_sections(
         area = '<div id="curves" class="curves"></div>' + "".join(notes)
         parts.append(section("figures", "Figures", area))
     figures = "".join(filters_figure(s.filters) for s in sources if s.filters is not None)
+    figures += '<div id="curves" class="curves"></div>' if figures else ""
     if figures:
         parts.append(section("figures", "Errors of the filters", figures))
     losses = [outcome_figures(source.run, source.shown) for source in sources]
@@ -455,7 +459,4 @@ def _script() -> str:
     licence = "/*! uPlot\n" + _asset("uPlot.LICENSE.txt").replace("*/", "") + "*/\n"
     scripts = "\n".join(_asset(name) for name in SCRIPTS)
     plots = _asset("language.js") + _asset("uPlot.iife.min.js")
-    return (
-        f'{licence}{plots}\n(function () {{\n"use strict";\n{scripts}\n'
-        "})();\n"
-    )
+    return f'{licence}{plots}\n(function () {{\n"use strict";\n{scripts}\n}})();\n'

@@ -313,6 +313,31 @@ def _interval_curves(mean: Any, error: Any) -> list[list[float | None]]:
     return [to_json_value(curve.tolist()) for curve in curves]
 
 
+def filter_curves(source: ReportSource) -> dict[str, Any] | None:
+    """Return the mean square errors over time of compared filters, with the bounds of those that
+    have one, as JSON values; None without errors. ``row`` is that of the filter in the figure of
+    RMS errors.
+    """
+    comparison = source.filters
+    known = [c for c in comparison.curves if np.isfinite(c.square).any()] if comparison else []
+    if comparison is None or not known:
+        return None
+    names = [row.filter for row in comparison.rows if row.ran]
+    curves = [
+        {
+            "label": curve.label,
+            "row": names.index(curve.label),
+            "x": curve.times.tolist(),
+            "y": _interval_curves(curve.square, np.zeros(1) if curve.se is None else curve.se),
+            "bound": None if curve.bound is None else to_json_value(curve.bound.tolist()),
+        }
+        for curve in known
+    ]
+    central = {curve.central for curve in known}
+    limit = central.pop() if len(central) == 1 else math.nan
+    return {"curves": curves, "runs": comparison.runs, "central": to_json_value(limit)}
+
+
 def sweep_curves(source: ReportSource) -> dict[str, Any] | None:
     """Return the worst RMS error of a sweep over its first varied key, as JSON values, with one
     curve for each combination of values of the other keys.

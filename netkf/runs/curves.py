@@ -20,6 +20,8 @@ class ErrorCurve(NamedTuple):
               single run
     runs    : number of runs
     central : mean trace of P of the centralised filter by theory, nan if unknown
+    bound   : (T,) mean over nodes of the bound on the mean trace of P, None where there is none
+    unit    : unit of the states, squared that of ``square``
     """
 
     label: str
@@ -28,6 +30,8 @@ class ErrorCurve(NamedTuple):
     se: FloatArray | None = None
     runs: int = 1
     central: float = np.nan
+    bound: FloatArray | None = None
+    unit: str = "units of the state"
 
 
 def squares_over_time(batch: RunBatch, rows: np.ndarray) -> FloatArray:

@@ -409,11 +409,16 @@ def write_comparison(
 
 
 def _curve_columns(curves: Sequence[ErrorCurve]) -> dict[str, Any]:
-    """Return a row per filter and time: filter, t, mean square error and its standard error."""
+    """Return a row per filter and time: filter, t, mean square error and its standard error, bound
+    on the mean trace of P and trace of P of the centralised filter, nan where there is none.
+    """
     errors = [np.full(len(c.times), np.nan) if c.se is None else c.se for c in curves]
+    bounds = [np.full(len(c.times), np.nan) if c.bound is None else c.bound for c in curves]
     return {
         "filter": [curve.label for curve in curves for _ in curve.times],
         "t": np.concatenate([curve.times for curve in curves]),
         "mse": np.concatenate([curve.square for curve in curves]),
         "mse_se": np.concatenate(errors),
+        "bound": np.concatenate(bounds),
+        "central": np.repeat([c.central for c in curves], [len(c.times) for c in curves]),
     }

@@ -17,6 +17,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.runs.curves import ErrorCurve, squares_over_time
 from netkf.runs.quantities import NETWORK, NetworkSink, with_network
 from netkf.runs.simulate import simulate
+from netkf.runs.summary import promise_traces
 from netkf.scenario.scenario import Scenario
 from netkf.studies.metrics import mean_over_runs
 
@@ -57,10 +58,15 @@ def curve_rows(scenario: Scenario, runs: int) -> np.ndarray:
 
 
 def mean_curve(label: str, scenario: Scenario, curves: FloatArray) -> ErrorCurve:
-    """Return the mean over runs of ``curves`` (R, K), with its standard error."""
+    """Return the mean over runs of ``curves`` (R, K), with its standard error, and what theory
+    gives to compare it with.
+    """
     runs, times = len(curves), scenario.times[curve_rows(scenario, len(curves))]
     error = curves.std(axis=0, ddof=1) / math.sqrt(runs) if runs > 1 else None
-    return ErrorCurve(label, times, curves.mean(axis=0), error, runs)
+    promised = promise_traces(scenario, times)
+    bound = None if promised.bound is None else promised.bound.mean(axis=1)
+    square, central = curves.mean(axis=0), promised.central
+    return ErrorCurve(label, times, square, error, runs, central, bound, scenario.unit)
 
 
 def block_values(

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from netkf.core.notebook import NotebookTable
 from netkf.core.printable import one_line
 from netkf.runs.curves import ErrorCurve
@@ -83,26 +85,25 @@ def read_comparison(directory: Path, base: Scenario, manifest: dict[str, Any]) -
         seed=manifest["seed"],
         confidence=manifest["confidence"],
         rows=tuple(rows),
-        curves=_read_curves(directory / CURVES, manifest["runs"]["done"]) if has_curves else (),
+        curves=_read_curves(directory / CURVES, manifest["runs"]["done"], base)
+        if has_curves
+        else (),
         directory=directory,
         manifest=manifest,
         base=base,
     )
 
 
-def _read_curves(path: Path, runs: int) -> tuple[ErrorCurve, ...]:
-    numbers = read_numbers(path, ["t", "mse", "mse_se"], allow_empty=True)
-    tables = numbers.groupby(read_texts(path, "filter").astype(str), sort=False)
-    return tuple(
-        ErrorCurve(
-            str(label),
-            table["t"].to_numpy(),
-            table["mse"].to_numpy(),
-            table["mse_se"].to_numpy(),
-            runs,
-        )
-        for label, table in tables
-    )
+def _read_curves(path: Path, runs: int, base: Scenario) -> tuple[ErrorCurve, ...]:
+    names = ["t", "mse", "mse_se", "bound", "central"]
+    numbers = read_numbers(path, names, allow_empty=True)
+    curves = []
+    for label, table in numbers.groupby(read_texts(path, "filter").astype(str), sort=False):
+        times, square, se, bound, central = (table[name].to_numpy() for name in names)
+        known = bound if np.isfinite(bound).all() else None
+        curve = ErrorCurve(str(label), times, square, se, runs, central[0], known, base.unit)
+        curves.append(curve)
+    return tuple(curves)
 
 
 def _read_filter(row: dict[str, Any], names: tuple[str, ...]) -> ComparedFilter:

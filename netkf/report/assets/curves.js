@@ -1,17 +1,17 @@
 // Curves with uPlot: one look, a line at the time of the clock, a click that sets it.
 const Curves = (() => {
   const HEIGHT = 240, WHOLE = ["node", "lag (readings)"]; // labels of axes with whole numbers
-  const DASHES = { solid: [], dashed: [7, 4], dotted: [2, 3] };
+  const DASHES = { solid: [], dashed: [7, 4], dotted: [2, 3], dashdot: [7, 3, 2, 3] };
 
   // series: { label, x, y, low, high, colour, dash, width, points, dots, mark }, all over the same x
   // where there is a band; `dots` has no line, nor has `mark` (dot, ring, tick), whose limits are
-  // bars. `timed` curves follow the clock.
-  function figure(app, { title, note, unit, xlabel, series, lines, band, timed }) {
+  // bars. `timed` curves follow the clock; those that are `apart` have a logarithmic scale.
+  function figure(app, { title, note, unit, xlabel, series, lines, band, timed, apart }) {
     const box = Format.element("div", { class: "plot" });
     const whole = Format.element("figure", { class: "curve" },
       Format.element("figcaption", {}, Format.element("strong", {}, title), " ", note || ""), box,
       legend(series, lines, band));
-    const steep = isSteep(series);
+    const steep = apart || isSteep(series);
     let plot = null, dragged = false;
     function build() {
       if (plot) plot.destroy();
@@ -30,7 +30,7 @@ const Curves = (() => {
         width, height: HEIGHT, padding: [12, 12, 0, 0], legend: { show: false },
         // A stretch of time that is dragged over is what all figures over time then show.
         cursor: { drag: { x: Boolean(timed), y: false, setScale: false, dist: 6 }, y: false },
-        scales: { x: { time: false, ...(timed ? { range: (u, low, high) => app.span || [low, high > low ? high : low + 1] } : {}), ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
+        scales: { x: { time: false, ...(timed ? { range: (u, low, high) => app.span || (app.runs.length ? [0, app.end] : [low, high > low ? high : low + 1]) } : {}), ...(xlabel === "node" ? { range: (u, low, high) => [low - 0.5, high + 0.5] } : {}) }, y: { range: (u, low, high) => yRange(low, high, lines, band, steep) } },
         axes: [{ ...axis, label: xlabel || "time (s)", labelSize: 22, size: 34,
           ...(WHOLE.includes(xlabel) ? { values: (u, splits) => splits.map((v) => (Number.isInteger(v) ? String(v) : "")) } : {}) }, { ...axis, label: unit, labelSize: 20, size: 58, values: (u, splits) => splits.map(steep ? powerOfTen : tick) }],
         series: [{}, ...expanded(series)],

@@ -54,8 +54,11 @@ const Figures = (() => {
     const found = page.ensembles[r], entry = found && found.spread && found.spread[String(app.nodeId)];
     if (!entry) return [];
     const [y, low, high] = entry;
-    return [{ label: name + "error of node " + app.nodeId + ", median of all runs; shaded: 90 % of them", x: found.times, y, low, high, colour: coloured(page.runs, r, "purple"), width: 1, dash: "dashed" }];
+    return [{ label: name + "error of node " + app.nodeId + ", median of all runs; shaded: 90 % of them", x: found.times, y, low, high, colour: coloured(page.runs, r, "purple"), width: 1, dash: "dotted" }];
   }
+
+  // Which run of an ensemble moves.
+  const which = (runs) => (page.ensembles.some(Boolean) ? ", replica " + runs.map((run) => run.replica).join(" and ") : "");
 
   function errors(app, runs) {
     const series = [], lines = [];
@@ -64,7 +67,8 @@ const Figures = (() => {
       series.push(...spread(app, r, name));
       if (run.truth) {
         const all = overNodes(run, run.samples.sq_error);
-        series.push({ label: name + "all nodes, root mean square; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
+        // Beside the runs of two ensembles those of all nodes would hide the curves.
+        if (runs.length === 1 || !page.ensembles[r]) series.push({ label: name + "all nodes, root mean square; shaded: smallest to largest", x, y: all.rms, low: all.low, high: all.high, colour, width: 1, dash: "dotted" });
         if (i >= 0) series.push({ label: name + "error of node " + run.names[i], x, y: root(column(run, run.samples.sq_error, i)), colour, width: 2.5 });
       } else {
         const all = overNodes(run, traces(run));
@@ -77,8 +81,8 @@ const Figures = (() => {
     for (const [label, value] of Object.entries(runs[0].limits)) lines.push({ label: label + ", square root:", y: Math.sqrt(value), colour: "purple", dash: lines.length ? "dotted" : "dashed" });
     const truth = runs.some((run) => run.truth);
     const bound = runs.some((run) => run.samples.bound);
-    return { title: truth ? (bound ? "Error and bound" : "Error and uncertainty") : "Uncertainty and disagreement", unit: (truth ? "|x - xhat|, " : "") + runs[0].unit, timed: true, series, lines,
-      note: bound ? "One run: the bound is about the mean over runs." : truth ? "P is the covariance that the filter claims." : "Without truth there is no error." };
+    return { title: truth ? (bound ? "Error and bound" : "Error and uncertainty") : "Uncertainty and disagreement", unit: (truth ? "|x - xhat|, " : "") + page.unit, timed: true, series, lines,
+      note: bound ? "One run" + which(runs) + ": the bound is about the mean over runs." : truth ? "P is the covariance that the filter claims" + which(runs) + "." : "Without truth there is no error." };
   }
 
   function nees(app, runs) {
@@ -190,7 +194,7 @@ const Figures = (() => {
       series.push({ label: name + "square root of mean trace P", x, y: root(of("mean_trace")), colour: coloured(summaries, r, "green"), mark: "ring" });
       if (of("bound").some(Number.isFinite)) series.push({ label: name + "square root of its bound", x, y: root(of("bound").map((v) => v ?? NaN)), colour: coloured(summaries, r, "ink"), mark: "tick" });
     });
-    return series.length ? { title: "Averages per node", unit: "root mean square", xlabel: "node", series, note: "Over time; the numbers stand in the table." } : null;
+    return series.length ? { title: "Averages per node", unit: "root mean square, " + page.unit, xlabel: "node", series, note: "Over time; the numbers stand in the table." } : null;
   }
 
   function ensemble(app, ensembles) {
@@ -204,7 +208,7 @@ const Figures = (() => {
       add("mean trace P of node " + app.nodeId, entry.trace, coloured(ensembles, r, "green"), "dashed");
       if (entry.bound) series.push({ label: name + "bound H(12)", x, y: entry.bound, colour: coloured(ensembles, r, "ink"), dash: "dotted", width: 2 });
     });
-    return series.length ? { title: "Mean over the runs", unit: "squared units", timed: true, series, note: "Shaded: at least two standard errors on each side." } : null;
+    return series.length ? { title: "Mean over the runs", unit: "squared " + page.unit, timed: true, series, note: "Shaded: at least two standard errors on each side." } : null;
   }
 
   function ensembleNees(app, ensembles) {
@@ -227,15 +231,37 @@ const Figures = (() => {
     const series = [{ label: "B - A, mean squared error of node " + app.nodeId + "; shaded: interval", x, y, low, high, colour: "purple" }];
     if (sure.some(Number.isFinite)) series.push({ label: "certain: the interval leaves out 0", x, y: sure, colour: "ink", points: true, width: 3 });
     const title = sure.some(Number.isFinite) ? "Where they differ for certain" : "The difference over time, nowhere certain";
-    return { title, unit: "squared units", timed: true, series, lines: [{ label: "no difference", y: 0, colour: "ink", dash: "dotted" }],
+    return { title, unit: "squared " + page.unit, timed: true, series, lines: [{ label: "no difference", y: 0, colour: "ink", dash: "dotted" }],
       note: "All intervals, of all nodes and times, hold together with probability " + found.confidence + "." };
+  }
+
+  // The look of the k-th of many curves, in the order of figures/style.py and report/filter_figure.py.
+  const MANY = ["ink", "red", "blue", "green", "orange", "purple"], DASHES = ["solid", "dashed", "dashdot"];
+  const look = (k) => ({ colour: MANY[k % 6], dash: DASHES[(k + Math.floor(k / 6)) % 3], width: 2 });
+  const APART = 10; // as LOG_LEVELS of figures/style.py
+
+  function median(values) {
+    const known = values.filter(Number.isFinite).sort((a, b) => a - b);
+    return known[Math.floor(known.length / 2)];
+  }
+
+  function filters(found) {
+    if (!found) return null;
+    const series = found.curves.flatMap((s) => {
+      const style = look(s.row), curve = { label: s.label, x: s.x, y: s.y[0], low: s.y[1], high: s.y[2], ...style };
+      return s.bound ? [curve, { ...style, label: "bound on its mean trace P", x: s.x, y: s.bound, dash: "dotted", width: 1 }] : [curve];
+    });
+    const lines = found.central === null ? [] : [{ label: "centralised filter, trace of P by theory:", y: found.central, colour: "ink", dash: "dotted" }];
+    const levels = found.curves.map((s) => median(s.y[0])).filter((level) => level > 0);
+    const apart = Math.max(...levels) > APART * Math.min(...levels);
+    return { title: "Mean square error over time", unit: "squared " + page.unit, timed: true, series, lines, apart,
+      note: "Mean over the nodes and " + Format.count(found.runs) + " runs of each; shaded: two standard errors." };
   }
 
   function sweep(app, found) {
     if (!found) return null;
-    const colours = ["blue", "red", "green", "orange", "purple", "ink"], dashes = ["solid", "dashed", "dotted"];
-    const series = found.series.map((s, k) => ({ label: s.label, x: s.x, y: s.y[0], low: s.y[1], high: s.y[2], colour: colours[k % 6], dash: dashes[Math.floor(k / 6) % 3], points: true, width: 2 }));
-    return { title: "Worst node over the sweep", unit: "RMS error", xlabel: found.key, series, note: "Shaded: two standard errors." };
+    const series = found.series.map((s, k) => ({ label: s.label, x: s.x, y: s.y[0], low: s.y[1], high: s.y[2], ...look(k), points: true }));
+    return { title: "Worst node over the sweep", unit: "RMS error, " + page.unit, xlabel: found.key, series, note: "Shaded: two standard errors." };
   }
 
   function all(app, page) {
@@ -243,7 +269,7 @@ const Figures = (() => {
     return [
       difference(app, page.difference), ensemble(app, page.ensembles), ensembleNees(app, page.ensembles),
       live && errors(app, page.runs), live && nees(app, page.runs), live && innovations(app, page.runs), live && whiteness(app, page.runs), live && ages(app, page.runs),
-      live && traffic(app, page.runs), averages(app, page.summaries), sweep(app, page.sweep),
+      live && traffic(app, page.runs), averages(app, page.summaries), sweep(app, page.sweep), filters(page.filters),
     ].filter(Boolean);
   }
 
