@@ -128,7 +128,8 @@ def print_summary(scenario: Scenario, completed: Any) -> None:
     print_title(scenario)
     print()
     promised = completed.promised
-    print(summary_table(completed.summary, promised.limit_label, promised.notes))
+    label, unit, states = promised.limit_label, scenario.common_unit, scenario.states_note
+    print(summary_table(completed.summary, label, promised.notes, unit, states))
 
 
 def print_ensemble(completed: Any, runs: int) -> None:

@@ -20,7 +20,7 @@ from netkf.report.worst import StartUp, WorstSample, WorstSamples, summary_sampl
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import CONFIDENCE
 from netkf.runs.tables import format_number, format_with_error
-from netkf.studies.compare import MESSAGES, Comparison, Entry
+from netkf.studies.compare import Comparison, Entry, quantity_label
 from netkf.studies.compare_filters import ComparedFilter
 from netkf.studies.filter_values import Quantity
 from netkf.studies.stored import StoredComparison
@@ -42,7 +42,6 @@ MAX_LISTED = 4
 """Nodes or links that a sentence lists."""
 MAX_COMPARED = 500_000
 """Events of a run up to which two runs are compared event by event."""
-LABELS = {"rms_error": "RMS error", "mean_trace": "mean trace P", "mean_nees": "mean NEES"}
 PAPER = f". H is the paper {PAPERS['H']}"
 FALSE_ALARM = 0.01
 """Probability that the NEES of at least one sample of a run is called too large if P is exact."""
@@ -100,13 +99,8 @@ def describe_differences(
     ]
     if others:
         sentences.append(f"Other certain differences of B from A: {', '.join(others)}")
-    return sentences + _describe_first_difference(first, second)
-
-
-def quantity_label(name: str) -> str:
-    """Return a quantity of summaries in words."""
-    words = f"messages {name}" if name in MESSAGES else name.replace("_", " ")
-    return LABELS.get(name, words)
+    remarks = [remark[:1].upper() + remark[1:] for remark in comparison.remarks()]
+    return sentences + remarks + _describe_first_difference(first, second)
 
 
 def _describe_winner(name: str, a: Entry, b: Entry) -> str:

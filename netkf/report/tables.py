@@ -25,21 +25,14 @@ from netkf.runs.tables import (
     format_with_error,
     has_bound,
 )
-from netkf.studies.compare import Comparison, Entry
+from netkf.studies.compare import Comparison, Entry, quantity_label
 from netkf.studies.filter_values import JUDGED, Quantity
 from netkf.studies.stored import StoredComparison
 from netkf.trace.nees import traces
 
 MAX_ROWS = 2_000
 """Rows of a table on a page."""
-HEADLINE = {
-    "rms_error": "RMS error",
-    "worst_instant": "largest error at any sample",
-    "mean_trace": "mean trace P",
-    "mean_nees": "mean NEES",
-    "transmissions": "transmissions",
-    "lost": "messages lost",
-}
+HEADLINE = ("rms_error", "worst_instant", "mean_trace", "mean_nees", "transmissions", "lost")
 """Quantities with which a page of two runs begins."""
 VERDICT_ORDER = ("broken", "undecided", "holds", "not promised")
 INTERVAL_WIDTH = 2.0
@@ -75,7 +68,7 @@ def summary_section(source: ReportSource) -> str:
     summary = source.summary
     if not summary:
         return paragraph("There is no summary: the runs ended before it was written")
-    columns = columns_of(summary)
+    columns = columns_of(summary, source.scenario.common_unit)
     # The first cell is the id of a node, or "all".
     rows = [
         [row.get("node", "all"), *(format_with_error(row[k], row.get(f"{k}_se")) for k in columns)]
@@ -99,7 +92,8 @@ def summary_section(source: ReportSource) -> str:
         )
         if messages.get(name) is not None
     )
-    notes = [f"messages: {counts}", *_bound_notes(source), *summary.get("notes", [])]
+    states = [source.scenario.states_note] if source.scenario.states_note else []
+    notes = [*states, f"messages: {counts}", *_bound_notes(source), *summary.get("notes", [])]
     return table_box(caption, ["node", *columns.values()], listed) + bullets(notes)
 
 
@@ -132,7 +126,7 @@ def differences_table(comparison: Comparison) -> str:
     for quantity, node, entries in comparison.rows:
         if node < 0 and quantity in HEADLINE and entries[0].value is not None:
             values = [format_with_error(entry.value, entry.se) for entry in entries]
-            rows.append([HEADLINE[quantity], *values])
+            rows.append([quantity_label(quantity), *values])
     caption = "Keys that differ, and errors" if comparison.settings else "The same keys; errors"
     return table_box(caption, ["", *_lettered(comparison)], rows)
 
@@ -145,7 +139,7 @@ def comparison_section(comparison: Comparison) -> str:
     """Return the differences of two directories, A and B, as HTML."""
     rows = []
     for quantity, node, (first, second) in comparison.rows:  # node -1: all nodes
-        label = quantity if node < 0 else f"{quantity} of node {node}"
+        label = quantity_label(quantity) + ("" if node < 0 else f" of node {node}")
         values = [format_with_error(entry.value, entry.se) for entry in (first, second)]
         rows.append([label, *values, *_difference_cells(second)])
     header = ["quantity", *_lettered(comparison), "B - A", "interval", "certain?"]

@@ -23,6 +23,8 @@ COLUMNS = {
     "mean_nees": "NEES",
 }
 """Headers of the columns of averages, by the key in summary.json."""
+POWERS = {"rms_error": 1, "mean_trace": 2, "bound": 2}
+"""Powers of the unit of the states in columns that have one."""
 BOUND_COLUMNS = ("bound", "ratio")
 """Keys of the columns that a table leaves out if no node has a bound."""
 
@@ -68,15 +70,20 @@ def shorten_rows(rows: list[list[str]], max_rows: int) -> list[list[str]]:
 
 
 def summary_table(
-    summary: dict[str, Any], limit: str = "limit S of Tanwani's H(13)", notes: Sequence[str] = ()
+    summary: dict[str, Any],
+    limit: str = "limit S of Tanwani's H(13)",
+    notes: Sequence[str] = (),
+    unit: str = "",
+    states: str = "",
 ) -> str:
     """Return the table that `netkf run` prints, from the contents of summary.json.
 
     It has a row for each node (the best and the worst of large networks) and one for all nodes,
     followed by ``notes``, the limits to compare traces with (``limit`` is the name of the first,
-    empty if no bound is known for any network with this filter), NEES and messages.
+    empty if no bound is known for any network with this filter), NEES and messages. Columns name
+    the ``unit`` of all states; ``states`` is a line with their names.
     """
-    lines = list(_node_table(summary))
+    lines = [*_node_table(summary, unit), *([states] if states else [])]
     if limit and not has_bound(summary):
         lines.append(f"bound: {summary['bound']}")
     lines += [f"note: {note}" for note in (*summary["notes"], *notes)]
@@ -121,14 +128,29 @@ def has_bound(summary: dict[str, Any]) -> bool:
     return any(row["bound"] is not None for row in summary["nodes"])
 
 
-def columns_of(summary: dict[str, Any]) -> dict[str, str]:
-    """Return the headers of the columns of averages that a table of this summary has, by key."""
+def columns_of(summary: dict[str, Any], unit: str = "") -> dict[str, str]:
+    """Return the headers of the columns of averages that a table of this summary has, by key, with
+    the ``unit`` of all states.
+    """
     left_out = () if has_bound(summary) else BOUND_COLUMNS
-    return {key: header for key, header in COLUMNS.items() if key not in left_out}
+    return {
+        key: header + in_unit(unit, POWERS.get(key, 0), ", ")
+        for key, header in COLUMNS.items()
+        if key not in left_out
+    }
 
 
-def _node_table(summary: dict[str, Any]) -> Iterator[str]:
-    columns = columns_of(summary)
+def in_unit(unit: str, power: int = 1, before: str = " ") -> str:
+    """Return a unit to a power of 0, 1 or 2, as text behind a number or a word; "" without one."""
+    if not unit or not power:
+        return ""
+    if power == 1:
+        return before + unit
+    return before + (f"{unit}^2" if unit.isalpha() else f"({unit})^2")
+
+
+def _node_table(summary: dict[str, Any], unit: str) -> Iterator[str]:
+    columns = columns_of(summary, unit)
     nodes = sorted(summary["nodes"], key=lambda row: row["node"])
     omitted, half = max(len(nodes) - MAX_NODES, 0), MAX_NODES // 2
     if omitted:

@@ -71,6 +71,8 @@ from netkf.scenario.stamps import Time, restamp
 from netkf.scenario.time_grid import choose_grid, snap_limits
 
 EVERY_READING, HEALTHY = "every reading is used", "all sensors are healthy"
+MAX_LABELS = 12
+"""States that a line names."""
 RIGHT_CLOCKS = "clocks of nodes are right"
 ALL_READ = "nodes take all readings that gains and P count"
 """Assumptions of all filters, see ``ScenarioModel.departures``."""
@@ -361,8 +363,27 @@ class ScenarioModel(Component):
     @cached_property
     def unit(self) -> str:
         """The unit of all states, "units of the state" where they have none or different ones."""
+        return self.common_unit or "units of the state"
+
+    @cached_property
+    def common_unit(self) -> str:
+        """The unit of all states, empty where they have none or different ones."""
         units = {unit for _, plant in self.all_plants for unit in plant.units or ("",)}
-        return (units.pop() if len(units) == 1 else "") or "units of the state"
+        return units.pop() if len(units) == 1 else ""
+
+    @property
+    def states_note(self) -> str:
+        """The names and units of the states by plant, as ``states: x (m), y (m)``; empty if no
+        plant gives them.
+        """
+        parts = []
+        for name, plant in self.all_plants:
+            labels = [self._column_label(k, {label}) for k, label in enumerate(plant.labels)]
+            if any(plant.labels):
+                whose = f"{name}: " if self.views is not None else ""
+                parts.append(whose + ", ".join(labels[:MAX_LABELS]))
+                parts[-1] += ", ..." * (len(labels) > MAX_LABELS)
+        return f"states: {'; '.join(parts)}" if parts else ""
 
     @property
     def width(self) -> int:

@@ -36,12 +36,30 @@ from netkf.runs.documents import (
 from netkf.runs.parquet_files import column_names, read_numbers
 from netkf.runs.quantities import quantities_in
 from netkf.runs.stored import AVERAGES_FORM, MANIFEST_FORM, SUMMARY_FORM, read_checked_document
+from netkf.runs.tables import in_unit
 from netkf.scenario.writing import toml_text
 from netkf.studies.metrics import mean_over_runs
 
 AVERAGES = ("rms_error", "mean_trace", "mean_nees")
 MESSAGES = ("sent", "delivered", "lost")
 TRACES = ("bound", "limit", "central")
+PLANT = re.compile(r"plant\.|plants\.\d+\.")
+"""Beginnings of the keys of plants."""
+LABELS = {
+    "rms_error": "RMS error",
+    "mean_nees": "mean NEES",
+    "mean_trace": "mean trace P",
+    "worst_instant": "largest error at any sample",
+    "time_above": "share of samples above the level",
+    "mean_age": "mean age of readings (s)",
+    "worst_age": "largest age of readings (s)",
+    "time_connected": "share of the time connected",
+    "joules": "energy (J)",
+    "limit": "limit of trace P",
+    "central": "trace P, centralised filter",
+    "bound": "bound on trace P",
+}
+"""Quantities in words; others are called by their names."""
 TITLES = ("name", "claim")
 """Keys of scenarios that change no run."""
 DIAGONAL = re.compile(r"P(\d+)_?\1$")
@@ -56,6 +74,13 @@ SUMMARY: dict[str, Any] = {
     "notes?": TEXTS,
     "messages_se?": {f"{name}?": NUMBER for name in MESSAGES},
 }
+
+
+def quantity_label(name: str) -> str:
+    """Return a quantity of summaries in words."""
+    if name.startswith("quantile_"):
+        return f"{name.removeprefix('quantile_')} % quantile of errors"
+    return LABELS.get(name, f"messages {name}" if name in MESSAGES else name)
 
 
 class Entry(NamedTuple):
@@ -235,7 +260,7 @@ class Comparison(NotebookTable):
 
     All marks of certain differences are right with probability ``confidence``. ``notes`` are those
     of the summaries, on what their averages leave out; ``settings`` the keys in which the scenarios
-    differ.
+    differ; ``units`` those of all states of each, empty where they have none or several.
     """
 
     directories: tuple[str, ...]
@@ -245,11 +270,27 @@ class Comparison(NotebookTable):
     rows: tuple[ComparedRow, ...]
     notes: tuple[tuple[str, ...], ...] = ()
     settings: tuple[ComparedSetting, ...] = ()
+    units: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         real = sum(any(entry.real for entry in row.entries) for row in self.rows)
         names = ", ".join(self.directories[:3]) + (", ..." if len(self.directories) > 3 else "")
         return f"<netkf comparison of {names}: {real} of {len(self.rows)} rows differ for certain>"
+
+    def remarks(self) -> list[str]:
+        """Return sentences on what the values of the directories mean beside each other."""
+        keys = [key for key, _ in self.settings]
+        units = list(dict.fromkeys(unit for unit in self.units if unit))
+        found = []
+        if len(units) > 1:
+            found.append(f"errors are in {', '.join(units)}: they do not compare")
+        elif units:
+            found.append(f"errors are in {units[0]}, traces of P in{in_unit(units[0], 2)}")
+        if any(PLANT.match(key) and not key.endswith((".units", ".states")) for key in keys):
+            found.append("the plants differ, and so the states whose errors these are")
+        elif keys and {*keys} <= {"seed", "replica"}:
+            found.append("only the draws differ: these are runs of one scenario")
+        return found
 
     @property
     def table(self) -> pd.DataFrame:
@@ -310,7 +351,16 @@ def compare(directories: Sequence[str | Path], confidence: float = 0.95) -> Comp
         rows=tuple(rows),
         notes=tuple(tuple(run.summary.get("notes", ())) for run in runs),
         settings=_differing_settings(runs),
+        units=tuple(_common_unit(run.settings) for run in runs),
     )
+
+
+def _common_unit(settings: dict[str, str]) -> str:
+    """Return the unit of all states, empty where they have none or several."""
+    plants = [m[0] for m in map(PLANT.match, settings) if m]
+    texts = {settings.get(f"{plant}units", "['']") for plant in plants}
+    units = {unit for text in texts for unit in tomllib.loads(f"units = {text}")["units"]}
+    return str(units.pop()) if len(units) == 1 else ""
 
 
 def _compare_quantity(
@@ -323,7 +373,7 @@ def _compare_quantity(
     # Run by run if both had the same truth, which is more accurate, else as independent runs.
     paired = _paired_differences(first, other, quantity, node)
     if paired is not None:
-        method = "paired" if quantity != "rms_error" else "paired, mean squares"
+        method = "paired" if quantity != "rms_error" else "paired by mean squares"
         return _with_interval(entry, *mean_over_runs(paired), len(paired) - 1, level, method)
     if base.value is None:
         return entry

@@ -13,7 +13,7 @@ from netkf.core.printable import shorten
 from netkf.network.deliveries import MessageKey
 from netkf.runs.files import to_json_value
 from netkf.runs.outcomes import Downtime
-from netkf.runs.tables import format_number, format_table, shorten_rows
+from netkf.runs.tables import format_number, format_table, in_unit, shorten_rows
 from netkf.studies.message_sets import SmallestSet
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Why:
     it was first, and ``smallest`` the smallest set of missing messages that would have sufficed
     (None if the filter gives no P). ``missing`` has all messages that were not used, by their
     identity, ``down`` the nodes that were down at that instant, and ``notes`` sentences on the
-    limits of the replays.
+    limits of the replays; ``unit`` is that of all states, empty where they have none or several.
     """
 
     scenario: str
@@ -118,6 +118,7 @@ class Why:
     missing: dict[MessageKey, Missing] = field(repr=False)
     down: tuple[Downtime, ...] = ()
     notes: tuple[str, ...] = ()
+    unit: str = ""
 
     @property
     def trace(self) -> float:
@@ -215,10 +216,13 @@ class Why:
         sentence = f"Node {self.node} at {self.at:g} s ({scenario}, {run})"
         if math.isfinite(self.trace):
             rms = math.sqrt(max(self.trace, 0.0))
-            sentence += f": trace P is {self.trace:.4g}, which claims an RMS error of {rms:.3g}"
+            sentence += f": trace P is {self.trace:.4g}{in_unit(self.unit, 2)}, which claims an "
+            sentence += f"RMS error of {rms:.3g}{in_unit(self.unit)}"
         else:
             sentence += ": the filter gives no covariance"
-        error = f"; its error is {self.error:.3g}" if math.isfinite(self.error) else ""
+        error = ""
+        if math.isfinite(self.error):
+            error = f"; its error is {self.error:.3g}{in_unit(self.unit)}"
         yield f"{sentence}{error}."
         for one in self.down[:MAX_LISTED]:
             since = f"since {one.begin:.6g} s, {self.at - one.begin:.4g} s before ({one.kind})"
@@ -355,7 +359,8 @@ class Why:
 
     def _replay_table(self) -> str:
         truth = any(math.isfinite(w.error) for w in self.what_ifs)
-        header = ["replayed with", "messages", "trace P", "change", *(["error"] if truth else [])]
+        header = ["replayed with", "messages", "trace P" + in_unit(self.unit, 2, ", "), "change"]
+        header += ["error" + in_unit(self.unit, 1, ", ")] if truth else []
         rows = [
             [
                 w.label,

@@ -247,6 +247,7 @@ def format_comparison(comparison: Comparison) -> str:
         for mark, texts in zip(numbered, comparison.notes, strict=True)
         for note in texts
     ]
+    notes[:0] = [f"note: {remark}" for remark in comparison.remarks()]
     lines += ["", *notes] if notes else []
     methods = {e.method for row in comparison.rows for e in row.entries if e.method}
     if methods - {"one run"}:

@@ -124,6 +124,7 @@ def why(
             if one.begin <= at < one.end
         ),
         notes=_replay_notes(evidence, left_out),
+        unit=run_scenario.common_unit,
     )
 
 

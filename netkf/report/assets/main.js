@@ -152,8 +152,8 @@ function fillTables() {
 
 function nodeTable(run, r) {
   const state = State.at(run, app.time, 0), [a, b] = app.axes, n = run.n;
-  const parts = a === b ? [a] : [a, b];
-  const header = ["node", ...parts.flatMap((c) => [run.states[c].replace(/^x(?=\d)/, "xhat"), "95 % +-"]), "trace P", "error", "NEES", "age of information"];
+  const parts = a === b ? [a] : [a, b], inUnit = page.unit === "units of the state" ? "" : " (" + page.unit + ")";
+  const header = ["node", ...parts.flatMap((c) => [run.states[c].replace(/^x(?=\d)/, "xhat"), "95 % +-"]), "trace P", "error" + inUnit, "NEES", "age of information (s)"];
   const rows = state.nodes.map((s) => [s.node,
     ...parts.flatMap((c) => [Format.number(s.xhat[c]), Format.number(run.scale.interval * Math.sqrt(State.variance(s.P, n, c, c)))]),
     Format.number(s.trace), Format.number(s.error), Format.number(s.nees), Format.number(s.age)]);
