@@ -422,6 +422,16 @@ def test_a_page_of_an_ensemble_says_which_run_moves_and_how_runs_spread(ensemble
         place = errors.index.get_loc(shown) + 1
         words = f"The run that moves below is replica {shown} of 12, RMS error {errors[shown]:.4g}"
         assert f"{words}, number {place} from the best" in page.shown
+        # The reader can choose the worst and the median.
+        others = {run["replica"]: run["words"] for run in page.data["replicas"][0]}
+        named = {
+            int(errors.index[-1]): "worst",
+            int(errors.index[(len(errors) - 1) // 2]): "median",
+        }
+        assert others.keys() == named.keys() - {shown}
+        for number, text in others.items():
+            words = f"replica {number} ({named[number]}, RMS error {errors[number]:.4g})"
+            assert text == words
     found = page.data["ensembles"][0]["spread"]["4"]
     at = states[(states["node"] == 4) & (states["t"] == 3.0)]["sq_error"]
     expected = np.sqrt(np.quantile(at, [0.5, 0.05, 0.95]))
@@ -439,9 +449,26 @@ def test_states_have_their_names_and_units_on_pages_and_figures(ring, tmp_path):
     assert page.data["runs"][0]["states"] == ["height (m)", "speed (m/s)"]
     assert netkf.open(tmp_path / "named").scenario.plant.states == ("height", "speed")
     assert "xhat0" in run.states.columns  # columns of tables stay
+    assert scenario.states_note == "states: height (m), speed (m/s)"
     metres = scenario.replace({"plant.units": ["m", "m"], "plant.states": ["x", "y"]})
     assert netkf.simulate(metres, engine="simpy").plot().axes[0].get_ylabel().endswith(", m")
     assert netkf.open(ring).scenario.state_labels == ("x0", "x1")
+    assert netkf.open(ring).scenario.states_note == ""
+    netkf.save(netkf.simulate(metres, engine="simpy"), metres, tmp_path / "metres")
+    page = Page(make_page([tmp_path / "metres"]))
+    assert page.data["unit"] == "m"
+    assert "RMS error, m mean trace P, m^2" in " ".join(page.shown.split())
+    assert "states: x (m), y (m)" in page.shown
+    told = netkf.why(tmp_path / "metres", node=1, at=2.0, replays=1).sentences()[0]
+    assert re.search(r"trace P is \S+ m\^2, which claims an RMS error of \S+ m; its error", told)
+    compared = netkf.compare([tmp_path / "metres", tmp_path / "metres"])
+    assert compared.remarks() == ["errors are in m, traces of P in m^2"]
+    names = {"plant.units": ["km", "km"], "horizon": 2.0, "plant.A": [[0.0, 1.0], [-2.0, 0.1]]}
+    other = netkf.load(SCENARIOS / "poisson_ring.toml", names)
+    netkf.save(netkf.simulate(other, engine="simpy"), other, tmp_path / "kilometres")
+    remarks = netkf.compare([tmp_path / "metres", tmp_path / "kilometres"]).remarks()
+    assert remarks[0] == "errors are in m, km: they do not compare"
+    assert remarks[1].startswith("the plants differ")
     for key, value in (("states", ["x"]), ("states", ["x", "x"]), ("units", ["m"] * 3)):
         with pytest.raises(ScenarioError, match=f"plant.{key}"):
             scenario.replace({f"plant.{key}": value})
@@ -505,6 +532,15 @@ def test_a_comparison_of_filters_has_a_page(tmp_path):
         assert (certain in page.shown) == q.real
         assert f"{q.value:.4g}" in page.shown
     assert """--filters 'push-sum,{kind="hcmci", steps=2},local,hybrid'""" in page.shown
+    curves = page.data["filters"]["curves"]
+    assert [curve["label"] for curve in curves] == [row.filter for row in ran]
+    runs = netkf.monte_carlo(scenario.replace({"filter": {"kind": "local"}}), 8, workers=1)
+    square = np.trace(runs.mean_error, axis1=2, axis2=3).mean(axis=1)
+    local = curves[-1]
+    np.testing.assert_allclose(local["x"], runs.times)
+    np.testing.assert_allclose(local["y"][0], square, rtol=1e-9)
+    central = netkf.theory.central_covariance(scenario).trace()
+    assert page.data["filters"]["central"] == pytest.approx(central, rel=1e-9)
     # Dots of the figure stand as far from the axis as errors are large, relative to each other.
     places = [float(x) for x in re.findall(r'<circle cx="([0-9.]+)"', text)]
     errors = [row.quantities["rms_error"].value for row in ran]
