@@ -52,9 +52,7 @@ def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
         if len(central) == 1:
             label = "centralised filter, trace of P by theory"
             axes.axhline(*central, color=MUTED, lw=0.9, ls=(0, (1, 2)), label=label)
-        if bounds := [c.bound for c in known[:MAX_CURVES] if c.bound is not None]:
-            name = "in its colour: bound on the mean trace of P"
-            axes.plot([], [], color=MUTED, ls=BOUND, lw=0.9, label=name)
+        bounds = _draw_bounds(axes, known[:MAX_CURVES])
         drawn = np.concatenate([*map(_high, known), *(c.square for c in known), *bounds])
         levels = [float(np.nanmedian(curve.square)) for curve in known[:MAX_CURVES]]
         set_scale(axes, np.append(drawn, list(central)), levels)
@@ -82,12 +80,23 @@ def _draw_curve(axes: Any, curve: ErrorCurve, k: int) -> None:
     axes.plot(
         curve.times, square, color=style.colour, ls=style.dashes, label=label, **marks | alone
     )
-    if curve.bound is not None:
-        bound = np.minimum(curve.bound, MAX_DRAWN)
-        axes.plot(curve.times, bound, color=style.colour, ls=BOUND, lw=0.9)
     if curve.se is not None:
         low, high = np.maximum(square - NORMAL_QUANTILE * curve.se, 0.0), _high(curve)
         axes.fill_between(curve.times, low, high, color=style.colour, alpha=0.15, lw=0)
+
+
+def _draw_bounds(axes: Any, curves: Sequence[ErrorCurve]) -> list[FloatArray]:
+    """Draw the bounds of those curves that have one, and return them."""
+    bounds = []
+    for k, curve in enumerate(curves):
+        if curve.bound is not None:
+            bounds.append(np.minimum(curve.bound, MAX_DRAWN))
+            colour = SERIES[k % len(SERIES)].colour
+            axes.plot(curve.times, bounds[-1], color=colour, ls=BOUND, lw=0.9)
+    if bounds:
+        label = "in its colour: bound on the mean trace of P"
+        axes.plot([], [], color=MUTED, ls=BOUND, lw=0.9, label=label)
+    return bounds
 
 
 def _unit(curves: Sequence[ErrorCurve]) -> str:

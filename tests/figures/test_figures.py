@@ -199,6 +199,12 @@ def test_errors_of_several_results_are_drawn_in_one_figure(results, tmp_path, ca
     np.testing.assert_allclose(one.get_ydata(), squares, rtol=1e-9)
     means = np.trace(ensemble.mean_error, axis1=2, axis2=3).mean(axis=1)
     np.testing.assert_allclose(many.get_ydata(), means, rtol=1e-12)
+    bounds = netkf.theory.covariance_bound(run.scenario, run.times)
+    bound = np.trace(bounds, axis1=2, axis2=3).mean(axis=1)
+    drawn = [
+        line.get_ydata() for line in figure.axes[0].lines if len(line.get_xdata()) == len(bound)
+    ]
+    assert any(np.allclose(line, bound, rtol=1e-9) for line in drawn)
     averages = {"one $run$": squares[1:].mean(), "many": means[1:].mean()}
     best = min(averages, key=averages.get).replace("$", r"\$")
     assert figure.get_suptitle().startswith(f"{best} has the smallest mean square error")

@@ -129,6 +129,8 @@ def test_curves_are_mean_square_errors_over_the_runs(scenario, found, tmp_path):
         axes = comparison.plot("error").axes[0]
         lines = {line.get_label(): line.get_ydata() for line in axes.lines}
         np.testing.assert_array_equal(lines["local"], curve.square)
+        limit = lines.pop("centralised filter, trace of P by theory")[0]
+        assert limit == pytest.approx(netkf.theory.central_covariance(scenario).trace())
         assert set(lines) == {row.filter for row in found.rows if row.ran}
 
 
