@@ -271,3 +271,39 @@ def test_a_short_run_costs_little_more_than_what_it_imports(tmp_path):
     unit = min(cpu_seconds("-c", "import numpy, pandas") for _ in range(2))
     assert min(cpu_seconds(*run, tmp_path / f"{k}") for k in range(2)) < 3.2 * unit
     assert cpu_seconds("-m", "netkf", "run", "nowhere.toml") < 1.0 * unit
+
+
+LONG = """
+import hashlib, sys
+from netkf.cli import process
+from netkf.core import interrupts
+
+def command(interruption):
+    interruption.arm()
+    with interrupts.writing_at_last(lambda: print("written", flush=True)):
+        begun = False
+        while True:
+            try:
+                if not begun:
+                    begun = True
+                    print("begun", flush=True)
+                hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)  # minutes of compiled code
+            except KeyboardInterrupt:  # the signal came before
+                pass
+
+process.END_SECONDS = 0.2
+process.run_as_process(command)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_what_compiled_code_keeps_from_python(number):
+    """Handlers in Python wait until it returns: a thread writes results and ends the process."""
+    line = [sys.executable, "-c", LONG]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(line, text=True, **streams) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(number)
+        out, error = process.communicate(timeout=20)
+    assert (process.returncode, out) == (130, "written\n")
+    assert error == "netkf: interrupted; what was finished is kept\n"

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from netkf.core.interrupts import LAST_WRITES
 from netkf.core.printable import printable
 
 TYPE_CHECKING = False  # as in netkf/__init__.py
@@ -23,6 +24,7 @@ INTERRUPTED = 130
 """Exit status of an interrupted command."""
 END_SECONDS = 8.0
 """Seconds after which the process of an interrupted command is ended if it has not ended itself."""
+INTERRUPTED_LATE = "netkf: interrupted; what was finished is kept"
 EXIT_SECONDS = 4.0
 """Seconds after which functions registered with ``atexit`` are not waited for."""
 RESEND_SECONDS = 0.02  # long enough for the frame that swallowed the exception to return
@@ -51,7 +53,23 @@ class Interruption:
             # A signal that a shell or nohup made the process ignore stays ignored.
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 self._previous_handlers[number] = signal.signal(number, self._receive)
+        if self._needs_deadline and sys.platform != "win32":  # where only sockets can wake up
+            descriptor, signalled = os.pipe()
+            os.set_blocking(signalled, False)
+            signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
+            _thread.start_new_thread(self._watch, (descriptor,))
+            self._needs_deadline = False
         return self
+
+    def _watch(self, descriptor: int) -> None:
+        """End the process END_SECONDS after a signal; runs in a thread of its own, because handlers
+        in Python wait until compiled code of the main thread returns.
+        """
+        while True:
+            numbers = os.read(descriptor, 9)
+            if not self._disarmed and any(n in self._previous_handlers for n in numbers):
+                break
+        end_later(INTERRUPTED, END_SECONDS, INTERRUPTED_LATE)
 
     def __exit__(self, *_: object) -> None:
         self._armed = False
@@ -77,8 +95,7 @@ class Interruption:
         self.received = True
         if self._needs_deadline:
             self._needs_deadline = False
-            message = "netkf: interrupted; what was finished is kept"
-            end_later(INTERRUPTED, END_SECONDS, message)
+            end_later(INTERRUPTED, END_SECONDS, INTERRUPTED_LATE)
         if self._armed:
             raise KeyboardInterrupt
 
@@ -102,10 +119,15 @@ class Interruption:
 
 
 def end_later(status: int, seconds: float, message: str = "") -> None:
-    """Start a thread that prints ``message`` and ends the process after ``seconds``."""
+    """Start a thread that after ``seconds`` writes results that wait in memory (LAST_WRITES),
+    prints ``message`` and ends the process.
+    """
 
     def end() -> None:
         time.sleep(seconds)
+        for write in tuple(LAST_WRITES):
+            with contextlib.suppress(Exception):
+                write()
         if message:
             with contextlib.suppress(Exception):
                 os.write(2, f"{message}\n".encode())

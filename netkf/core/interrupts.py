@@ -5,12 +5,29 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+
+TYPE_CHECKING = False  # as in netkf/__init__.py
+if TYPE_CHECKING:
+    from typing import Any
 
 DEFERRED = (signal.SIGINT, signal.SIGTERM)
+LAST_WRITES: list[Callable[[], None]] = []
+"""Functions that write results that wait in memory, called by a thread that ends the process while
+compiled code keeps the main thread.
+"""
 _is_deferring = False  # the main thread is in a block of defer_signals
+
+
+@contextmanager
+def writing_at_last(write: Callable[[], None]) -> Iterator[None]:
+    """Have ``write`` called if the process is ended within the block by another thread."""
+    LAST_WRITES.append(write)
+    try:
+        yield
+    finally:
+        LAST_WRITES.remove(write)
 
 
 @contextmanager

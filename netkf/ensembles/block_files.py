@@ -14,6 +14,7 @@ import json
 import os
 import platform
 import shutil
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
@@ -91,6 +92,7 @@ class BlockFiles(ABC):
         self._nodes: set[Node] = set()
         self._own: set[Node] = set()  # those of them that this installation made
         self._pending = MergeTree(merge)
+        self._lock = threading.RLock()  # another thread may write as the process ends
         self._spent = self._written = 0.0  # CPU seconds of all results, and of those written
         self.installations: list[dict[str, Any]] = []  # of the nodes that were found
 
@@ -156,27 +158,29 @@ class BlockFiles(ABC):
         those of its neighbours and written now or later; return it.
         """
         start, size = node
-        self._pending.add(start // size, value, size.bit_length() - 1)
-        self._spent += seconds
-        # Traces fill the memory; other results wait to be merged, as a file takes as much for many
-        # runs as for one.
-        patience = max(FIRST_WRITE, WRITE_SHARE * self._written)
-        if identity.trace == "full" or self._spent - self._written >= patience:
-            self.write(identity)
+        with self._lock:
+            self._pending.add(start // size, value, size.bit_length() - 1)
+            self._spent += seconds
+            # Traces fill the memory; other results wait to be merged, as a file takes as much for
+            # many runs as for one.
+            patience = max(FIRST_WRITE, WRITE_SHARE * self._written)
+            if identity.trace == "full" or self._spent - self._written >= patience:
+                self.write(identity)
         return value
 
     def write(self, identity: RunIdentity) -> None:
         """Write the results that ``add`` took and that are not written yet, merged with those of
         neighbours that are stored already; raises WriteError.
         """
-        for level, k, value in self._pending.nodes():
-            node = k << level, 1 << level
-            if identity.trace == "full":
-                self.save(node, value, identity)
-            else:
-                self._save_merged(node, value, identity)
-        self._pending = MergeTree(self._merge)
-        self._written = self._spent
+        with self._lock:
+            for level, k, value in self._pending.nodes():
+                node = k << level, 1 << level
+                if identity.trace == "full":
+                    self.save(node, value, identity)
+                else:
+                    self._save_merged(node, value, identity)
+            self._pending = MergeTree(self._merge)
+            self._written = self._spent
 
     def _save_merged(self, node: Node, value: Any, identity: RunIdentity) -> None:
         """Write a result merged with those of neighbours that were written here, in one file."""

@@ -12,6 +12,7 @@ from typing import Any
 
 from netkf.core.errors import WriteError
 from netkf.core.fields import integer, one_of
+from netkf.core.interrupts import writing_at_last
 from netkf.engines.base import Engine
 from netkf.ensembles.block_files import RunIdentity
 from netkf.ensembles.checkpoints import BlockCheckpoints
@@ -235,15 +236,16 @@ class DirectoryWriter:
             self._add,
             plan.max_block,
         )
-        statistics: RunStatistics = replicate_blocks(
-            partial(block_statistics, engine=engine, traces=plan.traces),
-            merge,
-            self.scenario,
-            plan.runs,
-            pool=pool,
-            progress=progress,
-            store=store,
-        )
+        with writing_at_last(partial(self.blocks.write, plan)):
+            statistics: RunStatistics = replicate_blocks(
+                partial(block_statistics, engine=engine, traces=plan.traces),
+                merge,
+                self.scenario,
+                plan.runs,
+                pool=pool,
+                progress=progress,
+                store=store,
+            )
         return statistics
 
     def _add(self, node: Node, statistics: RunStatistics, seconds: float) -> RunStatistics:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from netkf.core.interrupts import writing_at_last
 from netkf.ensembles.block_files import BlockFiles, RunIdentity
 from netkf.ensembles.replicas import BlockStore, Node, Progress, missing_ranges
 
@@ -138,15 +139,16 @@ class Worker:
             return value if returns else None
 
         try:
-            yield BlockStore(
-                {node: partial(blocks.load, node) if returns else _nothing for node in known},
-                add,
-                identity.max_block,
-                replicas,
-                # The next block may take as long as the slowest.
-                lambda: time.monotonic() + self._slowest > self.deadline or is_over(),
-                None if returns else _merge_nothing,
-            )
+            with writing_at_last(partial(blocks.write, identity)):
+                yield BlockStore(
+                    {node: partial(blocks.load, node) if returns else _nothing for node in known},
+                    add,
+                    identity.max_block,
+                    replicas,
+                    # The next block may take as long as the slowest.
+                    lambda: time.monotonic() + self._slowest > self.deadline or is_over(),
+                    None if returns else _merge_nothing,
+                )
         finally:
             if not is_over():
                 blocks.write(identity)

@@ -357,3 +357,18 @@ def test_64_workers_killed_at_random_and_repeated(tmp_path):
     one = ["--workers", "1", "--no-plot", "--out", str(tmp_path / "one")]
     assert main(["run", *line, *one]) == 0
     assert files(out) == files(tmp_path / "one")
+
+
+@pytest.mark.slow
+def test_a_long_compiled_run_is_dropped_in_time(tmp_path):
+    """Its block has no file, and no half of one; tests/test_process.py has the short twin."""
+    out = tmp_path / "plan"
+    line = [RING, "--set", "horizon=4000000.0", "--set", "probe=[0.0]", "--runs", "2"]
+    assert main(["plan", *line, "--out", str(out)]) == 0
+    with subprocess.Popen([*COMMAND, "work", str(out)], **QUIET) as process:
+        time.sleep(20.0)
+        process.send_signal(signal.SIGTERM)
+        began = time.monotonic()
+        assert process.wait(30) == 130
+        assert time.monotonic() - began < 10.0
+    assert {file.name for file in out.rglob("*")} <= {"scenario.toml", "manifest.json", "blocks"}
