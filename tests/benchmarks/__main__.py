@@ -10,8 +10,13 @@ it is a lower one (>=). Ratios hold from machine to machine, times do not.
 
 import argparse
 import importlib.util
+import tempfile
+from pathlib import Path
 
-from tests.benchmarks import history
+from netkf.ensembles.directory import EnsembleOptions
+from netkf.ensembles.parts import Part
+from netkf.ensembles.plans import open_plan, plan_ensemble, work_on_plan
+from tests.benchmarks import cases, history
 from tests.benchmarks.rows import ROWS
 from tests.benchmarks.table import heading, measured, shown
 
@@ -24,6 +29,24 @@ def missing(row):
         if words in row.name and importlib.util.find_spec(package) is None:
             return package
     return None
+
+
+LAB_RUNS, MAX_BYTES = 64, 100_000
+
+
+def show_bytes():
+    """Bytes a run of what one job on a plan of the lab leaves without traces; True if it is few."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan = Path(folder) / "plan"
+        plan_ensemble(cases.load("intel_lab"), LAB_RUNS, plan, EnsembleOptions(trace="none"))
+        work_on_plan(open_plan(plan), Part(0, 1))
+        found = sum(file.stat().st_size for file in (plan / "blocks").iterdir()) / LAB_RUNS
+    verdict = "" if found <= MAX_BYTES else "  MISSED"
+    print(
+        f"{'bytes of a run: job of 64 runs, lab':44s} {'byte':>6} {found:11,.0f} {'':19} ", end=""
+    )
+    print(f"{f'<= {MAX_BYTES}':>8}{verdict}")
+    return found <= MAX_BYTES
 
 
 def main():
@@ -48,6 +71,8 @@ def main():
         missed += [row.name] if not found.holds(row) else []
     if options.history:
         history.add(pairs)
+    if options.only is None and not show_bytes():
+        missed.append("bytes of a run")
     print(f"{len(missed)} of {len(rows)} missed" if missed else "no limit missed")
 
 

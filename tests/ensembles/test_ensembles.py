@@ -77,6 +77,25 @@ def test_bits_do_not_depend_on_who_does_what_and_when(short):
     assert alone.fingerprint == netkf.simulate(short).fingerprint
 
 
+def test_an_executor_that_does_not_tell_its_workers_gets_as_many_blocks_as_it_has():
+    class Counts(Executor):
+        """Knows neither its number of workers nor its work."""
+
+        submitted = 0
+
+        def submit(self, function, /, *arguments):
+            self.submitted += 1
+            future = Future()
+            if self.submitted == 2000:  # two blocks for each of them, before any has a result
+                future.set_exception(RuntimeError("enough"))
+            return future
+
+    counts, scenario = Counts(), netkf.load(SCENARIOS / "poisson_ring.toml", {"horizon": 1.0})
+    with pytest.raises(RuntimeError, match="enough"):
+        netkf.monte_carlo(scenario, 100_000, workers=1000, executor=counts)
+    assert counts.submitted == 2000
+
+
 def test_moments_are_those_of_the_stored_runs(short):
     ensemble = netkf.monte_carlo(short, 7, workers=1)
     runs = [netkf.simulate(short, replica=k) for k in range(7)]
