@@ -9,12 +9,11 @@ from typing import Any
 
 from netkf.core.errors import ScenarioError, suggest_nearest
 from netkf.core.extras import missing
-from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FORMATS
+from netkf.figures.names import FIGURE_NAMES, FIT_FIGURES, FIT_FILE, FORMATS
 
 
 def _run(options: argparse.Namespace) -> int:
     """Draw figures of directories into files and print their paths; return the exit status."""
-    from netkf.logs.fitting import read_fit
     from netkf.studies.opening import open as open_directory
 
     if find_spec("matplotlib") is None:
@@ -26,9 +25,12 @@ def _run(options: argparse.Namespace) -> int:
         _check_output(options.out, 1 if names == ("error",) else len(options.directories))
     results: list[Any] = []
     for directory in options.directories:
-        fit = read_fit(directory)
-        opened = open_directory(directory, trust=options.trust) if fit is None else fit
-        results.append(opened)
+        if (directory / FIT_FILE).is_file():
+            from netkf.logs.fitting import read_fit
+
+            results.append(read_fit(directory))
+        else:
+            results.append(open_directory(directory, trust=options.trust))
     # After all that can be refused: importing matplotlib takes a second.
     from netkf.figures.catalogue import plot_to_files
 

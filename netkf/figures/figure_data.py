@@ -24,6 +24,7 @@ from netkf.runs.summary import (
     summarise,
 )
 from netkf.scenario.scenario import Scenario
+from netkf.trace.messages import join_messages
 from netkf.trace.nees import traces
 from netkf.trace.run import Run
 
@@ -123,6 +124,11 @@ class FigureData:
         if not len(self.run.log):
             raise UnavailableError("There are no events: none occurred, or none were recorded.")
         return self.run.log
+
+    @cached_property
+    def joined(self) -> np.ndarray:
+        """The MESSAGE rows (M,) of the run, once for all figures; raises UnavailableError."""
+        return join_messages(self.log)
 
     def require_samples(self) -> None:
         """Raise UnavailableError unless there are samples."""

@@ -9,3 +9,5 @@ FIGURE_NAMES = (
 """The figures of runs and ensembles; a sweep has ``stability`` only."""
 FIT_FIGURES = ("envelope",)
 """The figures of a fit."""
+FIT_FILE = "fit_envelope.csv"
+"""The file of a fit that is drawn."""

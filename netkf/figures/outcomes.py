@@ -30,7 +30,7 @@ WINDOWS, MAX_ROWS = 60, 60
 
 
 def _require_outcomes(data: FigureData) -> Outcomes:
-    outcomes = outcomes_of(data.log, data.nodes)
+    outcomes = outcomes_of(data.joined, data.nodes)
     if not len(outcomes.sent):
         raise UnavailableError("No message was delivered or lost.")
     return outcomes
@@ -58,7 +58,6 @@ def fate_figure(data: FigureData) -> Picture:
     UnavailableError.
     """
     fates = fate_matrix(_require_outcomes(data), len(data.nodes))
-    np.fill_diagonal(fates, np.nan)
     if not (data.scenario.has_broadcasts and np.isfinite(fates).any()):
         reason = "No two nodes could hear the same transmission, or they lost all or nothing."
         raise UnavailableError(reason)

@@ -6,10 +6,10 @@ Here a direction is a directed link, from a sender to a receiver.
 from __future__ import annotations
 
 import contextlib
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import select_evenly, shade_downtimes
@@ -28,7 +28,7 @@ from netkf.figures.style import (
     new_figure,
 )
 from netkf.linalg.arrays import FloatArray
-from netkf.trace.messages import DELIVERED, UNDER_WAY, by_link, join_messages
+from netkf.trace.messages import DELIVERED, UNDER_WAY, by_link
 from netkf.trace.schema import CODES
 
 AGE_BINS = 160  # of time, for means and maxima of the age
@@ -198,10 +198,10 @@ class DirectedMessages(NamedTuple):
     lost: FloatArray
 
 
-def messages_by_direction(log: np.ndarray) -> list[DirectedMessages]:
-    """Return the messages with an outcome of each direction, from EVENT rows ``log``."""
+def messages_by_direction(messages: np.ndarray) -> list[DirectedMessages]:
+    """Return the messages with an outcome of each direction, from MESSAGE rows (M,)."""
     directions = []
-    for link in by_link(join_messages(log)):
+    for link in by_link(messages):
         delivered = np.sort(link["ended"][link["outcome"] == DELIVERED])
         lost = np.sort(link["ended"][~np.isin(link["outcome"], (DELIVERED, UNDER_WAY))])
         if len(delivered) or len(lost):
@@ -256,16 +256,21 @@ def links_figure(data: FigureData) -> Picture:
 
 def _require_messages(data: FigureData) -> list[DirectedMessages]:
     """Return the messages by direction; raises UnavailableError without any."""
-    directions = messages_by_direction(data.log)
+    directions = messages_by_direction(data.joined)
     if not directions:
         raise UnavailableError("No message was delivered or lost.")
     return directions
 
 
-def wilson_interval(delivered: int, total: int) -> tuple[float, float]:
-    """Return Wilson's interval of a delivery probability, at the level CONFIDENCE."""
-    interval = scipy.stats.binomtest(delivered, total).proportion_ci(CONFIDENCE, "wilson")
-    return float(interval.low), float(interval.high)
+def wilson_interval(delivered: Any, total: Any) -> tuple[Any, Any]:
+    """Return the two ends of Wilson's interval of a delivery probability, at the level CONFIDENCE,
+    for numbers of messages or arrays (K,) of them.
+    """
+    z2, share = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2.0) ** 2, delivered / total
+    half = np.sqrt(z2 * (share * (1.0 - share) + z2 / (4.0 * total)) / total)
+    centre, scale = share + z2 / (2.0 * total), 1.0 + z2 / total
+    # At the two ends rounding would leave the interval of probabilities.
+    return np.clip((centre - half) / scale, 0.0, 1.0), np.clip((centre + half) / scale, 0.0, 1.0)
 
 
 def delivery_figure(data: FigureData) -> Picture:
@@ -294,8 +299,9 @@ def _draw_shares(
     """Draw ``shares`` (L,) with intervals; return how many exclude the stated probability."""
     order = np.argsort(shares, kind="stable")
     directions = [directions[k] for k in order.tolist()]
-    low, high = np.transpose(
-        [wilson_interval(len(d.delivered), len(d.delivered) + len(d.lost)) for d in directions]
+    delivered = np.array([len(direction.delivered) for direction in directions])
+    low, high = wilson_interval(
+        delivered, delivered + np.array([len(direction.lost) for direction in directions])
     )
     positions = np.arange(len(order))
     width = max(0.4, min(3.0, 150.0 / len(order)))
@@ -331,7 +337,7 @@ def _draw_losses(axes: Any, directions: list[DirectedMessages], end: float) -> N
     lost = np.histogram(np.concatenate([d.lost for d in directions]), edges)[0]
     totals = lost + np.histogram(np.concatenate([d.delivered for d in directions]), edges)[0]
     bins = np.flatnonzero(totals)
-    low, high = np.transpose([wilson_interval(int(lost[k]), int(totals[k])) for k in bins.tolist()])
+    low, high = wilson_interval(lost[bins], totals[bins])
     centres = 0.5 * (edges[1:] + edges[:-1])[bins]
     axes.fill_between(centres, low, high, color=FAINT, alpha=0.6, lw=0, label="95% interval")
     shares = lost[bins] / totals[bins]

@@ -18,6 +18,7 @@ from netkf.core.fields import SourceFile, as_path, number
 from netkf.core.notebook import NotebookTable
 from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Progress
+from netkf.figures.names import FIT_FILE
 from netkf.linalg.arrays import FloatArray
 from netkf.logs import outcomes as stats
 from netkf.logs.envelope import COLUMNS, Interval, Law, compare_with_laws
@@ -65,7 +66,7 @@ MAYBE = 0.05
 """Below this p a departure is allowed for in other tests, whether it is there or not."""
 KEY = ["sender", "receiver", "message"]
 UNKNOWN, REPLAY = "unknown.csv", "fit_replay.csv"
-FILES = ("fit_links.csv", "fit_tests.csv", "fit_laws.csv", "fit_envelope.csv")
+FILES = ("fit_links.csv", "fit_tests.csv", "fit_laws.csv", FIT_FILE)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,7 +114,7 @@ def read_fit(directory: Path) -> StoredFit | None:
     """Return what ``netkf fit`` left in a directory, None if it left nothing; raises ScenarioError
     for a damaged file.
     """
-    path = directory / FILES[-1]
+    path = directory / FIT_FILE
     if not path.is_file():
         return None
     try:

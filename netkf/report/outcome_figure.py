@@ -14,6 +14,7 @@ from netkf.runs.outcomes import (
     fate_matrix,
     outcomes_of,
 )
+from netkf.trace.messages import join_messages
 from netkf.trace.run import Run
 
 MAX_NODES = 24
@@ -30,7 +31,7 @@ def outcome_figures(run: Run | None, label: str) -> str:
     """Return pictures of a run's losses; empty if nothing was lost."""
     if run is None or run.scenario is None or not len(run.log):
         return ""
-    outcomes, size = outcomes_of(run.log, run.nodes), len(run.nodes)
+    outcomes, size = outcomes_of(join_messages(run.log), run.nodes), len(run.nodes)
     down = downtimes(run.scenario, run.seed, run.replica)
     if outcomes.heard.all():
         return ""
@@ -38,7 +39,6 @@ def outcome_figures(run: Run | None, label: str) -> str:
     if size <= MAX_NODES:
         names = [str(node) for node in run.nodes]
         lost, fates = 1.0 - delivery_matrix(outcomes, size), fate_matrix(outcomes, size)
-        np.fill_diagonal(fates, np.nan)
         parts.append(_matrix(lost, names, "Share lost, from the sender (row) to the receiver"))
         if run.scenario.has_broadcasts and np.isfinite(fates).any():
             caption = "Shared fate: correlation of the outcomes of one broadcast at two hearers"

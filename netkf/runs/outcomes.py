@@ -14,7 +14,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.network.lives import lifetimes
 from netkf.rng.streams import Streams
 from netkf.scenario.scenario import Scenario
-from netkf.trace.messages import DELIVERED, UNDER_WAY, join_messages
+from netkf.trace.messages import DELIVERED, UNDER_WAY
 
 
 class Downtime(NamedTuple):
@@ -56,9 +56,8 @@ class Outcomes(NamedTuple):
     heard: np.ndarray
 
 
-def outcomes_of(log: np.ndarray, nodes: Sequence[int]) -> Outcomes:
-    """Return the messages of EVENT rows ``log`` that were heard, lost or late."""
-    messages = join_messages(log)
+def outcomes_of(messages: np.ndarray, nodes: Sequence[int]) -> Outcomes:
+    """Return those of the MESSAGE rows (M,) that were heard, lost or late."""
     messages = messages[messages["outcome"] != UNDER_WAY]
     return Outcomes(
         sender=np.searchsorted(nodes, messages["sender"]),
@@ -84,7 +83,7 @@ def delivery_matrix(outcomes: Outcomes, size: int) -> FloatArray:
 
 def fate_matrix(outcomes: Outcomes, size: int) -> FloatArray:
     """Return the correlation of the outcomes of hearers i and j of the same broadcasts, (N, N), nan
-    where they have none or one of them heard all, or nothing.
+    where they have none or one of them heard all, or nothing, and for i = j.
 
     Outcomes are taken about the mean of their link, and pooled over the senders.
     """
@@ -93,16 +92,21 @@ def fate_matrix(outcomes: Outcomes, size: int) -> FloatArray:
     order = np.lexsort((outcomes.receiver, outcomes.phase, outcomes.sent, outcomes.sender))
     sender, sent, phase = (a[order] for a in (outcomes.sender, outcomes.sent, outcomes.phase))
     again = (np.diff(sender) == 0) & (np.diff(sent) == 0) & (np.diff(phase) == 0)
-    broadcast = np.cumsum(np.append(0, ~again)) if len(order) else np.empty(0, dtype=int)
-    gaps = np.zeros((int(broadcast[-1]) + 1 if len(order) else 0, size))
+    # Messages that no other node could hear are most of a network of links, and say nothing here.
+    shared = np.append(False, again) | np.append(again, False) if len(order) else again
+    number = np.cumsum(np.append(0, ~again))[: len(order)]
+    broadcast, row = np.unique(number[shared], return_inverse=True)
+    gaps = np.zeros((len(broadcast), size))
     is_hearer = np.zeros_like(gaps)
-    gaps[broadcast, outcomes.receiver[order]] = gap[order]
-    is_hearer[broadcast, outcomes.receiver[order]] = 1.0
+    gaps[row, outcomes.receiver[order][shared]] = gap[order][shared]
+    is_hearer[row, outcomes.receiver[order][shared]] = 1.0
     with np.errstate(invalid="ignore", divide="ignore"):
         # Sums over the broadcasts that both may hear.
         squares = (gaps**2).T @ is_hearer
         correlation = (gaps.T @ gaps) / np.sqrt(squares * squares.T)
-    return np.where(is_hearer.T @ is_hearer > 0.0, correlation, math.nan)
+    fates = np.where(is_hearer.T @ is_hearer > 0.0, correlation, math.nan)
+    np.fill_diagonal(fates, math.nan)
+    return fates
 
 
 def loss_windows(

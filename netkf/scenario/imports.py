@@ -16,15 +16,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from importlib.machinery import PathFinder
-from importlib.metadata import EntryPoint, entry_points
 from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from netkf.core.contracts import ContractError, place_of_error
 from netkf.core.errors import ScenarioError, quote
 from netkf.core.stamps import TimeBase
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 PARTS = "netkf.parts"
 """The group of entry points by which installed packages offer classes."""
@@ -104,6 +106,9 @@ def offered_kinds(cls: type | None = None) -> list[str]:
 
 @lru_cache(maxsize=8)
 def _offers(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    # Not needed for built-in kinds, and slow to import.
+    from importlib.metadata import entry_points
+
     with _replace_import_path(list(path)):
         return tuple(entry_points(group=PARTS))
 

@@ -11,6 +11,7 @@ from netkf.algorithms.models import FlowModel
 from netkf.checks.innovations import ExpectedIncrements, autocorrelation, compute_innovations
 from netkf.figures.traffic import age_of_information, messages_by_direction, wilson_interval
 from netkf.studies.consistency import run_consistency
+from netkf.trace.messages import join_messages
 from tests.conftest import SCENARIOS
 from tests.figures.conftest import one_node
 
@@ -45,22 +46,22 @@ def test_the_age_of_information_is_that_of_a_plain_loop(results, kind):
 def test_directions_have_the_messages_of_the_log(results, kind):
     run = results(kind)
     events = run.events
-    for one in messages_by_direction(run.log):
+    for one in messages_by_direction(join_messages(run.log)):
         sent = events[(events["kind"] == "send") & (events["node"] == one.sender)]
         sent = sent[sent["peer"] == one.receiver]
         # What is on its way at the end has neither arrived nor been lost.
         assert 0 <= len(sent) - len(one.delivered) - len(one.lost) <= 1
-    found = messages_by_direction(run.log)
+    found = messages_by_direction(join_messages(run.log))
     assert sum(len(d.delivered) for d in found) == run.count("deliver")
     assert sum(len(d.lost) for d in found) == run.count("lost") + run.count("late")
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 5), (5, 5), (3, 10), (500, 1000)])
-def test_wilson_is_the_formula(k, n):
-    z, p = scipy.stats.norm.ppf(0.975), k / n
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    np.testing.assert_allclose(wilson_interval(k, n), (centre - half, centre + half), atol=1e-12)
+def test_wilson_is_that_of_scipy(k, n):
+    expected = scipy.stats.binomtest(k, n).proportion_ci(0.95, "wilson")
+    np.testing.assert_allclose(wilson_interval(k, n), expected, atol=1e-12)
+    low, high = wilson_interval(np.array([k, k]), np.array([n, n + 1]))
+    assert (low[0], high[0]) == wilson_interval(k, n)
 
 
 def test_innovations_are_those_of_a_plain_kalman_filter(results):

@@ -13,6 +13,7 @@ from netkf.runs.outcomes import (
     loss_windows,
     outcomes_of,
 )
+from netkf.trace.messages import join_messages
 
 TOML = """
 format = 1
@@ -60,7 +61,10 @@ def messages_by_pandas(run):
 
 
 def test_delivery_and_windows_by_pandas(shared):
-    messages, outcomes = messages_by_pandas(shared), outcomes_of(shared.log, shared.nodes)
+    messages, outcomes = (
+        messages_by_pandas(shared),
+        outcomes_of(join_messages(shared.log), shared.nodes),
+    )
     expected = messages.pivot_table(index="sender", columns="receiver", values="heard")
     np.testing.assert_allclose(delivery_matrix(outcomes, 3), expected.to_numpy())
     edges = np.linspace(0.0, 1500.0, 7)
@@ -77,7 +81,7 @@ def test_shared_fate_is_the_share(shared):
     """The correlation of two hearers is the share of broadcasts that have one fate; by pandas it is
     that of columns of outcomes.
     """
-    fates = fate_matrix(outcomes_of(shared.log, shared.nodes), 3)
+    fates = fate_matrix(outcomes_of(join_messages(shared.log), shared.nodes), 3)
     messages = messages_by_pandas(shared)
     for i, j, sender in ((1, 2, 10), (0, 2, 11), (0, 1, 12)):
         own = messages[messages.sender == sender]
@@ -111,7 +115,7 @@ def test_downtimes_are_the_events_of_the_run(tmp_path):
 
 def test_figures_show_the_matrices(shared):
     figures = FigureSet(shared)
-    outcomes = outcomes_of(shared.log, shared.nodes)
+    outcomes = outcomes_of(join_messages(shared.log), shared.nodes)
     for name, matrix in (("matrix", delivery_matrix), ("fate", fate_matrix)):
         axes = figures.draw(name).axes[0]
         shown = np.ma.filled(axes.images[0].get_array().astype(float), np.nan)
