@@ -1,6 +1,8 @@
 """How the process of a command ends: closed streams, signals, text from files."""
 
 import os
+import pty
+import re
 import resource
 import shlex
 import signal
@@ -230,6 +232,38 @@ def test_names_that_are_not_ascii_may_stand_on_a_machine_that_knows_no_others(tm
         assert done.returncode == 0, done.stderr
     files = set(os.listdir(folder + b"/out"))
     assert {b"events.parquet", b"states.parquet", b"manifest.json"} <= files
+
+
+PROGRESS = """
+import time
+from netkf.cli import process, progress
+progress.QUIET_SECONDS = 0.2
+with process.safe_streams(), progress.ProgressLine() as line:
+    update = line.make_count_update("runs")
+    update(0, 10)
+    time.sleep(0.1)
+    update(5, 10)
+    print("note", flush=True)
+    time.sleep(1.0)
+print("end")
+"""
+
+
+def test_a_terminal_shows_a_rate_and_what_is_left_and_a_pipe_nothing():
+    here, there = pty.openpty()
+    command = [sys.executable, "-c", PROGRESS]
+    subprocess.run(command, stdin=there, stdout=there, stderr=there, check=True)
+    shown = os.read(here, 10_000).decode()
+    os.close(here), os.close(there)
+    clear = re.escape("\r\x1b[K")
+    rate = r"5 of 10 runs, [\d.e+]+ per second, about 0 s left"
+    # A line of its own for the note; then the time, until the line is removed.
+    begin, later = f"{clear}0 of 10 runs{clear}{rate}{clear}note\r\n", f"{clear}{rate}; 1 s so far"
+    pattern = rf"{begin}({later})*{clear}end\r\n"
+    assert re.fullmatch(pattern, shown), shown
+    assert "so far" in shown
+    piped = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (piped.stdout, piped.stderr) == ("note\nend\n", "")
 
 
 UNNEEDED = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,7 +73,11 @@ class Command(NamedTuple):
             from netkf.cli.planned import plan_study
 
             return plan_study(module._run, options)
-        status: int = module._run(options)
+        from netkf.cli.progress import ProgressLine
+
+        status: int
+        with nullcontext() if hasattr(module, "ProgressLine") else ProgressLine():
+            status = module._run(options)
         return status
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from netkf.core.errors import quote, suggest_nearest
+from netkf.core.errors import ScenarioError, quote, suggest_nearest
 from netkf.core.printable import one_line, shorten
 
 if TYPE_CHECKING:
@@ -56,6 +57,13 @@ def load_scenario(
     ``ignored`` has values, by key, for keys that the command does not use: they replace those of
     the file, which may be invalid together with other options. Raises ScenarioError.
     """
+    try:
+        os.stat(options.scenario)  # before the imports of a scenario, which take longer
+    except OSError as error:
+        rule = f"cannot be read ({error.strerror})"
+        raise ScenarioError(shorten(options.scenario), rule, None, "check the path") from None
+    except ValueError:  # a name that no file can have
+        pass
     from netkf.scenario.reading import load
 
     copy: Path | None = getattr(options, "copy", None)

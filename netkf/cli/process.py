@@ -173,6 +173,10 @@ def open_missing_streams() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
 
 
+before_writing: list[Callable[[], None]] = []
+"""Called before text is written to a standard stream: a progress line leaves its place."""
+
+
 class OutputError(OSError):
     """Standard output cannot be written to."""
 
@@ -193,6 +197,8 @@ class SafeStream:
 
     def write(self, text: str) -> int:
         """Write a text with its control characters escaped; return the length written."""
+        for function in before_writing:
+            function()
         return self.direct(printable(text))
 
     def direct(self, text: str) -> int:

@@ -17,7 +17,6 @@ from netkf.cli.options import (
 )
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
-from netkf.engines.soundness import describe_divergence
 
 if TYPE_CHECKING:
     from netkf.runs.run import CompletedRun
@@ -149,6 +148,8 @@ def print_ensemble(completed: Any, runs: int) -> None:
 
 
 def _describe_divergence(completed: CompletedRun, nodes: Sequence[int]) -> str:
+    from netkf.engines.soundness import describe_divergence
+
     samples = completed.samples
     problem = describe_divergence(nodes, *samples.last)
     averaging = ""

@@ -2,7 +2,8 @@
 
 netkf, one process and no trace, through ``netkf.monte_carlo``, against hand-written numba kernels
 of the same job (``by_hand``), batched numpy, filterpy, Stone Soup and simdkalman (``peers``), and
-pieces of netkf against scipy, numpy and bare SimPy. Processor time, medians of ``--runs``
+pieces of netkf against scipy, numpy and bare SimPy; commands (``--only command``) against
+``python -c "import numpy, pandas"``. Processor time, medians of ``--runs``
 measurements made in turn, after everything is compiled. A ratio says how many times the time of
 the other netkf takes where the limit is an upper one (<=), and how many times faster netkf is where
 it is a lower one (>=). Ratios hold from machine to machine, times do not.
@@ -17,6 +18,7 @@ from netkf.ensembles.directory import EnsembleOptions
 from netkf.ensembles.parts import Part
 from netkf.ensembles.plans import open_plan, plan_ensemble, work_on_plan
 from tests.benchmarks import cases, history
+from tests.benchmarks.commands import COMMANDS
 from tests.benchmarks.rows import ROWS
 from tests.benchmarks.table import heading, measured, shown
 
@@ -55,9 +57,10 @@ def main():
     parser.add_argument("--runs", type=int, default=5, help="measurements of each (default 5)")
     parser.add_argument("--history", action="store_true", help="keep the ratios, see history.py")
     options = parser.parse_args()
-    rows = [row for row in ROWS if options.only is None or options.only in row.name]
+    known = [*ROWS, *COMMANDS]
+    rows = [row for row in known if options.only is None or options.only in row.name]
     if not rows:
-        parser.error(f"no row is named so; there are {', '.join(row.name for row in ROWS)}")
+        parser.error(f"no row is named so; there are {', '.join(row.name for row in known)}")
     missed, pairs = [], []
     heading()
     for row in rows:
