@@ -112,7 +112,8 @@ def _model_class() -> Any:
     class Reading(gaussian):  # type: ignore[misc,valid-type]
         """``y = H x + v`` or ``y = h(x) + v``; ``reading`` is H (p, n) or a Linearised."""
 
-        reading: Any = base.Property(doc="H, or h with its Jacobian")
+        # Not an annotation: Python 3.14 hides those of this module, whose evaluation is postponed.
+        reading = base.Property(Any, doc="H, or h with its Jacobian")
 
         @property
         def ndim_meas(self) -> int:
