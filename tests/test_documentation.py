@@ -15,6 +15,7 @@ ELSEWHERE = {  # pages whose blocks have tests of their own
     "scenario_files.md": "test_docs.py",
 }
 NEEDS = {"formats.md": ("xarray", "h5netcdf", "stonesoup", "filterpy")}
+SLOW = ("blocks.md",)  # tests/studies/test_blocks.py runs these commands on a small scenario
 FOLLOWED = [page for page in PAGES if page.name not in ELSEWHERE and blocks(page)]
 
 
@@ -32,7 +33,14 @@ def follower(tmp_path, monkeypatch):
     found.close()
 
 
-@pytest.mark.parametrize("page", FOLLOWED, ids=page_name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.slow) if page.name in SLOW else page
+        for page in FOLLOWED
+    ],
+    ids=page_name,
+)
 def test_the_page_does_what_it_says(follower, page):
     for package in NEEDS.get(page.name, ()):
         pytest.importorskip(package)

@@ -161,6 +161,7 @@ def test_check_knows_of_how_many_nodes_p_is_right(
     assert "broken" not in set(table["verdict"])
 
 
+@pytest.mark.slow
 def test_factors_that_cannot_be_inverted_are_not_used(tmp_path: Path) -> None:
     """A pair that has not heard each other for long makes contact first."""
     scenario = load(ROBOTS, tmp_path, filter=KEPT | {"estimates": "own"}, **TWO)

@@ -219,7 +219,9 @@ def test_every_node_learns_how_many_there_are_and_what_they_see():
             np.testing.assert_allclose(state.information, 100.0 * np.eye(2), atol=1e-6)
 
 
-@pytest.mark.parametrize(("delivery", "wrong"), [(0.7, 0.5), (0.5, 0.9)])
+@pytest.mark.parametrize(
+    ("delivery", "wrong"), [pytest.param(0.7, 0.5, marks=pytest.mark.slow), (0.5, 0.9)]
+)
 def test_the_stop_rule_of_the_paper_breaks_and_the_safe_one_does_not(delivery, wrong):
     """Section 4: nodes with N^(i) wrong by more than 1 %: 76 % and 98 %; safe 0 %."""
     paper = np.array([numbers("paper", delivery, 200, seed)[0] for seed in range(4)])

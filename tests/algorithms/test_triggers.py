@@ -216,6 +216,7 @@ def test_theory_follows_silence_and_checks_the_rate(tmp_path):
     assert verdicts[[SILENCE, RATE]].tolist() == ["not promised", "not promised"]
 
 
+@pytest.mark.slow
 def test_nodes_that_send_too_often_break_the_rate(tmp_path, monkeypatch):
     """Coins that fall on silence half as often as they should."""
     emit = ScheduledReadings.kernels.emit

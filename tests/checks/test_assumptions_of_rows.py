@@ -147,6 +147,7 @@ def test_rare_losses_of_links_are_not_taken_for_correlated(q, windows, sent):
     assert all(value < 1.0 for value in values)
 
 
+@pytest.mark.slow
 def test_senders_of_directed_graphs_are_those_of_its_links(tmp_path):
     edges = [[0, 1], [1, 2], [2, 0], [1, 0]]
     network = {
@@ -206,6 +207,7 @@ class Weaker(Hybrid):
         return Weights(lambda *degrees: 0.5 * given.of(*degrees), None, 2.0 * given.largest_degree)
 
 
+@pytest.mark.slow
 def test_a_class_with_weights_of_its_own_may_say_how_many_links_they_allow(tmp_path):
     scenario = scenario_of(RING, tmp_path, filter={"kind": f"{HERE}:Weaker", "epsilon": 0.4})
     rows = judged(scenario)
@@ -247,6 +249,7 @@ def test_losses_without_one_known_probability_are_not_compared_with_it(kind, rea
         assert reason in reason_of(rows, row)
 
 
+@pytest.mark.slow
 def test_a_replay_that_equations_cannot_give_accuses_nobody(ring):
     scenario = with_check_times(ring)
     results = [run_replica(scenario, 5, k) for k in range(10)]

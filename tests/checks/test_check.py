@@ -11,7 +11,7 @@ from netkf.checks.evidence import BROKEN, HOLDS, NOT_PROMISED
 from netkf.core.errors import TheoryError
 from netkf.laws import intervals
 from netkf.scenario.reading import from_table
-from tests.conftest import SCENARIOS
+from tests.conftest import SCENARIOS, with_slow
 
 GOSSIP = {
     "format": 1,
@@ -169,7 +169,7 @@ FLOW = {
 }
 
 
-@pytest.mark.parametrize("kind", FLOW)
+@pytest.mark.parametrize("kind", with_slow(FLOW, ("Stale", "MissingX", "SwappedIndex", "Deaf")))
 def test_broken_filters_in_continuous_time_are_caught(kind, tmp_path):
     filtering = {"kind": f"tests.checks.broken:{kind}", "epsilon": 0.3}
     changes = {"filter": filtering}
@@ -201,10 +201,10 @@ def broken_promises(scenario, runs):
     [
         # Its errors alone are too small a change for so few runs.
         ("LosesMass", {MASS, STEPS}, set(), 10),
-        ("SendsTooMuch", {MASS, STEPS}, set(), 10),
+        pytest.param("SendsTooMuch", {MASS, STEPS}, set(), 10, marks=pytest.mark.slow),
         ("NeverAverages", {ERRORS, "mean squares become the exact steady ones"}, {MASS, STEPS}, 12),
         ("Overshoots", {ERRORS}, {MASS, STEPS}, 10),
-        ("ForgetsN", {ERRORS}, {MASS, STEPS}, 15),
+        pytest.param("ForgetsN", {ERRORS}, {MASS, STEPS}, 15, marks=pytest.mark.slow),
     ],
 )
 def test_broken_push_sum_is_caught(kind, caught, not_seen, runs, tmp_path):
@@ -309,6 +309,7 @@ def test_a_wrong_mean_matching_is_caught(tmp_path):
     assert found["G (10), (19), Proposition 7"].verdict == "holds"
 
 
+@pytest.mark.slow
 def test_arrivals_of_the_wrong_probability_are_caught(tmp_path, monkeypatch):
     # These rows need no law of the errors of each run, but one of some runs.
     monkeypatch.setattr(exact, "MAX_REPLAYED", 50)
@@ -330,6 +331,7 @@ def test_broken_intermittent_filters_are_caught(kind, source, tmp_path):
     assert is_caught(rows_of(check(scenario, runs=30, workers=1))[source])
 
 
+@pytest.mark.slow
 def test_correct_filters_hold_with_enough_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(exact, "MAX_REPLAYED", 150)
     found = check(scenario_of(SCALAR, tmp_path), runs=500, workers=1)
@@ -352,6 +354,7 @@ def test_what_is_not_promised_says_why():
     assert "every exchange is a swap" in row.assumptions
 
 
+@pytest.mark.slow
 def test_undecided_says_how_many_runs_would_do(tmp_path):
     few = rows_of(check(scenario_of(SCALAR, tmp_path), runs=12, workers=1))["R (12)"]
     assert few.verdict == "undecided"

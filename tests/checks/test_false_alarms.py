@@ -142,12 +142,14 @@ def test_scalar_filters_are_held_to_their_law_at_the_end(F, R, cov, delivery, ho
     assert not broken_rows(scalar_scenario(tmp_path, F, R, cov, delivery, horizon), runs=60)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_laws")
 def test_a_point_of_the_support_is_found_within_the_spread_of_all_starts():
     scenario = netkf.load(SCENARIOS / "intermittent_random10.toml", {"horizon": 15.0})
     assert not broken_rows(scenario, runs=60, seed=1000)
 
 
+@pytest.mark.slow
 def test_a_limit_that_is_not_reached_says_which_horizon_would_do(tmp_path):
     sensors = [{"nodes": [0], "H": [[1.0]], "R": [[1.0]]}]
     plant = {"kind": "linear", "F": [[1.1]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
@@ -181,6 +183,7 @@ def test_a_distance_that_is_rounding_has_no_exponent(tmp_path):
     assert found["H Theorem 3, (13)"].verdict == HOLDS
 
 
+@pytest.mark.slow
 def test_few_runs_in_one_dimension_are_judged_by_their_exact_law(tmp_path):
     plant = {"kind": "linear", "F": [[0.9]], "Q": [[1.0]], "period": 1.0, "cov": [[1.0]]}
     sensors = [{"nodes": [0, 2], "H": [[1.0]], "R": [[1.0]]}]
@@ -195,6 +198,7 @@ def test_few_runs_in_one_dimension_are_judged_by_their_exact_law(tmp_path):
     assert len(accused) <= 1
 
 
+@pytest.mark.slow
 def test_links_too_fast_to_simulate_faster_are_not_refused(tmp_path):
     changes = {"network.activation.rate": 1e8, "horizon": 1e-6, "probe": 1e-6}
     assert check(scenario_of(RING, tmp_path, **changes), runs=10, workers=1)

@@ -172,6 +172,7 @@ def test_forecasts_of_all_kinds_of_intervals_hold_within_a_factor(kind):
     assert 1.0 / 1.5 < np.median(ratios) < 1.5
 
 
+@pytest.mark.slow
 def test_runs_added_to_a_verdict_are_those_of_one_check(tmp_path):
     scenario = scenario_of(INTERMITTENT, tmp_path)
     first = check(scenario, 12, workers=1)
@@ -192,6 +193,7 @@ def test_runs_added_to_a_verdict_are_those_of_one_check(tmp_path):
         check(scenario, 30, seed=77, earlier=more)
 
 
+@pytest.mark.slow
 def test_until_decided_ends_where_it_should(tmp_path):
     scenario = scenario_of(INTERMITTENT, tmp_path)
     seen = []

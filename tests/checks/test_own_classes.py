@@ -36,6 +36,7 @@ def test_own_attributes_are_those_that_a_class_defines_anew(part, own):
     assert own_attributes(part) == own
 
 
+@pytest.mark.slow
 def test_own_weights_are_a_design_and_the_row_says_so(tmp_path):
     verdict, row = beside(RING, "HeavierLinks", tmp_path)
     assert row.verdict == NOT_PROMISED
@@ -44,6 +45,7 @@ def test_own_weights_are_a_design_and_the_row_says_so(tmp_path):
     assert bool(verdict)
 
 
+@pytest.mark.slow
 def test_weights_that_change_nothing_hold(tmp_path):
     verdict, row = beside(RING, "SameWeights", tmp_path)
     assert row.verdict == HOLDS

@@ -42,6 +42,7 @@ def few_laws(monkeypatch):
     monkeypatch.setattr(exact, "MIN_REPLAYED", 0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_laws")
 def test_averages_over_one_path():
     """R Proposition 25: also at delivery 0.3, where P has no mean; broken at another delivery."""
@@ -68,6 +69,7 @@ def test_the_mean_diverges_at_a_node_without_a_neighbour_that_has_a_sensor():
     assert growing.margin[0] == pytest.approx(60 * np.log(2), rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_laws")
 def test_all_sensors_together():
     """G (27)-(29): broken for the switched chain of another matching."""

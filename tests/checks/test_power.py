@@ -44,6 +44,7 @@ def ring():
     return scenario, [run_replica(scenario, 5, k) for k in range(FEW)]
 
 
+@pytest.mark.slow
 def test_rows_would_have_found_small_errors_at_the_default(ring):
     # What a row would find depends on how much it saw, and not on what: each run counts 20 times.
     scenario, results = ring

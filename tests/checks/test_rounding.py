@@ -155,6 +155,7 @@ def test_nobody_judges_a_covariance_that_is_not_given(silent):
     assert found.notes == ("the filter gives no covariance",)
 
 
+@pytest.mark.slow
 def test_check_says_that_there_is_no_covariance(ring):
     mute = ring.replace({"filter": {"kind": f"{__name__}:Mute", "epsilon": 0.3}})
     with pytest.raises(netkf.TheoryError, match="gives no covariance"):

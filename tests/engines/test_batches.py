@@ -8,7 +8,7 @@ from netkf.engines.compiled import batches
 from netkf.engines.compiled.engine import CompiledEngine
 from netkf.engines.simpy.engine import SimpyEngine
 from netkf.trace.schema import KINDS
-from tests.conftest import scenario_files
+from tests.conftest import scenario_files, with_slow
 
 SHORT = {"delayed_links": 6.0, "intel_lab": 240.0, "intel_lab_radio": 240.0, "push_sum_planar": 3.0}
 FILES = {file.stem: file for file in scenario_files()}
@@ -73,7 +73,7 @@ def test_a_batch_of_one_where_memory_is_short(ring, monkeypatch):
     assert_alone(ring.replace({"horizon": 2.0}), CompiledEngine(), 7, range(2))
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", with_slow(FILES, ("diffusion_regression", "ulb_library")))
 def test_compiled_batches_hold_the_runs_of_the_scenarios(name):
     scenario = netkf.load(FILES[name])
     horizon = min(scenario.horizon, SHORT.get(name, scenario.horizon))

@@ -10,7 +10,7 @@ from netkf.engines.compiled.engine import CompiledEngine
 from tests.engines.agreement import assert_agree
 from tests.engines.drawn import FILTERS, LITERATURE, drawn_scenario
 
-FEW, MANY, TOGETHER = 64, 360, 8
+FEW, MANY, TOGETHER = 32, 360, 8
 SIZES = 1, 2, 5
 """Numbers of states: loops are unrolled up to 4, by code that is compiled for each."""
 

@@ -285,7 +285,7 @@ def slotted(draw, filters=SLOT_FILTERS):
     }
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(slotted(LITERATURE))
 def test_drawn_scenarios_of_the_literature_agree(tables):
     try:
@@ -421,6 +421,7 @@ def test_growth_beyond_numbers_is_reported_alike(build):
     assert assert_agree(grown).status == "diverged"
 
 
+@pytest.mark.slow
 def test_covariances_beyond_all_bounds_take_their_time_and_no_more(build):
     """Far from the only sensor nobody knows anything, and resets bring it P of 1e20."""
     plant = {"kind": "diffusion", "A": [[0.0, 1.0], [-1.0, 0.2]], "B": [[0.0], [1.0]]}

@@ -325,6 +325,7 @@ def test_the_normalised_outer_product_of_gaussians(seed):
     )
 
 
+@pytest.mark.slow
 def test_information_level_of_section_vi():
     """D (19) for every past; numbers measured independently. No sensor alone excites."""
     scenario = section_vi()

@@ -112,6 +112,7 @@ def test_frames_move_messages_beside_modes_that_decay_fast(kind):
     np.testing.assert_allclose(runs[0].error, runs[1].error, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_errors_so_large_that_they_round_each_other_are_known():
     """Blind nodes below the threshold: errors of 1e20 leave rounding where a sensor takes them."""
     run = netkf.simulate(scenario("hybrid", SENSORS, horizon=300.0), engine="simpy")

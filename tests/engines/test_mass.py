@@ -155,6 +155,7 @@ def test_p_of_a_slow_mode_knows_nothing_of_a_fast_one(growth):
         assert abs(run.sums["weight"][1] - 5.0) < 1e-12
 
 
+@pytest.mark.slow
 def test_totals_that_fade_mode_by_mode_are_information_about_the_state():
     """Estimates stay affine in the readings, theory follows P and errors, and engines agree."""
     turn = np.array([[1.0, 0.3], [-0.7, 0.8]])

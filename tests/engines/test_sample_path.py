@@ -5,6 +5,7 @@ import pytest
 
 from netkf.engines.simpy import nodes
 from netkf.theory import error_covariance
+from tests.conftest import with_slow
 
 from .linearity import engine_covariance
 
@@ -40,12 +41,14 @@ def test_the_error_has_fourth_order_in_the_sensing_period(ring, monkeypatch):
     assert 14.0 < errors[1] / errors[2] < 18.0
 
 
+@pytest.mark.slow
 def test_first_transient_needs_no_shorter_period(ring):
     wide = [[1e4, 0.0], [0.0, 1e4]]
     changes = {"horizon": 0.6, "probe": 0.1, "plant.cov": wide, "filter.cov": wide}
     assert deviation(ring.replace(changes)) < STATED / 50
 
 
+@pytest.mark.slow
 def test_precise_sensors(ring):
     changes = {"horizon": 1.0, "probe": 0.1, "sensors.0.R": [[0.01]]}
     assert deviation(ring.replace(changes)) < STATED / 50
@@ -57,7 +60,11 @@ def test_samples_off_the_sensing_grid(ring):
 
 
 @pytest.mark.parametrize(
-    "delay", [{"kind": "constant", "seconds": 0.3}, {"kind": "exponential", "mean": 0.2}]
+    "delay",
+    [
+        {"kind": "constant", "seconds": 0.3},
+        pytest.param({"kind": "exponential", "mean": 0.2}, marks=pytest.mark.slow),
+    ],
 )
 def test_delays(ring, delay):
     changes = {
@@ -88,7 +95,7 @@ def test_several_sensors_on_a_node_and_rows_of_zeros(ring):
     assert deviation(ring.replace({"horizon": 1.0, "sensors": more})) < STATED / 20
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", with_slow(range(3), (1, 2)))
 def test_random_systems_with_large_first_covariances(build, seed):
     random = np.random.default_rng(seed)
     n = 2

@@ -199,6 +199,7 @@ def test_a_class_says_how_its_messages_are_read(folder: Path, changes: dict[str,
     np.testing.assert_allclose(run.xhat, expected.xhat, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_told_late_leaves_blocks_whose_dynamics_are_not_linear(folder: Path) -> None:
     unicycle = {
         **{"name": "pose", "nodes": list(NODES), "f": "unicycle", "step": 0.05},

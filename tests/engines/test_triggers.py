@@ -100,7 +100,9 @@ def test_both_engines_send_the_same(name, tmp_path):
             assert_batch(scenario)
 
 
-@pytest.mark.parametrize("name", ["intermittent", "hcmci", "diffusion", "consensus"])
+@pytest.mark.parametrize(
+    "name", with_slow(["intermittent", "hcmci", "diffusion", "consensus"], {"hcmci", "diffusion"})
+)
 def test_links_of_one_direction(name, tmp_path):
     """Node 3 hears nobody, and nobody hears node 4."""
     network = {**ONE_WAY, "activation": {"kind": "broadcast"}, "channel": CHANNELS["lossy"]}

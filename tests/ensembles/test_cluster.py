@@ -147,6 +147,7 @@ def test_a_scheduler_that_dies_is_told_in_one_line(ring, cluster):
         )
 
 
+@pytest.mark.slow
 def test_the_extra_is_named_where_distributed_is_missing(ring, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(netkf.EngineError, match=r"pip install 'netkf\[cluster\]'"):

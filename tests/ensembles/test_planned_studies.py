@@ -11,7 +11,7 @@ from netkf.ensembles import block_files
 from netkf.ensembles.merge_tree import MergeTree
 from netkf.runs import provenance
 from netkf.runs.documents import write_sealed
-from tests.conftest import SCENARIOS
+from tests.conftest import SCENARIOS, with_slow
 
 RING = [str(SCENARIOS / "poisson_ring.toml"), "--set", "horizon=1.0"]
 SLOW = ["--engine", "simpy"]
@@ -48,7 +48,7 @@ def said(capsys):
     return re.sub(r'"directory": .*', "", text)
 
 
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize("name", with_slow(STUDIES, {"until"}))
 def test_parts_of_a_study_are_the_study(name, tmp_path, capsys):
     line, plan, out = STUDIES[name], tmp_path / "plan", tmp_path / "out"
     status = main([*line, "--out", str(tmp_path / "whole"), "--workers", "1"])

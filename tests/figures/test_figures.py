@@ -11,7 +11,7 @@ from netkf.cli.main import main
 from netkf.figures.catalogue import FIGURES, FigureSet
 from netkf.figures.names import FIGURE_NAMES
 from netkf.figures.style import style_context
-from tests.conftest import SCENARIOS
+from tests.conftest import SCENARIOS, with_slow
 from tests.figures.conftest import KINDS
 
 SLACK = 1.0
@@ -73,7 +73,7 @@ def drawing(results):
 
 
 @pytest.mark.parametrize("name", FIGURES)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", with_slow(KINDS, {"no samples", "interrupted", "diverged"}))
 def test_text_neither_overlaps_nor_leaves_the_canvas(drawing, kind, name):
     assert_well_laid_out(drawing(kind).draw(name))
 

@@ -102,7 +102,9 @@ def test_increments_have_the_innovations_of_an_integrated_ornstein_uhlenbeck_pro
     np.testing.assert_allclose([found[0], root[0, 0]], [y - h * J * xhat, math.sqrt(S)], rtol=1e-12)
 
 
-@pytest.mark.parametrize(("believed", "expected"), [(1.0, 1.0), (0.5, 2.0)])
+@pytest.mark.parametrize(
+    ("believed", "expected"), [(0.5, 2.0), pytest.param(1.0, 1.0, marks=pytest.mark.slow)]
+)
 def test_increments_are_as_far_from_expectations_as_exact_covariances_say(believed, expected):
     """With half of the true R the noise, which is most of a short interval's, looks doubled."""
     sensors = [{"nodes": [0], "H": [[1.0, 0.2]], "R": [[2.0]]}]

@@ -18,6 +18,7 @@ from netkf.figures.style import (
     style_context,
     text_width,
 )
+from tests.conftest import with_slow
 
 # Machado, Oliveira and Fernandes (2009), severity 1.0, on linear RGB.
 EYES = {
@@ -78,7 +79,7 @@ def test_categorical_series_differ_by_more_than_colour():
         assert str(one.dashes) != str(other.dashes)
 
 
-@pytest.mark.parametrize("kind", ["ring", "ensemble", "slots", "no truth"])
+@pytest.mark.parametrize("kind", with_slow(["ring", "ensemble", "slots", "no truth"], {"no truth"}))
 def test_no_two_series_of_a_figure_look_alike(results, kind):
     drawing = FigureSet(results(kind))
     pairs = 0

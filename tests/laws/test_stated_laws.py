@@ -10,6 +10,7 @@ from netkf.laws.stating import stated_law
 from netkf.parts import Chain, Delay, Lattice, LinkClock, Loss, Renewal, WaitingLaw
 from netkf.testing import check_channel, check_clock
 from tests.checks.parts.test_parts import TICKS, broken, from_table, verdicts, with_network
+from tests.conftest import with_slow
 
 
 def erlang(shape, mean=1.0):
@@ -120,7 +121,7 @@ def scenario(name, settings):
     return from_table(with_network(TICKS, activation=part))
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("name", with_slow(PARTS, {"chain"}))
 def test_a_law_of_ones_own_is_tested(name):
     checker, cls, wrong, words, promise = PARTS[name]
     assert checker(cls) is None

@@ -81,6 +81,7 @@ def matrices():
         yield B @ B.T
 
 
+@pytest.mark.slow
 def test_the_truth_and_the_readings_have_the_same_bits_under_other_kernels_of_openblas():
     """OPENBLAS_CORETYPE chooses the loops that OpenBLAS would take on another CPU."""
     cores = (None, "Prescott", "Nehalem", "Haswell")

@@ -112,6 +112,7 @@ def test_all_frames_must_arrive(scenario_of):
     assert "broken" not in set(table["verdict"])
 
 
+@pytest.mark.slow
 def test_check_of_a_busy_radio_promises_nothing_of_arrivals(scenario_of):
     for queue in ("wait", "drop"):
         radio = f'bits_per_second = {128 / AIR}, queue = "{queue}"'

@@ -259,6 +259,7 @@ def test_states_do_not_depend_on_what_else_is_asked_for():
     np.testing.assert_array_equal(grid[0.4], alone[0.4])
 
 
+@pytest.mark.slow
 def test_noise_inside_steps_has_its_law(folder):
     """x(t) - x(0) of a Wiener process with steps of 1 s, at times inside the first two."""
 

@@ -400,6 +400,7 @@ def run_netkf(file, *arguments):
     )
 
 
+@pytest.mark.slow
 def test_modules_need_trust_and_travel_with_the_run(custom):
     refused = run_netkf(custom, "run", custom.name)
     assert refused.returncode == 2

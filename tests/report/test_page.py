@@ -35,7 +35,7 @@ from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
 from netkf.studies.compare_filters import compare_filters, write_comparison
 from netkf.trace.messages import MESSAGE, join_messages
-from tests.conftest import SCENARIOS
+from tests.conftest import SCENARIOS, with_slow
 from tests.report.conftest import EVIL, write_verdict
 from tests.report.decoding import Page
 from tests.report.oracle import plain_messages
@@ -46,7 +46,7 @@ def findings_of(directory):
     return describe_source(source, join_messages(source.run.log))
 
 
-@pytest.mark.parametrize("name", ["ring", "delayed", "slots", "library"])
+@pytest.mark.parametrize("name", with_slow(["ring", "delayed", "slots", "library"], {"library"}))
 def test_a_page_holds_every_number_of_its_run(name, request):
     directory = request.getfixturevalue(name)
     page, run = Page(make_page([directory])), netkf.open(directory)
@@ -181,6 +181,7 @@ def test_a_node_that_hardly_hears_anybody_is_said_to_be_one(library, ring):
     assert not any("Over the whole run" in line for line in findings_of(ring))
 
 
+@pytest.mark.slow
 def test_lists_that_are_cut_say_how_many_are_left_out(library):
     told = Page(make_page([library])).shown
     run = netkf.open(library)

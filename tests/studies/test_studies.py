@@ -338,6 +338,7 @@ def test_a_bound_is_called_a_bound(short):
     assert "proves nothing" in found.sure
 
 
+@pytest.mark.slow
 def test_where_the_bound_says_no_it_is_simulated(short):
     """The bound on worst_rms asks for far more than simulation says is needed."""
     target = "worst_rms<=1.7"

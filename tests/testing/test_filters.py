@@ -76,8 +76,12 @@ def test_every_kind_of_filter_is_here():
             assert type(part) is KINDS["filter"][name]
 
 
-LONG = ("block-belief-propagation", "block-cross-covariances", "block-intersection")
-"""Filters whose check is slow."""
+LONG = (
+    *("block-belief-propagation", "block-cross-covariances", "block-intersection", "partition"),
+    *("push-sum", "diffusion", "hcmci", "belief-propagation", "hybrid"),
+    *("track-fusion rule=ci", "track-fusion rule=ici", "event-triggered trigger=stochastic"),
+)
+"""Filters whose check is slow; others of their kind are checked each time."""
 
 
 @pytest.mark.parametrize("name", with_slow(SOUND, LONG))
@@ -162,7 +166,7 @@ class TransposedKalman(parts.DiffusionKalman):
 @pytest.mark.parametrize(
     ("cls", "settings"),
     [
-        (Transposed, {}),
+        pytest.param(Transposed, {}, marks=pytest.mark.slow),
         (TransposedKalman, {"weights": [[0.6, 0.1, 0.3], [0.3, 0.6, 0.1], [0.1, 0.3, 0.6]]}),
     ],
 )

@@ -10,6 +10,7 @@ from netkf.testing import sensors as of_sensors
 from netkf.testing.matchings import _check_matching
 from netkf.testing.plants import _check_plant
 from netkf.testing.sensors import _check_sensor
+from tests.conftest import with_slow
 from tests.testing.broken_plants import FLOW, LINEAR, MATCHINGS, PLANTS, REGRESSOR, SENSORS
 from tests.testing.sound_parts import HEALTHY_MATCHINGS, HEALTHY_PLANTS, HEALTHY_SENSORS
 from tests.testing.test_channels import refused
@@ -29,7 +30,7 @@ def fewer_draws(name, monkeypatch):
 
 
 @pytest.mark.usefixtures("fewer_draws")
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("name", with_slow(SENSORS, {"Drifts"}))
 def test_every_breach_of_a_sensor_is_named(name):
     refused(check_sensor, *SENSORS[name])
 
@@ -87,7 +88,7 @@ def matchings():
     ]
 
 
-@pytest.mark.parametrize("k", range(len(sensors())))
+@pytest.mark.parametrize("k", with_slow(range(len(sensors())), {4}))
 def test_sound_sensors_pass(k):
     assert check_sensor(sensors()[k]) is None
 
@@ -135,6 +136,7 @@ def test_what_is_of_another_family_is_told():
         check_plant(parts.LinearPlant, Q=[[1.0]])
 
 
+@pytest.mark.slow
 def test_false_alarms_are_as_rare_as_stated(monkeypatch):
     """At a level of 5 % for a whole check."""
     monkeypatch.setattr(noise, "LEVEL", 0.05)

@@ -13,7 +13,7 @@ from netkf import testing
 from netkf.checks.check import find_checks
 from netkf.core.errors import ScenarioError, TheoryError
 from tests.checks.broken import Overconfident
-from tests.conftest import ROOT, SCENARIOS
+from tests.conftest import ROOT, SCENARIOS, with_slow
 from tests.testing.test_filters import SOUND
 
 SHORT = {
@@ -57,7 +57,10 @@ def test_a_folder_without_scenarios_is_no_empty_test(tmp_path):
         testing.scenario_files(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("name", SHORT)
+LONG = ("blind_unstable", "delayed_links", "diffusion_regression", "intermittent_random10")
+
+
+@pytest.mark.parametrize("name", with_slow(SHORT, LONG))
 def test_the_promises_of_our_files_are_kept(name):
     horizon = SHORT[name]
     scenario = netkf.load(SCENARIOS / f"{name}.toml").replace(
@@ -134,6 +137,7 @@ def test_the_names_are_public():
         _ = testing.check_weather
 
 
+@pytest.mark.slow
 def test_the_ten_lines_of_the_reference_are_a_test_file(tmp_path):
     """The example of a user's test file, run by pytest as a user would."""
     text = (ROOT / "docs" / "scenario_files.md").read_text(encoding="utf-8")

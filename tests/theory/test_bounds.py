@@ -200,6 +200,7 @@ def test_precise_sensors_and_late_messages_have_a_bound(build, case):
     np.testing.assert_allclose(bound, P.reshape(N, n, n), atol=1e-6 * np.abs(P).max())
 
 
+@pytest.mark.slow
 def test_a_short_delay_is_integrated_in_longer_stretches(build):
     """The same equation cut into stretches of one delay, and the limit of no delay."""
 
@@ -250,6 +251,7 @@ def test_threshold_of_one_blind_node(build, a, eps):
     assert float(str(caught.value).split()[-1]) == pytest.approx(critical, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_threshold_where_every_node_sees_a_part(build):
     """Two growing modes, each seen by one node: the claim is decided by integrating for long."""
     plant = {
@@ -465,6 +467,7 @@ def test_a_constant_parameter_has_no_steady_state_that_can_be_solved_for(build):
         theory.steady_covariance_bound(build(plant=still))
 
 
+@pytest.mark.slow
 def test_a_node_that_nobody_can_follow_takes_seconds_or_is_refused(build):
     """A precise node beside one whose covariance grows by 1e13: implicit steps did not end."""
     A, B, C = np.array([[0.0, 1.0], [0.0, 6.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])

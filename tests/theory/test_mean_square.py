@@ -411,6 +411,7 @@ def late_averages(folder, at, channel, horizon):
     return expected, parts.mean(axis=0), parts.std(axis=0, ddof=1) / math.sqrt(40)
 
 
+@pytest.mark.slow
 def test_a_run_with_delays_has_these_mean_squares(tmp_path):
     """Without delays they would be smaller by 8 to 14 %."""
     expected, mean, deviation = late_averages(tmp_path, "links", "losses", 1200.0)
