@@ -3,6 +3,7 @@
 import csv
 import math
 
+import matplotlib as mpl
 from look import BLUE, GREY, HERE, ORANGE, draw, options
 
 COLUMNS = 4
@@ -50,6 +51,7 @@ def history(figure):
 
 def main(arguments=None):
     chosen = options(__doc__, arguments)
+    mpl.rcParams["svg.fonttype"] = "none"  # letters as paths would be most of the file
     draw(chosen.out, "benchmarks_history", history, (9.6, 12.5))
 
 
