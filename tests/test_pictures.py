@@ -69,6 +69,7 @@ def test_a_directory_in_use_is_refused_before_anything_runs(name, tmp_path, caps
     assert "must be a new or empty directory" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_name_of_a_window_does_not_matter(tmp_path):
     words = [sys.executable, "-m", "netkf", *COMMANDS["run"], "--out", str(tmp_path / "out")]
     env = {**os.environ, "MPLBACKEND": "nonsense"}

@@ -307,7 +307,7 @@ def test_a_short_run_costs_little_more_than_what_it_imports(tmp_path):
     assert cpu_seconds("-m", "netkf", "run", "nowhere.toml") < 1.0 * unit
 
 
-LONG = """
+STUBBORN = """
 import hashlib, sys
 from netkf.cli import process
 from netkf.core import interrupts
@@ -333,7 +333,7 @@ process.run_as_process(command)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_what_compiled_code_keeps_from_python(number):
     """Handlers in Python wait until it returns: a thread writes results and ends the process."""
-    line = [sys.executable, "-c", LONG]
+    line = [sys.executable, "-c", STUBBORN]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(line, text=True, **streams) as process:
         assert process.stdout.readline() == "begun\n"

@@ -159,6 +159,7 @@ def test_the_figures_of_the_push_sum_paper_are_drawn(tmp_path, monkeypatch):
     assert out.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_what_the_push_sum_paper_reports_holds_as_the_table_says(tmp_path):
     arguments = ["--cells", "2", "--gammas", "1", "--deltas", "4.01", "--draws", "fresh"]
     stability = script("analysis", "push_sum_stability")
@@ -168,6 +169,7 @@ def test_what_the_push_sum_paper_reports_holds_as_the_table_says(tmp_path):
     assert (tmp_path / "drawn.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_figure_of_the_diffusion_paper_is_drawn(tmp_path):
     out = tmp_path / "drawn.png"
     arguments = ["--slots", "300", "--runs", "3", "--exact", "3", "--workers", "1"]
@@ -241,6 +243,7 @@ def test_errors_at_motes_that_are_never_read_are_those_that_pages_name(monkeypat
     }
 
 
+@pytest.mark.slow
 def test_with_a_walking_offset_for_each_mote_filters_are_nearer_than_the_plain_mean():
     found = script("analysis", "ulb_library").offsets(fit=False)
     assert {name: round(float(error), 3) for name, error in found.items()} == {

@@ -57,16 +57,17 @@ def load_scenario(
     ``ignored`` has values, by key, for keys that the command does not use: they replace those of
     the file, which may be invalid together with other options. Raises ScenarioError.
     """
+    copy: Path | None = getattr(options, "copy", None)
+    path = options.scenario if copy is None else copy
     try:
-        os.stat(options.scenario)  # before the imports of a scenario, which take longer
+        os.stat(path)  # before the imports of a scenario, which take longer
     except OSError as error:
         rule = f"cannot be read ({error.strerror})"
-        raise ScenarioError(shorten(options.scenario), rule, None, "check the path") from None
+        raise ScenarioError("", rule, None, "check the path", str(path)) from None
     except ValueError:  # a name that no file can have
         pass
     from netkf.scenario.reading import load
 
-    copy: Path | None = getattr(options, "copy", None)
     if copy is not None:  # that of a plan, with all changes
         return load(copy, trust=options.trust)
     changes = {**parse_changes(options.set), **ignored}

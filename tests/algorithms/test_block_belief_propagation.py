@@ -143,6 +143,7 @@ def test_p_is_right_where_nodes_forget_and_too_small_on_loops(tmp_path: Path, te
     assert shares[1].max() > 1.05
 
 
+@pytest.mark.slow
 def test_check_knows_that_p_is_right_on_trees_alone(tmp_path: Path) -> None:
     promise = "P is the covariance of the error, given the events"
     for edges, verdict in (([[1, 2]], "holds"), ([[1, 2], [2, 3], [3, 1]], "not promised")):

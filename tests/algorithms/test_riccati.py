@@ -64,6 +64,7 @@ def test_the_kernel_is_the_formula(seed, n, reads):
         np.testing.assert_allclose(seen, moved, rtol=0, atol=1e-10 * np.abs(moved).max())
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 5), st.floats(1e-4, 3.0), st.floats(1e-4, 3.0))
 def test_flow_composes_over_gaps_and_keeps_covariances(seed, n, first, second):

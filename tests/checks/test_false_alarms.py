@@ -165,6 +165,7 @@ def test_a_limit_that_is_not_reached_says_which_horizon_would_do(tmp_path):
     assert "not reached in this horizon, one of about" in row.evidence
 
 
+@pytest.mark.slow
 def test_mean_squares_are_held_to_those_of_their_own_time(tmp_path):
     wide = {"plant.cov": [[100.0, 0.0], [0.0, 100.0]]}
     for horizon in (11.0, 12.0):

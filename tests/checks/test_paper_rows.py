@@ -81,6 +81,7 @@ def test_all_sensors_together():
     assert is_broken(gossip._sensors_together(other, LEVEL))
 
 
+@pytest.mark.slow
 def test_tracking_errors_stay_bounded():
     """D Theorem 4.2: broken where errors grow tenfold, and early where they must."""
     made = load("diffusion_regression", horizon=40.0, probe=1.0)

@@ -173,6 +173,7 @@ class Indefinite(netkf.parts.Hybrid):
         return xhat, -P if P[0, 0] > 0.4 else P
 
 
+@pytest.mark.slow
 def test_negative_covariances_end_a_run(ring):
     odd = ring.replace({"filter": {"kind": f"{__name__}:Indefinite", "epsilon": 0.3}})
     run = netkf.simulate(odd)

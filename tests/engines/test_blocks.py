@@ -140,6 +140,7 @@ def test_kept_cross_covariances(tmp_path: Path, text: str) -> None:
     assert_agree(load(text, tmp_path, filter={"kind": KEPT, "estimates": "own"}))
 
 
+@pytest.mark.slow
 def test_unicycles() -> None:
     changes = {"horizon": 6.0, "network.channel.loss": {"kind": "bernoulli", "delivery": 0.8}}
     assert_agree(netkf.load("scenarios/blocks/cooperative_localisation.toml", changes))

@@ -27,10 +27,12 @@ def deviation(scenario):
     return (np.linalg.norm(mine - exact, axis=(-1, -2)) / size).max()
 
 
+@pytest.mark.slow
 def test_default_sensing_period_keeps_what_the_docs_state(ring):
     assert deviation(ring.replace({"horizon": 2.0})) < STATED / 50
 
 
+@pytest.mark.slow
 def test_the_error_has_fourth_order_in_the_sensing_period(ring, monkeypatch):
     # no shorter stretches where P is large
     monkeypatch.setattr(nodes, "interval_end", lambda now, time, length: time)
@@ -54,6 +56,7 @@ def test_precise_sensors(ring):
     assert deviation(ring.replace(changes)) < STATED / 50
 
 
+@pytest.mark.slow
 def test_samples_off_the_sensing_grid(ring):
     changes = {"horizon": 2.0, "probe": [0.33, 0.7, 1.1, 1.95], "plant.sensing_period": 0.25}
     assert deviation(ring.replace(changes)) < STATED / 20
@@ -76,6 +79,7 @@ def test_delays(ring, delay):
     assert deviation(ring.replace(changes)) < STATED / 20
 
 
+@pytest.mark.slow
 def test_filters_that_believe_another_model(ring):
     model = {"A": [[0.0, 1.0], [-1.2, 0.0]], "B": [[0.3], [0.7]], "R": [[1.0]]}
     assert deviation(ring.replace({"horizon": 1.5, "filter.model": model})) < STATED / 20
@@ -87,6 +91,7 @@ def test_baselines(ring, kind):
     assert deviation(short) < STATED / 20
 
 
+@pytest.mark.slow
 def test_several_sensors_on_a_node_and_rows_of_zeros(ring):
     more = [
         {"nodes": [0, 2], "H": [[1.0, 0.0]], "R": [[0.25]]},

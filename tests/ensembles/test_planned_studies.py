@@ -184,3 +184,19 @@ def test_files_of_neighbours_are_merged_into_one(tmp_path):
     assert blocks.nodes == [(0, 8), (8, 4), (12, 1)]
     assert len(list(tmp_path.iterdir())) == 3
     assert [blocks.load(node) for node in blocks.nodes] == [v for _, _, v in tree.nodes()]
+
+
+def test_a_plan_has_all_that_it_needs(tmp_path, monkeypatch, capsys):
+    """Other machines lack the file and the folder in which it was planned."""
+    here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    here.mkdir(), elsewhere.mkdir()
+    shutil.copy(SCENARIOS / "gossip_ring.toml", here)
+    monkeypatch.chdir(here)
+    line = ["sweep", "gossip_ring.toml", "--vary", "horizon=2,3", "--runs", "2", "--no-plot"]
+    assert main([*line, "--set", "probe=1.0", "--out", str(tmp_path / "out"), "--plan", "p"]) == 0
+    (here / "p").rename(elsewhere / "p")
+    shutil.rmtree(here)
+    monkeypatch.chdir(elsewhere)
+    assert main(["work", "p"]) == 0
+    assert main(["merge", "p"]) == 0
+    assert (tmp_path / "out" / "sweep.csv").is_file()

@@ -204,6 +204,7 @@ def coarser(noise: FloatArray) -> FloatArray:
     return np.stack([plain, tilted], axis=1)
 
 
+@pytest.mark.slow
 def test_the_truth_is_of_order_three_halves_in_the_path():
     """Errors of the path at one time against steps that are 64 times shorter, for equal noise."""
     random, finest, levels = np.random.default_rng(1), 2.0**-10, range(7)

@@ -335,6 +335,7 @@ def test_a_page_of_fifty_nodes_and_100_000_events_is_small_and_complete(tmp_path
     assert Page(text).data["runs"][0]["messages"]["step"] == 1
 
 
+@pytest.mark.slow
 def test_larger_pages_are_thinned_until_they_fit(ring, monkeypatch):
     whole = len(make_page([ring]))
     monkeypatch.setattr(pages, "MAX_BYTES", whole - 5_000)

@@ -39,6 +39,7 @@ def test_a_weighted_limit_is_not_called_S(build, tmp_path):
         assert "limit S" not in words
 
 
+@pytest.mark.slow
 def test_a_limit_without_the_delay_says_so(build, tmp_path):
     delay = {"network.channel.delay": {"kind": "constant", "seconds": 0.1}}
     for words in said(build().replace(delay), tmp_path):

@@ -60,6 +60,7 @@ def messages_by_pandas(run):
     return sent[[*key, "t"]].merge(heard, on=key, how="left").fillna({"heard": 0.0})
 
 
+@pytest.mark.slow
 def test_delivery_and_windows_by_pandas(shared):
     messages, outcomes = (
         messages_by_pandas(shared),

@@ -104,6 +104,7 @@ def test_right_models_are_accused_as_rarely_as_stated(walk, rows):
     assert accused <= 20  # at most 20 % are; more in one of 100 tests
 
 
+@pytest.mark.slow
 def test_what_is_stated_as_detectable_is_found(walk):
     random = np.random.default_rng(4)
     row = judge_innovations(walk, drawn(random), 0.99).rows[2]
@@ -227,6 +228,7 @@ def test_slots_and_records_without_truth(tmp_path):
     assert not netkf.innovations(given.replace({"plant.Q": [[2.5e-3]]}))
 
 
+@pytest.mark.slow
 def test_the_command_says_which_node(capsys):
     path = str(SCENARIOS / "ulb_library.toml")
     arguments = ["innovations", path, "--set", 'filter={kind="central"}', "--set", "horizon=2400.0"]

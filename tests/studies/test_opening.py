@@ -76,6 +76,7 @@ def test_a_run_comes_back_as_it_was(name, changes, tmp_path):
         np.testing.assert_allclose(bound, exact, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_errors_keep_the_digits_that_were_written(tmp_path):
     """A state of 1e12 leaves no digits of x - xhat, and the tables have them."""
     changes = {"plant.mean": [1e13, 0.0], "plant.A": [[0.0, 1.0], [-1.0, 4.0]], **SHORT}

@@ -28,6 +28,7 @@ def pair():
     return scenario.replace(changes)
 
 
+@pytest.mark.slow
 def test_the_rate_that_keeps_the_age(pair):
     found = netkf.size(pair, "network.activation.rate", 0.5, 8.0, "mean_age<=0.5", runs=32)
     assert found.by == "simulation"

@@ -81,6 +81,7 @@ def test_the_parts_of_our_files_keep_their_contracts(path):
         testing.check_clock(clock, link=scenario.topology.links[0])
 
 
+@pytest.mark.slow
 def test_the_channels_of_our_files_keep_their_contracts():
     channels = {}
     for path in testing.scenario_files(SCENARIOS):

@@ -500,6 +500,7 @@ def test_a_node_that_nobody_can_follow_takes_seconds_or_is_refused(build):
         theory.covariance_bound(scenario, [8.0])
 
 
+@pytest.mark.slow
 def test_a_bound_that_begins_at_0_beside_a_precise_sensor_ends(build):
     """Implicit steps ended as soon as a covariance had grown by a factor of 0, again and again."""
     scenario = build(

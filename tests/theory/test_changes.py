@@ -182,6 +182,7 @@ def test_what_is_about_one_piece_refuses_a_plant_that_changes():
                 getattr(s, name)
 
 
+@pytest.mark.slow
 def test_filters_that_do_not_know_are_said_to_be_wrong():
     rows = netkf.theory.assumptions(slots("diffusion", filter=UNAWARE)).set_index("assumption")
     known = netkf.theory.assumptions(clocks("local", filter=UNAWARE)).set_index("assumption")

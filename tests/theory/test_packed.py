@@ -72,6 +72,7 @@ def test_the_linear_part_is_the_derivative_of_the_slope(arriving):
     near(packed.unpack(flat.reshape(rows.shape)), expected, 1e-11)
 
 
+@pytest.mark.slow
 def test_the_solution_is_followed_to_all_digits(monkeypatch):
     """And to fewer by the implicit method, where explicit steps would be too many."""
     e = equations()

@@ -244,6 +244,7 @@ def test_a_simulation_stays_within_its_interval():
     assert np.abs(z).max() < 4.0
 
 
+@pytest.mark.slow
 def test_each_direction_has_its_own_probability(tmp_path):
     """Node 1 mostly hears node 0, node 0 hardly hears node 1; the engine sees it the same way."""
     rows = "sender,receiver,delivery_probability\n0,1,0.9\n1,0,0.2\n1,2,0.8\n2,1,0.6\n"
