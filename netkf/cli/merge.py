@@ -7,13 +7,14 @@ from functools import partial
 
 from netkf.cli import pictures
 from netkf.cli.options import FAILED, print_notes
-from netkf.cli.planned import describe_ranges, merge_study
+from netkf.cli.planned import merge_study, print_missing
 from netkf.cli.run import print_ensemble, print_summary
 
 
 def _run(options: argparse.Namespace) -> int:
     """Merge what workers left; return the exit status, 1 if results are missing."""
     from netkf.ensembles.plans import merge_plan, open_plan
+    from netkf.ensembles.replicas import Gap
     from netkf.runs.directory_lock import lock_directory
 
     plan = open_plan(options.directory, options.trust)
@@ -29,15 +30,8 @@ def _run(options: argparse.Namespace) -> int:
         merged = merge_plan(plan, options.mixed, finish=draw, note=lambda text: print_notes([text]))
     runs = plan.identity.runs
     if isinstance(merged, list):
-        _print_missing(plan.directory, merged, runs)
+        print_missing(plan.directory, [Gap(1, runs, merged)])
         return FAILED
     print_summary(plan.scenario, merged)
     print_ensemble(merged, runs)
     return 0
-
-
-def _print_missing(directory: object, missing: list[range], runs: int) -> None:
-    """Print which of the runs have no result, and what to do."""
-    count = sum(map(len, missing))
-    print(f"{count:,} of {runs:,} runs have no result: {describe_ranges(missing)}")
-    print(f"go on with netkf work {directory}")

@@ -114,7 +114,7 @@ def merge_study(plan: Plan, options: argparse.Namespace) -> int:
     gaps = _missing_runs(study_options.run, study_options, study)
     print_notes(study.worker.notes)
     if any(gap.missing for gap in gaps):
-        _print_missing(plan.directory, gaps, rounds)
+        print_missing(plan.directory, gaps, rounds)
         return FAILED
     if len(require_alike(study.installations, plan.directory, options.mixed)) > 1:
         print_notes(["results are of machines of different kinds: last digits may be others"])
@@ -173,13 +173,13 @@ def _run_on(run: Run, options: argparse.Namespace, study: PlannedStudy, workers:
         return run(options)
 
 
-def _print_missing(directory: Path, gaps: list[Gap], rounds: bool) -> None:
+def print_missing(directory: Path, gaps: list[Gap], rounds: bool = False) -> None:
     """Print which runs have no result, and what to do."""
     short = [gap for gap in gaps if gap.missing]
     missing = sum(len(runs) for gap in short for runs in gap.missing)
     total = sum(gap.runs for gap in gaps)
     where = [
-        (f"ensemble {gap.number}: " if len(gaps) > 1 else "") + describe_ranges(gap.missing)
+        (f"ensemble {gap.number}: " if len(gaps) > 1 else "") + _describe_ranges(gap.missing)
         for gap in short[:SHOWN]
     ]
     more = f"; and {len(short) - SHOWN} further ensembles" if len(short) > SHOWN else ""
@@ -188,7 +188,7 @@ def _print_missing(directory: Path, gaps: list[Gap], rounds: bool) -> None:
     print(f"go on with netkf work {directory}")
 
 
-def describe_ranges(missing: list[range]) -> str:
+def _describe_ranges(missing: list[range]) -> str:
     """Return ranges of runs as text."""
     listed = [f"{gap[0]}" if len(gap) == 1 else f"{gap[0]}-{gap[-1]}" for gap in missing[:SHOWN]]
     more = f" and {len(missing) - SHOWN} further ranges" if len(missing) > SHOWN else ""

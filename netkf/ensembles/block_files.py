@@ -110,8 +110,10 @@ class BlockFiles(ABC):
         """Return the result of a block from its arrays; may raise anything if they do not fit."""
 
     @abstractmethod
-    def require_fit(self, arrays: Any, stored: dict[str, Any]) -> None:
-        """Raise DamagedError unless the arrays of a block fit its ``stored`` identity."""
+    def require_fit(self, arrays: Any, stored: dict[str, Any]) -> int:
+        """Return the number of runs of which the arrays of a block are; raises DamagedError unless
+        they fit its ``stored`` identity.
+        """
 
     def find(
         self,
@@ -246,7 +248,9 @@ class BlockFiles(ABC):
                 if stored.get(key) != value:
                     name = "installation" if key in ("versions", "machine") else key
                     raise DamagedError(f"is of another {name}")
-            self.require_fit(arrays, stored)
+            start, size, runs = (int(stored[key]) for key in ("start", "size", "runs"))
+            if self.require_fit(arrays, stored) != min(size, runs - start):
+                raise DamagedError("has another number of runs than it says")
             return stored
 
     def _path(self, node: Node) -> Path:

@@ -84,19 +84,20 @@ class BlockCheckpoints(BlockFiles):
         traces = tuple(self._restore_trace(arrays, k) for k in range(count))
         return _restore_statistics(arrays)._replace(traces=traces)
 
-    def require_fit(self, arrays: Any, stored: dict[str, Any]) -> None:
-        """Raise DamagedError unless statistics have the form and the numbers that they should."""
+    def require_fit(self, arrays: Any, stored: dict[str, Any]) -> int:
+        """Return the number of runs; raises DamagedError unless their statistics have the form and
+        the numbers that they should.
+        """
         value = _restore_statistics(arrays)
         if not self._has_form(value):
             raise DamagedError("does not fit the scenario")
         if not self._has_numbers(value):
             raise DamagedError("lacks numbers that every run has")
         start, size, runs = (int(stored[key]) for key in ("start", "size", "runs"))
-        if value.runs != min(size, runs - start):
-            raise DamagedError("has another number of runs than it says")
         kept = len(range(start, min(start + size, runs, TRACED[stored["trace"]])))
         if _read_texts(arrays)["traces"] != kept:
             raise DamagedError("lacks events of its runs")
+        return value.runs
 
     def readable(self, scenario_digest: str, seed: int) -> list[RunStatistics]:
         """Return the statistics of all blocks of runs of a scenario (by its digest) and ``seed``

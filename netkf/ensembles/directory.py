@@ -195,16 +195,7 @@ class DirectoryWriter:
         self._tasks = tasks
         self.scenario, self.directory, self.plan = scenario, directory, plan
         self.blocks = BlockCheckpoints(directory, scenario)
-        self._manifest = Manifest(
-            directory=directory,
-            name=scenario.name,
-            seed=scenario.seed,
-            replica=0,
-            engine=plan.engine,
-            runs=plan.runs,
-            node_names=scenario.topology.names,
-            time_grid=scenario.time_grid,
-        )
+        self._manifest = Manifest.of(scenario, directory, plan.engine, runs=plan.runs)
         self._done = self.simulated = 0
         self._last_note = 0.0
         self._ended = False

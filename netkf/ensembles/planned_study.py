@@ -18,7 +18,6 @@ from netkf.ensembles.blocks import Job
 from netkf.ensembles.merge_tree import Merge
 from netkf.ensembles.parts import Worker
 from netkf.ensembles.replicas import BlockStore, Form, Gap, MissingRunsError, missing_ranges
-from netkf.runs.documents import DamagedError
 from netkf.runs.files import BLOCKS_FOLDER, scenario_digest
 from netkf.scenario.scenario import Scenario
 
@@ -38,12 +37,9 @@ class StudyBlocks(BlockFiles):
         """Return the results of runs from their arrays."""
         return self._form.unpack({name: arrays[name] for name in arrays if name != "identity"})
 
-    def require_fit(self, arrays: Any, stored: dict[str, Any]) -> None:
-        """Raise DamagedError unless there are as many results as runs."""
-        start, size, runs = (int(stored[key]) for key in ("start", "size", "runs"))
-        first = next(iter(self._form.pack(self.unpack(arrays)).values()))
-        if len(first) != min(size, runs - start):
-            raise DamagedError("has another number of runs than it says")
+    def require_fit(self, arrays: Any, stored: dict[str, Any]) -> int:
+        """Return the number of runs whose results they are."""
+        return len(next(iter(self._form.pack(self.unpack(arrays)).values())))
 
 
 class PlannedStudy:

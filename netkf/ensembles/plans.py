@@ -30,16 +30,11 @@ from netkf.ensembles.pools import LocalPool, PoolOptions, make_pool
 from netkf.ensembles.replicas import Progress, missing_ranges, replicate_blocks
 from netkf.ensembles.resume import read_manifest
 from netkf.ensembles.statistics import block_statistics, merge
-from netkf.runs.documents import (
-    FINAL_STATUSES,
-    DamagedError,
-    check_seal,
-    read_document,
-    write_sealed,
-)
+from netkf.runs.documents import FINAL_STATUSES, DamagedError, check_seal, read_document
 from netkf.runs.failures import InterruptedRunError, explain_failures
 from netkf.runs.files import check_sources, create_output_directory, scenario_digest, write_scenario
 from netkf.runs.provenance import machine, versions
+from netkf.runs.run import Manifest
 from netkf.runs.simulate import choose_engine
 from netkf.scenario.reading import load
 from netkf.scenario.scenario import Scenario
@@ -95,20 +90,8 @@ def write_study(
     if scenario_digest(load(directory / "scenario.toml", trust=trust)) != digest:
         remedy = "put its files and classes beside it"
         raise ScenarioError("scenario", "is another one when it is copied", scenario.name, remedy)
-    manifest = {
-        "name": scenario.name,
-        "versions": versions(),
-        "machine": machine(),
-        "seed": scenario.seed,
-        "replica": 0,
-        "runs": {"wanted": runs, "done": 0},
-        "engine": "auto",
-        "status": "planned",
-        "scenario": digest,
-        "tasks": tasks,
-        "arguments": list(arguments),
-    }
-    write_sealed(directory / "manifest.json", manifest)
+    entries = {"scenario": digest, "tasks": tasks, "arguments": list(arguments)}
+    Manifest.of(scenario, directory, "auto", runs=runs).write("planned", entries)
 
 
 def open_plan(directory: Path, trust: bool = False) -> Plan:

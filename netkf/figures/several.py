@@ -160,5 +160,5 @@ def _curve(label: str, data: FigureData) -> ErrorCurve:
     # A node's standard errors bound those of the mean of all nodes, which are dependent.
     se = None if data.se_error is None else data.se_error.mean(axis=1)
     square, promised, unit = data.sq_error.mean(axis=1), data.promised, data.scenario.unit
-    bound = None if promised.bound is None else promised.bound.mean(axis=1)
-    return ErrorCurve(label, data.times, square, se, data.runs, promised.central, bound, unit)
+    central, bound = promised.central, promised.mean_bound
+    return ErrorCurve(label, data.times, square, se, data.runs, central, bound, unit)

@@ -110,13 +110,9 @@ class StoredFit:
     envelope: pd.DataFrame
 
 
-def read_fit(directory: Path) -> StoredFit | None:
-    """Return what ``netkf fit`` left in a directory, None if it left nothing; raises ScenarioError
-    for a damaged file.
-    """
+def read_fit(directory: Path) -> StoredFit:
+    """Return what ``netkf fit`` left in a directory; raises ScenarioError for a damaged file."""
     path = directory / FIT_FILE
-    if not path.is_file():
-        return None
     try:
         table = pd.read_csv(path)
         if not len(table) or list(table.columns) != COLUMNS or table["inside"].dtype != bool:

@@ -36,8 +36,8 @@ class Replicas(NamedTuple):
 
     def words(self, number: int) -> str:
         """Return a replica with its rank, if it has one, and its error."""
-        place = int(np.flatnonzero(self.numbers == number)[0]) if number in self.numbers else -1
-        if place < 0:
+        place = self.place_of(number)
+        if place is None:
             return f"replica {number}"
         ranks = "".join(f"{rank}, " for rank in RANKS if self.place(rank) == place)
         error = format_number(float(self.errors[place]))
@@ -46,6 +46,10 @@ class Replicas(NamedTuple):
     def place(self, rank: str) -> int:
         """Return the place in ``numbers`` of a rank, ``worst`` or ``median``."""
         return len(self.numbers) - 1 if rank == "worst" else (len(self.numbers) - 1) // 2
+
+    def place_of(self, number: int) -> int | None:
+        """Return the place in ``numbers`` of a replica, None if it was not recorded."""
+        return next(iter(np.flatnonzero(self.numbers == number).tolist()), None)
 
 
 def read_replicas(stored: StoredEnsemble) -> Replicas | None:
@@ -88,8 +92,8 @@ def describe_replica(shown: int, runs: int, replicas: Replicas | None) -> str:
     sentence = f"The run that moves below is replica {shown} of {runs:,}"
     if replicas is None:
         return f"{sentence}; its trace is what was kept (--trace full keeps all)"
-    place = int(np.flatnonzero(replicas.numbers == shown)[0]) if shown in replicas.numbers else -1
-    if place >= 0:
+    place = replicas.place_of(shown)
+    if place is not None:
         sentence += f", RMS error {format_number(float(replicas.errors[place]))}, number "
         sentence += f"{place + 1} from the best"
     ends = [

@@ -228,15 +228,7 @@ def _create_output(
     directory = create_output_directory(out, scenario.name)
     channel = scenario.network.channel
     is_recorded = isinstance(channel.loss, RecordedLoss) or isinstance(channel.delay, RecordedDelay)
-    manifest = Manifest(
-        directory=directory,
-        name=scenario.name,
-        seed=seed,
-        replica=replica,
-        engine=engine,
-        node_names=scenario.topology.names,
-        time_grid=scenario.time_grid,
-    )
+    manifest = Manifest.of(scenario, directory, engine, seed=seed, replica=replica)
     # Written first, so that the directory of a process that is killed says "interrupted".
     manifest.write("interrupted", {})
     write_scenario(directory, scenario, seed)
@@ -298,6 +290,17 @@ class Manifest:
     time_grid: TimeGrid
     runs: int = 1
     node_names: Mapping[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, scenario: Scenario, directory: Path, engine: str, **others: Any) -> Manifest:
+        """Return the manifest of runs of a scenario, of its own seed from replica 0 on unless
+        ``others``, further fields, say so.
+        """
+        given = {"seed": scenario.seed, "replica": 0, **others}
+        names, grid = scenario.topology.names, scenario.time_grid
+        return cls(
+            directory, scenario.name, engine=engine, time_grid=grid, node_names=names, **given
+        )
 
     def write(
         self,

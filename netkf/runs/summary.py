@@ -166,6 +166,11 @@ class PromisedTraces:
     limit_label: str = "limit S of Tanwani's H(13)"
     notes: tuple[str, ...] = ()
 
+    @property
+    def mean_bound(self) -> FloatArray | None:
+        """The mean (T,) of the bound over nodes, None if it does not apply."""
+        return None if self.bound is None else self.bound.mean(axis=1)
+
 
 def promise_traces(scenario: Scenario, times: FloatArray) -> PromisedTraces:
     """Return the traces that theory gives to compare those of P with at the sample ``times`` (T,),

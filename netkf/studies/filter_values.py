@@ -64,8 +64,7 @@ def mean_curve(label: str, scenario: Scenario, curves: FloatArray) -> ErrorCurve
     runs, times = len(curves), scenario.times[curve_rows(scenario, len(curves))]
     error = curves.std(axis=0, ddof=1) / math.sqrt(runs) if runs > 1 else None
     promised = promise_traces(scenario, times)
-    bound = None if promised.bound is None else promised.bound.mean(axis=1)
-    square, central = curves.mean(axis=0), promised.central
+    square, central, bound = curves.mean(axis=0), promised.central, promised.mean_bound
     return ErrorCurve(label, times, square, error, runs, central, bound, scenario.unit)
 
 
