@@ -5,6 +5,7 @@ import math
 import os
 import signal
 import sys
+import zlib
 from pathlib import Path
 
 # Dozens of tests start processes. Without bytecode on disk each of them would compile all modules
@@ -111,8 +112,21 @@ def pytest_configure(config):
     config.option.loadscopereorder = False
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest leaves out what is slow
 def pytest_collection_modifyitems(items):
-    """Long files first, then the others as they are found."""
+    """Long files first, then the others as they are found. Of a test that is marked ``one_in(k)``,
+    one in k cases stays and the others are slow. Which ones depends on their names alone, so that
+    tests with the same parameters keep different ones.
+    """
+    cases = {}
+    for item in items:
+        marker = item.get_closest_marker("one_in")
+        if marker and not item.get_closest_marker("slow"):
+            cases.setdefault((item.path, item.originalname, marker.args[0]), []).append(item)
+    for (_, _, k), of_test in cases.items():
+        of_test.sort(key=lambda item: zlib.crc32(item.nodeid.encode()))
+        for item in of_test[math.ceil(len(of_test) / k) :]:
+            item.add_marker(pytest.mark.slow)
     places = {ROOT / "tests" / name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
 

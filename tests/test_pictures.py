@@ -25,6 +25,7 @@ def full(*_, **__):
     raise OSError(28, "No space left on device")
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_a_picture_that_cannot_be_written_is_a_note(name, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", full)

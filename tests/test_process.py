@@ -23,6 +23,7 @@ QUICK = shlex.quote(str(SCENARIOS / "ulb_library.toml"))
 NETKF = f"{shlex.quote(sys.executable)} -m netkf"
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("line", "status"),
     [

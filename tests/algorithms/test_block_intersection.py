@@ -179,6 +179,7 @@ BLOCK_FILTERS = {
 """Settings of filters of blocks, changes of a scenario, and how P is to that of all blocks."""
 
 
+@pytest.mark.one_in(7)
 @pytest.mark.parametrize("name", BLOCK_FILTERS)
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED], ids=["slots", "clocks"])
 def test_no_block_filter_is_below_the_stacked_kalman_filter(

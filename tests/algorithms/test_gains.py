@@ -24,6 +24,7 @@ def system(seed, n=3, p=2):
     return A, B @ B.T, H, V @ V.T + 0.1 * np.eye(p), S @ S.T
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("seed", range(5))
 def test_gains_are_the_projections_of_the_exact_weight(seed):
     """K_j = (2j+1)/g int P_j(s) Phi(g, s) P(s) H' R^-1 ds, with Phi from the closed loop's ODE."""

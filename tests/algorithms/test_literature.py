@@ -143,6 +143,7 @@ def expected_states(scenario, run, name):
     return np.stack([x for x, _ in found]), np.stack([P for _, P in found])
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_the_textbook(name, engine, tmp_path):
@@ -156,6 +157,7 @@ def test_the_textbook(name, engine, tmp_path):
             np.testing.assert_allclose(run.xhat, xhat, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", FILTERS)
 def test_both_engines_make_the_same_run_and_theory_follows_it(name, tmp_path):
     """Exact covariances of the errors against the engine's own linear map."""

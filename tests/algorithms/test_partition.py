@@ -114,6 +114,7 @@ def test_without_coupling_it_is_the_local_filter(tmp_path: Path, text: str) -> N
     np.testing.assert_allclose(run.P, local.P, rtol=1e-12)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours", "all"])
 @pytest.mark.parametrize("delivery", [1.0, 0.5])
@@ -234,6 +235,7 @@ def test_errors_of_many_runs_are_within_the_bounds(tmp_path: Path) -> None:
     assert (ensemble.mean_nees[-1] > 0.4 * n).all()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("text", [AREAS, clocked(AREAS)], ids=["slots", "clocks"])
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
 @pytest.mark.parametrize("seconds", [0.0, 0.3])

@@ -73,6 +73,7 @@ CASES = [
 ]
 
 
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize(("kind", "noise", "n", "R", "size"), CASES)
 def test_single_gaps(kind, noise, n, R, size):
     random = np.random.default_rng(n)
@@ -174,6 +175,7 @@ def test_a_gap_is_the_sum_of_its_parts(kind, p):
         assert mean == pytest.approx(moved, rel=1e-12)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("gap", [1e-4, 0.02, 0.7, 13.0])
 @pytest.mark.parametrize("p", [0, 1, 2])
 def test_agrees_with_the_flow_of_covariances_at_ordinary_scales(p, gap):

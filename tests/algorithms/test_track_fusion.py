@@ -90,6 +90,7 @@ def expected_states(scenario, run, kind, minimise):
     return np.stack([x for x, _ in found]), np.stack([P for _, P in found])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("kind", "minimise"), PAIRS)
 def test_the_textbook(kind, minimise, tmp_path):
     for n in (1, 2, 4):
@@ -344,6 +345,7 @@ def test_tracks_that_start_apart_are_refused(tmp_path):
         scenario_of({**TRACKS, "mean": mean}, tmp_path)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("F", [[[0.947, 0.251], [-0.049, 0.563]], [[1.01, 0.2], [0.0, 0.03]]])
 @pytest.mark.parametrize("rule", ["ci", "ici"])
 def test_roots_that_rounding_has_made_thin_are_not_fused_as_if_they_were(rule, F, tmp_path):

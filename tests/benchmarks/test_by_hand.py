@@ -148,6 +148,7 @@ def test_means_over_runs_agree_in_higher_dimensions(case):
     agree(case, 300, results)
 
 
+@pytest.mark.slow
 def test_batched_numpy_agrees_too():
     case, runs = gossip()
     job = (*jobs.in_slots(case), len(case.times))

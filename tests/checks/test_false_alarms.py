@@ -127,6 +127,7 @@ def few_laws(monkeypatch):
     monkeypatch.setattr(exact, "MAX_REPLAYED", 20)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.usefixtures("few_laws")
 @pytest.mark.parametrize(
     ("F", "R", "cov", "delivery", "horizon"),
@@ -263,6 +264,7 @@ def test_rounding_is_measured_by_the_terms():
     assert compare_identities(np.array([np.nan]), size, 1e9, 1e-8, "").margin[0] < 0.0
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("table", [GOSSIP, INTERMITTENT], ids=["gossip", "intermittent"])
 @pytest.mark.parametrize("driven", [1.0, 0.0])
 def test_directions_without_any_error_are_not_judged(table, driven, tmp_path):
@@ -276,6 +278,7 @@ def test_directions_without_any_error_are_not_judged(table, driven, tmp_path):
     assert not broken_rows(from_table({**table, "plant": plant}, tmp_path), runs=12)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("scenario_number", range(6))
 def test_scenarios_drawn_at_random_are_not_accused(scenario_number, tmp_path):
     """One for each filter; the same for hundreds in ``python -m tests.checks.calibration``."""
@@ -362,6 +365,7 @@ OWN_PARTS = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", OWN_PARTS)
 def test_parts_are_held_to_what_they_state(name, tmp_path):
     table, changes = OWN_PARTS[name]
@@ -390,6 +394,7 @@ SHORT = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", SHORT)
 def test_parts_that_show_little_are_not_accused(name, tmp_path):
     table, changes = SHORT[name]

@@ -150,6 +150,7 @@ KINDS = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_forecasts_of_all_kinds_of_intervals_hold_within_a_factor(kind):
     # Runs that decide a healthy row: the forecast against what it takes.
@@ -227,6 +228,7 @@ def test_a_kept_verdict_is_the_same_and_grows(tmp_path):
     assert names == {"scenario.toml", "verdict.json", "verdict.csv", "verdict.txt", "results.npz"}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("damage", ["missing", "text", "null", "npz", "rows"])
 def test_a_damaged_verdict_is_one_line(damage, tmp_path):
     scenario = scenario_of(GOSSIP, tmp_path)

@@ -242,6 +242,7 @@ SUMMARIES = [
 ]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("part", "name"), SUMMARIES)
 def test_a_wrong_number_in_the_summary_is_found(part, name, runs, monkeypatch):
     scenario, run = runs["ring"]
@@ -283,6 +284,7 @@ FILES = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("change", FILES)
 def test_files_that_are_not_the_run_are_found(change, runs, monkeypatch):
     scenario, run = runs["ring"]
@@ -295,6 +297,7 @@ def test_healthy_files_hold_the_run(runs):
         assert files_fault(scenario, run, CompiledEngine()) == ""
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("seed", [0, 1, 7, 12])
 def test_drawn_scenarios_are_recorded_without_a_fault(seed, tmp_path):
     """Every filter under every clock that it has, with all kinds of sensors, losses and delays."""

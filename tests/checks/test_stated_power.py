@@ -153,6 +153,7 @@ def shares_found(draw, trials=TRIALS):
     return [np.mean([draw(size, random)[0] for _ in range(trials)]) for size in (stated, 0.0)]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", {**EXACT, **CAREFUL})
 def test_the_stated_error_is_found_with_the_stated_probability(name):
     found, accused = shares_found({**EXACT, **CAREFUL}[name])
@@ -187,6 +188,7 @@ GAPS = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("name", "cell"),
     [("poisson", 1), ("poisson in short runs", 7), ("gamma", 7), ("weibull", 1)],

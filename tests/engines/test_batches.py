@@ -60,6 +60,7 @@ def assert_alone(scenario, engine, seed, replicas, fingerprint=False):
     assert done == list(replicas)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("largest", [256, 3])
 @pytest.mark.parametrize("name", CASES)
 def test_runs_drawn_together_are_what_they_are_alone(ring, monkeypatch, name, largest):
@@ -73,6 +74,7 @@ def test_a_batch_of_one_where_memory_is_short(ring, monkeypatch):
     assert_alone(ring.replace({"horizon": 2.0}), CompiledEngine(), 7, range(2))
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", with_slow(FILES, ("diffusion_regression", "ulb_library")))
 def test_compiled_batches_hold_the_runs_of_the_scenarios(name):
     scenario = netkf.load(FILES[name])

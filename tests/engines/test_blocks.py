@@ -93,6 +93,7 @@ def clocked(text: str) -> str:
 FLOW = "A = [[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, -0.1]]\nB ="
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours", ["pose"]])
 @pytest.mark.parametrize("more", ["", RANGES, "clocks"])
 def test_local_filters_of_own_states(tmp_path: Path, estimates: object, more: str) -> None:
@@ -105,6 +106,7 @@ def test_local_filters_of_own_states(tmp_path: Path, estimates: object, more: st
     assert np.isnan(run.xhat).any()
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours", "all"])
 @pytest.mark.parametrize("rule", ["split", "ci", "naive"])
 @pytest.mark.parametrize("text", [ROBOTS, CLOCKED])
@@ -125,6 +127,7 @@ def test_recorded_pairs_under_clocks(tmp_path: Path, estimates: str) -> None:
 KEPT = "block-cross-covariances"
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("linearise", ["ekf", "ukf"])
 @pytest.mark.parametrize(
     ("kind", "estimates"),

@@ -396,6 +396,7 @@ CASES = [
 ]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize(("kind", "sensor", "delay"), CASES)
 def test_both_engines_agree_under_clocks(kind, sensor, delay):
     at = {"intermittent": "readings", "gossip": "links"}.get(kind, "nodes")

@@ -26,6 +26,7 @@ def agree(seeds, folder, sizes=SIZES, filters=FILTERS):
     return runs
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("first", range(0, FEW, TOGETHER))
 def test_drawn_scenarios_agree(first, tmp_path):
     agree(range(first, first + TOGETHER), tmp_path)
@@ -34,7 +35,8 @@ def test_drawn_scenarios_agree(first, tmp_path):
 LATER = range(TOGETHER, FEW + 2 * TOGETHER, TOGETHER)
 
 
-@pytest.mark.parametrize("first", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in LATER)])
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, *LATER])
 def test_filters_of_the_literature_agree(first, tmp_path):
     """Fusion with the best weight, constant gains, consensus on predictions, beliefs."""
     for scenario, run in agree(

@@ -96,6 +96,7 @@ cov = {matrix([start["cov"] for start in starts])}
     return file
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("engine", ["simpy", "auto"])
 @pytest.mark.parametrize("case", CASES, ids=[f"{c['filter']}-{c['seed']}" for c in CASES])
 def test_replays(case, engine, tmp_path):

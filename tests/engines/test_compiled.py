@@ -35,6 +35,7 @@ SHORT = {
 }
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda file: file.stem)
 def test_every_scenario_agrees(file):
     scenario = netkf.load(file)
@@ -45,6 +46,7 @@ def test_every_scenario_agrees(file):
     assert_agree(scenario.replace({"horizon": horizon}))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "file",
     [f for f in scenario_files() if tomllib.loads(f.read_text())["filter"]["kind"] == "hybrid"],
@@ -74,6 +76,7 @@ SLOTS = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", SLOTS)
 @pytest.mark.parametrize("rows", [1 << 15, 50])
 def test_slots_made_together_agree(monkeypatch, name, rows):
@@ -84,6 +87,7 @@ def test_slots_made_together_agree(monkeypatch, name, rows):
     assert_agree(scenario.replace({"horizon": 12.0 * scenario.slot_plant.period, **changes}))
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize(
     ("stop", "tolerance", "links"),
     [
@@ -285,6 +289,7 @@ def slotted(draw, filters=SLOT_FILTERS):
     }
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(slotted(LITERATURE))
 def test_drawn_scenarios_of_the_literature_agree(tables):
@@ -305,6 +310,7 @@ def test_drawn_scenarios_in_slots_agree(tables):
     assert_agree(scenario)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(slotted(STOPS))
 def test_drawn_push_sum_that_stops_agrees(tables):

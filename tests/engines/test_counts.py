@@ -123,6 +123,7 @@ def in_continuous_time(scenario, run):
     return {"processes": processes, "events": events}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", CLOCKED)
 def test_simpy_counts_what_the_trace_says_under_clocks(name, build, stepped):
     plant, sensors, net, filters = CLOCKED[name]

@@ -257,6 +257,7 @@ def test_exact_error_covariance_of_the_cases(case, tmp_path):
     np.testing.assert_allclose(traces, truth["trace_per_sensor"], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["diffusion", "local", "central", "intermittent", "gossip"])
 def test_exact_error_covariance_against_the_engine_draw_by_draw(kind, tmp_path):
     """With losses, late messages, a blind node and filters that have a wrong F and R."""

@@ -71,6 +71,7 @@ def scenario(kind, sensors, growth=1.1, horizon=14.0):
     return from_table(table, Path())
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("mixed", [False, True], ids=["samples", "with increments"])
 @pytest.mark.parametrize("kind", FILTERS)
 def test_frames_change_no_error(kind, mixed, monkeypatch):
@@ -122,6 +123,7 @@ def test_errors_so_large_that_they_round_each_other_are_known():
     assert (4e-16 * np.abs(run.error[early]).max() < np.sqrt(least)).all()
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["intermittent", "diffusion", "central"])
 def test_errors_keep_their_size_however_far_the_plant_goes(kind):
     run = netkf.simulate(scenario(kind, SENSORS, horizon=300.0), engine="simpy")

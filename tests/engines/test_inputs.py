@@ -92,6 +92,7 @@ def fitting(name, time, **more):
 COMPILED = {("kcf", "slots"), ("push-sum", "slots"), ("hybrid", "clocks"), ("gossip", "clocks")}
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", ALL)
 def test_a_known_input_changes_no_event_no_covariance_and_no_error(name):
     found = {time: fitting(name, time) for time in ACTIVATIONS}
@@ -135,6 +136,7 @@ def response_of(driven, times):
     return found.imag
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("unstable", [False, True])
 @pytest.mark.parametrize("model", [None, {"input": False}, {"A": [[0.0, 0.5], [-0.4, -0.2]]}])
 @pytest.mark.parametrize("increments", [False, True])
@@ -171,6 +173,7 @@ def integrated(A, G, u, m, start):
     return solved.y[:, -1]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("sensing", ["slots", "samples", "increments"])
 @pytest.mark.parametrize("model", [{}, {"input": False}, {"schedule": False}])
 def test_inputs_of_a_plant_that_changes(sensing, model):
@@ -357,6 +360,7 @@ class Louder(Local):
         return 2.0 * state.xhat, state.P
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("model", [None, {"R": [[0.1]]}])
 @pytest.mark.parametrize("plant", ["slots", "samples", "increments", "ekf", "ukf"])
 def test_a_filter_that_does_not_move_is_told_by_its_model(plant, model):
@@ -419,6 +423,7 @@ UNKNOWN = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_filters_do_not_know_is_the_mean_of_their_errors(name):
     time, model, tolerance = UNKNOWN[name]
@@ -472,6 +477,7 @@ def owned(slotted, estimates, filtering):
     return from_table(table, Path())
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("slotted", [True, False])
 @pytest.mark.parametrize(
     ("kind", "estimates"),

@@ -54,6 +54,7 @@ CASES = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("slotted", [False, True])
 @pytest.mark.parametrize("case", CASES)
 def test_what_passes_the_largest_number_ends_the_run_and_is_named(case, slotted):

@@ -225,6 +225,7 @@ def test_the_network_of_a_run_does_not_depend_on_gains_or_stop_rules(planar):
     assert fates(gains, planar) == wanted
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("changes", "conserved"),
     [

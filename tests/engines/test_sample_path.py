@@ -62,6 +62,7 @@ def test_samples_off_the_sensing_grid(ring):
     assert deviation(ring.replace(changes)) < STATED / 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "delay",
     [
@@ -85,6 +86,7 @@ def test_filters_that_believe_another_model(ring):
     assert deviation(ring.replace({"horizon": 1.5, "filter.model": model})) < STATED / 20
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["local", "central"])
 def test_baselines(ring, kind):
     short = ring.replace({"horizon": 2.0, "filter": {"kind": kind}})
@@ -100,6 +102,7 @@ def test_several_sensors_on_a_node_and_rows_of_zeros(ring):
     assert deviation(ring.replace({"horizon": 1.0, "sensors": more})) < STATED / 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", with_slow(range(3), (1, 2)))
 def test_random_systems_with_large_first_covariances(build, seed):
     random = np.random.default_rng(seed)

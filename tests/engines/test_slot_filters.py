@@ -55,6 +55,7 @@ def made(name, folder, seed=0, n=2, **more):
     return scenario_of(FILTERS[name], folder, seed, n, **more)
 
 
+@pytest.mark.one_in(9)
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("name", FILTERS)
 def test_both_engines_make_the_same_run(name, network, tmp_path):
@@ -70,6 +71,7 @@ def test_both_engines_make_the_same_run(name, network, tmp_path):
     assert (missing > 5) == (network not in ("lossless", "complete", "alone"))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("network", ["loss", "one way", "dense"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_batches_hold_the_single_runs(name, network, tmp_path):
@@ -94,6 +96,7 @@ UNSTABLE = {"kind": "linear", "F": [[1.3, 0.2], [0.0, 1.2]], "Q": [[0.1, 0.0], [
 UNSTABLE |= {"cov": [[1.0, 0.2], [0.2, 2.0]], "period": 1.0}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", FILTERS)
 def test_errors_of_unstable_plants_are_exact(name, tmp_path):
     """Where states have no digits left: both engines count from the same origins."""
@@ -120,6 +123,7 @@ COUNTING = {"consensus-innovations", "cross-covariance", "scheduled"}
 """Those whose P counts every reading, so that none may be missing (tests/scenario)."""
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("network", ["loss", "one way", "late"])
 @pytest.mark.parametrize("name", sorted({*FILTERS, *READINGS} - COUNTING))
 def test_recorded_sensors_may_miss_slots(name, network, tmp_path):

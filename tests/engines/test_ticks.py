@@ -107,6 +107,7 @@ def test_ticks_and_fates_are_those_drawn_link_by_link(busy, monkeypatch, in_pyth
     assert_same(made, plain)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("channel", ["shared", "bursts", "shared bursts", "lognormal"])
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_all_clocks_and_channels(ring, monkeypatch, in_python, clock, channel):

@@ -78,6 +78,7 @@ def scenario(folder: Path, estimates: str, kind: str = "kcf:Kcf", **changes: Any
     return from_table(table, folder).replace(changes)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", ["kcf:Kcf", "kcf_kernels:Kcf"])
 @pytest.mark.parametrize("estimates", BLOCKS)
 def test_the_consensus_filter_of_the_page_speaks_of_common_blocks(
@@ -115,6 +116,7 @@ def test_the_consensus_filter_of_the_page_speaks_of_common_blocks(
     assert run.count("send") == (0 if estimates == "own" else 6 * 4)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("estimates", ["named", "own+neighbours"])
 @pytest.mark.parametrize("clocks", [False, True])
 def test_compiled_code_translates_as_python_does(
@@ -240,6 +242,7 @@ class AffineTuples(tuples.Tuples):
 """
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["affine:Affine", "affine:AffineTuples"])
 def test_errors_of_translated_messages_are_exact(folder: Path, kind: str) -> None:
     """By the recursion of all poses and estimates together, written plainly."""

@@ -79,6 +79,7 @@ LONG = ("belief-propagation", "cross-covariance", "hcmci", "consensus")
 """Inner filters that take long to compile, and are compiled without a trigger anyway."""
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", with_slow(INNER, LONG))
 def test_both_engines_send_the_same(name, tmp_path):
     """Node 2 has two sensors, node 4 none."""
@@ -100,9 +101,8 @@ def test_both_engines_send_the_same(name, tmp_path):
             assert_batch(scenario)
 
 
-@pytest.mark.parametrize(
-    "name", with_slow(["intermittent", "hcmci", "diffusion", "consensus"], {"hcmci", "diffusion"})
-)
+@pytest.mark.one_in(4)
+@pytest.mark.parametrize("name", ["intermittent", "hcmci", "diffusion", "consensus"])
 def test_links_of_one_direction(name, tmp_path):
     """Node 3 hears nobody, and nobody hears node 4."""
     network = {**ONE_WAY, "activation": {"kind": "broadcast"}, "channel": CHANNELS["lossy"]}
@@ -111,6 +111,7 @@ def test_links_of_one_direction(name, tmp_path):
     assert_batch(scenario)
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", with_slow(INNER, {"belief-propagation", "cross-covariance"}))
 def test_frames_of_unstable_plants(name, tmp_path):
     """The origin moves, and with it everything that a trigger keeps."""

@@ -198,6 +198,7 @@ def tables(folder, unit):
 FINE, NONE = {"kind": "periodic", "period": 1}, {"kind": "constant", "seconds": 0}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", UNITS)
 def test_tables_in_every_unit(name, tmp_path):
     unit = UNITS[name]

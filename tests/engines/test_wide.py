@@ -45,6 +45,7 @@ def exact(H, information, cov):
     return cov * (np.eye(len(H)) - along) + along / (1.0 / cov + information * (H @ H))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("engine", ["simpy", "auto"])
 @pytest.mark.parametrize("cov", [1e-6, 1.0, 1e4, 1e8, 1e10, 1e12])
 @pytest.mark.parametrize("H", [[1.0, 0.5, 0.3], [1.0, 0.5, 0.3, -0.2]], ids=["n = 3", "n = 4"])

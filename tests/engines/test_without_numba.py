@@ -75,6 +75,7 @@ def test_simpy_runs_every_scenario_without_numba(pattern, least):
     assert_same(got, results(files))
 
 
+@pytest.mark.slow
 def test_both_engines_run_with_compiling_disabled():
     names = ("delayed_links", "intel_lab_radio", "gossip_ring", "push_sum_planar")
     files = [str(ROOT / "scenarios" / f"{name}.toml") for name in names]

@@ -117,6 +117,7 @@ def listen():
         yield begin
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("treat", [silent, closes, is_a_web_server, sends_noise])
 def test_what_is_no_scheduler_is_told_in_one_line(ring, monkeypatch, listen, treat):
     monkeypatch.setattr("netkf.ensembles.pools.PATIENCE", 2)

@@ -137,6 +137,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("how", DAMAGE)
 def test_a_damaged_block_is_done_again(cut, made, how):
     DAMAGE[how](cut / "blocks" / "000000003-1.npz", random.Random(1))
@@ -211,6 +212,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("key", CHANGES)
 def test_a_changed_manifest_is_refused(cut, made, key):
     change(cut / "manifest.json", key, CHANGES[key])

@@ -72,6 +72,7 @@ def drawing(results):
     return of
 
 
+@pytest.mark.one_in(12)
 @pytest.mark.parametrize("name", FIGURES)
 @pytest.mark.parametrize("kind", with_slow(KINDS, {"no samples", "interrupted", "diverged"}))
 def test_text_neither_overlaps_nor_leaves_the_canvas(drawing, kind, name):
@@ -260,6 +261,7 @@ def test_a_missing_matplotlib_is_one_line(results, monkeypatch, capsys, tmp_path
     assert "pip install 'netkf[plot]'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_paths_in_the_plane_are_those_of_the_nodes_and_their_own_estimates():
     """Errors and the share inside ellipses computed again with numpy alone."""
     file = SCENARIOS / "blocks" / "mrclam_small" / "scenario.toml"

@@ -56,6 +56,7 @@ def test_directions_have_the_messages_of_the_log(results, kind):
     assert sum(len(d.lost) for d in found) == run.count("lost") + run.count("late")
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("k", "n"), [(0, 5), (5, 5), (3, 10), (500, 1000)])
 def test_wilson_is_that_of_scipy(k, n):
     expected = scipy.stats.binomtest(k, n).proportion_ci(0.95, "wilson")
@@ -102,6 +103,7 @@ def test_increments_have_the_innovations_of_an_integrated_ornstein_uhlenbeck_pro
     np.testing.assert_allclose([found[0], root[0, 0]], [y - h * J * xhat, math.sqrt(S)], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("believed", "expected"), [(0.5, 2.0), pytest.param(1.0, 1.0, marks=pytest.mark.slow)]
 )

@@ -29,6 +29,7 @@ def square_times(size, matrix, vector, scratch, line, out):
         out[i] = product[i]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("n", [1, 2, 4, 5])
 def test_local_arrays_hold_what_is_written(n):
     random = np.random.default_rng(n)
@@ -57,6 +58,7 @@ def matrix_times(size, matrix, vector, scratch, line, out):
         store(MANY, out, i, load(MANY, product, i))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("n", [1, 2, 4, 5])
 def test_local_arrays_of_lanes_hold_what_is_written(n):
     random = np.random.default_rng(n)

@@ -26,6 +26,7 @@ def chain(n):
     return np.diag(np.ones(n - 1), 1) if n > 1 else np.zeros((1, 1))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("n", SIZES)
 def test_plants_without_damping_neither_grow_nor_decay(n):
     random = np.random.default_rng(n)

@@ -98,6 +98,7 @@ def test_the_share_of_one_fate_from_none_to_all(share):
     assert rate(covered) > binomial_range(100, 0.95)[0]
 
 
+@pytest.mark.slow
 def test_departures_of_the_stated_size_are_found_with_the_stated_power():
     """Of bursts (a chain whose outcomes are correlated by r), and of shared fate."""
     unit = time_test(drawn(np.random.default_rng(0))).detectable(LEVEL)

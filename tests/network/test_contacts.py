@@ -69,6 +69,7 @@ def ticks_of(run, link):
     return rows["t"][chosen].tolist()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", CLOCKS)
 def test_links_tick_as_their_clock_inside_and_never_outside(name, make):
     plain, contacts = make(CLOCKS[name])

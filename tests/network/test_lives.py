@@ -365,6 +365,7 @@ def assert_accounts_balance(log, horizon):
     assert all(sent_at[key] > horizon - 5.0 for key in under_way)
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("slots", [True, False])
 @pytest.mark.parametrize(
     "filter_", ["hybrid", "constant-gain", "push-sum", "intermittent", "hcmci"]
@@ -387,6 +388,7 @@ def test_engines_agree_and_accounts_balance(tmp_path, slots, filter_):
         assert_accounts_balance(one.log, scenario.horizon)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("slots", "filter_", "numbers"),
     [
@@ -431,6 +433,7 @@ def test_a_node_that_forgets_begins_with_its_mean_whatever_drives_the_plant(
     np.testing.assert_allclose(run.xhat[at, node], expected, atol=1e-12)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 @pytest.mark.parametrize("slots", [True, False])
 def test_recorded_twins_replay_to_the_bit(tmp_path, slots, engine):

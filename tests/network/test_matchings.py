@@ -23,6 +23,7 @@ def matching(words):
     return Matching(protocol=name, **more)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("case", MEANS, ids=lambda c: f"{c['graph']} {c['protocol']}")
 def test_exact_means_and_draws(case):
     topology = Edges(edges=case["edges"], nodes=case["N"]).build(0)

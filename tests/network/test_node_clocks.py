@@ -199,6 +199,7 @@ def test_lattices_are_of_local_times_whatever_the_clock_shows(clock, offset):
     assert NodeTime(TimeGrid(), offset, 1.02).ahead(Poisson(rate=1.0)) == 0.0
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("at", ["nodes", "directions", "links"])
 @pytest.mark.parametrize(
     ("kind", "engine"),
@@ -225,6 +226,7 @@ FILTERS = [
 ]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("kind", "at"), FILTERS)
 @pytest.mark.parametrize("offset", [-50.0, 0.2, 50.0])
 def test_filters_take_any_stamp(scenario_of, kind, at, offset):

@@ -118,6 +118,7 @@ def outcomes(run):
     return sends["node"], sends["peer"], sends["message"], sends["t"], flags
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("time", ["nodes", "links", "slots"])
 def test_engines_agree(scenario_of, kind, time):

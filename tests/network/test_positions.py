@@ -114,6 +114,7 @@ def from_states(moving, at, owners=(0, 1, 2, 3)):
     return lambda node, time: states[time][first[node] : first[node] + 2]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_equal_distances_lose_what_bernoulli_loses(tmp_path, clock):
     """At one distance of all nodes the events are those of Bernoulli losses, to the bit, in both
@@ -133,6 +134,7 @@ def test_equal_distances_lose_what_bernoulli_loses(tmp_path, clock):
     assert_agree(fixed)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("source", ["table", "state"])
 def test_each_message_meets_the_distance_at_its_sending(tmp_path, clock, source):
@@ -195,6 +197,7 @@ def test_nodes_of_a_table_hear_robots(tmp_path, clock, timed):
     assert {(0, 1), (3, 2)} <= met
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("clock", "filtering"),
     [
@@ -236,6 +239,7 @@ def test_recorded_places_replay_to_the_bit(tmp_path, clock):
     np.testing.assert_array_equal(replay.xhat, run.xhat)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("source", ["table", "state"])
 def test_nothing_is_sent_out_of_range(tmp_path, clock, source):
@@ -287,6 +291,7 @@ def test_truth_and_clocks_do_not_depend_on_who_hears_whom(tmp_path, clock):
     assert len(rows(one, "send")) < len(rows(other, "send"))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("clock", ["links", "directions", "nodes"])
 def test_unicycles_that_send_late(tmp_path, clock):
     """Predictions are cut where nodes send to somebody, or broadcast to nobody."""

@@ -7,6 +7,7 @@ import pytest
 
 import netkf
 from netkf.scenario.reading import from_table
+from tests.conftest import with_slow
 
 R_SEEN = np.diag([0.04, 0.01])
 Q_POSE, Q_TARGET, F_TARGET = np.diag([1e-3, 1e-3, 4e-4]), 0.02 * np.eye(2), 0.98 * np.eye(2)
@@ -163,7 +164,11 @@ def test_nodes_that_estimate_their_own_block_have_its_filter(scenario):
 
 
 @pytest.mark.parametrize(
-    "kind", ["block-intersection", "block-cross-covariances", "block-belief-propagation"]
+    "kind",
+    with_slow(
+        ["block-intersection", "block-cross-covariances", "block-belief-propagation"],
+        {"block-cross-covariances"},
+    ),
 )
 def test_what_others_read_of_a_pose_helps(scenario, kind):
     sensors = [

@@ -380,6 +380,7 @@ COMPILED = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("method", ["ekf", "ukf", "ckf"])
 @pytest.mark.parametrize("case", COMPILED)
 def test_both_engines_agree(folder, case, method):

@@ -23,6 +23,7 @@ START = {
 TURNS = (0.9, -2.3, 1e-3, 3e-6, 0.0)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("w", TURNS)
 @pytest.mark.parametrize("name", MOTIONS)
 def test_flows_are_those_of_the_rates(name, w):

@@ -94,6 +94,7 @@ def plain_estimates(kind, slots, seed):
     return np.array(found)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("engine", ["simpy", "compiled"])
 @pytest.mark.parametrize("slots", [False, True], ids=["clocks", "slots"])
 @pytest.mark.parametrize("kind", FAULTS)

@@ -28,6 +28,7 @@ def test_periods_allow_a_growth_of_two_to_the_tenth():
     assert frame_slots(np.eye(2)) is None
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("block", [1, 7, 64])
 @pytest.mark.parametrize("growth", [1.05, np.sqrt(2.0), 3000.0])
 def test_local_increments_in_slots_are_exact(growth, block, monkeypatch):

@@ -155,6 +155,7 @@ def test_default_period_follows_the_fastest_time_constant():
     assert f"{slow:e}"[0] in "125"
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("n", [1, 4, 16])
 @pytest.mark.parametrize(("since", "gap"), [(0.0, 0.13), (0.05, 0.15), (0.07, 0.02), (0.1, 1e-5)])
 def test_moments_of_a_part_are_those_of_response_and_cubic(n, since, gap):

@@ -89,6 +89,7 @@ def linear_map(monkeypatch, plant, times, horizon):
     return np.array(columns).T
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("kind", PLANTS)
 @pytest.mark.parametrize(
     "times",
@@ -171,6 +172,7 @@ def test_increments_over_short_gaps_keep_their_relative_law(kind):
         assert not np.triu(L, 1).any()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", PLANTS)
 def test_a_state_depends_on_its_time_only(kind):
     """Not on other times, before, after or between, nor on frames or on a horizon of that size."""

@@ -648,6 +648,7 @@ def test_sweeps_are_not_compared(ring, sweep):
         make_page([ring, sweep])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("command", "options"),
     [

@@ -19,6 +19,7 @@ def counted(rows, size):
     return found
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
 def test_blocks_do_not_matter(file):
     """By hand: in slots the distinct (node, t, phase) of sends, under clocks every send, or where

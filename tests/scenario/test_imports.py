@@ -58,6 +58,7 @@ def scenario(folder, kind="evil:P", **changes):
     return file
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("kind", "path"),
     [

@@ -29,6 +29,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("first", range(0, 300, 50))
 def test_drawn_cases_are_refused_in_one_line_or_are_scenarios(folder, first):
     for seed in range(first, first + 50):
@@ -93,6 +94,7 @@ GRAPHS = [
 LIMITS += [(RING, {"network.graph": g}, "network.graph", "at most") for g in GRAPHS]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("file", "changes", "key", "words"), LIMITS)
 def test_sizes_are_answered_before_they_hurt(file, changes, key, words):
     began, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -113,6 +115,7 @@ def test_a_graph_that_is_never_connected_is_given_up_soon():
     assert time.process_time() - began < 3.0 * SECONDS
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("number", range(len(malformed.DOCUMENTS)))
 def test_documents_that_are_hard_to_read_are_refused_soon(tmp_path, number):
     file = tmp_path / "case.toml"

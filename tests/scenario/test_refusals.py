@@ -812,6 +812,7 @@ def test_the_unchanged_scenario_is_no_mistake(write):
     assert netkf.load(write({})).name == "poisson-ring"
 
 
+@pytest.mark.one_in(10)
 @pytest.mark.parametrize(("change", "key", "fragment"), rows(TABLE))
 def test_a_mistake_is_refused_in_one_line(change, key, fragment, write, refusal, tmp_path):
     path = write(change)

@@ -199,6 +199,7 @@ def test_a_counter_that_wraps_is_told_how_to_go_on(make):
         make("losses", "0,1,0,0\n")
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("command", ["run", "check", "sweep", "consistency"])
 def test_every_command_says_it_once(command, make, tmp_path, capsys):
     make("ticks of nodes")

@@ -14,6 +14,7 @@ from netkf.scenario.writing import as_table, resolve_defaults, to_toml
 from tests.conftest import scenario_files
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
 def test_written_scenarios_read_back_the_same(file):
     scenario = netkf.load(file)
@@ -24,6 +25,7 @@ def test_written_scenarios_read_back_the_same(file):
         assert resolve_defaults(scenario)["plant"]["sensing_period"] > 0.0
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("file", scenario_files(), ids=lambda f: f.stem)
 def test_resolved_scenarios_give_the_same_run(file, tmp_path):
     scenario = netkf.load(file)

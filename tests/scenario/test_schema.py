@@ -30,6 +30,7 @@ def validator():
     return jsonschema.Draft202012Validator(schema)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("path", scenario_files(), ids=lambda path: path.stem)
 def test_shipped_scenarios_are_valid_as_written_and_with_every_default(validator, path):
     validator.validate(tomllib.loads(path.read_text(encoding="utf-8")))

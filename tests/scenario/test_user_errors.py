@@ -172,6 +172,7 @@ def write(folder, name, part, body):
     return module
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", MISTAKES)
 def test_one_line_names_class_method_file_and_line(name, tmp_path, monkeypatch, capsys):
     part, body, words = MISTAKES[name]

@@ -47,6 +47,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_takes_nodes_with_states_of_different_size(
     places: dict[str, Path], name: str, capsys: pytest.CaptureFixture[str]

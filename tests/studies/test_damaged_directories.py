@@ -193,6 +193,7 @@ def test_the_same_directory_has_no_differences(made):
     assert np.isfinite([row.entries[0].value for row in found.rows if row.quantity == "sent"]).all()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("kind", ["Int64", "Float64", "float64"])
 @pytest.mark.parametrize("column", ["peer", "message", "t", "age"])
 def test_types_that_pandas_notes_in_a_file_do_not_matter(copy, capsys, kind, column):

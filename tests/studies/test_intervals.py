@@ -120,6 +120,7 @@ class Scipy:
         self.special = special
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("special", [OneSided, Normal])
 @pytest.mark.parametrize(
     ("module", "name"), [(filter_values, "compare_filters"), (targets, "size")]

@@ -51,6 +51,7 @@ def test_what_is_no_path_is_refused(function, value):
         function(value)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("name", "changes"),
     [

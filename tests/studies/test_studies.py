@@ -227,6 +227,7 @@ SAMPLED = {
 POISSON = {"kind": "poisson", "rate": 2.0}
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("key", "values", "moved"),
     [

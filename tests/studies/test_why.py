@@ -270,6 +270,7 @@ def write(path, header, rows):
     path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows), ""]))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("name", "node", "at"),
     [("hybrid", 2, 8.0), ("intersection", 0, 7.0), ("gossip", 1, 7.0), ("late", 3, 9.0)],
@@ -310,6 +311,7 @@ CHANNELS = {
 }
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("name", ["gossip", "diffusion", "readings", "push-sum"])
 def test_both_engines_deliver_the_chosen_messages(runs, name, channel):

@@ -90,6 +90,7 @@ def test_delays_of_few_values_keep_the_contract():
     assert check_channel(Tries()) is None
 
 
+@pytest.mark.slow
 def test_our_own_channels_keep_the_contract(tables):
     ours = losses(tables)
     assert set(ours) == set(KINDS["loss"])
@@ -108,11 +109,13 @@ def test_our_own_clocks_keep_the_contract(tables):
     assert check_clock(parts.RecordedClock(tables["ticks"]), link=(1, 2)) is None
 
 
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", CHANNELS)
 def test_every_breach_of_a_channel_is_named(name):
     refused(check_channel, *CHANNELS[name])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", CLOCKS)
 def test_every_breach_of_a_clock_is_named(name):
     refused(check_clock, *CLOCKS[name])

@@ -84,6 +84,7 @@ LONG = (
 """Filters whose check is slow; others of their kind are checked each time."""
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", with_slow(SOUND, LONG))
 def test_our_own_filters_keep_the_contract(name):
     for part in SOUND[name]:
@@ -96,6 +97,7 @@ def test_our_own_filters_say_that_they_commute(name):
     assert all(commutes(part) for part in SOUND[name])
 
 
+@pytest.mark.one_in(8)
 @pytest.mark.parametrize("name", BROKEN)
 def test_every_breach_is_named(name):
     cls, settings, words = BROKEN[name]

@@ -29,18 +29,21 @@ def fewer_draws(name, monkeypatch):
             monkeypatch.setattr(module, count, max(2, getattr(module, count) // 4))
 
 
+@pytest.mark.one_in(7)
 @pytest.mark.usefixtures("fewer_draws")
 @pytest.mark.parametrize("name", with_slow(SENSORS, {"Drifts"}))
 def test_every_breach_of_a_sensor_is_named(name):
     refused(check_sensor, *SENSORS[name])
 
 
+@pytest.mark.one_in(7)
 @pytest.mark.usefixtures("fewer_draws")
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_breach_of_a_plant_is_named(name):
     refused(check_plant, *PLANTS[name])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", MATCHINGS)
 def test_every_breach_of_a_matching_is_named(name):
     refused(check_matching, *MATCHINGS[name])
@@ -88,16 +91,19 @@ def matchings():
     ]
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("k", with_slow(range(len(sensors())), {4}))
 def test_sound_sensors_pass(k):
     assert check_sensor(sensors()[k]) is None
 
 
+@pytest.mark.one_in(5)
 @pytest.mark.parametrize("k", range(len(plants())))
 def test_sound_plants_pass(k):
     assert check_plant(plants()[k]) is None
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("k", range(len(matchings())))
 def test_sound_matchings_pass(k):
     assert check_matching(matchings()[k]) is None

@@ -69,6 +69,7 @@ def test_the_promises_of_our_files_are_kept(name):
     assert testing.assert_promises(scenario, runs=10, confidence=0.999, workers=1) is None
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("path", testing.scenario_files(SCENARIOS), ids=lambda path: path.stem)
 def test_the_parts_of_our_files_keep_their_contracts(path):
     scenario = netkf.load(path)

@@ -140,6 +140,7 @@ def enumerated(scenario):
     return [X[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)], radius
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("algorithm", [CONSTANT, KCF], ids=["constant-gain", "kcf"])
 def test_every_outcome_enumerated(algorithm, channel, tmp_path):
@@ -368,6 +369,7 @@ def late_network(folder, at, channel, delay, edges=None, horizon=5.0, probe=1.0)
     )  # fmt: skip
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("channel", ["losses", "losses of both"])
 @pytest.mark.parametrize("at", ["links", "directions", "nodes"])
 def test_a_short_delay_is_nearly_none(at, channel, tmp_path):

@@ -69,6 +69,7 @@ def test_radii_of_section_5(gamma, delivery, links, expected):
     )
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(
     ("gamma", "delivery", "expected"),
     [
@@ -158,6 +159,7 @@ def test_against_plain_enumeration(gamma, symmetric, links):
 RING = [[k, (k + 1) % 10] for k in range(10)]
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     "settings",
     [

@@ -103,6 +103,7 @@ def close(found, expected, tolerance):
     assert (np.abs(found - expected) <= tolerance * size).all()
 
 
+@pytest.mark.one_in(11)
 @pytest.mark.parametrize("channel", [{}, LOSSY, LATE], ids=["sure", "lossy", "late"])
 @pytest.mark.parametrize("sensors", [SAMPLED, MIXED], ids=["sampled", "mixed"])
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
@@ -119,6 +120,7 @@ def test_covariances_are_those_of_the_run(name, at, sensors, channel, tmp_path):
     assert np.linalg.eigvalsh(stacked).min() > -1e-12
 
 
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
 def test_errors_are_the_linear_map_of_the_engine(name, at, tmp_path):
     """Filters of one clock each come late; of several some do."""
@@ -147,6 +149,7 @@ def test_filters_with_another_plant_and_other_noises(tmp_path):
     close(error_law(scenario, run).P, run.P, 1e-9)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("name", "at"), CASES, ids=["-".join(map(str, c)) for c in CASES])
 def test_the_mean_of_errors_is_what_other_starts_add(name, at, tmp_path):
     # Same truth, readings and messages: estimates differ by the mean of their errors only.
