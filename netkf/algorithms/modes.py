@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 
 from netkf.linalg.arrays import FloatArray
+from netkf.linalg.spectra import balance
 
 MAX_PROJECTOR = 1e5
 """Largest norm of the projector on a part of the modes along the others; those that are nearer to
@@ -64,7 +65,7 @@ def split_modes(A: FloatArray, level: float, slotted: bool) -> ModeSplit | None:
     """
     n = len(A)
     # Units of states, in powers of 2, do not decide what is close.
-    balanced, (scaling, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+    balanced, scaling = balance(A)
     factor, shift = (np.exp(level), 0.0) if slotted else (1.0, level)
     moved = (balanced - shift * np.eye(n)) / factor
     S, Q, k = scipy.linalg.schur(moved, sort="ouc" if slotted else "rhp")

@@ -300,7 +300,10 @@ COMMANDS = (
                 dest="seconds",
                 metavar="DURATION",
             ),
-            _option("--workers", "number of processes", type=parse_workers, default=1),
+            (
+                _option("--workers", "number of processes (default: 1)", type=parse_workers),
+                POOL[1],
+            ),
             _trust("DIR"),
         ),
         takes_scenario=False,

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from netkf.ensembles.parts import Part
     from netkf.ensembles.planned_study import PlannedStudy
     from netkf.ensembles.plans import Plan
+    from netkf.ensembles.pools import PoolOptions
     from netkf.ensembles.replicas import Gap
 
 Run = Callable[[argparse.Namespace], int]
@@ -65,8 +66,9 @@ def has_rounds(options: argparse.Namespace) -> bool:
     return hasattr(options, "target") or bool(getattr(options, "until", None))
 
 
-def work_on_study(plan: Plan, part: Part, options: argparse.Namespace) -> int:
-    """Simulate a part of the runs of each ensemble; return the exit status, 1 if some are left.
+def work_on_study(plan: Plan, part: Part, pool: PoolOptions, options: argparse.Namespace) -> int:
+    """Simulate a part of the runs of each ensemble in a ``pool``; return the exit status, 1 if some
+    are left.
 
     In a study with rounds other jobs are waited for as long as ``--for`` allows.
     """
@@ -81,7 +83,7 @@ def work_on_study(plan: Plan, part: Part, options: argparse.Namespace) -> int:
         while True:
             study = PlannedStudy(plan.directory, worker, returns=rounds)
             try:
-                gaps = _missing_runs(study_options.run, study_options, study, options.workers)
+                gaps = _missing_runs(study_options.run, study_options, study, pool)
             except KeyboardInterrupt:
                 remedy = f"; go on with netkf work {plan.directory}"
                 raise InterruptedRunError(plan.directory, remedy) from None
@@ -138,7 +140,10 @@ def _study_options(plan: Plan, given: argparse.Namespace) -> argparse.Namespace:
 
 
 def _missing_runs(
-    run: Run, options: argparse.Namespace, study: PlannedStudy, workers: int = 1
+    run: Run,
+    options: argparse.Namespace,
+    study: PlannedStudy,
+    pool_options: PoolOptions | None = None,
 ) -> list[Gap]:
     """Run a study without what it prints and writes; return the ensembles that it needs, with
     their missing runs; none if it came to its end.
@@ -155,7 +160,7 @@ def _missing_runs(
         )
         try:
             with quiet:
-                _run_on(run, options, study, workers)
+                _run_on(run, options, study, pool_options)
         except MissingRunsError as error:
             return error.gaps
         finally:
@@ -163,11 +168,17 @@ def _missing_runs(
     return []
 
 
-def _run_on(run: Run, options: argparse.Namespace, study: PlannedStudy, workers: int = 1) -> int:
+def _run_on(
+    run: Run,
+    options: argparse.Namespace,
+    study: PlannedStudy,
+    pool_options: PoolOptions | None = None,
+) -> int:
     """Run a study whose results are those of a plan; return its exit status."""
-    from netkf.ensembles.pools import PoolOptions, make_pool
+    from netkf.ensembles.pools import LocalPool, make_pool
 
-    with make_pool(workers, PoolOptions(workers)) as pool:
+    given = pool_options
+    with LocalPool() if given is None else make_pool(given.workers or 1, given) as pool:
         pool.plan = study
         options.executor, options.workers, options.scheduler = pool, None, None
         return run(options)

@@ -17,9 +17,10 @@ def _run(options: argparse.Namespace) -> int:
 
     plan = open_plan(options.directory, options.trust)
     part = Part(*options.part) if options.part else part_of_array(plan.tasks)
+    workers = options.workers if options.workers or options.scheduler else 1
+    pool = PoolOptions(workers=workers, scheduler=options.scheduler)
     if plan.arguments:
-        return work_on_study(plan, part, options)
-    pool = PoolOptions(workers=options.workers)
+        return work_on_study(plan, part, pool, options)
     with ProgressLine() as line:
         update = line.make_count_update("runs")
         done = work_on_plan(plan, part, options.seconds, pool, update)

@@ -115,7 +115,12 @@ class ConnectivitySink(Sink):
 
     def _parts(self, up: np.ndarray) -> tuple[int, np.ndarray]:
         """Return in how many parts the links ``up`` (D,) join the nodes, and that of each (N,)."""
-        size, ends = len(self._scenario.nodes), self._ends[up].T
+        size, ends, topology = len(self._scenario.nodes), self._ends[up].T, self._scenario.topology
+        if up.all() and not topology.directed:  # known without scipy, whose import takes its time
+            labels = np.empty(size, dtype=int)
+            for k, part in enumerate(topology.components):
+                labels[[topology.index[node] for node in part]] = k
+            return len(topology.components), labels
         graph = scipy.sparse.coo_array(
             (np.ones(len(ends[0])), (ends[0], ends[1])), shape=(size, size)
         )

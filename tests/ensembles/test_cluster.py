@@ -11,12 +11,17 @@ import time
 import pytest
 
 import netkf
+from netkf.cli.main import main
 from netkf.core.errors import EngineError
-from netkf.ensembles import pools
-from netkf.ensembles.pools import DaskPool
+from netkf.ensembles import plans, pools
+from netkf.ensembles.parts import Part
+from netkf.ensembles.pools import DaskPool, PoolOptions
+from tests.conftest import SCENARIOS
 from tests.ensembles.test_ensembles import assert_same_bits
 
 pytest.importorskip("distributed")
+
+RING = str(SCENARIOS / "poisson_ring.toml")
 
 
 def begin(stack, module, *arguments):
@@ -140,12 +145,35 @@ def test_what_is_no_address_is_refused_at_once(ring, address):
     assert str(error.value).isprintable()
 
 
-def test_a_scheduler_that_dies_is_told_in_one_line(ring, cluster):
+def test_a_plan_of_a_study_is_worked_on_there(cluster, tmp_path, capsys):
+    study = ["sweep", RING, "--vary", "filter.epsilon=0.2,0.5", "--runs", "5", "--no-plot"]
+    study += ["--set", "horizon=1.0"]
+    assert main([*study, "--plan", str(tmp_path / "plan"), "--out", str(tmp_path / "there")]) == 0
+    assert main(["work", str(tmp_path / "plan"), "--scheduler", cluster[0]]) == 0
+    assert "all of" in capsys.readouterr().out
+    assert main(["merge", str(tmp_path / "plan")]) == 0
+    assert main([*study, "--workers", "1", "--out", str(tmp_path / "here")]) == 0
+    there, here = (tmp_path / name / "sweep.csv" for name in ("there", "here"))
+    assert there.read_bytes() == here.read_bytes()
+
+
+def test_a_scheduler_that_dies_is_told_in_one_line_and_a_plan_outlives_it(cluster, tmp_path):
     address, _, scheduler = cluster
+    scenario, runs = netkf.load(RING, {"horizon": 1.0}), 400
+    folder = plans.plan_ensemble(scenario, runs, tmp_path / "plan")
+    plan, all_runs = plans.open_plan(folder), Part(0, 1)
+
+    def kill(done, wanted):
+        if done >= 16:
+            scheduler.kill()
+
     with pytest.raises(netkf.EngineError, match="does not answer any more"):
-        netkf.monte_carlo(
-            ring, 2000, scheduler=address, progress=lambda done, wanted: scheduler.kill()
-        )
+        plans.work_on_plan(plan, all_runs, pool=PoolOptions(scheduler=address), progress=kill)
+    done = plans.work_on_plan(plan, all_runs)
+    # What it had sent is kept.
+    assert 0 < done.simulated < runs
+    merged = plans.merge_plan(plan)
+    assert_same_bits(merged.ensemble, netkf.monte_carlo(scenario, runs, workers=1))
 
 
 @pytest.mark.slow

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import scipy
 
 from netkf.linalg.arrays import is_definite
 from netkf.linalg.spectra import (
     FACTOR,
     RATE,
+    balance,
     eigenvalues,
     growth_factor,
     growth_rate,
@@ -108,3 +110,19 @@ def test_definite_matrices_are_told_from_singular_ones():
     assert is_definite(np.diag([1e12, 1e-12]))
     assert not is_definite(np.diag([1.0, 0.0]))
     assert not is_definite(np.diag([1.0, -1.0]))
+
+
+def test_matrices_are_balanced_as_lapack_does():
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        n = random.integers(1, 8)
+        units = np.exp(4.0 * random.standard_normal((2, n)))
+        there = random.random((n, n)) < 0.7
+        A = random.standard_normal((n, n)) * np.outer(*units) * there
+        balanced, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
+        found = balance(A)
+        np.testing.assert_array_equal(found[1], scale)
+        np.testing.assert_array_equal(found[0], balanced)
+    far, scale = balance(np.array([[0.0, 1e300], [1e-300, 0.0]]))
+    assert np.abs(np.log2(far[far > 0.0])).max() <= 0.5
+    assert (np.frexp(scale)[0] == 0.5).all()
