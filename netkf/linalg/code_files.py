@@ -62,10 +62,12 @@ class CodeFiles:
 
     def _load(self, sig: Any, target_context: Any) -> Any:
         from numba.core.compiler import CompileResult
+        from numba.core.runtime import nrt
 
         compile_result: Any = CompileResult
-        # Refreshed, or the context may lack what the code refers to.
-        target_context.refresh()
+        # All that machine code refers to. ``refresh`` would import what only compiling needs, such
+        # as linear algebra of numba and scipy: half of all that a short run imports.
+        nrt.rtsys.initialize(target_context)
         key = self._key(sig, target_context.codegen())
         expected = self._read_index().get(key)
         data = _read_own(self._data_path(key)) if expected else None

@@ -273,3 +273,16 @@ def test_old_code_is_removed_and_nothing_else(tmp_path):
         os.utime(tmp_path / name, (0, 0))
     compiling._remove_old_folders(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {*kept, *names[-3:]}
+
+
+LOAD = """
+import sys
+from tests.linalg.test_code_files import call, halved
+print(call(halved), *({"numba.np.linalg", "scipy.linalg"} & {*sys.modules}))
+"""
+
+
+def test_loading_imports_nothing_that_only_compiling_needs(made):
+    there = os.environ | {"NUMBA_CACHE_DIR": str(made), "PYTHONPATH": str(ROOT)}
+    words = [sys.executable, "-c", LOAD]
+    assert subprocess.check_output(words, env=there, text=True) == "(1.5, 0)\n"
