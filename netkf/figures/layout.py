@@ -38,17 +38,18 @@ def compute_layout(topology: Topology) -> Positions:
     """Return positions: rings as a circle, small networks by Kamada and Kawai, large by pivots."""
     if len(topology.nodes) > MAX_KAMADA_KAWAI:
         return _pivot_layout(topology)
+    nodes, degrees = topology.nodes, set(topology.degrees.values())
+    if len(nodes) <= MAX_RING and degrees <= {0, 2}:
+        # The order of the nodes is that around the circle.
+        angles = 2.0 * np.pi * np.arange(len(nodes)) / len(nodes)
+        circle = zip(nodes, np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True)
+        return {node: (x, y) for node, x, y in circle}
     import networkx
 
     graph: networkx.Graph[int] = networkx.Graph()
-    # The order of the nodes is that around the circle.
-    graph.add_nodes_from(topology.nodes)
+    graph.add_nodes_from(nodes)
     graph.add_edges_from(topology.links)
-    degrees = set(topology.degrees.values())
-    if len(topology.nodes) <= MAX_RING and degrees <= {0, 2}:
-        points: dict[int, Any] = networkx.circular_layout(graph)
-    else:
-        points = networkx.kamada_kawai_layout(graph)
+    points: dict[int, Any] = networkx.kamada_kawai_layout(graph)
     return {node: (float(x), float(y)) for node, (x, y) in points.items()}
 
 
