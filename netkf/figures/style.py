@@ -167,7 +167,13 @@ def write_figure(figure: Figure, path: Path) -> None:
             figure.set_dpi(RESOLUTION)
             engine.execute(figure)
             figure.set_layout_engine("none")
-        figure.savefig(temporary, dpi=RESOLUTION, format=file_format, metadata=metadata)
+        if file_format == "png":
+            # ``savefig`` would first draw all artists to nowhere.
+            figure.set_dpi(RESOLUTION)
+            canvas: Any = FigureCanvasAgg(figure)
+            canvas.print_png(temporary, metadata=metadata)
+        else:
+            figure.savefig(temporary, dpi=RESOLUTION, format=file_format, metadata=metadata)
 
 
 def draw_legend(axes: Any, columns: int | None = None) -> None:

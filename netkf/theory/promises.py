@@ -30,7 +30,7 @@ from netkf.theory import (
     steady_error_covariance,
     true_limit_covariance,
 )
-from netkf.theory.assumptions import assumption_rows
+from netkf.theory.assumption_rows import assumption_rows
 from netkf.theory.block_promises import block_lines, block_promises
 from netkf.theory.common.blocks import have_one_view
 from netkf.theory.common.papers import paper_legend
