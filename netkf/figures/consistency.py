@@ -52,6 +52,7 @@ def nees_figure(data: FigureData) -> Picture:
     divisor = f" over {data.runs:,} runs" if data.runs > 1 else ""
     freedom = " and ".join(f"{data.runs * size:,}" for size in sorted(set(sizes)))
     note = f"Band: chi-square with {freedom} degrees of freedom{divisor}."
+    note += f" Errors of {data.scenario.states_note}." * bool(data.scenario.states_note)
     headline = f"{inside:.0%} of the samples lie in the {CONFIDENCE:.0%} band of NEES; their mean "
     mean = float((values / unit)[known].mean())
     headline += f"{'is' if len(set(sizes)) == 1 else 'over n is'} {mean:.3g} where exact "
@@ -83,6 +84,7 @@ def nis_figure(data: FigureData) -> Picture:
     headline = f"NIS per row of a reading is {mean:.3g} where exact covariances give 1; "
     headline += f"{share:.0%} of {count:,} readings lie in their {CONFIDENCE:.0%} interval"
     note = "Dots: single readings; line: means of bins, with the interval of each if P is exact."
+    note += f" Readings: {read}." if (read := data.scenario.what_is_read(-1)) else ""
     finish_figure(figure, data.title(headline), data.caption(note))
     return figure
 
@@ -132,7 +134,8 @@ def draw_nis(axes: Any, innovations: Innovations) -> tuple[float, float]:
 
 def whiteness_figure(data: FigureData) -> Picture:
     """Draw the autocorrelations of whitened innovations; raises UnavailableError."""
-    curves, counts = autocorrelations(require_innovations(data))
+    innovations = require_innovations(data)
+    curves, counts = autocorrelations(innovations)
     if not curves:
         raise UnavailableError(f"No node has {MIN_READINGS} readings of one kind.")
     smallest, lags = min(counts.values()), len(next(iter(curves.values())))
@@ -146,7 +149,9 @@ def whiteness_figure(data: FigureData) -> Picture:
     worst = max(curves, key=lambda node: float(np.abs(curves[node]).max()))
     figure = new_figure(7.4, 4.2)
     axes = figure.add_subplot()
-    _draw_correlations(axes, curves, worst, band, lags)
+    sizes = innovations.rows[innovations.nodes == worst]
+    label = data.scenario.label_of_value(worst, 0, sizes)
+    _draw_correlations(axes, curves, (worst, label), band, lags)
     share = outside / (lags * len(curves))
     judgement = (
         "as expected of white noise" if share <= WHITE_SHARE else "so innovations are not white"
@@ -158,9 +163,11 @@ def whiteness_figure(data: FigureData) -> Picture:
 
 
 def _draw_correlations(
-    axes: Any, curves: dict[int, FloatArray], worst: int, band: float, lags: int
+    axes: Any, curves: dict[int, FloatArray], worst: tuple[int, str], band: float, lags: int
 ) -> None:
-    """Draw the autocorrelations (lags,) of each node, with the 95% ``band`` of white noise."""
+    """Draw the autocorrelations (lags,) of each node, with the 95% ``band`` of white noise;
+    ``worst`` is the node of the largest, and the label of its readings.
+    """
     positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
     axes.axhline(0.0, color=EXACT, lw=0.8)
@@ -177,9 +184,11 @@ def _draw_correlations(
         )
         mean = all_curves.mean(axis=0)
         axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
-    name = "all readings" if worst < 0 else f"node {worst}"
+    node, read = worst
+    name = "all readings" if node < 0 else f"node {node}"
+    name += f", {read}" * bool(read)
     label = f"{name}, the largest" if len(curves) > 1 else name
-    axes.plot(positions, curves[worst], "--s", color=SENSING, ms=3.5, label=label)
+    axes.plot(positions, curves[node], "--s", color=SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")
     axes.xaxis.get_major_locator().set_params(integer=True)
     limit = max(1.3 * float(np.abs(all_curves).max()), 2.0 * band)

@@ -87,6 +87,7 @@ def run_data(
         "broadcasts": bool(len(run.log)) and (source.scenario.slotted or run.count("transmit") > 0),
         "n": run.xhat.shape[2],
         "states": list(source.scenario.state_labels),
+        "readings": [source.scenario.what_is_read(node) for node in (*run.nodes, -1)],
         "nodes": list(run.nodes),
         "names": [str(node) for node in run.nodes],
         "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],
@@ -107,7 +108,9 @@ def run_data(
         "messages": _message_columns(thinned, run, packer),
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
         "marks": _event_columns(run, MARKS, MAX_MARKS, packer),
-        "innovations": innovation_columns(readings, run.nodes, budget.messages // 4, packer),
+        "innovations": innovation_columns(
+            readings, source.scenario, run.nodes, budget.messages // 4, packer
+        ),
         "traffic": bin_messages(messages, horizon, BINS),
         "totals": {
             "events": len(run.log),

@@ -17,6 +17,7 @@ from netkf.report.directories import ReportSource
 from netkf.report.packing import Packer
 from netkf.runs.summary import NORMAL_QUANTILE, chi_square_interval
 from netkf.runs.tables import format_number
+from netkf.scenario.scenario import Scenario
 
 MAX_EVENTS = 200_000
 """Events of a run up to which a page replays it for its readings, which takes some seconds."""
@@ -108,7 +109,11 @@ def _judge_mean(mean: float, low: float, high: float) -> str:
 
 
 def innovation_columns(
-    readings: Innovations | str | None, nodes: tuple[int, ...], max_readings: int, packer: Packer
+    readings: Innovations | str | None,
+    scenario: Scenario,
+    nodes: tuple[int, ...],
+    max_readings: int,
+    packer: Packer,
 ) -> dict[str, Any] | None:
     """Return the NIS (normalised squared innovations) of the readings for the live views, as
     columns added to ``packer``, with the means and the autocorrelations of each node; every k-th
@@ -141,6 +146,7 @@ def innovation_columns(
             str(index.get(node, -1)): {
                 "band": NORMAL_QUANTILE / float(np.sqrt(counts[node])),
                 "values": curve.tolist(),
+                "label": scenario.label_of_value(node, 0, readings.rows[readings.nodes == node]),
             }
             for node, curve in curves.items()
         },

@@ -234,6 +234,7 @@ def _assemble_page(
         "labels": [source.label for source in sources],
         "sweep": tables.sweep_curves(sources[0]),
         "filters": tables.filter_curves(sources[0]),
+        "states": "; ".join(dict.fromkeys(s.scenario.states_note for s in sources)).strip("; "),
         "unit": " or ".join(dict.fromkeys(source.scenario.unit for source in sources)),
     }
     body = _page_header(entries, comparison) + _main_sections(

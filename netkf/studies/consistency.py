@@ -315,7 +315,8 @@ class Consistency(NotebookTable):
 
     ``low`` and ``high`` are the two-sided chi-square bounds at ``confidence`` on the mean NEES of a
     sample over the runs if P is exact, of the largest number of states ``n``; divided by n they
-    bound the ANEES. ``notes`` are sentences on what was left out, and why.
+    bound the ANEES. ``notes`` are sentences on what was left out, and why; ``states`` has the names
+    and units of the states that NEES is of, empty without any.
     """
 
     scenario: str
@@ -326,6 +327,7 @@ class Consistency(NotebookTable):
     high: float
     rows: tuple[NodeConsistency, ...]
     notes: tuple[str, ...] = ()
+    states: str = ""
 
     def __repr__(self) -> str:
         broken = sum(row.verdict.startswith("BROKEN") for row in self.rows)
@@ -439,6 +441,7 @@ def judge_consistency(
         high=float(high[largest]),
         rows=tuple(rows),
         notes=notes,
+        states=scenario.states_note,
     )
 
 

@@ -122,6 +122,7 @@ class NodeInnovations:
     bias : mean innovation of the ``component`` of readings (counted from 0) that stands out most,
            in its unit, which should be within ``bias_reach`` of 0; ``bias_detectable`` is found
            with probability 0.9
+    label : what this component is, by the names and units of the plant, as x (m); else empty
     ljung_box, freedom, p_white : the statistic, its degrees of freedom and its p;
         ``correlation_detectable`` at one lag is found with probability 0.9
     log_likelihood : log density of the readings given those that the node knew before
@@ -148,6 +149,7 @@ class NodeInnovations:
     since: float
     until: float
     verdict: str
+    label: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -235,7 +237,7 @@ def judge_innovations(
     level = (1.0 - confidence) / max(1, len(nodes)) / (4 if law.kind == "white" else 2)
     rows = [
         _judge_node(
-            recorded, node, np.flatnonzero(is_finite & (recorded.nodes == node)), law, level
+            scenario, recorded, node, np.flatnonzero(is_finite & (recorded.nodes == node)), law, level
         )
         for node in nodes
     ]
@@ -243,7 +245,12 @@ def judge_innovations(
 
 
 def _judge_node(
-    recorded: Innovations, node: int, chosen: np.ndarray, law: Law, level: float
+    scenario: Scenario,
+    recorded: Innovations,
+    node: int,
+    chosen: np.ndarray,
+    law: Law,
+    level: float,
 ) -> NodeInnovations:
     """Return the row of a node with the ``chosen`` readings, each of whose tests rejects a right
     model with probability ``level``.
@@ -262,6 +269,7 @@ def _judge_node(
         low, high = (float(end) for end in chi_square_interval(counted, 1.0 - level))
         detectable = high / (2.0 * float(gammaincinv(0.5 * counted, 1.0 - POWER)) / counted)
     bias, reach, found, component = _bias(recorded, chosen, inflation, level)
+    label = scenario.label_of_value(node, component, rows)
     lags = min(LAGS, len(chosen) // 5)
     columns = [column for column in columns if len(column) >= MIN_READINGS]
     statistic = p = correlation = math.nan
@@ -273,7 +281,7 @@ def _judge_node(
     reasons = [reason for reason, holds in (
         (f"NIS above {high:.3g}", bool(law.kind) and mean > high),
         (f"NIS below {low:.3g}", law.kind in ("white", "exact") and mean < low),
-        ("biased", bool(law.kind) and abs(bias) > reach),
+        ("biased" + f" in {label}" * bool(label), bool(law.kind) and abs(bias) > reach),
         ("correlated", is_white and p < level),
     ) if holds]  # fmt: skip
     if is_white and not reasons and stretch.p < level:
@@ -286,7 +294,7 @@ def _judge_node(
     return NodeInnovations(
         node, len(chosen), mean, low, high, detectable, bias, reach, found, component, statistic,
         lags * len(columns), p, correlation, float(recorded.log_density[chosen].sum()),
-        since, until, verdict,
+        since, until, verdict, label,
     )  # fmt: skip
 
 
@@ -359,13 +367,16 @@ def _detectable_correlation(count: int, freedom: int, level: float) -> float:
 def format_innovations(tests: InnovationTests, full: bool = True) -> str:
     """Return a row per node, those that are broken first unless ``full``, and a legend."""
     listed = sorted(tests.rows, key=lambda row: not (full or row.verdict.startswith("BROKEN")))
-    header = ["node", "readings", "NIS", "bias", "Ljung-Box p", "log-likelihood", "verdict"]
+    named = any(row.label or row.component for row in listed)
+    header = ["node", "readings", "NIS", "bias", *["of"] * named]
+    header += ["Ljung-Box p", "log-likelihood", "verdict"]
     rows = [
         [
             str(row.node),
             f"{row.readings:,}",
             format_number(row.nis),
             f"{format_number(row.bias)} +- {row.bias_reach:.2g}",
+            *[row.label or f"y{row.component}"] * named,
             format_number(row.p_white),
             f"{row.log_likelihood:.6g}",
             row.verdict,
@@ -384,7 +395,10 @@ def format_innovations(tests: InnovationTests, full: bool = True) -> str:
     lines.append(f"{words[tests.law.kind]}; all together at confidence {tests.confidence:g}")
     if tests.law.kind:
         largest = [max(getattr(row, name) for row in tests.rows) for name in DETECTABLE]
-        text = "found with probability 0.9 at every node: a mean NIS of {:.3g}, a bias of {:.3g}"
+        text = "found with probability 0.9 at every node: a mean NIS of {:.3g}, a bias of {}"
         text += ", a correlation at one lag of {:.3g}" * (tests.law.kind == "white")
+        # Biases of different units do not compare.
+        found = sorted((row.label, row.bias_detectable) for row in tests.rows)
+        largest[1] = ", ".join(f"{b:.3g}" + f" in {of}" * bool(of) for of, b in dict(found).items())
         lines.append(text.format(*largest))
     return "\n".join(lines)

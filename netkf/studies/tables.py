@@ -142,6 +142,7 @@ def format_consistency(consistency: Consistency, full: bool = True) -> str:
             f"difference from the expected NEES, all {rows_are} together at confidence {level}",
             f"inside: samples whose mean over the runs lies in {ends} (ANEES {scaled}), the "
             f"chi-square bounds at {level} where P is exact{of_largest}",
+            *filter(None, [consistency.states]),
             *(f"note: {note}" for note in consistency.notes),
         ]
     )

@@ -100,7 +100,7 @@ const Figures = (() => {
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
     const { sizes, nees_intervals } = runs[0].samples, i = Math.max(0, app.nodeOf(runs[0]));
     return { title: "Does P fit the error?", unit: "NEES", timed: true, series, band: nees_intervals[i],
-      lines: [{ label: "expected where P is exact:", y: sizes[i], colour: "green", dash: "dashed" }], note: "Squared error in units of P." };
+      lines: [{ label: "expected where P is exact:", y: sizes[i], colour: "green", dash: "dashed" }], note: "Squared error in units of P" + (page.states && "; " + page.states) + "." };
   }
 
   const PARTS = 30; // parts of a run over which squared innovations are averaged
@@ -123,7 +123,7 @@ const Figures = (() => {
         parts.set(at, [sum + v.nis[k], count + 1]);
       });
       const at = [...parts.keys()].sort((a, b) => a - b), name = letter(runs, r), [mean, low, high] = v.means[i];
-      const whose = i < 0 ? "of all nodes together" : "of node " + run.names[i];
+      const read = run.readings.at(i), whose = (i < 0 ? "of all nodes together" : "of node " + run.names[i]) + (read && ": " + read);
       series.push({ label: name + "each reading " + whose, x, y: rows.map((k) => v.nis[k]), colour: COLOURS[r], dots: true });
       series.push({ label: name + "mean of each " + Format.number(wide) + " s", x: at.map((k) => (k + 0.5) * wide), y: at.map((k) => parts.get(k)[0] / parts.get(k)[1]), colour: coloured(runs, r, "ink"), width: 2 });
       lines.push({ label: name + "mean of all (where P is exact " + Format.number(low) + " .. " + Format.number(high) + "):", y: mean, colour: coloured(runs, r, "purple"), dash: "dotted" });
@@ -141,7 +141,7 @@ const Figures = (() => {
       const i = readingsOf(run, app.nodeOf(run)), found = i === null ? null : run.innovations.correlations[i];
       if (!found) return;
       band = band || [-found.band, found.band];
-      series.push({ label: letter(runs, r) + (i < 0 ? "all readings" : "readings of node " + run.names[i]), x: found.values.map((_, k) => k + 1), y: found.values, colour: COLOURS[r], points: true, dash: r ? "dashed" : "solid" });
+      series.push({ label: letter(runs, r) + (i < 0 ? "all readings" : "readings of node " + run.names[i]) + (found.label && ": " + found.label), x: found.values.map((_, k) => k + 1), y: found.values, colour: COLOURS[r], points: true, dash: r ? "dashed" : "solid" });
     });
     return series.length ? { title: "Are innovations white?", unit: "autocorrelation", xlabel: "lag (readings)", series, band, note: "Beyond the band a prediction misses what earlier readings said." } : null;
   }
