@@ -149,9 +149,8 @@ def whiteness_figure(data: FigureData) -> Picture:
     worst = max(curves, key=lambda node: float(np.abs(curves[node]).max()))
     figure = new_figure(7.4, 4.2)
     axes = figure.add_subplot()
-    sizes = innovations.rows[innovations.nodes == worst]
-    label = data.scenario.label_of_value(worst, 0, sizes)
-    _draw_correlations(axes, curves, (worst, label), band, lags)
+    read = data.scenario.label_of_value(worst, 0, innovations.rows[innovations.nodes == worst])
+    _draw_correlations(axes, curves, (worst, read), band, lags)
     share = outside / (lags * len(curves))
     judgement = (
         "as expected of white noise" if share <= WHITE_SHARE else "so innovations are not white"
@@ -165,9 +164,7 @@ def whiteness_figure(data: FigureData) -> Picture:
 def _draw_correlations(
     axes: Any, curves: dict[int, FloatArray], worst: tuple[int, str], band: float, lags: int
 ) -> None:
-    """Draw the autocorrelations (lags,) of each node, with the 95% ``band`` of white noise;
-    ``worst`` is the node of the largest, and the label of its readings.
-    """
+    """Draw autocorrelations (lags,) by node, the ``worst`` with what it reads, and the ``band``."""
     positions = np.arange(1, lags + 1)
     axes.axhspan(-band, band, color=EXACT, alpha=0.2, lw=0, label="95% if white")
     axes.axhline(0.0, color=EXACT, lw=0.8)
@@ -185,8 +182,7 @@ def _draw_correlations(
         mean = all_curves.mean(axis=0)
         axes.plot(positions, mean, "-o", color=INK, ms=3.5, label="mean of all nodes")
     node, read = worst
-    name = "all readings" if node < 0 else f"node {node}"
-    name += f", {read}" * bool(read)
+    name = ("all readings" if node < 0 else f"node {node}") + f", {read}" * bool(read)
     label = f"{name}, the largest" if len(curves) > 1 else name
     axes.plot(positions, curves[node], "--s", color=SENSING, ms=3.5, label=label)
     axes.set(xlabel="lag, readings of the node", ylabel="autocorrelation of innovations")

@@ -1,4 +1,6 @@
-"""Names of figures and formats of their files, for whom matplotlib is not imported yet."""
+"""Names of figures, formats of their files and the looks of series, without matplotlib."""
+
+from typing import NamedTuple
 
 FORMATS = ("png", "svg", "pdf")
 """Formats of picture files, which are their suffixes."""
@@ -11,3 +13,25 @@ FIT_FIGURES = ("envelope",)
 """The figures of a fit."""
 FIT_FILE = "fit_envelope.csv"
 """The file of a fit that is drawn."""
+
+
+class SeriesStyle(NamedTuple):
+    """The look of a series, ``dark`` on a dark page; no two of SERIES look alike without colour."""
+
+    colour: str
+    dark: str
+    dashes: str
+    marker: str
+
+
+SERIES = (
+    SeriesStyle("#0072B2", "#4c9be8", "-", "o"),
+    SeriesStyle("#D55E00", "#ff8f4d", "--", "s"),
+    SeriesStyle("#009E73", "#2ec4a0", "-.", "^"),
+    SeriesStyle("#CC79A7", "#e39cc4", ":", "D"),
+    SeriesStyle("#222222", "#f0f0f0", (0, (6, 1, 1, 1, 1, 1)), "v"),  # type: ignore[arg-type]
+    SeriesStyle("#E69F00", "#e69f00", (0, (3, 3)), "P"),  # type: ignore[arg-type]
+    SeriesStyle("#56B4E9", "#a6dcff", (0, (1, 3)), "X"),  # type: ignore[arg-type]
+    SeriesStyle("#555555", "#a5a9ae", (0, (8, 3)), "*"),  # type: ignore[arg-type]
+)
+"""Looks of runs, filters and other series, in figures and on pages: the first has the first."""

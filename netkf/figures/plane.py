@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.figures.figure_data import FigureData, UnavailableError
-from netkf.figures.style import INK, SERIES, Picture, finish_figure, new_figure
+from netkf.figures.names import SERIES
+from netkf.figures.style import INK, Picture, finish_figure, new_figure
 from netkf.linalg.arrays import FloatArray
 from netkf.trace.run import Run
 

@@ -11,11 +11,11 @@ import numpy as np
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 from netkf.figures.figure_data import FigureData, reduce_result
+from netkf.figures.names import SERIES
 from netkf.figures.style import (
     MAX_DRAWN,
     MUTED,
     SECONDS,
-    SERIES,
     Picture,
     draw_legend,
     finish_figure,
@@ -40,19 +40,21 @@ def errors_figure(curves: Sequence[ErrorCurve], origin: str = "") -> Picture:
     """Return the mean square errors ``curves`` over time as one figure; ``origin`` begins its
     caption.
     """
-    known = [c for c in curves if np.isfinite(c.square).any()]
+    # A curve has the look of its place, whichever of the others have errors.
+    placed = [(k, c) for k, c in enumerate(curves) if np.isfinite(c.square).any()]
+    known = [c for _, c in placed]
     with style_context():
         if not known:
             return message_figure("No error to show", NO_TRUTH, [origin])
         figure = new_figure(7.4, 4.6)
         axes = figure.add_subplot()
-        for k, curve in enumerate(known[:MAX_CURVES]):
+        for k, curve in placed[:MAX_CURVES]:
             _draw_curve(axes, curve, k)
         central = {curve.central for curve in curves if math.isfinite(curve.central)}
         if len(central) == 1:
             label = "centralised filter, trace of P by theory"
             axes.axhline(*central, color=MUTED, lw=0.9, ls=(0, (1, 2)), label=label)
-        bounds = _draw_bounds(axes, known[:MAX_CURVES])
+        bounds = _draw_bounds(axes, placed[:MAX_CURVES])
         drawn = np.concatenate([*map(_high, known), *(c.square for c in known), *bounds])
         levels = [float(np.nanmedian(curve.square)) for curve in known[:MAX_CURVES]]
         set_scale(axes, np.append(drawn, list(central)), levels)
@@ -85,10 +87,10 @@ def _draw_curve(axes: Any, curve: ErrorCurve, k: int) -> None:
         axes.fill_between(curve.times, low, high, color=style.colour, alpha=0.15, lw=0)
 
 
-def _draw_bounds(axes: Any, curves: Sequence[ErrorCurve]) -> list[FloatArray]:
-    """Draw the bounds of those curves that have one, and return them."""
+def _draw_bounds(axes: Any, placed: Sequence[tuple[int, ErrorCurve]]) -> list[FloatArray]:
+    """Draw the bounds of those numbered curves that have one, and return them."""
     bounds = []
-    for k, curve in enumerate(curves):
+    for k, curve in placed:
         if curve.bound is not None:
             bounds.append(np.minimum(curve.bound, MAX_DRAWN))
             colour = SERIES[k % len(SERIES)].colour

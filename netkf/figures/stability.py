@@ -13,6 +13,7 @@ import numpy as np
 from netkf.algorithms.registry import built_in_filters
 from netkf.core.errors import NetkfError, TheoryError
 from netkf.figures.figure_data import FigureData, UnavailableError
+from netkf.figures.names import SERIES
 from netkf.figures.style import (
     EXACT,
     INK,
@@ -22,7 +23,6 @@ from netkf.figures.style import (
     RELAY,
     SENSING,
     SEQUENTIAL,
-    SERIES,
     Picture,
     draw_legend,
     finish_figure,

@@ -12,7 +12,7 @@ import io
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -22,34 +22,16 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextToPath
 
 from netkf.core.printable import one_line
+from netkf.figures.names import SERIES
 from netkf.linalg.arrays import FloatArray
 from netkf.runs.files import write_atomically
 
-INK, MUTED, FAINT = "#222222", "#555555", "#bbbbbb"
-VERMILLION, SKY, GREEN, ORANGE = "#D55E00", "#56B4E9", "#009E73", "#E69F00"
-BLUE, PURPLE, YELLOW = "#0072B2", "#CC79A7", "#F0E442"
+BLUE, VERMILLION, GREEN, PURPLE, INK, ORANGE, SKY, MUTED = (one.colour for one in SERIES)
+FAINT, YELLOW = "#bbbbbb", "#F0E442"
 SENSING, RELAY, EXACT, LOST = VERMILLION, SKY, GREEN, VERMILLION
 """Colours of nodes with and without a sensor, of exact values of theory, and of lost messages."""
 
 
-class SeriesStyle(NamedTuple):
-    """The style of a series of data; no two of SERIES look alike even without colour."""
-
-    colour: str
-    dashes: str
-    marker: str
-
-
-SERIES = (
-    SeriesStyle(INK, "-", "o"),
-    SeriesStyle(VERMILLION, "--", "s"),
-    SeriesStyle(SKY, "-.", "^"),
-    SeriesStyle(GREEN, ":", "D"),
-    SeriesStyle(ORANGE, (0, (6, 1, 1, 1, 1, 1)), "v"),  # type: ignore[arg-type]
-    SeriesStyle(BLUE, (0, (3, 3)), "P"),  # type: ignore[arg-type]
-    SeriesStyle(PURPLE, (0, (1, 3)), "X"),  # type: ignore[arg-type]
-    SeriesStyle(MUTED, (0, (8, 3)), "*"),  # type: ignore[arg-type]
-)
 SEQUENTIAL = "cividis_r"
 """Colour map of quantities: its lightness decreases as the quantity grows, also without colour."""
 

@@ -108,9 +108,7 @@ def run_data(
         "messages": _message_columns(thinned, run, packer),
         "senses": _event_columns(run, ("sense",), budget.messages // 2, packer),
         "marks": _event_columns(run, MARKS, MAX_MARKS, packer),
-        "innovations": innovation_columns(
-            readings, source.scenario, run.nodes, budget.messages // 4, packer
-        ),
+        "innovations": innovation_columns(readings, run, budget.messages // 4, packer),
         "traffic": bin_messages(messages, horizon, BINS),
         "totals": {
             "events": len(run.log),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from netkf.core.printable import shorten
+from netkf.figures.names import SERIES
 from netkf.report.markup import paragraph, text
 from netkf.runs.tables import format_number
 from netkf.studies.compare_filters import ComparedFilter
@@ -17,14 +18,11 @@ MAX_LABEL = 26
 MAX_RATIO = 10.0
 """Ratio of the largest to the smallest bar end on the axis: larger errors are drawn at its end."""
 
-COLOURS = ("ink", "red", "blue", "green", "orange", "purple")
-"""Classes of the colours of filters, here and in the curves over time."""
-
 
 def filters_figure(comparison: StoredComparison) -> str:
     """Return the RMS errors of filters with two standard errors as SVG; empty if none is finite."""
     ran = [row for row in comparison.rows if row.ran]
-    colours = {row.filter: COLOURS[k % len(COLOURS)] for k, row in enumerate(ran)}
+    colours = {row.filter: f"series-{k % len(SERIES)}" for k, row in enumerate(ran)}
     rows = [row for row in ran if math.isfinite(row.rms_error.value)]
     if not rows:
         return ""

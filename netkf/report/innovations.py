@@ -15,9 +15,9 @@ from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource
 from netkf.report.packing import Packer
+from netkf.runs.stored import StoredRun
 from netkf.runs.summary import NORMAL_QUANTILE, chi_square_interval
 from netkf.runs.tables import format_number
-from netkf.scenario.scenario import Scenario
 
 MAX_EVENTS = 200_000
 """Events of a run up to which a page replays it for its readings, which takes some seconds."""
@@ -109,17 +109,13 @@ def _judge_mean(mean: float, low: float, high: float) -> str:
 
 
 def innovation_columns(
-    readings: Innovations | str | None,
-    scenario: Scenario,
-    nodes: tuple[int, ...],
-    max_readings: int,
-    packer: Packer,
+    readings: Innovations | str | None, run: StoredRun, max_readings: int, packer: Packer
 ) -> dict[str, Any] | None:
     """Return the NIS (normalised squared innovations) of the readings for the live views, as
     columns added to ``packer``, with the means and the autocorrelations of each node; every k-th
     reading if there are more than ``max_readings``; None without innovations.
 
-    Nodes are given by their index in ``nodes``, -1 for readings that one filter uses together.
+    Nodes are given by their index in ``run.nodes``, -1 for readings that one filter uses together.
     """
     if not isinstance(readings, Innovations):
         return None
@@ -127,7 +123,7 @@ def innovation_columns(
     step = max(1, -(-len(finite) // max(1, max_readings)))
     rows = finite[::step]
     curves, counts = autocorrelations(readings)
-    index = {node: k for k, node in enumerate(nodes)}
+    index, label_of = {node: k for k, node in enumerate(run.nodes)}, run.scenario.label_of_value
     row_nodes = [index.get(node, -1) for node in readings.nodes[rows].tolist()]
     means = zip(*(column.tolist() for column in node_means(readings)), strict=True)
     return {
@@ -146,7 +142,7 @@ def innovation_columns(
             str(index.get(node, -1)): {
                 "band": NORMAL_QUANTILE / float(np.sqrt(counts[node])),
                 "values": curve.tolist(),
-                "label": scenario.label_of_value(node, 0, readings.rows[readings.nodes == node]),
+                "label": label_of(node, 0, readings.rows[readings.nodes == node]),
             }
             for node, curve in curves.items()
         },

@@ -17,6 +17,7 @@ import numpy as np
 from netkf.checks.innovations import Innovations
 from netkf.core.errors import ScenarioError, WriteError
 from netkf.core.version import __version__
+from netkf.figures.names import SERIES
 from netkf.report import tables
 from netkf.report.claims import describe_differences, describe_source
 from netkf.report.data import Budget, positions, run_data, thinning_rules
@@ -234,6 +235,7 @@ def _assemble_page(
         "labels": [source.label for source in sources],
         "sweep": tables.sweep_curves(sources[0]),
         "filters": tables.filter_curves(sources[0]),
+        "series": [f"series-{k}" for k in range(len(SERIES))],
         "states": "; ".join(dict.fromkeys(s.scenario.states_note for s in sources)).strip("; "),
         "unit": " or ".join(dict.fromkeys(source.scenario.unit for source in sources)),
     }
@@ -241,7 +243,8 @@ def _assemble_page(
         entries, comparison, command, rules, bool(runs)
     )
     title = " and ".join(dict.fromkeys(source.scenario.name for source in sources))
-    script, style = _script(), _asset("uPlot.min.css") + "\n" + _asset("page.css")
+    script = _script()
+    style = f"{_asset('uPlot.min.css')}\n{_asset('page.css')}{_series_css()}"
     policy = POLICY.format(script=content_hash(script), style=content_hash(style))
     return _asset("page.html").format(
         policy=text(policy),
@@ -285,7 +288,7 @@ def _page_header(entries: list[_AnalysedSource], comparison: Comparison | str | 
         findings = bullets((line + "." for line in _source_sentences(entry)), "findings")
         if len(entries) > 1:
             heading = text(f"{'AB'[k]}: {entry.source.label}{status}")
-            findings = f'<div><h2 class="run-{"ab"[k]}">{heading}</h2>{findings}</div>'
+            findings = f'<div><h2 class="series-{k}">{heading}</h2>{findings}</div>'
         else:
             title += status
         columns.append(findings)
@@ -451,6 +454,18 @@ def _source_command(source: ReportSource) -> str:
 def _asset(name: str) -> str:
     """Return the text of a file in the folder ``assets``."""
     return (resources.files("netkf.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _series_css() -> str:
+    """Return the style sheet of SERIES, on a light and a dark page."""
+    numbers = range(len(SERIES))
+    light, dark = (
+        ";".join(f"--series-{k}: {getattr(SERIES[k], of)}" for k in numbers)
+        for of in ("colour", "dark")
+    )
+    css = f":root {{ {light} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
+    rule = ".series-{0} {{ stroke: var(--series-{0}); border-color: var(--series-{0}); }}\n"
+    return css + "".join(map(rule.format, numbers))
 
 
 @cache

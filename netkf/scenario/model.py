@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -202,24 +202,6 @@ def takes_samples(sensor: Sensor) -> bool:
     )
 
 
-def _value_labels(sensor: Sensor, states: Sequence[str]) -> list[str]:
-    """Return labels of the values of a reading from those of the n ``states``: range, bearing, or
-    the only state, or the states of one label, whose value or difference it is; else empty.
-    """
-    if isinstance(sensor, PositionedSensor):
-        of = ", ".join(filter(None, (states[k] for k in sensor.states)))
-        distance = f"range in {of}" if of else "range"
-        return [distance] * (sensor.rows - sensor.turns) + ["bearing (rad)"] * sensor.turns
-    rows, table = sensor.matrix_of(len(states)), sensor.record
-    if not sensor.linear or (sensor.varying and (table is None or table.regressors)):
-        return [""] * len(rows)
-    read = [{states[k] for k in np.flatnonzero(row)} for row in rows]
-    is_plain = np.isin(np.abs(rows), (0.0, 1.0)).all(axis=1)
-    return [
-        of.pop() if plain and len(of) == 1 else "" for of, plain in zip(read, is_plain, strict=True)
-    ]
-
-
 _plant = dataclasses.replace(
     instance_of(Plant),
     convert=lambda value: None if value is None else instance_of(Plant).convert(value),
@@ -404,40 +386,47 @@ class ScenarioModel(Component):
                 parts[-1] += ", ..." * (len(labels) > MAX_LABELS)
         return f"states: {'; '.join(parts)}" if parts else ""
 
-    def labels_of_readings(self, node: int) -> tuple[str, ...]:
+    def labels_of_readings(self, node: int) -> list[str]:
         """Return the labels of the values that all sensors of a ``node`` (-1: of all nodes) read,
-        in their order: of states as in ``states_note``, of ranges and bearings; empty for others.
+        in their order: of states, as in ``states_note``, of ranges and bearings; else empty.
         """
-        plants = [plant.labels for _, plant in self.all_plants]
-        states = [
-            self._column_label(k, {label}) if label else ""
-            for one in plants
-            for k, label in enumerate(one)
+        of_plants = [enumerate(plant.labels) for _, plant in self.all_plants]
+        states = [x and self._column_label(k, {x}) for plant in of_plants for k, x in plant]
+        placed = [
+            p for owner, own in self.placed_sensors.items() if node in (-1, owner) for p in own
         ]
-        found: list[str] = []
-        for owner, placed in self.placed_sensors.items():
-            for sensor in (self.sensors[p.entry] for p in placed if node in (-1, owner)):
-                labels = _value_labels(sensor, states)
-                # Increments are of the integral over time.
-                is_read = self.slotted or takes_samples(sensor)
-                found += labels if is_read else [""] * len(labels)
-        return tuple(found)
+        return [x for p in placed for x in self._value_labels(self.sensors[p.entry], states)]
+
+    def _value_labels(self, sensor: Sensor, states: Sequence[str]) -> Iterator[str]:
+        """Yield the labels of the values of a reading from those of the n ``states``."""
+        if isinstance(sensor, PositionedSensor):
+            of = ", ".join(filter(None, (states[k] for k in sensor.states)))
+            yield from [f"range in {of}" if of else "range"] * (sensor.rows - sensor.turns)
+            yield from ["bearing (rad)"] * sensor.turns
+            return
+        record = sensor.record
+        is_fixed = sensor.linear and not (sensor.varying if record is None else record.regressors)
+        # Increments are of the integral over time.
+        is_fixed &= self.slotted or takes_samples(sensor)
+        for row in sensor.matrix_of(len(states)):
+            # A state, or the difference of two of one name.
+            of_row = {states[k] for k in np.flatnonzero(row).tolist()} if is_fixed else set()
+            is_plain = len(of_row) == 1 and bool((np.abs(row[row != 0.0]) == 1.0).all())
+            yield of_row.pop() if is_plain else ""
 
     def label_of_value(self, node: int, number: int, sizes: np.ndarray) -> str:
-        """Return the label of the value ``number`` of the readings of a ``node``, which have as many
-        values as ``sizes`` (M,) say; empty if it has none, or readings differ in what they read.
+        """Return the label of the value ``number`` of readings of a ``node``, which have ``sizes``
+        (M,) values; empty if it has none, or readings differ in what they read.
         """
         labels = self.labels_of_readings(node)
         is_whole = bool((sizes == len(labels)).all())
         return labels[number] if is_whole else labels[0] if len(set(labels)) == 1 else ""
 
     def what_is_read(self, node: int) -> str:
-        """Return the labels of what a ``node`` (-1: all) reads, as ``x (m), y (m)``; empty if one
-        has none.
-        """
+        """Return what a ``node`` (-1: all) reads, as ``x (m), y (m)``; empty if it is unknown."""
         labels = list(dict.fromkeys(self.labels_of_readings(node)))
-        listed = ", ".join(labels[:MAX_LABELS]) + ", ..." * (len(labels) > MAX_LABELS)
-        return listed if all(labels) else ""
+        more = ", ..." * (len(labels) > MAX_LABELS)
+        return ", ".join(labels[:MAX_LABELS]) + more if all(labels) else ""
 
     @property
     def width(self) -> int:

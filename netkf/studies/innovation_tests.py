@@ -236,25 +236,19 @@ def judge_innovations(
     nodes = np.unique(recorded.nodes[is_finite]).tolist()
     level = (1.0 - confidence) / max(1, len(nodes)) / (4 if law.kind == "white" else 2)
     rows = [
-        _judge_node(
-            scenario, recorded, node, np.flatnonzero(is_finite & (recorded.nodes == node)), law, level
-        )
+        _judge_node(scenario, recorded, np.flatnonzero(is_finite & (recorded.nodes == node)), level)
         for node in nodes
     ]
     return InnovationTests(scenario.name, confidence, law, tuple(rows))
 
 
 def _judge_node(
-    scenario: Scenario,
-    recorded: Innovations,
-    node: int,
-    chosen: np.ndarray,
-    law: Law,
-    level: float,
+    scenario: Scenario, recorded: Innovations, chosen: np.ndarray, level: float
 ) -> NodeInnovations:
-    """Return the row of a node with the ``chosen`` readings, each of whose tests rejects a right
+    """Return the row of the node of the ``chosen`` readings, each of whose tests rejects a right
     model with probability ``level``.
     """
+    law, node = law_of(scenario), int(recorded.nodes[chosen[0]])
     nis, rows, is_white = recorded.nis[chosen], recorded.rows[chosen], law.kind == "white"
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
     whitened = [recorded.whitened[i] for i in chosen]

@@ -8,10 +8,10 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from netkf.figures.catalogue import FigureSet
+from netkf.figures.names import SERIES
 from netkf.figures.style import (
     RELAY,
     SENSING,
-    SERIES,
     break_lines,
     new_figure,
     set_scale,

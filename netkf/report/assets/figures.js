@@ -1,17 +1,11 @@
 // The figures of a page: which curves there are. How they look is in curves.js.
 const Figures = (() => {
   // One colour is one run in every figure of two runs: what is claimed is dashed, bounds are dotted.
-  const COLOURS = ["blue", "red"];
-  const coloured = (runs, r, alone) => (runs.length > 1 ? COLOURS[r] : alone);
+  const coloured = (runs, r, alone) => (runs.length > 1 ? page.series[r] : alone);
   const root = (values) => Array.from(values, (v) => Math.sqrt(v));
 
-  function letter(runs, r) {
-    return runs.length > 1 ? "AB"[r] + ": " : "";
-  }
-
-  function column(run, values, i) {
-    return Array.from({ length: run.samples.count }, (_, k) => values[k * run.N + i]);
-  }
+  const letter = (runs, r) => (runs.length > 1 ? "AB"[r] + ": " : "");
+  const column = (run, values, i) => Array.from({ length: run.samples.count }, (_, k) => values[k * run.N + i]);
 
   // Over the nodes at each sample: root of the mean square, smallest and largest root.
   function overNodes(run, values) {
@@ -63,7 +57,7 @@ const Figures = (() => {
   function errors(app, runs) {
     const series = [], lines = [];
     runs.forEach((run, r) => {
-      const i = app.nodeOf(run), name = letter(runs, r), x = run.samples.t, colour = COLOURS[r];
+      const i = app.nodeOf(run), name = letter(runs, r), x = run.samples.t, colour = page.series[r];
       series.push(...spread(app, r, name));
       if (run.truth) {
         const all = overNodes(run, run.samples.sq_error);
@@ -90,11 +84,11 @@ const Figures = (() => {
     runs.forEach((run, r) => {
       const i = app.nodeOf(run);
       if (!run.truth || i < 0) return;
-      series.push({ label: letter(runs, r) + "NEES of node " + run.names[i], x: run.samples.t, y: column(run, run.samples.nees, i), colour: COLOURS[r], width: 1.8, dash: r ? "dashed" : "solid" });
+      series.push({ label: letter(runs, r) + "NEES of node " + run.names[i], x: run.samples.t, y: column(run, run.samples.nees, i), colour: page.series[r], width: 1.8, dash: r ? "dashed" : "solid" });
       // Of each block that the node estimates, beside that of all of them.
       run.samples.blocks.forEach(([node, name], k) => {
         const y = run.samples["nees_of_block_" + k];
-        if (node === i && y) series.push({ label: letter(runs, r) + name + " by node " + run.names[i], x: run.samples.t, y: Array.from(y), colour: COLOURS[r], width: 0.8, dash: "dotted" });
+        if (node === i && y) series.push({ label: letter(runs, r) + name + " by node " + run.names[i], x: run.samples.t, y: Array.from(y), colour: page.series[r], width: 0.8, dash: "dotted" });
       });
     });
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
@@ -124,7 +118,7 @@ const Figures = (() => {
       });
       const at = [...parts.keys()].sort((a, b) => a - b), name = letter(runs, r), [mean, low, high] = v.means[i];
       const read = run.readings.at(i), whose = (i < 0 ? "of all nodes together" : "of node " + run.names[i]) + (read && ": " + read);
-      series.push({ label: name + "each reading " + whose, x, y: rows.map((k) => v.nis[k]), colour: COLOURS[r], dots: true });
+      series.push({ label: name + "each reading " + whose, x, y: rows.map((k) => v.nis[k]), colour: page.series[r], dots: true });
       series.push({ label: name + "mean of each " + Format.number(wide) + " s", x: at.map((k) => (k + 0.5) * wide), y: at.map((k) => parts.get(k)[0] / parts.get(k)[1]), colour: coloured(runs, r, "ink"), width: 2 });
       lines.push({ label: name + "mean of all (where P is exact " + Format.number(low) + " .. " + Format.number(high) + "):", y: mean, colour: coloured(runs, r, "purple"), dash: "dotted" });
     });
@@ -141,7 +135,7 @@ const Figures = (() => {
       const i = readingsOf(run, app.nodeOf(run)), found = i === null ? null : run.innovations.correlations[i];
       if (!found) return;
       band = band || [-found.band, found.band];
-      series.push({ label: letter(runs, r) + (i < 0 ? "all readings" : "readings of node " + run.names[i]) + (found.label && ": " + found.label), x: found.values.map((_, k) => k + 1), y: found.values, colour: COLOURS[r], points: true, dash: r ? "dashed" : "solid" });
+      series.push({ label: letter(runs, r) + (i < 0 ? "all readings" : "readings of node " + run.names[i]) + (found.label && ": " + found.label), x: found.values.map((_, k) => k + 1), y: found.values, colour: page.series[r], points: true, dash: r ? "dashed" : "solid" });
     });
     return series.length ? { title: "Are innovations white?", unit: "autocorrelation", xlabel: "lag (readings)", series, band, note: "Beyond the band a prediction misses what earlier readings said." } : null;
   }
@@ -154,8 +148,8 @@ const Figures = (() => {
         const row = Array.from(run.samples.age.subarray(k * run.N, (k + 1) * run.N)).filter(Number.isFinite);
         return row.length ? row.reduce((a, b) => a + b, 0) / row.length : NaN;
       });
-      series.push({ label: letter(runs, r) + "mean of all nodes", x, y: mean, colour: COLOURS[r], width: 1, dash: "dotted" });
-      if (i >= 0) series.push({ label: letter(runs, r) + "node " + run.names[i], x, y: column(run, run.samples.age, i), colour: COLOURS[r], width: 2 });
+      series.push({ label: letter(runs, r) + "mean of all nodes", x, y: mean, colour: page.series[r], width: 1, dash: "dotted" });
+      if (i >= 0) series.push({ label: letter(runs, r) + "node " + run.names[i], x, y: column(run, run.samples.age, i), colour: page.series[r], width: 2 });
     });
     if (!series.some((s) => s.y.some(Number.isFinite))) return null;
     return { title: "Age of information", unit: "seconds", timed: true, series,
@@ -184,12 +178,12 @@ const Figures = (() => {
     const series = [], many = summaries.length > 1;
     summaries.forEach((rows, r) => {
       if (!rows) return;
-      const x = rows.map((row) => row.node + (many ? 0.24 * r - 0.12 : 0)), name = many ? "AB"[r] + ": " : "";
+      const x = rows.map((row) => row.node + (many ? 0.24 * r - 0.12 : 0)), name = letter(summaries, r);
       const of = (key) => rows.map((row) => row[key]);
       const wide = (key, side) => rows.map((row) => (row[key + "_se"] ? row[key] + side * 2 * row[key + "_se"] : row[key]));
       if (of("rms_error").some(Number.isFinite)) {
         const bars = rows.some((row) => row.rms_error_se) ? { low: wide("rms_error", -1), high: wide("rms_error", 1) } : {};
-        series.push({ label: name + "RMS error" + (bars.low ? ", bars: two standard errors" : ""), x, y: of("rms_error"), ...bars, colour: COLOURS[r], mark: "dot" });
+        series.push({ label: name + "RMS error" + (bars.low ? ", bars: two standard errors" : ""), x, y: of("rms_error"), ...bars, colour: page.series[r], mark: "dot" });
       }
       series.push({ label: name + "square root of mean trace P", x, y: root(of("mean_trace")), colour: coloured(summaries, r, "green"), mark: "ring" });
       if (of("bound").some(Number.isFinite)) series.push({ label: name + "square root of its bound", x, y: root(of("bound").map((v) => v ?? NaN)), colour: coloured(summaries, r, "ink"), mark: "tick" });
@@ -202,9 +196,9 @@ const Figures = (() => {
     ensembles.forEach((found, r) => {
       const entry = found && found.nodes[String(app.nodeId)];
       if (!entry) return;
-      const name = ensembles.length > 1 ? "AB"[r] + ": " : "", x = found.times;
+      const name = letter(ensembles, r), x = found.times;
       const add = (label, [y, low, high], colour, dash) => series.push({ label: name + label, x, y, low, high, colour, dash, width: 2 });
-      if (entry.square[0].some(Number.isFinite)) add("mean squared error of node " + app.nodeId, entry.square, COLOURS[r], "solid");
+      if (entry.square[0].some(Number.isFinite)) add("mean squared error of node " + app.nodeId, entry.square, page.series[r], "solid");
       add("mean trace P of node " + app.nodeId, entry.trace, coloured(ensembles, r, "green"), "dashed");
       if (entry.bound) series.push({ label: name + "bound H(12)", x, y: entry.bound, colour: coloured(ensembles, r, "ink"), dash: "dotted", width: 2 });
     });
@@ -217,7 +211,7 @@ const Figures = (() => {
       const entry = found && found.nodes[String(app.nodeId)];
       if (!entry || !entry.nees[0].some(Number.isFinite)) return;
       const [y, low, high] = entry.nees;
-      series.push({ label: (ensembles.length > 1 ? "AB"[r] + ": " : "") + "mean NEES of node " + app.nodeId, x: found.times, y, low, high, colour: COLOURS[r], width: 2 });
+      series.push({ label: letter(ensembles, r) + "mean NEES of node " + app.nodeId, x: found.times, y, low, high, colour: page.series[r], width: 2 });
     });
     const known = ensembles.find((found) => found && found.nodes[String(app.nodeId)]);
     return series.length ? { title: "Does P fit the error, on average?", unit: "mean NEES", timed: true, series, band: known.nodes[String(app.nodeId)].nees_interval, note: "Shaded in the colour of a curve: two standard errors." } : null;
@@ -235,9 +229,9 @@ const Figures = (() => {
       note: "All intervals, of all nodes and times, hold together with probability " + found.confidence + "." };
   }
 
-  // The look of the k-th of many curves, in the order of figures/style.py and report/filter_figure.py.
-  const MANY = ["ink", "red", "blue", "green", "orange", "purple"], DASHES = ["solid", "dashed", "dashdot"];
-  const look = (k) => ({ colour: MANY[k % 6], dash: DASHES[(k + Math.floor(k / 6)) % 3], width: 2 });
+  // The look of the k-th of many curves, whose colour is that of figures/names.py.
+  const DASHES = ["solid", "dashed", "dashdot"];
+  const look = (k) => ({ colour: page.series[k % page.series.length], dash: DASHES[(k + Math.floor(k / page.series.length)) % 3], width: 2 });
   const APART = 10; // as LOG_LEVELS of figures/style.py
 
   function median(values) {

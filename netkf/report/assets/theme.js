@@ -5,7 +5,7 @@ const Theme = (() => {
 
   function read() {
     const style = getComputedStyle(document.documentElement);
-    for (const name of NAMES) found[name] = style.getPropertyValue("--" + name).trim();
+    for (const name of [...NAMES, ...page.series]) found[name] = style.getPropertyValue("--" + name).trim();
     return found;
   }
 
