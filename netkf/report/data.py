@@ -87,7 +87,7 @@ def run_data(
         "broadcasts": bool(len(run.log)) and (source.scenario.slotted or run.count("transmit") > 0),
         "n": run.xhat.shape[2],
         "states": list(source.scenario.state_labels),
-        "readings": [source.scenario.what_is_read(node) for node in (*run.nodes, -1)],
+        "read": [source.scenario.what_is_read(node) for node in (*run.nodes, -1)],
         "nodes": list(run.nodes),
         "names": [str(node) for node in run.nodes],
         "sensors": [node for node in run.nodes if node in source.scenario.placed_sensors],

@@ -33,6 +33,7 @@ from netkf.report.tables import difference_curves
 from netkf.runs.documents import file_digests, write_sealed
 from netkf.runs.run import run_to_directory
 from netkf.runs.tables import summary_table
+from netkf.scenario.reading import from_table
 from netkf.studies.compare_filters import compare_filters, write_comparison
 from netkf.trace.messages import MESSAGE, join_messages
 from tests.conftest import SCENARIOS, with_slow
@@ -480,6 +481,77 @@ def test_states_have_their_names_and_units_on_pages_and_figures(ring, tmp_path):
     assert blocks.state_labels == ("x", "y", "heading")
 
 
+def test_readings_have_their_names_and_one_colour_is_one_run(tmp_path):
+    table = {
+        "format": 1,
+        "name": "cart",
+        "horizon": 12.0,
+        "probe": 3.0,
+        "plant": {
+            "kind": "diffusion",
+            "A": [[0.0, 1.0], [0.0, -0.3]],
+            "B": [[0.0], [0.5]],
+            "states": ["height", "speed"],
+            "units": ["m", "m/s"],
+        },
+        "sensors": [
+            {
+                "nodes": [node],
+                "H": [row],
+                "R": [[0.4]],
+                "sampling": {"kind": "poisson", "rate": 4.0},
+            }
+            for node, row in enumerate([[1.0, 0.0], [0.0, 1.0]])
+        ],
+        "network": {"graph": {"kind": "path", "nodes": 2}},
+        "filter": {"kind": "local"},
+    }
+    scenario = from_table(table, tmp_path)
+    runs = [netkf.simulate(scenario, seed=seed, engine="simpy") for seed in (0, 1)]
+    stored = [
+        netkf.save(run, scenario, tmp_path / name) for run, name in zip(runs, "AB", strict=True)
+    ]
+    html = make_page(stored)
+    page = Page(html)
+    data = page.data["runs"][0]
+    assert data["read"] == ["height (m)", "speed (m/s)", "height (m), speed (m/s)"]
+    correlations = data["innovations"]["correlations"]
+    assert [correlations[k]["label"] for k in "01"] == ["height (m)", "speed (m/s)"]
+    assert page.data["states"] == "states: height (m), speed (m/s)"
+    nis, nees = (runs[0].plot(name).get_supxlabel() for name in ("nis", "nees"))
+    assert "Readings: height (m), speed (m/s)." in " ".join(nis.split())
+    assert "states: height (m), speed (m/s)." in " ".join(nees.split())
+    legend = runs[0].plot("whiteness").axes[0].get_legend().get_texts()
+    assert {"node 0, height (m), the largest", "node 1, speed (m/s), the largest"} & {
+        one.get_text() for one in legend
+    }
+
+    # The page has the colours that matplotlib draws, light ones where it is dark.
+    lines = netkf.plot({"A": runs[0], "B": runs[1]}).axes[0].get_lines()[:2]
+    drawn = [matplotlib.colors.to_hex(line.get_color()) for line in lines]
+    light, dark = (
+        dict(re.findall(r"--(series-\d): (#\w+)", part))
+        for part in re.findall(r":root \{ (--series-0[^}]*)\}", html)
+    )
+    names = page.data["series"]
+    assert [light[name].lower() for name in names[:2]] == drawn
+    for heading, name in zip("AB", names, strict=False):
+        assert re.search(rf'<h2 class="{name}">{heading}: ', html)
+    for paper, colours, least in (("#ffffff", light, 3.0), ("#14171b", dark, 4.5)):
+        shown = [contrast(colours[name], paper) for name in names[: 5 if least == 3.0 else 8]]
+        assert min(shown) >= least - 0.1, shown
+
+
+def contrast(one, other):
+    """Return the contrast ratio of two colours, WCAG 2.2."""
+    levels = []
+    for colour in (one, other):
+        rgb = np.array(matplotlib.colors.to_rgb(colour))
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        levels.append(float(linear @ [0.2126, 0.7152, 0.0722]) + 0.05)
+    return max(levels) / min(levels)
+
+
 def test_intervals_of_differences_over_time(ensembles):
     one, other = (read_source(directory) for directory in ensembles)
     found = difference_curves(one, other)
@@ -604,9 +676,9 @@ def test_an_interrupted_ensemble_shows_the_runs_that_were_kept(tmp_path):
 
 
 def test_the_command(ring, tmp_path, capsys):
-    assert main(["report", str(ring), "--out", str(tmp_path / "page.html")]) == 0
-    assert capsys.readouterr().out == f"written to {tmp_path / 'page.html'}\n"
-    assert "poisson-ring" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert main(["report", str(ring), "--out", str(tmp_path / "html")]) == 0
+    assert capsys.readouterr().out == f"written to {tmp_path / 'html'}\n"
+    assert "poisson-ring" in (tmp_path / "html").read_text(encoding="utf-8")
     for arguments in (["report", str(tmp_path)], ["report", str(ring), "--replica", "7"]):
         assert main(arguments) == 2
         assert capsys.readouterr().err.count("\n") == 1
@@ -614,7 +686,7 @@ def test_the_command(ring, tmp_path, capsys):
 
 
 def test_only_pages_are_overwritten(ring, tmp_path, capsys):
-    page, notes = tmp_path / "page.html", tmp_path / "notes.html"
+    page, notes = tmp_path / "html", tmp_path / "notes.html"
     for _ in range(2):  # a page may be made again
         assert main(["report", str(ring), "--out", str(page)]) == 0
     notes.write_text("<!DOCTYPE html>\n<title>netkf: my notes</title>\n")

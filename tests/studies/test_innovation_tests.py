@@ -3,6 +3,7 @@ stated, broken ones with the power that is stated, at the node and from the time
 """
 
 import json
+import re
 
 import numpy as np
 import pandas as pd
@@ -16,10 +17,12 @@ from netkf.cli.main import main
 from netkf.scenario.reading import from_table
 from netkf.studies.innovation_tests import (
     find_stretch,
+    format_innovations,
     judge_innovations,
     ljung_box,
     whiteness_p,
 )
+from netkf.studies.tables import format_consistency
 from tests.conftest import SCENARIOS
 
 WALK = {
@@ -228,6 +231,81 @@ def test_slots_and_records_without_truth(tmp_path):
     assert 1 in broken(found)
     assert found.rows[1].since == pytest.approx(121.0, abs=15.0)
     assert not netkf.innovations(given.replace({"plant.Q": [[2.5e-3]]}))
+
+
+NAMED = {
+    **WALK,
+    "horizon": 2.0,
+    "probe": 1.0,
+    "plant": {
+        "kind": "diffusion",
+        "A": [[-0.1, 1.0], [0.0, -0.3]],
+        "B": [[0.0], [0.5]],
+        "states": ["height", "speed"],
+        "units": ["m", "m/s"],
+    },
+    "sensors": [
+        {
+            **WALK["sensors"][0],
+            "nodes": [0, 2],
+            "H": [[1.0, 0.0], [0.0, -1.0]],
+            "R": np.eye(2).tolist(),
+        },
+        {
+            **WALK["sensors"][0],
+            "nodes": [1],
+            "H": [[1.0, 0.0], [2.0, 0.0]],
+            "R": np.eye(2).tolist(),
+        },
+        {
+            "sampling": WALK["sensors"][0]["sampling"],
+            "kind": "range-bearing",
+            "nodes": [2],
+            "R": np.eye(2).tolist(),
+            "positions": [[0.0, 0.0]],
+        },
+    ],
+}
+
+
+def test_what_is_biased_has_its_name_and_unit(tmp_path):
+    """The second values of nodes are shifted: those read the speed, twice the height, and either
+    the speed or a bearing.
+    """
+    scenario = from_table(NAMED, tmp_path)
+
+    def shifted(node, times, z):
+        return z + np.array([0.0, 3.0])
+
+    rng = np.random.default_rng(7)
+    recorded = drawn(rng, nodes=3, rows=2, change=shifted)
+    linear = scenario.replace({"sensors": NAMED["sensors"][:2]})
+    tests = judge_innovations(linear, recorded, 0.99)
+    assert [row.component for row in tests.rows] == [1, 1, 1]
+    assert [row.label for row in tests.rows] == ["speed (m/s)", "", "speed (m/s)"]
+    assert "biased in speed (m/s)" in tests.rows[0].verdict
+    shown = format_innovations(tests).splitlines()
+    assert [re.split(r"  +", line.strip())[4] for line in (shown[0], *shown[2:5])] == [
+        *("of", "speed (m/s)", "y1", "speed (m/s)"),
+    ]
+    assert "in speed (m/s)" in shown[-1]
+    # Of two sensors at different times nobody can tell which one the second values come from.
+    assert [scenario.label_of_value(2, 1, np.full(9, size)) for size in (2, 4)] == [
+        *("", "speed (m/s)"),
+    ]
+    assert scenario.label_of_value(2, 3, np.full(9, 4)) == "bearing (rad)"
+    assert scenario.what_is_read(2).endswith("range in height (m), speed (m/s), bearing (rad)")
+    unnamed = linear.replace({"plant.states": None, "plant.units": None})
+    assert judge_innovations(unnamed, recorded, 0.99).rows[0].label == ""
+    alone = judge_innovations(from_table(WALK, tmp_path), drawn(rng), 0.99)
+    assert " of " not in format_innovations(alone).splitlines()[0]
+
+
+def test_consistency_names_the_states(tmp_path):
+    scenario = from_table({**NAMED, "sensors": NAMED["sensors"][:1]}, tmp_path)
+    found = netkf.consistency(scenario, 10, engine="simpy", workers=1)
+    assert found.states == "states: height (m), speed (m/s)"  # and so in --json
+    assert found.states in format_consistency(found).splitlines()
 
 
 @pytest.mark.slow

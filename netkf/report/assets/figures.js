@@ -117,7 +117,7 @@ const Figures = (() => {
         parts.set(at, [sum + v.nis[k], count + 1]);
       });
       const at = [...parts.keys()].sort((a, b) => a - b), name = letter(runs, r), [mean, low, high] = v.means[i];
-      const read = run.readings.at(i), whose = (i < 0 ? "of all nodes together" : "of node " + run.names[i]) + (read && ": " + read);
+      const read = run.read.at(i), whose = (i < 0 ? "of all nodes together" : "of node " + run.names[i]) + (read && ": " + read);
       series.push({ label: name + "each reading " + whose, x, y: rows.map((k) => v.nis[k]), colour: page.series[r], dots: true });
       series.push({ label: name + "mean of each " + Format.number(wide) + " s", x: at.map((k) => (k + 0.5) * wide), y: at.map((k) => parts.get(k)[0] / parts.get(k)[1]), colour: coloured(runs, r, "ink"), width: 2 });
       lines.push({ label: name + "mean of all (where P is exact " + Format.number(low) + " .. " + Format.number(high) + "):", y: mean, colour: coloured(runs, r, "purple"), dash: "dotted" });
