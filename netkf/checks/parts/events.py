@@ -28,6 +28,8 @@ from netkf.trace.schema import CODES
 NO_CLOCKS = ClockGroup((), np.empty(0), (), ())
 MAX_BASE = 1 << 31
 """Ids beyond which two do not fit into one integer."""
+MAX_TABLE = 1 << 22
+"""Largest table of all pairs of ids."""
 
 
 @lru_cache(maxsize=8)
@@ -222,7 +224,9 @@ def losses_of(scenario: Scenario, run: Run) -> LossCounts | None:
     masks = (followed, after_loss, both_lost)
     counts = [np.bincount(lost_at[m], minlength=size) for m in masks]
     is_lost = np.isin(sent_at * width + sends["message"], keys)
-    return LossCounts(sent, lost, *counts, *_pairs_of_hearers(sends, is_lost))
+    of_broadcasts = slice(None) if scenario.has_broadcasts else slice(0)
+    pairs = _pairs_of_hearers(sends[of_broadcasts], is_lost[of_broadcasts])
+    return LossCounts(sent, lost, *counts, *pairs)
 
 
 def _pairs_of_hearers(sends: np.ndarray, is_lost: np.ndarray) -> list[np.ndarray]:
@@ -248,6 +252,10 @@ def _places(entities: Sequence[Entity], columns: Sequence[np.ndarray]) -> IntArr
     keys, wanted = known[0], rows[0]
     for own, column in zip(known[1:], rows[1:], strict=True):
         keys, wanted = keys * base + own, wanted * base + column
+    if (size := base ** len(columns)) <= MAX_TABLE:
+        table = np.full(size, -1, dtype=np.int64)
+        table[keys] = np.arange(len(keys))
+        return np.asarray(table[wanted])
     order = np.argsort(keys)
     found = order[np.minimum(np.searchsorted(keys[order], wanted), len(order) - 1)]
     return np.where(keys[found] == wanted, found, -1).astype(np.int64)
