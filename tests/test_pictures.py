@@ -28,7 +28,7 @@ def full(*_, **__):
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_a_picture_that_cannot_be_written_is_a_note(name, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", full)
+    monkeypatch.setattr("matplotlib.backends.backend_agg.FigureCanvasAgg.print_png", full)
     out = tmp_path / "out"
     assert main([*COMMANDS[name], "--out", str(out)]) == 0
     printed = capsys.readouterr()
