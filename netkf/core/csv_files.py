@@ -234,11 +234,9 @@ class _Entries:
             return number
         if source.node_ids is None and len(name) <= MAX_NAME and name.isprintable():
             return source.unknown.setdefault(name, -1 - len(source.unknown))
-        raise self._refusal(
-            column,
-            "must name a node of the graph",
-            f"{suggest_nearest(name, source.node_ids or ())}correct it, or the graph",
-        )
+        remedy = f"{suggest_nearest(name, source.node_ids or ())}correct it, or the graph"
+        remedy += "; landmarks have numbers" * (self._header[column] == "to")
+        raise self._refusal(column, "must name a node of the graph", remedy)
 
     def stamp(self, column: int) -> float:
         """Return the time in the column with this index, in simulated seconds; raises ScenarioError

@@ -46,6 +46,11 @@ class TimeBase:
                 pass
         return float(EXACT.subtract(self.exact(text), self.origin))
 
+    def text(self, seconds: float) -> str:
+        """Return the stamp of a simulated time: ``seconds`` reads it as this time, to the bit."""
+        stamp = EXACT.add(Decimal(repr(seconds)), self.origin).scaleb(-UNITS[self.unit], EXACT)
+        return f"{stamp:f}" if self.origin or self.unit != "s" else repr(seconds)
+
     def half_digit(self, text: str) -> float:
         """Return half of the last digit of the stamp ``text``, in seconds: how far the instant may
         be from it if it was rounded. An origin that has as few digits adds its own.

@@ -231,7 +231,8 @@ def links_figure(data: FigureData) -> Picture:
     # Empty series for the legend.
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
-    labels = [f"{direction.sender} to {direction.receiver}" for direction in selection]
+    names = {int(node): node for node in data.nodes}
+    labels = [f"{names[one.sender]} to {names[one.receiver]}" for one in selection]
     axes.set_yticks(range(len(selection)), labels, fontsize=6.5)
     axes.set_ylim(-0.8, len(selection) - 0.2)
     axes.invert_yaxis()

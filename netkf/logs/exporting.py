@@ -98,7 +98,7 @@ def _lives(scenario: Scenario, run: Run, network: dict[str, Any]) -> Files:
     """Return the tables of lives, of nodes that keep their memory and of others."""
     words = {"crash": "down", "restart": "up", "leave": "leave", "join": "join"}
     files: Files = {}
-    entries = []
+    entries, stamp = [], scenario.time.stamps.text
     lives = lifetimes(scenario, Streams(run.seed, run.replica))
     for memory in ("kept", "lost"):
         own = {node: life for node, life in lives.items() if life.forgets == (memory == "lost")}
@@ -106,7 +106,8 @@ def _lives(scenario: Scenario, run: Run, network: dict[str, Any]) -> Files:
         rows += [(c.time, node, words[c.kind]) for node, life in own.items() for c in life.changes]
         if own:
             name = f"lives_{memory}.csv"
-            files[name] = "t,node,what\n" + "".join(f"{t!r},{i},{w}\n" for t, i, w in sorted(rows))
+            lines = (f"{stamp(t)},{i},{w}\n" for t, i, w in sorted(rows))
+            files[name] = "t,node,what\n" + "".join(lines)
             entry = {"kind": "recorded", "nodes": list(own), "path": name, "memory": memory}
             entries.append(entry)
     network["lives"] = entries
@@ -135,7 +136,7 @@ def _positions(scenario: Scenario, run: Run) -> Files:
                 raise ScenarioError("position", rule, len(point), "export --to log")
             if point:
                 place = [repr(float(z)) for z in (*point, 0.0)[:2]]
-                lines.append(f"{t!r},{node},{','.join(place)}")
+                lines.append(f"{scenario.time.stamps.text(t)},{node},{','.join(place)}")
     return {"positions.csv": "\n".join(lines) + "\n"}
 
 
@@ -176,7 +177,8 @@ def export_log(run: Run, out: str | Path) -> tuple[Path, ...]:
     activation = scenario.network.activation
     if isinstance(activation, LinkClock) and activation.at != "readings":
         rows = run.log[run.log["kind"] == CODES["tick"]]
-        ticks = pd.DataFrame({"t": rows["t"], "node": [names[i] for i in rows["node"].tolist()]})
+        stamps = [scenario.time.stamps.text(t) for t in rows["t"].tolist()]
+        ticks = pd.DataFrame({"t": stamps, "node": [names[i] for i in rows["node"].tolist()]})
         if activation.at != "nodes":
             ticks["peer"] = [names[i] for i in rows["peer"].tolist()]
         files["ticks.csv"] = ticks.to_csv(index=False)

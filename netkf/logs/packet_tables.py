@@ -18,6 +18,7 @@ from netkf.logs.packets import (
     choose_origin,
     count_phrase,
     find_resolution,
+    find_unit,
     parse_numbers,
     parse_stamps,
     read_texts,
@@ -28,25 +29,21 @@ from netkf.logs.packets import (
 SYNONYMS = {
     "t": (
         *("time", "timestamp", "ts", "seconds", "datetime", "date", "stamp", "when", "sent_at"),
+        *("time_sent", "t_sent", "send_time", "sent_time", "tx_time", "t_tx"),
         *("s", "ms", "us", "ns", "epoch"),
     ),
     "sender": ("src", "source", "from", "tx", "transmitter", "srcmac", "origin", "by"),
     "receiver": ("dst", "dest", "destination", "rx", "to", "hearer", "listener", "mac", "heard_by"),
     "number": (
-        "seq",
-        "seqno",
-        "seqnum",
-        "sequence",
-        "n",
-        "counter",
-        "packet",
-        "pkt",
-        "msg",
-        "message",
+        *("seq", "seqno", "seqnum", "sequence", "n", "counter"),
+        *("packet", "pkt", "msg", "message"),
     ),
     "channel": ("ch", "freq", "frequency"),
     "heard": ("received", "delivered", "ok", "success", "outcome", "status"),
-    "t_heard": ("t_rx", "rx_time", "received_at", "arrival", "arrived", "t_received"),
+    "t_heard": (
+        *("t_rx", "rx_time", "received_at", "arrival", "arrived", "arrival_time", "t_received"),
+        *("time_received", "received_time", "receive_time", "recv_time", "t_recv"),
+    ),
     "rssi": ("rssi_dbm", "lqi", "snr"),
     "event": ("kind", "type", "what", "direction"),
     "node": ("id", "mote"),
@@ -62,6 +59,7 @@ LOST = ("lost", "loss", "drop", "dropped", "miss", "missed")
 YES = ("1", "1.0", "true", "yes", "y", "ok", *HEARD)
 NO = ("0", "0.0", "false", "no", "n", "fail", "failed", *LOST)
 UNKNOWN = ("", "nan", "na", "none", "unknown", "?", "-1")
+NO_STAMP = ("", "nan", "na", "nat", "none", "null", "-1", *LOST)  # of t_heard
 EXTRAS = ("positions", "readings")
 
 
@@ -100,9 +98,9 @@ def read_tables(log: Path, columns: Mapping[str, str]) -> PacketLog:
     if early.size:
         where = table["where"].iloc[early[0]]
         rule = f"{where}: is heard before it is sent"
-        raise ScenarioError(str(log), rule, None, "correct the stamps, or leave t_heard out")
+        raise ScenarioError(str(log), rule, None, "correct the stamps; lost packets have none")
     sends, outcomes = _match(table, resolution, notes, str(log))
-    result = PacketLog(sends, outcomes, origin, resolution, "lost", notes)
+    result = PacketLog(sends, outcomes, origin, resolution, "lost", notes, is_run=is_run)
     if is_run and (log / "ticks.csv").is_file():
         result.ticks = log / "ticks.csv"
     if (table["what"] == "outcome").all() and (table["heard"] == 0.0).any():
@@ -190,7 +188,17 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
         rule = f"line {raw.index[wrong[0]]}: number must be an integer from 0"
         raise ScenarioError(str(path), rule, table["number"].iloc[wrong[0]], "correct the entry")
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
-    return _Rows(table, parse_stamps(path, raw, names["t"]), _read_arrivals(path, raw, names))
+    t_unit = find_unit(path, raw, names["t"], notes)
+    stamps, arrivals = parse_stamps(path, raw, names["t"], t_unit), _read_arrivals(path, raw, names)
+    has_receiver = (table["receiver"] != "").to_numpy()
+    is_lost = has_receiver & np.array([arrival is None for arrival in arrivals])
+    tells = names["t_heard"] and not (names["heard"] or names["event"])
+    if tells and is_lost.any() and not is_lost.all():
+        # The log has a row for each message, with a time if it arrived.
+        table["what"] = np.where(has_receiver, "outcome", "tx")
+        table.loc[is_lost, "heard"] = 0.0
+        notes.append(f"used: rows without {names['t_heard']}, lost: {is_lost.sum():,}")
+    return _Rows(table, stamps, arrivals)
 
 
 def _find_columns(path: Path, raw: pd.DataFrame, notes: list[str]) -> dict[str, str]:
@@ -230,8 +238,9 @@ def _read_arrivals(path: Path, raw: pd.DataFrame, names: dict[str, str]) -> list
     if not column:
         return arrivals
     is_open = raw[column].str.lower().isin(["inf", "infinity"])
-    has = (raw[column] != "") & ~is_open
-    stamps = iter(parse_stamps(path, raw[has], column))
+    has = ~raw[column].str.lower().isin(NO_STAMP) & ~is_open
+    unit = find_unit(path, raw[has], column) if has.any() else ""
+    stamps = iter(parse_stamps(path, raw[has], column, unit))
     return [
         next(stamps) if a else Decimal("Infinity") if b else None
         for a, b in zip(has, is_open, strict=True)

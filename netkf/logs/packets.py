@@ -38,6 +38,10 @@ NOT_LOGGED = "its sender logs what it sends, and not this"
 """Reasons for which outcomes are not known."""
 LATE = 2
 """A number may be that much smaller than the one before because reports are out of order."""
+MAX_SECONDS = 1e11
+"""Stamps from here on are hardly seconds: these would be of the year 5138."""
+YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9
+"""In seconds since 1970."""
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)_(\d\d)[.:](\d\d)[.:](\d\d)")
 
 
@@ -52,7 +56,7 @@ class PacketLog:
     absent   : what a transmission without a row at a hearer is: "lost" or "unknown"
     resolution : seconds of the last digit of stamps
     positions : node, x, y, and readings: t, node, y0; empty if there are none
-    ticks    : the table of the ticks of clocks, of a run
+    is_run   : times are simulated, those of a run, whose clocks have the table ``ticks``
     """
 
     sends: pd.DataFrame
@@ -63,6 +67,7 @@ class PacketLog:
     notes: list[str] = field(default_factory=list)
     positions: pd.DataFrame = field(default_factory=pd.DataFrame)
     readings: pd.DataFrame = field(default_factory=pd.DataFrame)
+    is_run: bool = False
     ticks: Path | None = None
 
 
@@ -119,12 +124,30 @@ def parse_numbers(path: Path, table: pd.DataFrame, name: str, gaps: bool = False
     return values
 
 
-def parse_stamps(path: Path, table: pd.DataFrame, name: str) -> list[Decimal]:
-    """Return a column of stamps as exact seconds (K,): numbers in the unit that ends the name of
-    the column, as t_ms, ISO 8601 times, or 2014-09-07_22.41.23. Raises ScenarioError.
+def find_unit(path: Path, table: pd.DataFrame, name: str, notes: list[str] | None = None) -> str:
+    """Return the unit of a column of stamps: the one that ends its name, as in t_ms, else seconds,
+    unless these would be after the year 5000. Such stamps are in the unit in which they are times
+    since 1970 of the years 1990 to 2100, and a note says so; others are refused (ScenarioError).
     """
-    unit = name.rpartition("_")[2]
-    base = TimeBase(unit if unit in UNITS else "s")
+    unit, first = name.rpartition("_")[2], str(table[name].iloc[0])
+    size = abs(float(first)) if re.fullmatch(r"[+-]?\d{12,}(\.\d*)?", first) else 0.0
+    if unit in UNITS or size < MAX_SECONDS:
+        return unit if unit in UNITS else "s"
+    fits = [u for u, power in UNITS.items() if YEAR_1990 <= size * 10.0**power <= YEAR_2100]
+    if not fits:
+        remedy = f"say the unit of the column: --columns t_ns={name} (s, ms, us, ns)"
+        rule = f"line {table.index[0]}: {name} is too large for seconds"
+        raise ScenarioError(str(path), rule, first, remedy)
+    if notes is not None:
+        notes.append(f"used: {path.name}: {name} is in {fits[0]} since 1970, by its size")
+    return fits[0]
+
+
+def parse_stamps(path: Path, table: pd.DataFrame, name: str, unit: str = "") -> list[Decimal]:
+    """Return a column of stamps as exact seconds (K,): numbers in the ``unit`` (by default that of
+    ``find_unit``), ISO 8601 times, or 2014-09-07_22.41.23. Raises ScenarioError.
+    """
+    base = TimeBase(unit or find_unit(path, table, name))
     stamps = []
     for line, text in zip(table.index, table[name], strict=True):
         try:

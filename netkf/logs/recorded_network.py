@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from netkf.core.errors import ScenarioError
+from netkf.core.stamps import TimeBase
 from netkf.logs.packets import PacketLog, accounts, count_phrase, settle
 from netkf.network.clocks import LinkClock, OnReadings
 from netkf.network.matchings import Matching
@@ -84,6 +85,8 @@ def write_network(
     whose plant, sensors and filter replace those made here. Raises ScenarioError.
     """
     rename_nodes(log)
+    if like is not None:
+        _begin_with(like, log)
     outcomes = settle(log, hole, unreported)
     if outcomes.empty:
         raise ScenarioError(name, "has no packet that anybody could hear", None, "check the log")
@@ -205,7 +208,8 @@ def _own_scenario(
         sends = sends[~sends["sender"].isin(silent)]
     directed = bool((sends["to"] != "").any())
     ticks = sends[["t", "sender", "to"]].set_axis(["t", "node", "peer"], axis=1)
-    files: Files = {"transmissions.csv": _ticks(ticks if directed else ticks[["t", "node"]])}
+    ticks = ticks if directed else ticks[["t", "node"]]
+    files: Files = {"transmissions.csv": ticks.to_csv(index=False)}
     rate = len(sends) / sends["sender"].nunique() / max(float(sends["t"].max()), 1e-9)
     last = max(float(sends["t"].max()), float(log.readings["t"].max()) if len(log.readings) else 0)
     horizon = float(math.floor(last) + 1)
@@ -238,10 +242,6 @@ def _own_scenario(
             log.notes.append(f"dropped: positions, of {len(placed)} of {len(nodes)} nodes only")
     files["scenario.toml"] = HEAD.format(**keys, told=told) + plant + network + FILTER
     return files
-
-
-def _ticks(ticks: pd.DataFrame) -> str:
-    return ticks.sort_values("t", kind="stable").to_csv(index=False)
 
 
 def _round_number(value: float) -> float:
@@ -304,12 +304,32 @@ def _scenario_like(
         )
     for source in source_files(scenario):
         if source not in replaced:
-            if source.name in (*TABLES, *files):
+            if source.name in TABLES or files.get(source.name, source.full) != source.full:
                 rule = "the scenario names a table as import does"
                 raise ScenarioError("path", rule, source.name, "rename the table")
             files[source.name] = source.full
     files["scenario.toml"] = to_toml(resolved)
     return files
+
+
+def _begin_with(scenario: Scenario, log: PacketLog) -> None:
+    """Count the log's times from [time] origin of the scenario, if it has one, and drop what was
+    sent before; raises ScenarioError if nothing is left. The log of a run counts so already.
+    """
+    if scenario.time.origin is None or log.is_run:
+        return
+    origin, sends = scenario.time.stamps.origin, log.sends
+    t = sends["t"] + float(log.origin - origin)
+    kept = (t > 0.0).to_numpy()
+    if not (kept & (t <= scenario.horizon).to_numpy()).any():
+        rule = f"must begin before the end of the log, whose packets are from {log.origin} on"
+        raise ScenarioError("time.origin", rule, str(origin), "correct it, or the unit of stamps")
+    rows = log.outcomes[kept[log.outcomes["send"]]].reset_index(drop=True)
+    log.outcomes = rows.assign(send=np.cumsum(kept)[rows["send"]] - 1)
+    log.sends = sends.assign(t=t.round(9))[kept].reset_index(drop=True)
+    log.origin = origin
+    if not kept.all():
+        log.notes.append(f"dropped: sent by [time] origin of the scenario: {(~kept).sum():,}")
 
 
 def _recorded_activation(
@@ -333,15 +353,16 @@ def _recorded_activation(
     if log.ticks is None and is_broadcast != (at == "nodes"):
         at = "nodes" if is_broadcast else "directions"
         log.notes.append(f'used: clocks at = "{at}", by what the log says of packets')
-    return {**table, "at": at}, log.ticks or _clock_rows(sends, at)
+    return {**table, "at": at}, log.ticks or _clock_rows(sends, at, scenario.time.stamps)
 
 
-def _clock_rows(sends: pd.DataFrame, at: str) -> str:
-    """Return the ticks of clocks ``at`` nodes, directions or links that make nodes send so."""
+def _clock_rows(sends: pd.DataFrame, at: str, stamps: TimeBase) -> str:
+    """Return the ticks of clocks ``at`` nodes, directions or links, in ``stamps``, that send so."""
+    sends = sends.assign(t=[stamps.text(t) for t in sends["t"].tolist()])
     rows = sends[["t", "sender", "to"]].set_axis(["t", "node", "peer"], axis=1)
     if at == "nodes":
-        return _ticks(rows[["t", "node"]].drop_duplicates())
+        rows = rows[["t", "node"]]
     if at == "links":
         pair = np.sort(rows[["node", "peer"]].to_numpy(), axis=1)
         rows["node"], rows["peer"] = pair[:, 0], pair[:, 1]
-    return _ticks(rows.drop_duplicates())
+    return rows.drop_duplicates().to_csv(index=False)

@@ -53,7 +53,8 @@ def from_control(
         raise ScenarioError("system", "must be a state space", type(system).__name__, remedy)
     A, B, C = (matrix(name, np.asarray(getattr(space, name))) for name in "ABC")
     gain = np.eye(len(A)) if G is None else _shaped("G", matrix("G", np.atleast_2d(G)), len(A))
-    noise = _shaped("Q", covariance("Q", np.atleast_2d(Q)), gain.shape[1])
+    hint = "correct it" + ", or give G = system.B for noise at the inputs" * (G is None)
+    noise = _shaped("Q", covariance("Q", np.atleast_2d(Q)), gain.shape[1], hint)
     if np.any(space.D) and any(key.startswith("plant.input") for key in require_changes(changes)):
         rule = "feeds the input through to the readings, which netkf does not"
         remedy = "subtract D u from the outputs and set D = 0"
@@ -103,9 +104,9 @@ def from_filterpy(kf: Any, changes: Changes = None, *, period: float = 1.0) -> S
     return _scenario(table, matrix("kf.H", np.atleast_2d(kf.H)), kf.R, kf.B, changes)
 
 
-def _shaped(key: str, value: FloatArray, rows: int) -> FloatArray:
+def _shaped(key: str, value: FloatArray, rows: int, hint: str = "correct it") -> FloatArray:
     if len(value) != rows:
-        raise ScenarioError(key, f"must have {rows} rows", value, "correct the matrix")
+        raise ScenarioError(key, f"must have {rows} rows", value, hint)
     return value
 
 

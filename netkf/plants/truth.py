@@ -238,7 +238,7 @@ def demand_states(source: SourceFile, truth: RecordedTruth, needed: FloatArray, 
         if truth.rows_at(time):
             continue
         times = truth.times
-        remedy = "add the row, or ask for no state then"
+        remedy = "add the row, or set [time] origin and horizon"
         if len(times) and times[0] < time < times[-1]:
             remedy = 'add the row, or write interpolate = "linear" or "hold"'
         elif len(times):

@@ -71,7 +71,8 @@ def describe_source(
             sentences.append(describe_replica(replica, source.runs, source.replicas))
     elif source.run is not None and len(source.run.times):
         sentences += _describe_worst_node(source, source.run, messages)
-        sentences += [describe_innovations(readings)] if isinstance(readings, Innovations) else []
+        if isinstance(readings, Innovations):
+            sentences.append(describe_innovations(readings, source.scenario))
         sentences += _describe_bound(source)
     elif source.status == "complete":
         sentences.append(
@@ -232,7 +233,7 @@ def _describe_start_up(worst: WorstSample, later: WorstSample, start: StartUp) -
 def _judge_error(source: ReportSource, run: StoredRun, worst: WorstSample) -> list[str]:
     """Return a sentence on whether P allows the error of the worst sample; empty without NEES."""
     column, row = run.nodes.index(worst.node), int(np.searchsorted(run.times, worst.time))
-    nees, n = float(run.nees[row, column]), run.x.shape[1]
+    nees, n = float(run.nees[row, column]), int(source.scenario.sizes[column])
     if not math.isfinite(nees):
         return []
     # NEES is chi-square with n degrees of freedom if P is exact. The samples are dependent, so the

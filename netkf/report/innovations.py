@@ -18,6 +18,7 @@ from netkf.report.packing import Packer
 from netkf.runs.stored import StoredRun
 from netkf.runs.summary import NORMAL_QUANTILE, chi_square_interval
 from netkf.runs.tables import format_number
+from netkf.scenario.scenario import Scenario
 
 MAX_EVENTS = 200_000
 """Events of a run up to which a page replays it for its readings, which takes some seconds."""
@@ -67,9 +68,10 @@ def node_means(readings: Innovations) -> NodeMeans:
     return NodeMeans(nodes, sums / freedom, low, high)
 
 
-def describe_innovations(readings: Innovations) -> str:
+def describe_innovations(readings: Innovations, scenario: Scenario) -> str:
     """Return a sentence on the nodes' mean NIS, and on how many contradict P."""
-    nodes, means, low, high = node_means(readings)
+    ids, means, low, high = node_means(readings)
+    nodes = [scenario.topology.named(k) if k >= 0 else k for k in ids.tolist()]
     count = int(np.isfinite(readings.nis).sum())
     sentence = f"Over {count:,} readings"
     if readings.increments:

@@ -87,7 +87,10 @@ def size(
     chosen = by or _choose_method(base, key, (low, high), parsed)
     search = Search(base, key, is_integer, parsed, chosen)
     if chosen == "theory":
-        return search.run(low, high, 1.0, quantity_by_theory(search.at(low), parsed)[1])
+        try:
+            return search.run(low, high, 1.0, quantity_by_theory(search.at(low), parsed)[1])
+        except TheoryError as error:
+            raise TheoryError(f"{error}; --by simulation sizes any filter and network") from None
     quantity = f"{parsed.description}, over the runs"
     task: BlockTask = partial(block_metrics, engine=engine_used)
     first = FIRST_BATCH

@@ -156,22 +156,25 @@ class Run(NotebookTable):
         }
         return pd.DataFrame(columns, index=pd.Index(self.nodes, name="node"))
 
-    def block(self, name: str, node: int, by: int | None = None) -> BlockSamples:
+    def block(self, name: str, node: int | str, by: int | str | None = None) -> BlockSamples:
         """Return the samples of one block of ``[[plants]]``, the one called ``name`` that ``node``
-        (id) owns or that all share, as it is estimated by the node ``by``, by default ``node``.
+        (id or name) owns or that all share, as the node ``by`` estimates it, by default ``node``.
 
         Raises ScenarioError for a block or a node that does not exist.
         """
         if self.scenario is None:
             rule, remedy = "is unknown for this run", "take a run that netkf.simulate returns"
             raise ScenarioError("scenario", rule, None, remedy)
-        by = node if by is None else by
-        for key, one in (("node", node), ("by", by)):
-            if one not in self.nodes:
-                raise ScenarioError(key, "must be a node of the run", one, "give another id")
+        wanted = {"node": node, "by": node if by is None else by}
+        ids = {key: self.scenario.topology.find(str(one)) for key, one in wanted.items()}
+        for key, one in wanted.items():
+            if ids[key] is None:
+                raise ScenarioError(
+                    key, "must be a node of the run", one, "give another id or name"
+                )
         with errors_under("name"):
-            place = self.scenario.layout.require(name, node)
-        k, first = self.nodes.index(by), place.first
+            place = self.scenario.layout.require(name, ids["node"])
+        k, first = self.nodes.index(ids["by"]), place.first
         if self.scenario.views is not None:
             found = np.flatnonzero(self.scenario.views[k] == first)
             if not found.size:

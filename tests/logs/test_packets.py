@@ -338,3 +338,97 @@ def test_a_run_directory_is_exported(tmp_path, capsys):
     }
     assert main(export) == 2
     assert "must be a new or empty folder" in capsys.readouterr().err
+
+
+def test_a_message_without_a_time_of_arrival_is_lost(tmp_path):
+    rows = ["seq,sender,receiver,time_sent,time_received", "0,a,b,1.0,1.25", "0,a,c,1.0,"]
+    rows += ["1,a,b,2.0,NaN", "1,a,c,2.0,2.5"]
+    netkf.import_log(write(tmp_path / "log.csv", rows), "csv", tmp_path / "out")
+    outcomes = table(tmp_path / "out", "outcomes.csv").sort_values(["receiver", "message"])
+    assert outcomes["delivered"].tolist() == [1, 0, 0, 1]
+    run = netkf.simulate(netkf.load(tmp_path / "out" / "scenario.toml"), engine="simpy")
+    events = run.events
+    assert events[events["kind"] == "deliver"]["t"].tolist() == [1.25, 2.5]
+    assert events[events["kind"] == "lost"]["t"].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(("unit", "digits"), [("ms", 3), ("us", 6), ("ns", 9)])
+def test_stamps_too_large_for_seconds_have_the_unit_of_their_size(tmp_path, unit, digits):
+    stamps = [f"1700000000{'250000000'[:digits]}", f"1700000001{'5' + '0' * (digits - 1)}"]
+    rows = ["timestamp,src,dst,seq,arrival", *(f"{t},a,b,{k},{t}" for k, t in enumerate(stamps))]
+    log = write(tmp_path / "log.csv", rows)
+    _, notes = netkf.import_log(log, "csv", tmp_path / "out")
+    assert f"used: log.csv: timestamp is in {unit} since 1970, by its size" in notes
+    assert "origin: simulated 0 is 1700000000 in the log" in notes
+    assert table(tmp_path / "out", "transmissions.csv")["t"].tolist() == [0.25, 1.5]
+
+
+def test_stamps_of_no_plausible_unit_are_refused(tmp_path):
+    log = write(tmp_path / "log.csv", ["t,src,dst", "50000000000000,a,b"])
+    with pytest.raises(ScenarioError, match=r"line 2: t is too large for seconds.*t_ns=t"):
+        netkf.import_log(log, "csv", tmp_path / "out")
+
+
+ROBOTS = """
+format = 1
+name = "robots"
+horizon = 4.0
+probe = 1.0
+[time]
+origin = 1700000010
+unit = "ns"
+[[plants]]
+name = "place"
+nodes = ["a", "b"]
+A = [[0.0]]
+B = [[0.1]]
+input = { kind = "recorded", path = "speed.csv", G = [[1.0]] }
+cov = [[1.0]]
+[[sensors]]
+of = "place"
+nodes = ["a", "b"]
+H = [[1.0]]
+R = [[1.0]]
+sampling = { kind = "periodic", period = 1.0 }
+[network]
+graph = { kind = "edges", edges = [["a", "b"]], directed = false }
+activation = { kind = "poisson", at = "nodes", rate = 1.0 }
+[filter]
+kind = "block-intersection"
+"""
+
+
+def test_a_log_counts_from_the_origin_of_the_scenario_that_it_is_like(tmp_path):
+    """Stamps of the scenario's tables are nanoseconds, and two blocks read one of them."""
+    (tmp_path / "robots.toml").write_text(ROBOTS)
+    epoch = 1_700_000_010 * 10**9
+    speeds = [f"{epoch + 5 * 10**8 * k},{node},{k}" for k in range(9) for node in "ab"]
+    write(tmp_path / "speed.csv", ["t,node,u0", *speeds])
+    sent = [(-1.5, "a", 0), (0.5, "a", 1), (1.25, "b", 0), (2.5, "a", 2), (5.0, "b", 1)]
+    lost = {2.5}
+    rows = ["time,src,dst,seq,heard"]
+    for t, node, k in sent:
+        other = "b" if node == "a" else "a"
+        rows.append(f"{epoch + round(t * 1e9)},{node},{other},{k},{int(t not in lost)}")
+    log, like = write(tmp_path / "log.csv", rows), tmp_path / "robots.toml"
+    _, notes = netkf.import_log(log, "csv", tmp_path / "out", like=like)
+    assert "dropped: sent by [time] origin of the scenario: 1" in notes
+    scenario = netkf.load(tmp_path / "out" / "scenario.toml")
+    run = netkf.simulate(scenario, engine="simpy")
+    events = run.events
+    for kind, times in (("send", [0.5, 1.25, 2.5]), ("deliver", [0.5, 1.25]), ("lost", [2.5])):
+        assert events[events["kind"] == kind]["t"].tolist() == times
+    assert run.block("place", "b").P.tolist() == run.block("place", 1).P.tolist()
+    with pytest.raises(ScenarioError, match="node: must be a node of the run; got 'c'"):
+        run.block("place", "c")
+    # As a log and as a twin it comes back, from the same origin.
+    netkf.export_log(run, tmp_path / "log")
+    netkf.import_log(tmp_path / "log", "csv", tmp_path / "again")
+    netkf.export_recorded(run, tmp_path / "twin")
+    for name in ("again", "twin"):
+        other = netkf.load(tmp_path / name / "scenario.toml")
+        assert netkf.first_difference(run, netkf.simulate(other, engine="simpy")) is None
+    text = ROBOTS.replace("1700000010", "1900000000")
+    (tmp_path / "later.toml").write_text(text)
+    with pytest.raises(ScenarioError, match=r"time.origin: must begin before the end of the log"):
+        netkf.import_log(log, "csv", tmp_path / "no", like=tmp_path / "later.toml")

@@ -123,3 +123,9 @@ def faded():
     kf = kalman()
     kf.alpha = 1.02
     return kf
+
+
+def test_noise_at_the_inputs_is_asked_for_where_Q_has_their_size():
+    system = signal.StateSpace([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
+    with pytest.raises(netkf.ScenarioError, match=r"Q: must have 2 rows.*give G = system.B"):
+        netkf.from_control(system, [[0.3]], [[0.1]])
