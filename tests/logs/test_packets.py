@@ -10,6 +10,7 @@ import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.logs.packets import unwrap
+from netkf.runs.labels import covariance_notes
 from tests.conftest import SCENARIOS
 
 MERCATOR = """\
@@ -369,6 +370,19 @@ def test_stamps_of_no_plausible_unit_are_refused(tmp_path):
         netkf.import_log(log, "csv", tmp_path / "out")
 
 
+def test_readings_that_come_late_and_do_not_count_have_a_note(tmp_path):
+    """So they do for no filter but block-intersection, and only in messages that take time."""
+    (tmp_path / "robots.toml").write_text(ROBOTS)
+    write(
+        tmp_path / "speed.csv", ["t,node,u0", "1700000010000000000,a,1", "1700000010000000000,b,1"]
+    )
+    late = {"network.channel.delay": {"kind": "constant", "seconds": 0.02}}
+    other = {"filter": {"kind": "block-belief-propagation", "estimates": "own"}}
+    for changes, has_note in ((late, True), ({}, False), (late | other, False)):
+        notes = covariance_notes(netkf.load(tmp_path / "robots.toml", changes))
+        assert any("in a message that took time" in note for note in notes) is has_note
+
+
 ROBOTS = """
 format = 1
 name = "robots"
@@ -421,6 +435,8 @@ def test_a_log_counts_from_the_origin_of_the_scenario_that_it_is_like(tmp_path):
     assert run.block("place", "b").P.tolist() == run.block("place", 1).P.tolist()
     with pytest.raises(ScenarioError, match="node: must be a node of the run; got 'c'"):
         run.block("place", "c")
+    labels = run.plot("links").axes[0].get_yticklabels()
+    assert [label.get_text() for label in labels] == ["a to b", "b to a"]
     # As a log and as a twin it comes back, from the same origin.
     netkf.export_log(run, tmp_path / "log")
     netkf.import_log(tmp_path / "log", "csv", tmp_path / "again")

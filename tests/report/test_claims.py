@@ -2,7 +2,9 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import scipy.stats
 
 from netkf.report import claims
 
@@ -53,3 +55,16 @@ def test_unknown_consistency_is_no_inconsistency():
         patch.setattr(claims, "_rms_error", lambda row: row.values["rms"])
         sentences = claims._describe_filters(SimpleNamespace(rows=rows, runs=1, first="a"))
     assert "P does not describe the errors of c (overconfident)" in sentences
+
+
+def test_an_error_is_judged_by_the_states_that_its_node_estimates(monkeypatch):
+    """Of two blocks of 3 states, each node estimates its own: NEES has 3 degrees of freedom."""
+    samples = SimpleNamespace(errors=np.zeros(50))
+    monkeypatch.setattr(claims, "summary_samples", lambda run, summary: samples)
+    source = SimpleNamespace(summary={}, scenario=SimpleNamespace(sizes=np.array([3, 3])))
+    times, nees = np.array([0.0, 1.0]), np.array([[3.0, 3.0], [2.5, 30.0]])
+    run = SimpleNamespace(nodes=(0, 1), times=times, nees=nees, x=np.zeros((2, 6)))
+    (text,) = claims._judge_error(source, run, SimpleNamespace(node=1, time=1.0))
+    limit = scipy.stats.chi2.isf(claims.FALSE_ALARM / 100, 3)
+    assert f"far more than its P says: NEES 30, above {limit:.4g}" in text
+    assert "(the mean is then 3)" in text
