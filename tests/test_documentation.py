@@ -15,7 +15,7 @@ ELSEWHERE = {  # pages whose blocks have tests of their own
     "scenario_files.md": "test_docs.py",
 }
 NEEDS = {"formats.md": ("xarray", "h5netcdf", "stonesoup", "filterpy")}
-SLOW = ("blocks.md", "gallery.md", "look.md", "sizing.md")  # others run their scripts
+SLOW = ("blocks.md", "faults.md", "gallery.md", "look.md", "sizing.md")  # others run their scripts
 FOLLOWED = [page for page in PAGES if page.name not in ELSEWHERE and blocks(page)]
 
 

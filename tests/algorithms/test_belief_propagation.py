@@ -195,6 +195,7 @@ def batch(scenario, run):
     return np.stack(found)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("at", ["links", "nodes"])
 def test_exact_on_trees_in_any_order(at, tmp_path):
     graph = {"kind": "edges", "edges": [[0, 1], [1, 2], [1, 3]]}

@@ -207,6 +207,7 @@ def test_no_block_filter_is_below_the_stacked_kalman_filter(
     assert (difference < 1e-9) == equal
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("estimates", ["own", "own+neighbours"])
 def test_only_the_naive_update_is_overconfident(tmp_path: Path, estimates: str) -> None:
     # Where covariances are split, runs take much longer; a P like the naive one is found by twelve.

@@ -219,6 +219,7 @@ def test_every_node_learns_how_many_there_are_and_what_they_see():
             np.testing.assert_allclose(state.information, 100.0 * np.eye(2), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("delivery", "wrong"), [pytest.param(0.7, 0.5, marks=pytest.mark.slow), (0.5, 0.9)]
 )

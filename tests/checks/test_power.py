@@ -69,6 +69,7 @@ def test_one_clock_that_is_off_is_found_as_stated():
         assert np.mean(np.array(off) > 0.0) == pytest.approx(0.9, abs=0.06)
 
 
+@pytest.mark.slow
 def test_what_no_test_could_find_is_stated(ring):
     """In few runs: the bound is that of the most powerful test, by its power at that error."""
     scenario, results = ring

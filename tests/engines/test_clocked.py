@@ -26,7 +26,7 @@ def agree(seeds, folder, sizes=SIZES, filters=FILTERS):
     return runs
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("first", range(0, FEW, TOGETHER))
 def test_drawn_scenarios_agree(first, tmp_path):
     agree(range(first, first + TOGETHER), tmp_path)

@@ -46,7 +46,7 @@ def test_every_scenario_agrees(file):
     assert_agree(scenario.replace({"horizon": horizon}))
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize(
     "file",
     [f for f in scenario_files() if tomllib.loads(f.read_text())["filter"]["kind"] == "hybrid"],

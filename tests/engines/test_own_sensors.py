@@ -109,6 +109,7 @@ def test_in_slots(slots, kind):
     assert run.status == "complete"
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("cls", [Turning, Biased, Empty])
 def test_samples(clocks, cls):
     scenario = in_clocks(clocks, cls)

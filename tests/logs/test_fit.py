@@ -126,6 +126,7 @@ def test_slow_changes_are_found():
     assert 0.05 < tests["constancy"].estimate < 0.15  # 0.15 / sqrt 2 = 0.106
 
 
+@pytest.mark.slow
 def test_slow_changes_are_neither_bursts_nor_shared_fate():
     """Few true assumptions are rejected; without windows most would be."""
     flags, without = [], []

@@ -23,6 +23,7 @@ def loaded(path):
     return module
 
 
+@pytest.mark.slow
 def test_the_scenario_loads_and_its_tests_pass(written):
     scenario = netkf.load(written / "my-ring.toml")
     assert scenario.name == "my-ring"

@@ -237,6 +237,7 @@ def test_errors_beyond_all_numbers_are_reported_without_a_warning():
     assert "nan" not in format_consistency(found)
 
 
+@pytest.mark.slow
 def test_each_block_of_a_node_is_judged(tmp_path):
     naive = load(
         ROBOTS, tmp_path, filter__rule="naive", filter__estimates="own+neighbours", horizon=8.0

@@ -77,7 +77,7 @@ def test_nodes_that_have_the_limit_need_no_rate(build):
         theory.link_rate_for(made, 0.0)
 
 
-@pytest.mark.one_in(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.1, 3.0])
 def test_the_threshold_of_a_blind_node(build, rate):
     """lambda > 2 a / pi: at half of it H(12) grows without bound, which H Proposition 4 denies."""
