@@ -45,6 +45,10 @@ NAIVE_NOTE = (
     'rule = "naive" takes errors of different nodes for independent, which they are not once nodes '
     "have told each other: P is overconfident"
 )
+LATE_NOTE = (
+    "block-intersection uses no reading of the receiver in a message that took time: P may grow; "
+    "block-belief-propagation uses late ones too"
+)
 RULES = {"naive": NAIVE, "ci": CI, "split": SPLIT}
 
 
@@ -342,9 +346,12 @@ class BlockIntersection(Filter):
 
     @property
     def needs(self) -> Needs:
-        """Samples; a note says what the naive rule does."""
-        notes = (NAIVE_NOTE,) if self.rule == "naive" else ()
-        return Needs(one_way=True, samples=True, blocks=True, notes=lambda _: notes)
+        """Samples; notes say what the naive rule does, and which readings are left out."""
+        return Needs(one_way=True, samples=True, blocks=True, notes=self._scenario_notes)
+
+    def _scenario_notes(self, scenario: Any) -> tuple[str, ...]:
+        naive = (NAIVE_NOTE,) if self.rule == "naive" else ()
+        return naive if scenario.network.channel.delay.fixed == 0.0 else (*naive, LATE_NOTE)
 
     @property
     def analysis(self) -> Analysis:

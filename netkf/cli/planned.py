@@ -175,10 +175,10 @@ def _run_on(
     pool_options: PoolOptions | None = None,
 ) -> int:
     """Run a study whose results are those of a plan; return its exit status."""
-    from netkf.ensembles.pools import LocalPool, make_pool
+    from netkf.ensembles.pools import PoolOptions, make_pool
 
-    given = pool_options
-    with LocalPool() if given is None else make_pool(given.workers or 1, given) as pool:
+    given = pool_options or PoolOptions(1)
+    with make_pool(given.workers or 1, given) as pool:
         pool.plan = study
         options.executor, options.workers, options.scheduler = pool, None, None
         return run(options)

@@ -17,7 +17,7 @@ def _run(options: argparse.Namespace) -> int:
 
     plan = open_plan(options.directory, options.trust)
     part = Part(*options.part) if options.part else part_of_array(plan.tasks)
-    workers = options.workers if options.workers or options.scheduler else 1
+    workers = None if options.scheduler else options.workers or 1
     pool = PoolOptions(workers=workers, scheduler=options.scheduler)
     if plan.arguments:
         return work_on_study(plan, part, pool, options)

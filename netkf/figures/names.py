@@ -1,6 +1,6 @@
 """Names of figures, formats of their files and the looks of series, without matplotlib."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 FORMATS = ("png", "svg", "pdf")
 """Formats of picture files, which are their suffixes."""
@@ -20,7 +20,7 @@ class SeriesStyle(NamedTuple):
 
     colour: str
     dark: str
-    dashes: str
+    dashes: Any
     marker: str
 
 
@@ -29,9 +29,9 @@ SERIES = (
     SeriesStyle("#D55E00", "#ff8f4d", "--", "s"),
     SeriesStyle("#009E73", "#2ec4a0", "-.", "^"),
     SeriesStyle("#CC79A7", "#e39cc4", ":", "D"),
-    SeriesStyle("#222222", "#f0f0f0", (0, (6, 1, 1, 1, 1, 1)), "v"),  # type: ignore[arg-type]
-    SeriesStyle("#E69F00", "#e69f00", (0, (3, 3)), "P"),  # type: ignore[arg-type]
-    SeriesStyle("#56B4E9", "#a6dcff", (0, (1, 3)), "X"),  # type: ignore[arg-type]
-    SeriesStyle("#555555", "#a5a9ae", (0, (8, 3)), "*"),  # type: ignore[arg-type]
+    SeriesStyle("#222222", "#f0f0f0", (0, (6, 1, 1, 1, 1, 1)), "v"),
+    SeriesStyle("#E69F00", "#e69f00", (0, (3, 3)), "P"),
+    SeriesStyle("#56B4E9", "#a6dcff", (0, (1, 3)), "X"),
+    SeriesStyle("#555555", "#a5a9ae", (0, (8, 3)), "*"),
 )
 """Looks of runs, filters and other series, in figures and on pages: the first has the first."""

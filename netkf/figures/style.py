@@ -144,14 +144,13 @@ def write_figure(figure: Figure, path: Path) -> None:
     undated: dict[str, Any] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     metadata = undated[file_format]
     with style_context(), write_atomically(path) as temporary:
+        figure.set_dpi(RESOLUTION)
         if (engine := figure.get_layout_engine()) is not None:
             # Once, instead of in a first drawing of all artists that is thrown away.
-            figure.set_dpi(RESOLUTION)
             engine.execute(figure)
             figure.set_layout_engine("none")
         if file_format == "png":
             # ``savefig`` would first draw all artists to nowhere.
-            figure.set_dpi(RESOLUTION)
             canvas: Any = FigureCanvasAgg(figure)
             canvas.print_png(temporary, metadata=metadata)
         else:

@@ -231,8 +231,8 @@ def links_figure(data: FigureData) -> Picture:
     # Empty series for the legend.
     axes.plot([], [], "|", color=INK, label="delivered")
     axes.plot([], [], "x", color=LOST, label="lost")
-    names = {int(node): node for node in data.nodes}
-    labels = [f"{names[one.sender]} to {names[one.receiver]}" for one in selection]
+    named = data.scenario.topology.named
+    labels = [f"{named(one.sender)} to {named(one.receiver)}" for one in selection]
     axes.set_yticks(range(len(selection)), labels, fontsize=6.5)
     axes.set_ylim(-0.8, len(selection) - 0.2)
     axes.invert_yaxis()

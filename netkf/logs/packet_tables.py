@@ -18,7 +18,6 @@ from netkf.logs.packets import (
     choose_origin,
     count_phrase,
     find_resolution,
-    find_unit,
     parse_numbers,
     parse_stamps,
     read_texts,
@@ -188,8 +187,7 @@ def _read_rows(path: Path, raw: pd.DataFrame, notes: list[str]) -> _Rows:
         rule = f"line {raw.index[wrong[0]]}: number must be an integer from 0"
         raise ScenarioError(str(path), rule, table["number"].iloc[wrong[0]], "correct the entry")
     table["what"], table["heard"] = _read_outcomes(path, raw, names, table)
-    t_unit = find_unit(path, raw, names["t"], notes)
-    stamps, arrivals = parse_stamps(path, raw, names["t"], t_unit), _read_arrivals(path, raw, names)
+    stamps, arrivals = parse_stamps(path, raw, names["t"], notes), _read_arrivals(path, raw, names)
     has_receiver = (table["receiver"] != "").to_numpy()
     is_lost = has_receiver & np.array([arrival is None for arrival in arrivals])
     tells = names["t_heard"] and not (names["heard"] or names["event"])
@@ -239,8 +237,7 @@ def _read_arrivals(path: Path, raw: pd.DataFrame, names: dict[str, str]) -> list
         return arrivals
     is_open = raw[column].str.lower().isin(["inf", "infinity"])
     has = ~raw[column].str.lower().isin(NO_STAMP) & ~is_open
-    unit = find_unit(path, raw[has], column) if has.any() else ""
-    stamps = iter(parse_stamps(path, raw[has], column, unit))
+    stamps = iter(parse_stamps(path, raw[has], column))
     return [
         next(stamps) if a else Decimal("Infinity") if b else None
         for a, b in zip(has, is_open, strict=True)

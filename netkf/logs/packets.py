@@ -124,12 +124,12 @@ def parse_numbers(path: Path, table: pd.DataFrame, name: str, gaps: bool = False
     return values
 
 
-def find_unit(path: Path, table: pd.DataFrame, name: str, notes: list[str] | None = None) -> str:
+def _find_unit(path: Path, table: pd.DataFrame, name: str, notes: list[str] | None) -> str:
     """Return the unit of a column of stamps: the one that ends its name, as in t_ms, else seconds,
     unless these would be after the year 5000. Such stamps are in the unit in which they are times
     since 1970 of the years 1990 to 2100, and a note says so; others are refused (ScenarioError).
     """
-    unit, first = name.rpartition("_")[2], str(table[name].iloc[0])
+    unit, first = name.rpartition("_")[2], str(next(iter(table[name]), ""))
     size = abs(float(first)) if re.fullmatch(r"[+-]?\d{12,}(\.\d*)?", first) else 0.0
     if unit in UNITS or size < MAX_SECONDS:
         return unit if unit in UNITS else "s"
@@ -143,11 +143,14 @@ def find_unit(path: Path, table: pd.DataFrame, name: str, notes: list[str] | Non
     return fits[0]
 
 
-def parse_stamps(path: Path, table: pd.DataFrame, name: str, unit: str = "") -> list[Decimal]:
-    """Return a column of stamps as exact seconds (K,): numbers in the ``unit`` (by default that of
-    ``find_unit``), ISO 8601 times, or 2014-09-07_22.41.23. Raises ScenarioError.
+def parse_stamps(
+    path: Path, table: pd.DataFrame, name: str, notes: list[str] | None = None
+) -> list[Decimal]:
+    """Return a column of stamps as exact seconds (K,): numbers in the unit that ends the name of
+    the column, as t_ms, or that their size tells, of which ``notes`` get a line; ISO 8601 times, or
+    2014-09-07_22.41.23. Raises ScenarioError.
     """
-    base = TimeBase(unit or find_unit(path, table, name))
+    base = TimeBase(_find_unit(path, table, name, notes))
     stamps = []
     for line, text in zip(table.index, table[name], strict=True):
         try:

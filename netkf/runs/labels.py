@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from netkf.algorithms.block_intersection import BlockIntersection
 from netkf.algorithms.registry import overridden
 from netkf.scenario.scenario import Scenario
 
@@ -26,17 +25,7 @@ def covariance_bias(scenario: Scenario) -> str:
 
 def covariance_notes(scenario: Scenario) -> tuple[str, ...]:
     """Return notes for users on P, on its bound and on NEES."""
-    notes = (mismatch_note(scenario), nees_note(scenario), late_readings_note(scenario))
-    return tuple(filter(None, notes))
-
-
-def late_readings_note(scenario: Scenario) -> str:
-    """Return a note if the filter leaves out readings in messages that took time, else ""."""
-    delay = scenario.network.channel.delay
-    if not isinstance(scenario.filter.algorithm, BlockIntersection) or delay.fixed == 0.0:
-        return ""
-    rule = "block-intersection uses no reading of the receiver in a message that took time"
-    return f"{rule}: P may grow; block-belief-propagation uses late ones too"
+    return tuple(filter(None, (mismatch_note(scenario), nees_note(scenario))))
 
 
 def nees_note(scenario: Scenario) -> str:

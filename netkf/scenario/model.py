@@ -392,10 +392,9 @@ class ScenarioModel(Component):
         """
         of_plants = [enumerate(plant.labels) for _, plant in self.all_plants]
         states = [x and self._column_label(k, {x}) for plant in of_plants for k, x in plant]
-        placed = [
-            p for owner, own in self.placed_sensors.items() if node in (-1, owner) for p in own
-        ]
-        return [x for p in placed for x in self._value_labels(self.sensors[p.entry], states)]
+        owners = [node] if node >= 0 else [*self.placed_sensors]
+        placed = [self.sensors[p.entry] for i in owners for p in self.placed_sensors.get(i, ())]
+        return [label for sensor in placed for label in self._value_labels(sensor, states)]
 
     def _value_labels(self, sensor: Sensor, states: Sequence[str]) -> Iterator[str]:
         """Yield the labels of the values of a reading from those of the n ``states``."""

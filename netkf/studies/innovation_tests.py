@@ -235,20 +235,18 @@ def judge_innovations(
     law, is_finite = law_of(scenario), np.isfinite(recorded.nis)
     nodes = np.unique(recorded.nodes[is_finite]).tolist()
     level = (1.0 - confidence) / max(1, len(nodes)) / (4 if law.kind == "white" else 2)
-    rows = [
-        _judge_node(scenario, recorded, np.flatnonzero(is_finite & (recorded.nodes == node)), level)
-        for node in nodes
-    ]
+    chosen = (np.flatnonzero(is_finite & (recorded.nodes == node)) for node in nodes)
+    rows = [_judge_node(scenario, recorded, of_node, law, level) for of_node in chosen]
     return InnovationTests(scenario.name, confidence, law, tuple(rows))
 
 
 def _judge_node(
-    scenario: Scenario, recorded: Innovations, chosen: np.ndarray, level: float
+    scenario: Scenario, recorded: Innovations, chosen: np.ndarray, law: Law, level: float
 ) -> NodeInnovations:
     """Return the row of the node of the ``chosen`` readings, each of whose tests rejects a right
     model with probability ``level``.
     """
-    law, node = law_of(scenario), int(recorded.nodes[chosen[0]])
+    node = int(recorded.nodes[chosen[0]])
     nis, rows, is_white = recorded.nis[chosen], recorded.rows[chosen], law.kind == "white"
     freedom, mean = float(rows.sum()), float(nis.sum() / rows.sum())
     whitened = [recorded.whitened[i] for i in chosen]

@@ -10,7 +10,6 @@ import netkf
 from netkf.cli.main import main
 from netkf.core.errors import ScenarioError
 from netkf.logs.packets import unwrap
-from netkf.runs.labels import covariance_notes
 from tests.conftest import SCENARIOS
 
 MERCATOR = """\
@@ -364,6 +363,17 @@ def test_stamps_too_large_for_seconds_have_the_unit_of_their_size(tmp_path, unit
     assert table(tmp_path / "out", "transmissions.csv")["t"].tolist() == [0.25, 1.5]
 
 
+def test_a_column_of_arrivals_may_be_empty(tmp_path):
+    """It then tells nothing: each row is a message heard, as without the column."""
+    rows = ["t,src,dst,seq,arrival", "1.0,a,b,0,", "2.0,a,b,1,"]
+    with_it = write(tmp_path / "with.csv", rows)
+    without = write(tmp_path / "without.csv", [row.rpartition(",")[0] for row in rows])
+    netkf.import_log(with_it, "csv", tmp_path / "one")
+    netkf.import_log(without, "csv", tmp_path / "other")
+    for name in ("transmissions.csv", "outcomes.csv", "links.csv"):
+        assert (tmp_path / "one" / name).read_text() == (tmp_path / "other" / name).read_text()
+
+
 def test_stamps_of_no_plausible_unit_are_refused(tmp_path):
     log = write(tmp_path / "log.csv", ["t,src,dst", "50000000000000,a,b"])
     with pytest.raises(ScenarioError, match=r"line 2: t is too large for seconds.*t_ns=t"):
@@ -379,7 +389,7 @@ def test_readings_that_come_late_and_do_not_count_have_a_note(tmp_path):
     late = {"network.channel.delay": {"kind": "constant", "seconds": 0.02}}
     other = {"filter": {"kind": "block-belief-propagation", "estimates": "own"}}
     for changes, has_note in ((late, True), ({}, False), (late | other, False)):
-        notes = covariance_notes(netkf.load(tmp_path / "robots.toml", changes))
+        notes = netkf.load(tmp_path / "robots.toml", changes).notes
         assert any("in a message that took time" in note for note in notes) is has_note
 
 
