@@ -13,13 +13,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from netkf.ensembles.block_files import BlockFiles, RunIdentity
+from netkf.ensembles.block_files import BlockFiles, RunIdentity, open_block
 from netkf.ensembles.blocks import Job
 from netkf.ensembles.merge_tree import Merge
 from netkf.ensembles.parts import Worker
 from netkf.ensembles.replicas import BlockStore, Form, Gap, MissingRunsError, missing_ranges
+from netkf.runs.documents import DamagedError
 from netkf.runs.files import BLOCKS_FOLDER, scenario_digest
 from netkf.scenario.scenario import Scenario
+
+MAX_LEVELS = 40  # of the tree over replicas
 
 
 class StudyBlocks(BlockFiles):
@@ -40,6 +43,19 @@ class StudyBlocks(BlockFiles):
     def require_fit(self, arrays: Any, stored: dict[str, Any]) -> int:
         """Return the number of runs whose results they are."""
         return len(next(iter(self._form.pack(self.unpack(arrays)).values())))
+
+    def load(self, node: Node) -> Any:
+        """Return the results of the runs of a node, which another worker may have merged into a
+        larger file since it was found; raises EngineError if there are none.
+        """
+        start, size = node
+        for length in (size << level for level in range(MAX_LEVELS)):
+            outer = start // length * length, length
+            with contextlib.suppress(DamagedError), open_block(self._path(outer)) as arrays:
+                value, rows = self.unpack(arrays), slice(start - outer[0], start - outer[0] + size)
+                is_list = isinstance(value, list)
+                return value[rows] if is_list else type(value)(*(field[rows] for field in value))
+        return super().load(node)
 
 
 class PlannedStudy:

@@ -51,8 +51,8 @@ class BlockStore(NamedTuple):
 
 
 class Form(NamedTuple):
-    """How the results of blocks are stored: functions that turn one into arrays by name, with one
-    row for each run, and back.
+    """How the results of blocks are stored: functions that turn one, a list of runs or a named
+    tuple of arrays with a row for each run, into arrays by name and back.
     """
 
     pack: Callable[[Any], dict[str, Any]]

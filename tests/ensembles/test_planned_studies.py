@@ -3,12 +3,17 @@
 import json
 import re
 import shutil
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 from netkf.cli.main import main
+from netkf.core.errors import EngineError
 from netkf.ensembles import block_files
 from netkf.ensembles.merge_tree import MergeTree
+from netkf.ensembles.planned_study import StudyBlocks
+from netkf.ensembles.replicas import Form, form_of
 from netkf.runs import provenance
 from netkf.runs.documents import write_sealed
 from tests.conftest import SCENARIOS, with_slow
@@ -184,6 +189,39 @@ def test_files_of_neighbours_are_merged_into_one(tmp_path):
     assert blocks.nodes == [(0, 8), (8, 4), (12, 1)]
     assert len(list(tmp_path.iterdir())) == 3
     assert [blocks.load(node) for node in blocks.nodes] == [v for _, _, v in tree.nodes()]
+
+
+class Squares(NamedTuple):
+    values: np.ndarray
+
+
+@pytest.mark.parametrize("as_list", [True, False])
+def test_results_are_found_where_another_worker_has_merged_them(as_list, tmp_path):
+    """A study with rounds reads all blocks, while other workers merge theirs with them."""
+
+    def result(*runs):
+        return [k * k for k in runs] if as_list else Squares(np.array(runs) ** 2)
+
+    def merge(a, b):
+        return a + b if as_list else Squares(np.concatenate([a.values, b.values]))
+
+    form = Form(lambda v: {"values": v}, lambda a: list(a["values"])) if as_list else None
+    reader, one, other = (
+        StudyBlocks(tmp_path, merge, form or form_of(Squares)) for _ in ("reader", "one", "other")
+    )
+    identity = block_files.RunIdentity("x", 1, 8, "none", "")
+    one.add((2, 2), result(2, 3), identity, 0.0)
+    one.write(identity)
+    assert reader.find(identity, True)[0] == other.find(identity, True)[0] == [(2, 2)]
+    for node in ((0, 2), (4, 4)):
+        other.add(node, result(*range(node[0], sum(node))), identity, 0.0)
+    other.write(identity)
+    assert [file.name for file in tmp_path.iterdir()] == ["000000000-8.npz"]
+    found = reader.load((2, 2))
+    assert (found if as_list else found.values.tolist()) == [4, 9]
+    shutil.rmtree(tmp_path)
+    with pytest.raises(EngineError, match="which does it again"):
+        reader.load((2, 2))
 
 
 def test_a_plan_has_all_that_it_needs(tmp_path, monkeypatch, capsys):
