@@ -3,16 +3,22 @@
 import json
 import re
 import shutil
+from argparse import Namespace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from netkf.cli.main import main
+from netkf.cli.main import main, make_parser
+from netkf.cli.planned import work_on_study
 from netkf.core.errors import EngineError
 from netkf.ensembles import block_files
 from netkf.ensembles.merge_tree import MergeTree
+from netkf.ensembles.parts import Part
 from netkf.ensembles.planned_study import StudyBlocks
+from netkf.ensembles.plans import open_plan
+from netkf.ensembles.pools import PoolOptions
 from netkf.ensembles.replicas import Form, form_of
 from netkf.runs import provenance
 from netkf.runs.documents import write_sealed
@@ -100,6 +106,14 @@ def plan(tmp_path, capsys):
     return folder
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What the command of ``plan`` writes."""
+    folder = tmp_path_factory.mktemp("studies") / "whole"
+    assert main([*STUDIES["sweep"], "--out", str(folder), "--workers", "1"]) == 0
+    return files(folder)
+
+
 def one_line(capsys):
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1
@@ -124,6 +138,48 @@ def test_damaged_and_mixed_results_of_studies(plan, monkeypatch, capsys):
     assert "machines of different kinds" in capsys.readouterr().err.splitlines()[-1]
     assert main(["merge", str(plan), "--mixed"]) == 0
     assert "last digits may be others" in capsys.readouterr().err
+
+
+def test_a_full_disk_keeps_what_was_written(plan, whole, monkeypatch, capsys):
+    written, write = [], Path.write_bytes
+
+    def fills(path, data):
+        if len(written) == 2:
+            raise OSError(28, "No space left on device")
+        written.append(path)
+        return write(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(plan), "write_bytes", fills)
+        assert main(["work", str(plan)]) == 2
+    assert "No space left on device" in one_line(capsys)
+    kept = files(plan / "blocks")
+    assert len(kept) == 2
+    assert main(["work", str(plan)]) == 0
+    assert "5 runs simulated" in capsys.readouterr().out
+    assert kept.items() <= files(plan / "blocks").items()
+    assert main(["merge", str(plan)]) == 0
+    assert files(plan.with_name("out")) == whole
+
+
+@pytest.mark.parametrize(("part", "simulated"), [(Part(0, 1), 5), (Part(1, 2), 7)])
+def test_two_workers_on_one_block_do_no_harm(part, simulated, plan, whole, monkeypatch, capsys):
+    """The second begins and ends before the first has written its block of the first ensemble."""
+    add, other = StudyBlocks.add, []
+    options = Namespace(trust=False, seconds=None, parse=make_parser().parse_args)
+
+    def meanwhile(*given):
+        if not other:
+            other.append(None)
+            other[0] = work_on_study(open_plan(plan), part, PoolOptions(1), options)
+        return add(*given)
+
+    monkeypatch.setattr(StudyBlocks, "add", meanwhile)
+    assert main(["work", str(plan)]) == 0
+    assert other == [0]
+    assert f": {simulated} runs simulated" in capsys.readouterr().out
+    assert main(["merge", str(plan)]) == 0
+    assert files(plan.with_name("out")) == whole
 
 
 def test_what_is_no_plan_of_a_study_is_refused_in_one_line(plan, tmp_path, capsys):
