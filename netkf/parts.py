@@ -112,12 +112,7 @@ from netkf.plants.faults import Biased, Drifting, Fault, Outliers, Stuck
 from netkf.plants.inputs import ConstantInput, Input, RecordedInput, SineInput
 from netkf.plants.linear import LinearPlant
 from netkf.plants.maps import NonlinearPlant
-from netkf.plants.nonlinear import (
-    BearingSensor,
-    NonlinearSensor,
-    RangeBearingSensor,
-    RangeSensor,
-)
+from netkf.plants.nonlinear import BearingSensor, NonlinearSensor, RangeBearingSensor, RangeSensor
 from netkf.plants.plant import Plant
 from netkf.plants.recorded import (
     RecordedDiffusion,

@@ -11,10 +11,7 @@ import numpy as np
 
 from netkf.checks.equations import error_promises
 from netkf.checks.evidence import Assumption, Finding, Promise
-from netkf.checks.exact import (
-    check_nees,
-    summarise_exactly,
-)
+from netkf.checks.exact import check_nees, summarise_exactly
 from netkf.checks.laws import (
     FIXED_READINGS,
     LAW_TOLERANCE,

@@ -20,11 +20,7 @@ from netkf.checks.evidence import (
     find_identity,
     find_unknown,
 )
-from netkf.checks.exact import (
-    check_expected_nees,
-    check_upper_bound,
-    with_promised_filter,
-)
+from netkf.checks.exact import check_expected_nees, check_upper_bound, with_promised_filter
 from netkf.checks.laws import find_largest
 from netkf.checks.paper import PaperChecks, usual_assumptions
 from netkf.checks.points import check_times, sampled_indices

@@ -19,13 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.algorithms.filter import (
-    Filter,
-    NodeInfo,
-    Reading,
-    interval_rule,
-    may_be_silent,
-)
+from netkf.algorithms.filter import Filter, NodeInfo, Reading, interval_rule, may_be_silent
 from netkf.algorithms.traits import Analysis, Needs, Timing, Weights
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray, square_root

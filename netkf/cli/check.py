@@ -9,12 +9,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from netkf.cli import pictures
-from netkf.cli.options import (
-    FAILED,
-    load_scenario,
-    print_json,
-    print_notes,
-)
+from netkf.cli.options import FAILED, load_scenario, print_json, print_notes
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 

@@ -5,12 +5,7 @@ from __future__ import annotations
 import argparse
 
 from netkf.cli import pictures
-from netkf.cli.options import (
-    load_scenario,
-    print_json,
-    print_table_notes,
-    print_title,
-)
+from netkf.cli.options import load_scenario, print_json, print_table_notes, print_title
 from netkf.cli.progress import ProgressLine
 
 

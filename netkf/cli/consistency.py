@@ -5,12 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from netkf.cli.options import (
-    FAILED,
-    load_scenario,
-    print_json,
-    print_table_notes,
-)
+from netkf.cli.options import FAILED, load_scenario, print_json, print_table_notes
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -10,11 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from netkf.cli import pictures
-from netkf.cli.options import (
-    load_scenario,
-    print_notes,
-    print_title,
-)
+from netkf.cli.options import load_scenario, print_notes, print_title
 from netkf.cli.progress import ProgressLine
 from netkf.core.errors import ScenarioError
 

@@ -6,10 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from netkf.cli.options import (
-    print_json,
-    print_notes,
-)
+from netkf.cli.options import print_json, print_notes
 from netkf.core.errors import ScenarioError
 from netkf.core.printable import shorten
 

@@ -6,11 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from netkf.checks.innovations import (
-    MIN_READINGS,
-    Innovations,
-    autocorrelations,
-)
+from netkf.checks.innovations import MIN_READINGS, Innovations, autocorrelations
 from netkf.core.errors import NetkfError
 from netkf.figures.figure_data import FigureData, UnavailableError
 from netkf.figures.panels import draw_nees

@@ -8,15 +8,7 @@ from typing import Any
 import numpy as np
 
 from netkf.figures.figure_data import UnavailableError
-from netkf.figures.style import (
-    INK,
-    LOST,
-    SKY,
-    Picture,
-    draw_legend,
-    finish_figure,
-    new_figure,
-)
+from netkf.figures.style import INK, LOST, SKY, Picture, draw_legend, finish_figure, new_figure
 
 COLUMNS = 3
 """Panels beside each other."""

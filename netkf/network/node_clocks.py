@@ -9,15 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from netkf.core.clock import Clock
-from netkf.core.fields import (
-    Component,
-    Rule,
-    SourceFile,
-    field,
-    list_of,
-    node_id,
-    number,
-)
+from netkf.core.fields import Component, Rule, SourceFile, field, list_of, node_id, number
 from netkf.core.instants import TimeGrid
 from netkf.core.laws import Lattice
 from netkf.linalg.arrays import FloatArray

@@ -12,12 +12,7 @@ from netkf.checks.innovations import Innovations
 from netkf.figures.layout import get_positions
 from netkf.report.directories import ReportSource
 from netkf.report.innovations import innovation_columns
-from netkf.report.messages import (
-    ThinnedMessages,
-    bin_messages,
-    information_age,
-    thin_messages,
-)
+from netkf.report.messages import ThinnedMessages, bin_messages, information_age, thin_messages
 from netkf.report.packing import Packer
 from netkf.report.worst import WorstSample
 from netkf.runs.stored import StoredRun

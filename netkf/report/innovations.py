@@ -6,11 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from netkf.checks.innovations import (
-    Innovations,
-    autocorrelations,
-    compute_innovations,
-)
+from netkf.checks.innovations import Innovations, autocorrelations, compute_innovations
 from netkf.core.errors import NetkfError
 from netkf.linalg.arrays import FloatArray
 from netkf.report.directories import ReportSource

@@ -19,13 +19,7 @@ import scipy
 
 from netkf.algorithms.filter import NetworkInfo, NodeInfo, commutes
 from netkf.algorithms.kernels.gains import longest_interval
-from netkf.algorithms.models import (
-    FlowModel,
-    MapModel,
-    RateModel,
-    SlotModel,
-    changing_models,
-)
+from netkf.algorithms.models import FlowModel, MapModel, RateModel, SlotModel, changing_models
 from netkf.algorithms.modes import rate_groups
 from netkf.algorithms.traits import Weights
 from netkf.core.contracts import ContractError

@@ -29,14 +29,7 @@ from netkf.network.deliveries import (
 )
 from netkf.runs.simulate import simulate
 from netkf.scenario.scenario import Scenario
-from netkf.studies.information import (
-    LATE,
-    REFUSED,
-    UNDER_WAY,
-    IntArray,
-    match_messages,
-    rows_until,
-)
+from netkf.studies.information import LATE, REFUSED, UNDER_WAY, IntArray, match_messages, rows_until
 
 
 class Outcome(NamedTuple):

@@ -29,12 +29,7 @@ from netkf.studies.search import (
     SimulationPlan,
     Sizing,
 )
-from netkf.studies.targets import (
-    Target,
-    parse_target,
-    quantity_by_theory,
-    theory_is_exact,
-)
+from netkf.studies.targets import Target, parse_target, quantity_by_theory, theory_is_exact
 
 
 def size(

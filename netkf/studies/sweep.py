@@ -22,12 +22,7 @@ from netkf.linalg.arrays import FloatArray
 from netkf.rng.streams import Streams
 from netkf.runs.documents import write_sealed
 from netkf.runs.failures import InterruptedRunError, explain_failures
-from netkf.runs.files import (
-    check_sources,
-    create_output_directory,
-    write_scenario,
-    write_text,
-)
+from netkf.runs.files import check_sources, create_output_directory, write_scenario, write_text
 from netkf.runs.parquet_files import write_table
 from netkf.runs.provenance import versions
 from netkf.runs.quantities import ensemble_names

@@ -23,12 +23,7 @@ from netkf.theory.intermittent import assumptions as intermittent
 from netkf.theory.kalman_consensus import linear_errors as kalman_consensus
 from netkf.theory.push_sum import assumptions as push_sum
 from netkf.theory.push_sum.promises import slot_lines, slot_promises
-from netkf.theory.stochastic_trigger.errors import (
-    UNHEARD,
-    all_hear_all,
-    error_columns,
-    start_equal,
-)
+from netkf.theory.stochastic_trigger.errors import UNHEARD, all_hear_all, error_columns, start_equal
 from netkf.theory.track_fusion.steady_errors import tracks_in_slots
 from netkf.trace.run import Run
 

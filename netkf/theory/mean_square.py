@@ -23,10 +23,7 @@ from netkf.theory.common.jumps import SlotJumps
 from netkf.theory.errors import diagonal_blocks, require_known_filter
 from netkf.theory.folders import LinearErrors, theory_of
 from netkf.theory.intermittent.riccati import steady_gain
-from netkf.theory.numerics.positive_maps import (
-    fixed_point,
-    spectral_radius,
-)
+from netkf.theory.numerics.positive_maps import fixed_point, spectral_radius
 
 MAX_ERRORS = 200
 """Largest number of errors of all nodes; a step then takes milliseconds, a solution seconds."""

@@ -18,11 +18,7 @@ from netkf.theory.common.evidence import (
 )
 from netkf.theory.common.plant_assumptions import start_rows
 from netkf.theory.common.random_links import all_messages_arrive
-from netkf.theory.diffusion.information import (
-    MAX_REGRESSORS,
-    few_regressors,
-    information_level,
-)
+from netkf.theory.diffusion.information import MAX_REGRESSORS, few_regressors, information_level
 
 MAX_NODES = 2000  # of a network whose diameter is computed, from the distances of all pairs
 
